@@ -1,0 +1,37 @@
+# Everything runs in .venv, made on first use; `make test PYTHON=python3` runs in an environment of your own.
+# PIP_FLAGS='--extra-index-url https://download.pytorch.org/whl/cpu' gets the small torch, without CUDA.
+PYTHON ?= .venv/bin/python
+PIP_FLAGS ?=
+VENV := $(filter .venv/bin/python,$(PYTHON))
+
+.PHONY: help demo test test-slow lint bench clean
+.DEFAULT_GOAL := help
+
+help:  ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+demo: $(VENV)  ## two small scenes, fused and rendered
+	$(PYTHON) examples/demo.py
+
+test: $(VENV)  ## the quick tests
+	$(PYTHON) -m pytest -q -m 'not slow'
+
+test-slow: $(VENV)  ## every test
+	$(PYTHON) -m pytest -q
+
+lint: $(VENV)  ## ruff
+	$(PYTHON) -m ruff check .
+
+bench: $(VENV)  ## the measurements that the claims rest on
+	$(PYTHON) -m benchmarks
+
+clean:  ## all that can be made again
+	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+.venv/bin/python: .venv/.stamp ;
+
+.venv/.stamp: pyproject.toml constraints.txt
+	$$(command -v python3.11 || command -v python3) -m venv .venv
+	.venv/bin/python -m pip install -q $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	touch $@

@@ -1,0 +1,242 @@
+"""The `.rfpack` bundle: a scene graph and the fields it places, in one file; see `formats/SPEC.md`."""
+
+import hashlib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from formats.archive import MAGIC, parse_archive, read_archive, write_archive
+from formats.atomic import atomic_writer, check_writable
+from formats.errors import BadHeader, ChecksumMismatch, FormatError, MissingMember, UnknownMember
+from formats.inputs import open_input
+from formats.records import FieldHeader, FieldRecord, decode_field, decode_header, encode_field
+from formats.scene import (
+    FORMAT,
+    MEMBER,
+    SceneGraph,
+    dump_scene,
+    make_node,
+    parse_scene,
+    read_scene,
+)
+
+SCENE = "scene.json"
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A scene graph and its fields by member name, `fields/<sha256[:16]>.safetensors`."""
+
+    scene: SceneGraph
+    fields: dict[str, FieldRecord]
+
+
+class BundleWriter:
+    """Collects encoded fields, then writes them with a scene graph that names them.
+
+    >>> writer = BundleWriter()
+    >>> member = writer.add_field(record)
+    >>> writer.write("chair.rfpack", SceneGraph((make_node("chair", field=member),)))
+    """
+
+    def __init__(self, scene: SceneGraph | None = None):
+        self.scene = scene
+        self.members: dict[str, bytes] = {}
+
+    def add_field(self, record: FieldRecord, precision: str = "float16") -> str:
+        """The member name of `record`, encoded; equal fields share one member. Raises as `encode_field`."""
+        name, data = field_member(record, precision)
+        self.members[name] = data
+        return name
+
+    def copy_field(self, path: Path | str, member: str) -> str:
+        """Take over `member` of the bundle at `path` byte for byte; raises as `read_bundle`."""
+        views = _checked_members(read_archive(path), str(path), verify=True)
+        if member not in views:
+            raise MissingMember(f"{path}: holds no member {member!r}")
+        self.members[member] = bytes(views[member])
+        return member
+
+    def write(self, path: Path | str, scene: SceneGraph | None = None, *, overwrite: bool = False) -> None:
+        """The bundle at `path`, whole or not at all; `scene` defaults to the writer's own.
+
+        Raises MissingMember (a node names a field not added), OutputExists, ResourceError, LimitExceeded.
+        """
+        scene = scene or self.scene
+        check_fields(scene, self.members, str(path))
+        content = dump_scene(scene)
+        check_writable(path, overwrite)
+        with atomic_writer(path) as file:
+            write_archive(file, [(SCENE, content), *sorted(self.members.items())])
+
+
+def single_field_bundle(
+    record: FieldRecord,
+    name: str,
+    *,
+    precision: str = "float16",
+    history: Iterable[dict] = (),
+    generator: str = "fusedrf",
+) -> BundleWriter:
+    """A writer whose scene is one node `name` that holds one field; its `write(path)` needs no more."""
+    writer = BundleWriter()
+    member = writer.add_field(record, precision)
+    writer.scene = SceneGraph((make_node(name, field=member),), history=tuple(history), generator=generator)
+    return writer
+
+
+def field_member(record: FieldRecord, precision: str = "float16") -> tuple[str, bytes]:
+    """The member name and bytes of one field."""
+    data = encode_field(record, precision)
+    return member_name(data), data
+
+
+def member_name(data: bytes | memoryview) -> str:
+    """The name that a field's bytes give it."""
+    return f"fields/{hashlib.sha256(data).hexdigest()[:16]}.safetensors"
+
+
+def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
+    """The bundle at `path`, every byte of it checked; without `verify` the checksums are not.
+
+    Raises a FormatError naming the file and the member: see `formats/errors.py`.
+    """
+    return _bundle(read_archive(path, verify=verify), str(path), verify)
+
+
+def parse_bundle(data: bytes | memoryview, where: str) -> Bundle:
+    """As `read_bundle`, of bytes."""
+    return _bundle(parse_archive(memoryview(data), where), where, verify=True)
+
+
+def read_summary(path: Path | str) -> dict:
+    """What `info` tells of a bundle or a plain scene.json, JSON-able, from headers alone.
+
+    Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
+    """
+    if _is_json(path):
+        summary = _scene_summary(read_scene(path), {})
+        return {"path": str(path), "format": "scene", "bytes": _size(path), **summary, "fields": []}
+    views = read_archive(path, verify=False)
+    scene = _scene(views, str(path))
+    members = _checked_members(views, str(path), verify=False)
+    check_fields(scene, members, str(path))
+    headers = {name: decode_header(view, f"{path}: {name}") for name, view in members.items()}
+    fields = [_field_summary(name, headers[name], len(members[name])) for name in members]
+    return {
+        "path": str(path),
+        "format": FORMAT,
+        "bytes": _size(path),
+        **_scene_summary(scene, headers),
+        "fields": fields,
+    }
+
+
+def is_bundle(path: Path | str) -> bool:
+    """Whether the file's content, not its name, is a bundle, whole or damaged."""
+    try:
+        with open_input(path) as file:
+            head = file.read(40)
+    except FormatError:
+        return False
+    return head[:4] == MAGIC and head[30:] == SCENE.encode()
+
+
+def sha256_of(path: Path | str) -> str:
+    """Hex SHA-256 of a file's bytes."""
+    with open_input(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def check_fields(scene: SceneGraph, members: Iterable[str], where: str) -> None:
+    """Every field that a node names is among `members`; MissingMember otherwise."""
+    for leaf in scene.leaves():
+        if leaf.field is not None and leaf.field not in members:
+            raise MissingMember(f"{where}: node {leaf.name!r} names {leaf.field!r}, no member of this bundle")
+
+
+def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
+    scene = _scene(views, where)
+    members = _checked_members(views, where, verify)
+    check_fields(scene, members, where)
+    return Bundle(scene, {name: decode_field(view, f"{where}: {name}") for name, view in members.items()})
+
+
+def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:
+    first = next(iter(views))
+    if first != SCENE:
+        raise UnknownMember(f"{where}: begins with member {first!r}, expected {SCENE!r}")
+    return parse_scene(bytes(views[SCENE]), f"{where}: {SCENE}")
+
+
+def _checked_members(views: dict[str, memoryview], where: str, verify: bool) -> dict[str, memoryview]:
+    """The fields among a bundle's members: names of the format, in order, and true to their content."""
+    names = [name for name in views if name != SCENE]
+    for name in names:
+        if not re.fullmatch(MEMBER, name):
+            raise UnknownMember(f"{where}: member {name!r}, expected {SCENE} and fields/<16 hex>.safetensors")
+        if verify and member_name(views[name]) != name:
+            raise ChecksumMismatch(f"{where}: member {name} is damaged (SHA-256); copy the file again")
+    if names != sorted(names):
+        raise BadHeader(f"{where}: its members are not sorted by name; write it with fusedrf")
+    return {name: views[name] for name in names}
+
+
+def _is_json(path: Path | str) -> bool:
+    with open_input(path) as file:
+        return file.read(64).lstrip()[:1] == b"{"
+
+
+def _size(path: Path | str) -> int:
+    return Path(path).stat().st_size
+
+
+def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
+    nodes = []
+    for node, depth, object_to_world in scene.walk():
+        header = headers.get(node.field)
+        aabb = header.metadata.get("aabb") if header else None
+        nodes.append(
+            {
+                "name": node.name,
+                "depth": depth,
+                "field": node.field,
+                "source": node.source,
+                "kind": header.kind if header else None,
+                "background": node.background,
+                "object_to_world": object_to_world.tolist(),
+                "aabb": aabb,
+                "world_aabb": world_aabb(aabb, object_to_world) if aabb else None,
+            }
+        )
+    return {
+        "version": scene.version,
+        "generator": scene.generator,
+        "composition": scene.composition,
+        "nodes": nodes,
+        "history": list(scene.history),
+    }
+
+
+def world_aabb(aabb: list[float], object_to_world: np.ndarray) -> list[float]:
+    """(6,) box in the world around the eight corners of a (6,) box in the object's frame."""
+    low, high = np.array(aabb[:3]), np.array(aabb[3:])
+    centre = object_to_world[:3, :3] @ (low + high) / 2 + object_to_world[:3, 3]
+    half = np.abs(object_to_world[:3, :3]) @ (high - low) / 2
+    return [*(centre - half).tolist(), *(centre + half).tolist()]
+
+
+def _field_summary(name: str, header: FieldHeader, size: int) -> dict:
+    arrays = {key: {"dtype": str(s.dtype), "shape": list(s.shape)} for key, s in sorted(header.specs.items())}
+    count = sum(int(np.prod(spec.shape)) for spec in header.specs.values())
+    return {
+        "member": name,
+        "kind": header.kind,
+        "bytes": size,
+        "parameters": count,
+        "arrays": arrays,
+        "metadata": header.metadata,
+    }

@@ -1,0 +1,231 @@
+"""Cameras in JSON: the frames of a `transforms*.json` and nerfstudio's `camera_path.json`, as `View`s.
+
+Poses are camera-to-world with OpenGL axes in all of them. A frame's own intrinsics go before the file's; of
+one source the first of `x_fov` (degrees), `fl_x` (pixels), `camera_angle_x` (radians) counts, and the same
+for y. Without a focal length for y pixels are square; without a principal point it is the centre.
+"""
+
+import json
+import math
+import re
+from collections import Counter
+from pathlib import Path, PurePosixPath
+
+from formats.errors import BadIntrinsics, BadJson, BadSchema, NoViews, UnsupportedCamera
+from formats.images import MAX_SIDE, read_image_header
+from formats.inputs import read_input
+from formats.views import View, checked_pose
+
+MAX_JSON = 256 * 2**20
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".PNG", ".JPG", ".JPEG")
+PERSPECTIVE = {"", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV"}
+JSON_TOKEN = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
+
+
+def read_cameras(path: Path | str, size: tuple[int, int] | None = None) -> tuple[View, ...]:
+    """The cameras of a `transforms*.json`, whose photos need not exist, or of a `camera_path.json`, in file
+    order.
+
+    `size` (width, height) replaces the file's; then a transforms.json keeps its horizontal field of view and
+    a camera path its vertical one, which is how each states them. Raises BadIntrinsics where no size is
+    known, BadPose, BadJson, BadSchema, MissingFile, NoViews, UnsupportedCamera.
+    """
+    path = Path(path)
+    document = read_document(path)
+    views = (
+        _path_views(path, document, size) if "camera_path" in document else _frame_views(path, document, size)
+    )
+    if not views:
+        raise NoViews(f"{path}: lists no cameras; expected at least one frame")
+    return views
+
+
+# --- transforms.json ----------------------------------------------------------------------------------------
+
+
+def read_document(path: Path) -> dict:
+    """A JSON object, in which // and /* */ comments are allowed as instant-ngp allows them."""
+    try:
+        text = read_input(path, MAX_JSON).decode("utf-8-sig")
+        document = json.loads(JSON_TOKEN.sub(lambda m: m[0] if m[0].startswith('"') else " ", text))
+    except RecursionError as error:
+        raise BadJson(f"{path}: JSON is nested too deep to be read") from error
+    except ValueError as error:
+        raise BadJson(f"{path}: not JSON: {error}") from error
+    if not isinstance(document, dict):
+        raise BadSchema(f"{path}: found a JSON {type(document).__name__}, expected an object with frames")
+    return document
+
+
+def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
+    """The frames as listed; BadSchema unless they are a list of objects."""
+    frames = document.get(key)
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise BadSchema(f'{path}: expected "{key}" to be a list of objects, one per camera, with their poses')
+    return frames
+
+
+def frame_photo(path: Path, frame: dict) -> Path | None:
+    """The frame's photo, an extension added where the file leaves it out; None if it is not on disk."""
+    written = frame_file(frame)
+    exact = path.parent / written
+    candidates = [exact, *(exact.with_name(exact.name + ending) for ending in EXTENSIONS)] if written else []
+    return next((candidate for candidate in candidates if _is_file(candidate)), None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name too long for the disk, or with a NUL in it
+        return False
+
+
+def frame_file(frame: dict) -> str:
+    """The frame's `file_path` with forward slashes and without a leading "./"; empty where there is none."""
+    written = frame.get("file_path")
+    return str(PurePosixPath(written.replace("\\", "/"))) if isinstance(written, str) and written else ""
+
+
+def frame_names(frames: list[dict]) -> list[str]:
+    """A distinct name per frame: the file stem, or the path joined by _ where two frames share a stem."""
+    files = [PurePosixPath(frame_file(frame) or f"{i:05d}") for i, frame in enumerate(frames)]
+    stems = [file.stem if file.suffix in EXTENSIONS else file.name for file in files]
+    shared = Counter(stems)
+    names = [
+        stem
+        if shared[stem] == 1
+        else "_".join([*(p for p in file.parent.parts if p not in ("/", "..")), stem])
+        for file, stem in zip(files, stems, strict=True)
+    ]
+    repeated = Counter(names)
+    return [name if repeated[name] == 1 else f"{name}_{i:05d}" for i, name in enumerate(names)]
+
+
+def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[int, int] | None) -> View:
+    """The camera of one frame at the size that the file states, else at `size` (width, height)."""
+    sources = (frame, document)
+    _check_model(sources, where)
+    width, height = _size(sources, size, where)
+    x, y = _focal(sources, "x", width, where), _focal(sources, "y", height, where)
+    if not (x or y):
+        raise BadIntrinsics(
+            f"{where}: no focal length; expected fl_x, x_fov or camera_angle_x here or in the file"
+        )
+    return View(
+        name=name,
+        camera_to_world=checked_pose(frame.get("transform_matrix"), where),
+        fl_x=x or y,
+        fl_y=y or x,
+        cx=_number(sources, "cx", where, width / 2),
+        cy=_number(sources, "cy", where, height / 2),
+        width=width,
+        height=height,
+        distortion=tuple(_number(sources, key, where, 0.0) for key in ("k1", "k2", "k3", "p1", "p2")),
+    )
+
+
+def frame_where(path: Path, index: int, frame: dict) -> str:
+    """How errors name a frame."""
+    return f"{path}: frame {index} ({frame_file(frame) or 'no file_path'})"
+
+
+def _frame_views(path: Path, document: dict, size: tuple[int, int] | None) -> tuple[View, ...]:
+    frames = read_frames(path, document)
+    first_photo = next((photo for photo in (frame_photo(path, frame) for frame in frames) if photo), None)
+    photo_size = read_image_header(first_photo)[:2] if first_photo else size
+    named = enumerate(zip(frames, frame_names(frames), strict=True))
+    views = [frame_view(frame_where(path, i, f), document, f, name, photo_size) for i, (f, name) in named]
+    return tuple(view.reframed(*size) if size else view for view in views)
+
+
+def _size(sources: tuple[dict, dict], size: tuple[int, int] | None, where: str) -> tuple[int, int]:
+    stated = [_number(sources, key, where, None) for key in ("w", "h")]
+    width, height = (round(side) for side in stated) if None not in stated else size or (None, None)
+    if width is None:
+        raise BadIntrinsics(
+            f"{where}: no w and h, and no photo to take them from; give the size of the pictures"
+        )
+    return checked_size(width, height, where)
+
+
+def checked_size(width: int, height: int, where: str) -> tuple[int, int]:
+    """Both sides within 1..MAX_SIDE; BadIntrinsics otherwise."""
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+        raise BadIntrinsics(f"{where}: a picture of {width}x{height} pixels, expected 1 to {MAX_SIDE} a side")
+    return width, height
+
+
+def _focal(sources: tuple[dict, dict], axis: str, side: int, where: str) -> float | None:
+    """Pixels; None where neither source says."""
+    for source in sources:
+        if (degrees := _number((source,), f"{axis}_fov", where, None)) is not None:
+            return fov_focal(math.radians(degrees), side, where)
+        if (pixels := _number((source,), f"fl_{axis}", where, None)) is not None:
+            return _positive(pixels, where)
+        if (radians := _number((source,), f"camera_angle_{axis}", where, None)) is not None:
+            return fov_focal(radians, side, where)
+    return None
+
+
+def fov_focal(radians: float, side: int, where: str) -> float:
+    """Focal length in pixels of a field of view across `side` pixels; BadIntrinsics if outside (0, pi)."""
+    if not 0 < radians < math.pi:
+        raise BadIntrinsics(
+            f"{where}: field of view of {math.degrees(radians):g} degrees, expected within 0 to 180"
+        )
+    return _positive(0.5 * side / math.tan(0.5 * radians), where)
+
+
+def _positive(pixels: float, where: str) -> float:
+    if not pixels > 0:
+        raise BadIntrinsics(f"{where}: focal length of {pixels:g} pixels, expected a positive one")
+    return pixels
+
+
+def _number(sources: tuple[dict, ...], key: str, where: str, default: float | None) -> float | None:
+    found = next((source[key] for source in sources if source.get(key) is not None), default)
+    if found is None:
+        return None
+    if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) < 1e30:
+        raise BadIntrinsics(f"{where}: {key} is {str(found)[:40]}, expected a finite number")
+    return float(found)
+
+
+def _check_model(sources: tuple[dict, dict], where: str) -> None:
+    model = next((source["camera_model"] for source in sources if "camera_model" in source), "")
+    if any(source.get("is_fisheye") for source in sources):
+        model = "fisheye"
+    if _number(sources, "k4", where, 0.0):
+        model = "k4"
+    if str(model).upper() not in PERSPECTIVE:
+        raise UnsupportedCamera(
+            f"{where}: a camera with {str(model)[:40]}, expected a pinhole with k1 k2 k3 p1 p2; "
+            "undistort the photos first"
+        )
+
+
+# --- camera_path.json ---------------------------------------------------------------------------------------
+
+
+def _path_views(path: Path, document: dict, size: tuple[int, int] | None) -> tuple[View, ...]:
+    kind = str(document.get("camera_type", "perspective")).lower()
+    if kind != "perspective":
+        raise UnsupportedCamera(f"{path}: camera_type {kind[:40]!r}, expected perspective")
+    if not size:
+        sides = [_number((document,), f"render_{side}", str(path), None) for side in ("width", "height")]
+        if None in sides:
+            raise BadIntrinsics(f"{path}: no render_width and render_height; give the size of the pictures")
+        size = checked_size(*(round(side) for side in sides), str(path))
+    frames = read_frames(path, document, "camera_path")
+    return tuple(_path_view(f"{path}: frame {i}", frame, f"{i:05d}", size) for i, frame in enumerate(frames))
+
+
+def _path_view(where: str, frame: dict, name: str, size: tuple[int, int]) -> View:
+    """nerfstudio's `fov` is the vertical one, in degrees."""
+    width, height = size
+    degrees = _number((frame,), "fov", where, None)
+    if degrees is None:
+        raise BadIntrinsics(f"{where}: no fov; expected the vertical field of view in degrees")
+    focal = fov_focal(math.radians(degrees), height, where)
+    pose = checked_pose(frame.get("camera_to_world"), where)
+    return View(name, pose, focal, focal, width / 2, height / 2, width, height)

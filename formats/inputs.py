@@ -1,0 +1,98 @@
+"""Hostile input: regular files opened safely, and JSON read strictly."""
+
+import errno
+import json
+import math
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from formats.errors import BadJson, LimitExceeded, MissingFile, NotAFile, ResourceError
+
+MAX_INTEGER = 2**63 - 1
+
+
+def open_input(path: Path | str) -> BinaryIO:
+    """A regular file opened for reading; never waits on a pipe or reads a device.
+
+    Raises MissingFile, NotAFile, or ResourceError where permission is missing.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0))
+    except PermissionError as error:
+        raise ResourceError(f"{path}: no permission to read it; check the file's mode") from error
+    except (OSError, ValueError) as error:
+        raise _unopened(path, error) from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise NotAFile(f"{path}: expected a regular file, found a folder, pipe or device")
+    return os.fdopen(descriptor, "rb")
+
+
+def _unopened(path: Path | str, error: Exception) -> Exception:
+    if isinstance(error, ValueError) or error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG):
+        return MissingFile(f"{path}: no such file; check the spelling and the folder it is relative to")
+    if error.errno in (errno.EISDIR, errno.ENXIO, errno.ELOOP):
+        return NotAFile(f"{path}: expected a regular file, found a folder, pipe or endless link")
+    return ResourceError(f"{path}: cannot be read ({error.strerror})")
+
+
+def read_input(path: Path | str, limit: int) -> bytes:
+    """All bytes of a regular file; LimitExceeded, from its size alone, where it holds more than `limit`."""
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise LimitExceeded(f"{path}: {size:,} bytes, a file of this sort has at most {limit:,}")
+        return file.read(limit)
+
+
+def parse_json(data: bytes, where: str):
+    """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise."""
+    try:
+        return json.loads(
+            bytes(data).decode("utf-8"),
+            object_pairs_hook=_unique,
+            parse_float=_finite,
+            parse_int=_bounded,
+            parse_constant=_refuse,
+        )
+    except RecursionError as error:
+        raise BadJson(f"{where}: JSON is nested too deep to be read") from error
+    except ValueError as error:
+        raise BadJson(f"{where}: not strict JSON: {error}") from error
+
+
+def _unique(pairs: list[tuple[str, object]]) -> dict:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"key {next(k for k in keys if keys.count(k) > 1)!r} appears twice in one object")
+    for text in [*found, *found.values()]:
+        _encodable(text)
+    return found
+
+
+def _encodable(text: object) -> None:
+    if isinstance(text, list):
+        for item in text:
+            _encodable(item)
+    elif isinstance(text, str) and any("\ud800" <= c <= "\udfff" for c in text):
+        raise ValueError(f"{text[:40]!r} holds half of a surrogate pair")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    if not math.isfinite(value):
+        raise ValueError(f"number {digits[:40]} is beyond the range of 64-bit floats")
+    return value
+
+
+def _bounded(digits: str) -> int:
+    if len(digits) > 20 or abs(int(digits)) > MAX_INTEGER:
+        raise ValueError(f"integer {digits[:40]} is beyond 64 bits")
+    return int(digits)
+
+
+def _refuse(name: str) -> None:
+    raise ValueError(f"{name} is not a JSON number")

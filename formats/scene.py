@@ -1,0 +1,502 @@
+"""The scene graph: named fields placed in a tree of transforms, and its JSON.
+
+Frames: `node_to_parent` and `object_to_world` are (4, 4) float64 and act on column points; the world's is the
+product from the root down. Placement words are glTF's: `translation`, `rotation` (unit quaternion xyzw) and
+`scale`, scale applied first; or `matrix`, four rows of four.
+"""
+
+import dataclasses
+import json
+import math
+import os
+import re
+import unicodedata
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from formats.atomic import atomic_writer, check_writable
+from formats.errors import (
+    BadJson,
+    BadName,
+    BadSchema,
+    CyclicScene,
+    DuplicateName,
+    FormatError,
+    FormatWarning,
+    LimitExceeded,
+    MissingFile,
+    NewerVersion,
+    NotFinite,
+    OutsideFolder,
+    SingularTransform,
+)
+from formats.inputs import parse_json, read_input
+
+FORMAT = "rfpack"
+VERSION = "1.0"
+MEMBER = r"fields/[0-9a-f]{16}\.safetensors"
+MAX_SCENE_BYTES = 4 << 20
+MAX_NODES = 10_000
+MAX_DEPTH = 64
+MAX_NAME_BYTES = 255
+MAX_TRANSLATION = 1e6
+SINGULAR_VALUES = (1e-4, 1e4)
+MAX_CONDITION = 1e6
+WARN_CONDITION = 1e3
+# A unit quaternion typed with two decimals is off by at most this.
+QUATERNION_SLACK = 1e-2
+# These could forge what a terminal shows; other format characters hold emoji together and stay.
+BIDIRECTIONAL = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+
+Vector3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
+Vector4 = Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
+Matrix4 = Annotated[list[Vector4], msgspec.Meta(min_length=4, max_length=4)]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
+
+
+class NodeSchema(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """One placed object: a `field` of this bundle, a `source` file, or a group of `children`."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_NAME_BYTES)]
+    field: Annotated[str, msgspec.Meta(pattern=f"^{MEMBER}$")] | msgspec.UnsetType = msgspec.UNSET
+    source: Text | msgspec.UnsetType = msgspec.UNSET
+    background: bool = False
+    translation: Vector3 | msgspec.UnsetType = msgspec.UNSET
+    rotation: Vector4 | msgspec.UnsetType = msgspec.UNSET
+    scale: Vector3 | msgspec.UnsetType = msgspec.UNSET
+    matrix: Matrix4 | msgspec.UnsetType = msgspec.UNSET
+    children: list["NodeSchema"] = []
+
+
+class SceneSchema(msgspec.Struct, omit_defaults=True):
+    """A scene graph: `scene.json` on disk, or the first member of a bundle."""
+
+    format: Literal["rfpack"]
+    version: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}$")]
+    nodes: list[NodeSchema]
+    generator: str = ""
+    composition: Literal["max", "add"] = "max"
+    history: list[dict] = []
+    requires: Annotated[list[str], msgspec.Meta(max_length=0)] = []
+
+
+NODE_KEYS = NodeSchema.__struct_fields__
+PLACEMENT_KEYS = ("translation", "rotation", "scale", "matrix")
+SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history")
+
+
+@dataclass(frozen=True)
+class Node:
+    """A placed object or group; `node_to_parent` (4, 4) follows from `placement`, kept as it was spelled."""
+
+    name: str
+    field: str | None = None
+    source: str | None = None
+    placement: dict = dataclasses.field(default_factory=dict)
+    background: bool = False
+    children: tuple["Node", ...] = ()
+    extras: dict = dataclasses.field(default_factory=dict)
+    node_to_parent: np.ndarray = dataclasses.field(init=False, compare=False, repr=False)
+
+    def __post_init__(self):
+        _check_name(self.name)
+        if self.field is not None and self.source is not None:
+            raise BadSchema(f"node {self.name!r}: has both a field and a source, expected one of them")
+        matrix = _placement_matrix(self.placement, self.name)
+        _check_affine(matrix, f"node {self.name!r}")
+        matrix.flags.writeable = False
+        object.__setattr__(self, "node_to_parent", matrix)
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A node that holds something: `object_to_world` is (4, 4) float64."""
+
+    name: str
+    field: str | None
+    source: str | None
+    object_to_world: np.ndarray
+    background: bool
+
+
+@dataclass(frozen=True)
+class SceneGraph:
+    """A valid tree of nodes: names unique, depth and count bounded, every world transform invertible."""
+
+    nodes: tuple[Node, ...]
+    composition: str = "max"
+    history: tuple[dict, ...] = ()
+    generator: str = "fusedrf"
+    version: str = VERSION
+    extras: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.composition not in ("max", "add"):
+            raise BadSchema(f"composition {self.composition!r} is neither 'max' nor 'add'")
+        seen: set[str] = set()
+        for count, (node, depth, object_to_world) in enumerate(self.walk(), 1):
+            name = unicodedata.normalize("NFC", node.name)
+            if name in seen:
+                raise DuplicateName(f"node name {node.name!r} appears twice; give every node its own name")
+            if count > MAX_NODES:
+                raise LimitExceeded(f"more than {MAX_NODES:,} nodes")
+            seen.add(name)
+            if depth > 1:
+                _check_affine(object_to_world, f"node {node.name!r} in the world")
+
+    def walk(self) -> Iterator[tuple[Node, int, np.ndarray]]:
+        """Every node in document order with its depth (roots 1) and `object_to_world` (4, 4)."""
+        stack = [(node, 1, node.node_to_parent) for node in reversed(self.nodes)]
+        while stack:
+            node, depth, object_to_world = stack.pop()
+            if depth > MAX_DEPTH:
+                raise LimitExceeded(f"node {node.name!r}: nested deeper than {MAX_DEPTH} levels")
+            yield node, depth, object_to_world
+            stack += [(c, depth + 1, object_to_world @ c.node_to_parent) for c in reversed(node.children)]
+
+    def leaves(self) -> list[Leaf]:
+        """The nodes that hold a field or a source, in document order."""
+        return [
+            Leaf(node.name, node.field, node.source, object_to_world, node.background)
+            for node, _, object_to_world in self.walk()
+            if node.field is not None or node.source is not None
+        ]
+
+
+def make_node(
+    name: str,
+    *,
+    source: str | None = None,
+    field: str | None = None,
+    translation=None,
+    rotation=None,
+    scale=None,
+    matrix=None,
+    background: bool = False,
+    children: tuple[Node, ...] = (),
+) -> Node:
+    """A node by translation (3,), rotation (4,) quaternion xyzw and scale (3,), or by matrix (4, 4).
+
+    Raises BadName, BadSchema, NotFinite, SingularTransform, LimitExceeded.
+    """
+    words = zip(PLACEMENT_KEYS, (translation, rotation, scale, matrix), strict=True)
+    placement = {key: np.asarray(value).tolist() for key, value in words if value is not None}
+    return Node(name, field, source, placement, background, tuple(children))
+
+
+def read_scene(path: Path | str) -> SceneGraph:
+    """The scene graph in a plain `scene.json`, whose nodes name sources only."""
+    scene = parse_scene(read_input(path, MAX_SCENE_BYTES), str(path))
+    for node, _, _ in scene.walk():
+        if node.field is not None:
+            raise BadSchema(
+                f"{path}: node {node.name!r} names a field, which only bundles hold; use a source"
+            )
+    return scene
+
+
+def parse_scene(data: bytes, where: str) -> SceneGraph:
+    """The scene graph in JSON bytes; `where` leads error sentences.
+
+    Raises BadJson, BadSchema, NewerVersion, BadName, DuplicateName, NotFinite, SingularTransform,
+    LimitExceeded; warns (FormatWarning) about a newer minor version, whose unknown keys are kept.
+    """
+    if len(data) > MAX_SCENE_BYTES:
+        raise LimitExceeded(f"{where}: a scene of {len(data):,} bytes, at most {MAX_SCENE_BYTES:,} are read")
+    content = parse_json(data, where)
+    newer = _check_version(content, where)
+    nodes = content.get("nodes")
+    _check_extent(nodes, where)
+    extras = {key: value for key, value in content.items() if key not in SCENE_KEYS}
+    known = {**content, "nodes": _known(nodes)} if newer else content
+    try:
+        spec = msgspec.convert(known, SceneSchema)
+        roots = tuple(_build_node(node) for node in nodes)
+        return SceneGraph(roots, spec.composition, tuple(spec.history), spec.generator, spec.version, extras)
+    except msgspec.ValidationError as error:
+        raise BadSchema(f"{where}: {error}") from error
+    except FormatError as error:
+        raise error.within(where) from error
+
+
+def dump_scene(scene: SceneGraph) -> bytes:
+    """Canonical JSON of `scene`: UTF-8, indented, numbers of a list on one line, newline at the end.
+
+    Read back before it is returned, so what is written can be read; raises as `parse_scene` where it cannot.
+    """
+    content = {
+        "format": FORMAT,
+        "version": scene.version,
+        "generator": scene.generator,
+        "composition": scene.composition,
+        "nodes": [_node_content(node) for node in scene.nodes],
+        "history": list(scene.history),
+        **{key: scene.extras[key] for key in sorted(scene.extras)},
+    }
+    try:
+        text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+        text = re.sub(r"\[\n\s*([-+.\deE,\s]+?)\n\s*\]", lambda m: f"[{' '.join(m[1].split())}]", text)
+        data = (text + "\n").encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise BadJson(f"the scene cannot be written as JSON ({error})") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)
+        parse_scene(data, "the scene")
+    return data
+
+
+def write_scene(path: Path | str, scene: SceneGraph, *, overwrite: bool = False) -> None:
+    """`scene` as a plain `scene.json`, whole or not at all. Raises OutputExists, ResourceError."""
+    check_writable(path, overwrite)
+    with atomic_writer(path) as file:
+        file.write(dump_scene(scene))
+
+
+def is_scene(path: Path | str) -> bool:
+    """Whether the file's content, not its name, is a scene graph; other JSON, broken or not, is none."""
+    try:
+        data = read_input(path, MAX_SCENE_BYTES)
+        content = parse_json(data, str(path)) if data.lstrip()[:1] == b"{" else None
+    except FormatError:
+        return False
+    return isinstance(content, dict) and content.get("format") == FORMAT
+
+
+def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = False) -> Path:
+    """The existing file or folder that `source`, written in `scene_path`, means.
+
+    Raises OutsideFolder for anything that may lead out of the scene's folder (absolute, `..`, a drive, a
+    link), MissingFile where nothing is there.
+    """
+    folder = Path(scene_path).parent
+    plain = unicodedata.normalize("NFKC", source)
+    if not source or not source.isprintable():
+        raise BadName(f"{scene_path}: source {source!r} is no path; expected printable characters")
+    parts = re.split(r"[/\\]", plain)
+    drive = re.match(r"[A-Za-z][A-Za-z0-9+.\-]*:", plain)
+    path = folder / source
+    inside = Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+    if not allow_outside and (".." in parts or parts[0] == "" or drive or not inside):
+        raise _outside(scene_path, source)
+    if not os.path.exists(path):
+        raise MissingFile(f"{scene_path}: source {source!r} is not there, looked for at {path}")
+    return path
+
+
+def expand_scene(path: Path | str, allow_outside: bool = False) -> SceneGraph:
+    """The scene in `path` with sources that are scenes themselves inlined as groups of children.
+
+    Inner names become `outer/inner`; inner sources become relative to the folder of `path`. Raises what
+    `read_scene` and `resolve_source` raise, CyclicScene where a scene leads back to itself, BadSchema where
+    an inner scene composes by another rule.
+    """
+    scene = read_scene(path)
+    return inline_scenes(scene, path, allow_outside)
+
+
+def inline_scenes(scene: SceneGraph, path: Path | str, allow_outside: bool = False) -> SceneGraph:
+    """As `expand_scene`, of a `scene` already read from `path` (a bundle's, say)."""
+    expansion = _Expansion(Path(path).parent, scene.composition, allow_outside)
+    nodes = expansion.nodes(scene.nodes, Path(path), "", (os.path.realpath(path),))
+    try:
+        return replace(scene, nodes=nodes)
+    except FormatError as error:
+        raise error.within(str(path)) from error
+
+
+def scene_schema() -> dict:
+    """JSON Schema (draft 2020-12) of scene.json, the one in `formats/scene.schema.json`."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "rfpack scene graph",
+        **msgspec.json.schema(SceneSchema),
+    }
+
+
+@dataclass
+class _Expansion:
+    """One run of `inline_scenes`; `count` bounds what scenes that name each other twice would unfold to."""
+
+    folder: Path
+    composition: str
+    allow_outside: bool
+    count: int = 0
+    found: dict[tuple[Path, str], tuple] = dataclasses.field(default_factory=dict)
+
+    def nodes(self, nodes, path: Path, prefix: str, trail: tuple[str, ...]) -> tuple[Node, ...]:
+        return tuple(self.node(node, path, prefix, trail) for node in nodes)
+
+    def node(self, node: Node, path: Path, prefix: str, trail: tuple[str, ...]) -> Node:
+        self.count += 1
+        if self.count > MAX_NODES or len(trail) > MAX_DEPTH:
+            bound = f"{MAX_NODES:,} nodes or {MAX_DEPTH} levels"
+            raise LimitExceeded(f"{path}: its nested scenes unfold to more than {bound}")
+        children = self.nodes(node.children, path, prefix, trail)
+        node = replace(node, name=prefix + node.name, children=children)
+        if node.source is None:
+            return node
+        target, real, inner = self.find(path, node.source)
+        if inner is None:
+            return node if path.parent == self.folder else replace(node, source=self.relative(target))
+        if real in trail:
+            loop = " -> ".join(Path(step).name for step in (*trail[trail.index(real) :], real))
+            raise CyclicScene(f"{target}: leads back to itself ({loop}); remove one of these sources")
+        if inner.composition != self.composition:
+            rules = f"{inner.composition!r}, the scene around it by {self.composition!r}"
+            raise BadSchema(f"{target}: composes by {rules}; give both one rule")
+        nested = self.nodes(inner.nodes, target, node.name + "/", (*trail, real))
+        if node.background:
+            nested = tuple(replace(child, background=True) for child in nested)
+        return replace(node, source=None, background=False, children=(*nested, *node.children))
+
+    def find(self, path: Path, source: str) -> tuple[Path, str, SceneGraph | None]:
+        """The source's path as written, its real path, and its scene (None if it is none), looked up once."""
+        if (path, source) not in self.found:
+            target = resolve_source(path, source, self.allow_outside)
+            inner = read_scene(target) if is_scene(target) else None
+            self.found[path, source] = target, os.path.realpath(target), inner
+        return self.found[path, source]
+
+    def relative(self, target: Path) -> str:
+        return Path(os.path.relpath(target, self.folder)).as_posix()
+
+
+def _outside(scene_path: Path | str, source: str) -> OutsideFolder:
+    what = f"{scene_path}: source {source!r} leads out of the scene's folder"
+    return OutsideFolder(f"{what}; move the file in, or give --allow-outside")
+
+
+def _check_name(name: str) -> None:
+    if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
+        raise BadName(f"node name {str(name)[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes")
+    if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in BIDIRECTIONAL for c in name):
+        raise BadName(f"node name {name!r} holds control characters; use letters that print")
+
+
+def _placement_matrix(placement: dict, name: str) -> np.ndarray:
+    if set(placement) - set(PLACEMENT_KEYS):
+        raise BadSchema(f"node {name!r}: placed by {sorted(placement)}, expected {', '.join(PLACEMENT_KEYS)}")
+    if "matrix" in placement:
+        if len(placement) > 1:
+            raise BadSchema(f"node {name!r}: has a matrix and {sorted(placement)[-1]}, expected one of them")
+        return _numbers(placement["matrix"], (4, 4), name, "matrix")
+    x, y, z, w = _unit(_numbers(placement.get("rotation", [0, 0, 0, 1]), (4,), name, "rotation"), name)
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
+    matrix[:3, 3] = _numbers(placement.get("translation", [0, 0, 0]), (3,), name, "translation")
+    return matrix
+
+
+def _numbers(values, shape: tuple[int, ...], name: str, word: str) -> np.ndarray:
+    try:
+        array = np.array(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadSchema(f"node {name!r}: {word} is not made of numbers") from error
+    if array.shape != shape:
+        raise BadSchema(f"node {name!r}: {word} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise NotFinite(f"node {name!r}: {word} holds NaN or infinity, expected finite numbers")
+    return array
+
+
+def _unit(quaternion: np.ndarray, name: str) -> np.ndarray:
+    norm = math.hypot(*quaternion)
+    if abs(norm - 1) > QUATERNION_SLACK:
+        raise BadSchema(f"node {name!r}: rotation has length {norm:.6g}, expected a unit quaternion xyzw")
+    return quaternion / norm
+
+
+def _check_affine(matrix: np.ndarray, who: str) -> None:
+    """Refuse what cannot be inverted to float64 accuracy; warn where sigma would be stretched past sense."""
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise BadSchema(f"{who}: last row {matrix[3].tolist()}, expected [0, 0, 0, 1]; columns act on points")
+    if np.abs(matrix[:3, 3]).max() > MAX_TRANSLATION:
+        raise LimitExceeded(f"{who}: translation {matrix[:3, 3].tolist()} passes {MAX_TRANSLATION:g} units")
+    high, _, low = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    smallest, largest = SINGULAR_VALUES
+    # The slack lets a scale of exactly the limit through the rounding of the decomposition.
+    if not (low >= smallest * (1 - 1e-9) and high <= largest * (1 + 1e-9) and high / low <= MAX_CONDITION):
+        raise SingularTransform(
+            f"{who}: scales by {low:.3g} to {high:.3g}, expected {smallest:g} to {largest:g} "
+            f"with a ratio of at most {MAX_CONDITION:g}"
+        )
+    if high / low > WARN_CONDITION:
+        warnings.warn(f"{who}: stretched {high / low:.0f} times more one way than another", FormatWarning, 2)
+
+
+def _check_version(content: object, where: str) -> bool:
+    """Whether a minor version newer than ours wrote `content`."""
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise BadSchema(f'{where}: no scene graph; expected a JSON object with "format": "{FORMAT}"')
+    found = content.get("version")
+    match = re.fullmatch(r"([0-9]{1,4})\.([0-9]{1,4})", found) if isinstance(found, str) else None
+    if match is None:
+        raise BadSchema(f"{where}: version {found!r}, expected a string such as {VERSION!r}")
+    major, minor = (int(number) for number in VERSION.split("."))
+    if int(match[1]) != major:
+        raise NewerVersion(f"{where}: version {found}, but this fusedrf reads {major}.x; update fusedrf")
+    if content.get("requires"):
+        raise NewerVersion(f"{where}: requires {content['requires']!r}, unknown here; update fusedrf")
+    newer = int(match[2]) > minor
+    if newer:
+        text = f"{where}: version {found} is newer than {VERSION}; what is new is ignored"
+        warnings.warn(text, FormatWarning, 3)
+    return newer
+
+
+def _check_extent(nodes: object, where: str) -> None:
+    """Count and depth on the raw JSON, before anything recurses into it."""
+    level, count, depth = nodes if isinstance(nodes, list) else [], 0, 0
+    while level:
+        count, depth = count + len(level), depth + 1
+        if count > MAX_NODES or depth > MAX_DEPTH:
+            raise LimitExceeded(f"{where}: more than {MAX_NODES:,} nodes or {MAX_DEPTH} levels of children")
+        lists = [node.get("children") for node in level if isinstance(node, dict)]
+        level = [child for children in lists if isinstance(children, list) for child in children]
+
+
+def _known(nodes: object) -> object:
+    """`nodes` without the keys that a newer minor version may have added."""
+    if not isinstance(nodes, list):
+        return nodes
+    return [_known_node(node) if isinstance(node, dict) else node for node in nodes]
+
+
+def _known_node(node: dict) -> dict:
+    known = {key: value for key, value in node.items() if key in NODE_KEYS}
+    return known | {"children": _known(node["children"])} if "children" in node else known
+
+
+def _build_node(content: dict) -> Node:
+    return Node(
+        content["name"],
+        content.get("field"),
+        content.get("source"),
+        {key: content[key] for key in PLACEMENT_KEYS if key in content},
+        content.get("background", False),
+        tuple(_build_node(child) for child in content.get("children", ())),
+        {key: value for key, value in content.items() if key not in NODE_KEYS},
+    )
+
+
+def _node_content(node: Node) -> dict:
+    content = {"name": node.name, "field": node.field, "source": node.source}
+    content = {key: value for key, value in content.items() if value is not None}
+    content |= {key: node.placement[key] for key in PLACEMENT_KEYS if key in node.placement}
+    if node.background:
+        content["background"] = True
+    content |= {key: node.extras[key] for key in sorted(node.extras)}
+    if node.children:
+        content["children"] = [_node_content(child) for child in node.children]
+    return content

@@ -1,0 +1,121 @@
+"""Posed pictures: a `View` is one camera and what it saw, a `Capture` is all views of one subject.
+
+`camera_to_world` is (4,4) float64, OpenGL axes: +x right, +y up, looking along -z. A camera-frame point (x,
+y, z) with z < 0 lands on pixel (cx + fl_x * u, cy + fl_y * v), where (u, v) is (x / -z, -y / -z) bent by the
+distortion. Pixel coordinates grow right and down, and the centre of the top left pixel is (0.5, 0.5).
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from formats.errors import BadPose, NoViews
+
+NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
+ORTHONORMAL_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One posed picture; `name` is its file stem, unique within its file or split."""
+
+    name: str
+    camera_to_world: np.ndarray
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, float, float, float, float] = NO_DISTORTION
+    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them."""
+    image_path: Path | None = None
+    pixels: np.ndarray | None = None
+    """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
+
+    def stretched(self, width: int, height: int) -> "View":
+        """The same camera behind a picture resampled to `width` x `height`, each axis by its own factor."""
+        x, y = width / self.width, height / self.height
+        focal = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
+        return replace(self, width=width, height=height, **focal)
+
+    def reframed(self, width: int, height: int) -> "View":
+        """The same camera at another size: its horizontal field of view stays, rows are cut or added."""
+        scale = width / self.width
+        cy = height / 2 + (self.cy - self.height / 2) * scale
+        focal = {"fl_x": self.fl_x * scale, "fl_y": self.fl_y * scale, "cx": self.cx * scale, "cy": cy}
+        return replace(self, width=width, height=height, **focal)
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Posed pictures of one subject; `test` views are for measuring only."""
+
+    path: Path
+    kind: str
+    """"blender", "transforms" or "mesh"."""
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    aabb: np.ndarray
+    """(6,) float64 [xmin ymin zmin xmax ymax zmax] in world units: where the subject is taken to be."""
+    opaque: bool
+    """No picture has an alpha channel."""
+    missing: int = 0
+    """Frames that the file lists without a picture on disk; they are left out."""
+
+
+def hold_out(capture: Capture, every: int) -> Capture:
+    """Train views 0, `every`, 2 `every`, ... moved behind the test views; NoViews if none is left."""
+    train = tuple(view for i, view in enumerate(capture.train) if i % every)
+    if not train:
+        raise NoViews(
+            f"{capture.path}: holding out every {every} of {len(capture.train)} views leaves none "
+            "to train on; hold out fewer"
+        )
+    return replace(capture, train=train, test=capture.test + capture.train[::every])
+
+
+def checked_pose(matrix: object, where: str) -> np.ndarray:
+    """A rigid (4,4) float64 pose from 16 or 12 numbers in rows of four; BadPose led by `where` otherwise."""
+    try:
+        pose = np.array(matrix, dtype=np.float64).reshape(-1, 4)
+    except (TypeError, ValueError, OverflowError):
+        raise BadPose(f"{where}: the camera pose is not a 4x4 matrix of numbers") from None
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4):
+        raise BadPose(f"{where}: the camera pose has {pose.size} numbers, expected four rows of four")
+    if not np.isfinite(pose).all():
+        raise BadPose(
+            f"{where}: the camera pose holds NaN or infinity; drop this frame or export the poses again"
+        )
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHONORMAL_TOLERANCE:
+        raise BadPose(f"{where}: the camera pose ends in the row {pose[3].tolist()}, expected [0, 0, 0, 1]")
+    _check_rotation(pose[:3, :3], where)
+    return pose
+
+
+def _check_rotation(rotation: np.ndarray, where: str) -> None:
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if error > ORTHONORMAL_TOLERANCE:
+        lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(rotation, axis=0))
+        raise BadPose(
+            f"{where}: the camera pose is no rotation (column lengths {lengths}, {error:.2g} from "
+            "orthonormal); apply the camera's scale before exporting"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise BadPose(f"{where}: the camera pose is mirrored (determinant -1); check the exporter's axes")
+
+
+def cameras_aabb(views: tuple[View, ...]) -> np.ndarray:
+    """(6,) float64 cube around the point nearest to all optical axes, out to the median camera distance."""
+    poses = np.array([view.camera_to_world for view in views])
+    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    middle = eyes.mean(0)
+    # About the cameras' middle, so that axes which never meet leave the point there, not at infinity.
+    offset = np.einsum("nij,nj->i", across, eyes - middle)
+    centre = middle + np.linalg.lstsq(across.sum(0), offset, rcond=1e-6)[0]
+    half = float(np.median(np.linalg.norm(eyes - centre, axis=1))) or 1.0
+    return np.concatenate([centre - half, centre + half])

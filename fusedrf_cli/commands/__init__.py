@@ -1,0 +1,1 @@
+"""One file per subcommand: parse, one call, one report. Each defines `command`."""

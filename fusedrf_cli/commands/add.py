@@ -1,0 +1,34 @@
+"""`fusedrf add`: one more object into a fused field."""
+
+import click
+
+from fusedrf_cli import options
+from fusedrf_cli.placement import node_words
+
+
+@click.command("add")
+@click.argument("fused", type=options.INPUT)
+@click.argument("source", metavar="OBJECT", type=options.INPUT)
+@options.writing("The fused field to write, OUT.rfpack.")
+@click.option("--name", required=True, help="The object's name in the scene.")
+@options.placement
+@options.time_budget
+@options.rgb
+@options.precision
+@options.seeded
+@options.reporting
+def command(fused, source, output, name, translate, rotate, scale, matrix, **words):
+    """Put one more object into a fused field.
+
+    OBJECT is scaled, then turned, then moved. Only the region of FUSED that it touches is learned again.
+
+    \b
+    Example:
+      fusedrf add fused.rfpack lamp.rfpack --name lamp -t 0,0,1 -r 0,0,45 -o more.rfpack
+    """
+    from formats.scene import make_node
+
+    node = make_node(name, source=source, **node_words(translate, rotate, scale, matrix))
+    from fusedrf_cli import bridge
+
+    return bridge.add(fused, source, output, name=name, object_to_world=node.node_to_parent, **words)

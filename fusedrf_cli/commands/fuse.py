@@ -1,0 +1,42 @@
+"""`fusedrf fuse`: a scene graph to one field."""
+
+import click
+
+from fusedrf_cli import options
+
+
+@click.command("fuse")
+@click.argument("scene", type=options.SCENE)
+@options.writing("The fused field to write, OUT.rfpack.")
+@click.option(
+    "--kind",
+    type=click.Choice(["auto", "vm", "blocks"]),
+    default="auto",
+    show_default=True,
+    help="Kind of field; auto: the smallest that is good enough.",
+)
+@options.max_size
+@options.target_psnr
+@options.time_budget
+@options.rgb
+@click.option("--from-scratch", is_flag=True, help="Do not start from the background's weights.")
+@click.option(
+    "--keep-sources", is_flag=True, help="Keep the sources inside; delete then restores what was hidden."
+)
+@options.precision
+@options.resume
+@options.allow_outside
+@options.seeded
+@options.reporting
+def command(scene, output, **words):
+    """Distil a whole scene into one field.
+
+    SCENE is a scene.json, a bundle, or - for a scene on stdin.
+
+    \b
+    Example:
+      fusedrf fuse scene.json -o fused.rfpack
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.fuse(scene, output, **words)

@@ -1,0 +1,54 @@
+"""`fusedrf train`: posed photos, or a mesh, to one field."""
+
+import click
+
+from fusedrf_cli import options
+
+
+@click.command("train")
+@click.argument("source", type=options.INPUT)
+@options.writing("The field to write, FIELD.rfpack.")
+@click.option("--kind", type=click.Choice(["vm"]), default="vm", show_default=True, help="Kind of field.")
+@click.option(
+    "--colour",
+    "--color",
+    type=click.Choice(["sh", "mlp"]),
+    default="sh",
+    show_default=True,
+    help="Spherical harmonics, or a small network.",
+)
+@click.option(
+    "--sh-degree",
+    type=click.IntRange(0, 3),
+    default=2,
+    show_default=True,
+    help="How far colour may depend on the view.",
+)
+@options.max_size
+@options.target_psnr
+@click.option(
+    "--time-budget",
+    type=options.POSITIVE,
+    metavar="S",
+    default=300.0,
+    show_default=True,
+    help="Stop optimising after S seconds.",
+)
+@click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
+@click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
+@options.precision
+@options.resume
+@options.seeded
+@options.reporting
+def command(source, output, **words):
+    """Learn one field from photos or a mesh.
+
+    SOURCE is a capture's folder, its transforms.json, or a .glb, .gltf, .obj or .ply mesh.
+
+    \b
+    Example:
+      fusedrf train photos/ -o chair.rfpack
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.train(source, output, **words)

@@ -1,0 +1,183 @@
+"""Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy grid is set."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.vm import VMField, VMShape
+from fusedrf_cli.engine.kernels import cpu
+from fusedrf_cli.engine.rendering.cameras import Camera
+
+RATE = 0.02
+RATE_DECAY = 0.05  # the last step's share of the first's rate
+STEP_PER_VOXEL = 0.5
+EARLY_STOP = 1e-3
+EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
+RESOLUTION_STAGES = ((0.0, 0.25), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))  # (share of the run, share of final voxels per axis)
+OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)  # shares of the run after which the occupancy is built anew
+SHRINK_AT = 0.06
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What a fit is asked for."""
+
+    shape: VMShape = VMShape()
+    longest: int = 256
+    """Texels on the longest axis at the end."""
+    steps: int = 3000
+    batch: int = 8192
+    """Rays per step."""
+    time_budget: float | None = None
+    """Seconds; when given, the schedule follows the clock and `steps` is not used."""
+    opacity_weight: float = 0.1
+    """Weight of the captured alpha against the colour; 0 for opaque photos."""
+    near: float = 0.0
+    seed: int = 0
+
+
+class RayPool:
+    """Random pixels of posed pictures as rays with target colours."""
+
+    def __init__(self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator, origin: np.ndarray):
+        """images (n, H, W, 4) uint8 straight alpha; origin (3,) is subtracted from the ray origins."""
+        self.images = torch.from_numpy(images).reshape(-1, 4)
+        self.generator, self.pixels = generator, images.shape[1] * images.shape[2]
+        keys = {camera.intrinsics: camera for camera in cameras}
+        index = {key: i for i, key in enumerate(keys)}
+        self.local = torch.stack([torch.from_numpy(c.local_directions()).reshape(-1, 3).float() for c in keys.values()])
+        self.map = torch.tensor([index[c.intrinsics] for c in cameras])
+        poses = np.stack([c.camera_to_world for c in cameras])
+        self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
+        self.position = torch.from_numpy(poses[:, :3, 3] - origin)
+        self.order, self.at = None, 0
+
+    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel once before any comes again."""
+        if self.order is None or self.at + count > len(self.order):
+            self.order, self.at = torch.randperm(len(self.images), generator=self.generator), 0
+        chosen = self.order[self.at : self.at + count]
+        self.at += count
+        view, pixel = chosen // self.pixels, chosen % self.pixels
+        local = self.local[self.map[view], pixel].double()
+        d = torch.einsum("nij,nj->ni", self.rotation[view], local)
+        d /= d.norm(dim=1, keepdim=True)
+        return self.position[view].contiguous().numpy(), d.numpy(), self.images[chosen].float() / 255
+
+
+def fit(
+    cameras: list[Camera],
+    images: np.ndarray,
+    aabb: np.ndarray,
+    settings: FitSettings,
+    advance: Callable[[float, dict], None] = lambda share, figures: None,
+    name: str = "",
+) -> VMField:
+    """Train a VM field on pictures (n, H, W, 4) uint8 with straight alpha, inside aabb (6,).
+
+    `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is given, so that
+    the same seed and number of threads gives the same numbers.
+    """
+    generator = torch.Generator().manual_seed(settings.seed)
+    pool = RayPool(cameras, images, generator, np.zeros(3))
+    field = VMField.create(aabb, texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1]))), settings.shape, generator, name)
+    run = _FitRun(field, pool, settings, generator)
+    while (share := run.share()) < 1.0:
+        run.refresh(share)
+        run.step(share)
+        if run.steps % 20 == 0:
+            advance(share, {"psnr": run.psnr})
+    run.refresh_occupancy(shrink=False)
+    return run.field
+
+
+class _FitRun:
+    """The moving parts of one fit."""
+
+    def __init__(self, field: VMField, pool: RayPool, settings: FitSettings, generator: torch.Generator):
+        self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
+        self.parts = torch.get_num_threads()
+        self.optimiser = Adam(field, self.parts)
+        self.started, self.steps = time.monotonic(), 0
+        self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), list(OCCUPANCY_AT)
+        self.mse = None
+
+    @property
+    def psnr(self) -> float:
+        """Running PSNR of the training rays, dB."""
+        return float(-10 * np.log10(max(self.mse or 1.0, 1e-10)))
+
+    def share(self) -> float:
+        """How much of the run is done, in [0, 1]."""
+        if self.settings.time_budget is not None:
+            return (time.monotonic() - self.started) / self.settings.time_budget
+        return self.steps / self.settings.steps
+
+    def refresh(self, share: float) -> None:
+        """Occupancy, box and resolution changes that are due."""
+        if self.refreshes and share >= self.refreshes[0]:
+            due = self.refreshes.pop(0)
+            self.refresh_occupancy(shrink=due == SHRINK_AT)
+        if self.stages and share >= self.stages[0][0]:
+            _, part = self.stages.pop(0)
+            self.resize(self.field.tensors[0].aabb, round(self.settings.longest * part))
+
+    def refresh_occupancy(self, shrink: bool) -> None:
+        """Mark the cells that hold matter, and with `shrink` cut the box down to them."""
+        occupancy = occupancy_of(self.field)
+        if not occupancy.occupied.any():
+            return
+        self.field = self.field.with_occupancy(occupancy)
+        self.optimiser.field = self.field
+        if shrink:
+            tight = occupancy.tight_aabb()
+            self.resize(tight, max(self.field.tensors[0].resolution))
+            occupancy = occupancy_of(self.field)
+            self.field = self.field.with_occupancy(occupancy)
+            self.optimiser.field = self.field
+
+    def resize(self, aabb: np.ndarray, longest: int) -> None:
+        """Another box or resolution; the optimiser starts anew, since its moments belong to other texels."""
+        self.field = self.field.resampled(aabb, texels(aabb, longest))
+        self.optimiser = Adam(self.field, self.parts)
+
+    def step(self, share: float) -> None:
+        """One batch of rays and one optimiser step."""
+        settings, field = self.settings, self.field
+        rays_o, rays_d, pixels = self.pool.draw(settings.batch)
+        jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
+        background = np.ones((len(rays_o), 3), np.float32)
+        target = pixels.clone()
+        target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
+        step = STEP_PER_VOXEL * field.voxel_size
+        loss = np.zeros((self.parts, 2))
+        diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
+        cpu.train_rays(
+            *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, settings.near, jitter, step, EARLY_STOP, target.numpy(), background,
+            settings.opacity_weight, int(diagonal / step) + 2, self.optimiser.grads, loss,
+        )  # fmt: skip
+        self.optimiser.step(RATE * RATE_DECAY**share)
+        mse = loss[:, 0].sum() / len(rays_o)
+        self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
+        self.steps += 1
+
+
+def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
+    """Texels per axis of near-cubic voxels, `longest` on the longest axis, at least 2."""
+    return tuple(max(2, n) for n in cell_counts(aabb, longest))
+
+
+def occupancy_of(field: VMField, cells: int = 128) -> OccupancyGrid:
+    """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell."""
+    box = field.tensors[0].aabb
+    counts = cell_counts(box, cells)
+    sigma = np.zeros(counts, np.float32)
+    cell = (box[3:] - box[:3]) / counts
+    offsets = (np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)).astype(np.float64)
+    cpu.density_at_cells(field.kernel_shape[0], field.arrays, box[:3].copy(), cell, offsets, sigma)
+    return OccupancyGrid(box, sigma * cell.min() > EMPTY_BELOW).dilated()

@@ -1,0 +1,44 @@
+"""Adam over a VM field's flat parameters, with per-part gradients and no work on entries that no sample touched."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kernels import cpu
+
+BETA1, BETA2, EPS = 0.9, 0.99, 1e-15  # TensoRF's; a gradient here can be tiny, so eps must not damp it
+BASIS_RATE_RATIO = 0.05  # TensoRF: 1e-3 for the colour basis where factors learn at 2e-2
+
+
+@dataclass
+class Adam:
+    """Moments and gradient parts of one field."""
+
+    field: VMField
+    parts: int
+
+    def __post_init__(self):
+        size = self.field.params.numel()
+        self.grads = np.zeros((self.parts, size), np.float32)
+        self.moment1, self.moment2 = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        self.steps = 0
+
+    def step(self, rate: float, shrink: float = 0.0) -> None:
+        """Apply and clear the gradients: rate for factors, BASIS_RATE_RATIO of it for colour bases."""
+        self.steps += 1
+        correction1, correction2 = 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
+        params = self.field.arrays.params
+        for low, high, ratio in self.slices():
+            cpu.adam(
+                params, self.grads, self.moment1, self.moment2, np.float32(rate * ratio), low, high, np.float32(BETA1), np.float32(BETA2),
+                np.float32(EPS), np.float32(correction1), np.float32(correction2), np.float32(shrink if ratio == 1 else 0),
+            )  # fmt: skip
+
+    def slices(self) -> list[tuple[int, int, float]]:
+        """(low, high, rate ratio) of every group of parameters."""
+        ends = [*self.field.layout[1:, 0], self.field.params.numel()]
+        groups = []
+        for row, end in zip(self.field.layout, ends, strict=True):
+            groups += [(int(row[0]), int(row[12]), 1.0), (int(row[12]), int(end), BASIS_RATE_RATIO)]
+        return groups

@@ -1,0 +1,61 @@
+"""The protocol every radiance field keeps, and the registry of field kinds."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+
+
+@runtime_checkable
+class RadianceField(Protocol):
+    """A volume that answers how dense, and what colour seen from here."""
+
+    kind: str
+    occupancy: OccupancyGrid
+
+    @property
+    def aabb(self) -> np.ndarray:
+        """(6,) float64 box outside of which the field is empty, in the field's frame."""
+        ...
+
+    @property
+    def voxel_size(self) -> float:
+        """The finest detail the field can hold, in units of its frame; renderers step by half of it."""
+        ...
+
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) per unit of length and rgb (N, 3) in [0, 1] at points (N, 3), seen along unit dirs (N, 3)."""
+        ...
+
+
+class StoredField(RadianceField, Protocol):
+    """A field kind that bundles can hold."""
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """Named arrays and JSON-able metadata from which `from_state` makes the field again."""
+        ...
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "StoredField":
+        """Inverse of `state`. Raises ValueError naming the array or key that does not fit."""
+        ...
+
+
+_KINDS: dict[str, type] = {}
+
+
+def register(cls: type) -> type:
+    """Class decorator: make a field kind known under its `kind`."""
+    _KINDS[cls.kind] = cls
+    return cls
+
+
+def field_kinds() -> dict[str, type]:
+    """All registered kinds by name."""
+    from fusedrf_cli.engine.fields import vm  # noqa: F401  (registers itself)
+
+    return dict(_KINDS)

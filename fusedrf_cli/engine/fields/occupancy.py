@@ -1,0 +1,80 @@
+"""The occupancy grid of a field: which cells of its box hold matter, and how far away the next such cell is."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fusedrf_cli.engine.kernels import GridArrays
+
+DEFAULT_CELLS = 128
+
+
+@dataclass(frozen=True)
+class OccupancyGrid:
+    """Cells of an axis-aligned box, occupied or empty."""
+
+    aabb: np.ndarray
+    """(6,) float64 [xmin ymin zmin xmax ymax zmax], in the frame of the field that owns the grid."""
+    occupied: np.ndarray
+    """(X, Y, Z) bool."""
+
+    @classmethod
+    def full(cls, aabb: np.ndarray, cells: int = 1) -> "OccupancyGrid":
+        """A grid that skips nothing."""
+        return cls(np.asarray(aabb, np.float64), np.ones(cell_counts(aabb, cells), bool))
+
+    @property
+    def cell(self) -> np.ndarray:
+        """(3,) size of a cell, in units of the frame."""
+        return (self.aabb[3:] - self.aabb[:3]) / self.occupied.shape
+
+    @cached_property
+    def skip(self) -> np.ndarray:
+        """(X, Y, Z) uint8: 0 in an occupied cell, else the Chebyshev distance in cells to the nearest occupied one (at most 255)."""
+        if not self.occupied.any():
+            return np.full(self.occupied.shape, 255, np.uint8)
+        if self.occupied.all():
+            return np.zeros(self.occupied.shape, np.uint8)
+        from scipy.ndimage import distance_transform_cdt
+
+        return np.minimum(distance_transform_cdt(~self.occupied, "chessboard"), 255).astype(np.uint8)
+
+    @cached_property
+    def arrays(self) -> GridArrays:
+        """The arrays kernels read."""
+        return GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
+
+    def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
+        """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where all is empty."""
+        if not self.occupied.any():
+            return self.aabb
+        index = np.argwhere(self.occupied)
+        lo = self.aabb[:3] + (index.min(0) - margin_cells) * self.cell
+        hi = self.aabb[:3] + (index.max(0) + 1 + margin_cells) * self.cell
+        return np.concatenate([np.maximum(lo, self.aabb[:3]), np.minimum(hi, self.aabb[3:])])
+
+    def dilated(self, cells: int = 1) -> "OccupancyGrid":
+        """The grid with every occupied region grown by a number of cells."""
+        from scipy.ndimage import binary_dilation
+
+        return OccupancyGrid(self.aabb, binary_dilation(self.occupied, np.ones((3, 3, 3), bool), iterations=cells))
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """(N,) bool: which points (N, 3) lie in an occupied cell."""
+        index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
+        inside = ((index >= 0) & (index < self.occupied.shape)).all(1)
+        found = np.zeros(len(points), bool)
+        i, j, k = index[inside].T
+        found[inside] = self.occupied[i, j, k]
+        return found
+
+    def centres(self) -> np.ndarray:
+        """(M, 3) centres of the occupied cells."""
+        return self.aabb[:3] + (np.argwhere(self.occupied) + 0.5) * self.cell
+
+
+def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
+    """Cells per axis of near-cubic cells, `longest` of them on the longest axis."""
+    extent = np.asarray(aabb, np.float64)[3:] - np.asarray(aabb, np.float64)[:3]
+    return tuple(int(n) for n in np.maximum(np.ceil(extent / extent.max() * longest - 1e-9), 1))

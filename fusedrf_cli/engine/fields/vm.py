@@ -1,0 +1,305 @@
+"""The `vm` field: vector-matrix decomposed grids (TensoRF, Chen et al. ECCV 2022) with spherical-harmonic colour.
+
+A VM field is one or more VM *tensors*, each in its own object frame, and *blocks* that place them in the field's frame. With
+one block it is TensoRF's. With several, an ownership grid says per cell which block is asked (two where they meet; the denser
+wins), so that a query costs the same however many there are, and an edit appends or drops a block and leaves the rest as it is.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.base import register
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
+
+MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
+SECTION_ALIGN = 16  # floats: a section starts on a cache line
+DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
+DENSITY_SCALE_PER_EXTENT = 75.0
+
+
+@dataclass(frozen=True)
+class VMTensor:
+    """Shape and units of one VM tensor; its numbers lie in the field's flat parameter vector."""
+
+    resolution: tuple[int, int, int]
+    """Texels per axis, corners on the faces of the box; at least 2."""
+    aabb: np.ndarray
+    """(6,) float64, in the object's frame."""
+    scale: float
+    """σ_object = scale * softplus(feature + shift), in 1/length of the object's frame."""
+    shift: float = DENSITY_SHIFT
+
+    @property
+    def voxel_size(self) -> np.ndarray:
+        """(3,) spacing of texels in the object's frame."""
+        return (self.aabb[3:] - self.aabb[:3]) / (np.asarray(self.resolution) - 1)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A VM tensor placed in the field's frame."""
+
+    tensor: int
+    object_to_field: np.ndarray
+    """(4, 4) float64 affine; columns act on points."""
+    name: str
+    """The node of the scene graph it stands for."""
+
+
+@dataclass(frozen=True)
+class VMShape:
+    """What all tensors of one field share."""
+
+    density_rank: int = 16
+    """Components per mode of the density."""
+    colour_rank: int = 24
+    """Components per mode of the colour features."""
+    sh_degree: int = 2
+
+    @property
+    def coefficients(self) -> int:
+        """SH coefficients per channel."""
+        return (self.sh_degree + 1) ** 2
+
+    def sections(self, resolution: tuple[int, int, int]) -> list[tuple[str, tuple[int, ...]]]:
+        """Names and shapes of a tensor's 13 sections, in the kernels' order (bodies.py)."""
+        n = resolution
+        named = []
+        for what, rank in (("density", self.density_rank), ("colour", self.colour_rank)):
+            named += [(f"{what}_plane_{m}", (n[a], n[b], rank)) for m, (a, b, _) in enumerate(MODES)]
+            named += [(f"{what}_line_{m}", (n[c], rank)) for m, (_, _, c) in enumerate(MODES)]
+        return [*named, ("colour_basis", (3, self.coefficients, 3 * self.colour_rank))]
+
+    def size(self, resolution: tuple[int, int, int]) -> int:
+        """Floats of a tensor in the flat vector."""
+        return sum(aligned(int(np.prod(shape))) for _, shape in self.sections(resolution))
+
+
+def aligned(count: int) -> int:
+    """Count rounded up to whole cache lines."""
+    return -(-count // SECTION_ALIGN) * SECTION_ALIGN
+
+
+@register
+class VMField:
+    """One or more placed VM tensors; see the module's docstring. Immutable but for `params`, which optimisers update in place."""
+
+    kind = "vm"
+
+    def __init__(
+        self,
+        shape: VMShape,
+        tensors: tuple[VMTensor, ...],
+        blocks: tuple[Block, ...],
+        params: torch.Tensor,
+        occupancy: OccupancyGrid,
+        owners: tuple[np.ndarray, np.ndarray] | None = None,
+    ):
+        """params (P,) float; owners are two (X, Y, Z) uint8 grids on the occupancy's cells, needed with more than one block."""
+        if len(blocks) > 1 and owners is None:
+            raise ValueError("a vm field of several blocks needs its ownership grids")
+        self.shape, self.tensors, self.blocks, self.params = shape, tensors, blocks, params
+        self.occupancy, self.owners = occupancy, owners
+
+    # -- making ------------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def create(
+        cls, aabb: np.ndarray, resolution: tuple[int, int, int], shape: VMShape, generator: torch.Generator, name: str = ""
+    ) -> "VMField":
+        """An untrained field: factors N(0, 0.1²) as TensoRF's, colour basis uniform as a linear layer's."""
+        aabb = np.asarray(aabb, np.float64)
+        scale = DENSITY_SCALE_PER_EXTENT / float((aabb[3:] - aabb[:3]).mean())
+        tensor = VMTensor(resolution, aabb, scale)
+        params = 0.1 * torch.randn(shape.size(resolution), generator=generator)
+        field = cls(shape, (tensor,), (Block(0, np.eye(4), name),), params, OccupancyGrid.full(aabb))
+        bound = (3 * shape.colour_rank) ** -0.5
+        field.sections(0)["colour_basis"].uniform_(-bound, bound, generator=generator)
+        return field
+
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "VMField":
+        """The same numbers under another occupancy grid (of the same cells where there are several blocks)."""
+        return VMField(self.shape, self.tensors, self.blocks, self.params, occupancy, self.owners)
+
+    def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
+        """A one-block field on another box and resolution: planes and lines are interpolated, outside the old box they are 0."""
+        (tensor,), (block,) = self.tensors, self.blocks
+        aabb = np.asarray(aabb, np.float64)
+        params = torch.zeros(self.shape.size(resolution), dtype=self.params.dtype)
+        new = VMField(
+            self.shape, (replace(tensor, resolution=resolution, aabb=aabb),), (block,), params, self.occupancy, None
+        )
+        at = [unit_texels(aabb, tensor.aabb, axis, resolution[axis]) for axis in range(3)]
+        old, target = self.sections(0), new.sections(0)
+        for what in ("density", "colour"):
+            for m, (a, b, c) in enumerate(MODES):
+                target[f"{what}_plane_{m}"].copy_(interpolate_axis(interpolate_axis(old[f"{what}_plane_{m}"], 0, at[a]), 1, at[b]))
+                target[f"{what}_line_{m}"].copy_(interpolate_axis(old[f"{what}_line_{m}"], 0, at[c]))
+        target["colour_basis"].copy_(old["colour_basis"])
+        return new
+
+    # -- reading -----------------------------------------------------------------------------------------------------------
+
+    @property
+    def aabb(self) -> np.ndarray:
+        """(6,) float64 box in the field's frame."""
+        return self.occupancy.aabb
+
+    @property
+    def voxel_size(self) -> float:
+        """Finest texel spacing of any block, in the field's frame."""
+        sizes = []
+        for block in self.blocks:
+            stretch = np.linalg.svd(block.object_to_field[:3, :3], compute_uv=False)[-1]
+            sizes.append(float(self.tensors[block.tensor].voxel_size.min() * stretch))
+        return min(sizes)
+
+    def sections(self, tensor: int) -> dict[str, torch.Tensor]:
+        """Views of the parameters of one tensor, by name."""
+        offsets, found = self.layout[tensor], {}
+        for offset, (name, shape) in zip(offsets, self.shape.sections(self.tensors[tensor].resolution), strict=True):
+            found[name] = self.params[int(offset) : int(offset) + int(np.prod(shape))].view(shape)
+        return found
+
+    @cached_property
+    def layout(self) -> np.ndarray:
+        """(T, 13) int64 offsets of the sections in params."""
+        rows, start = [], 0
+        for tensor in self.tensors:
+            row = []
+            for _, shape in self.shape.sections(tensor.resolution):
+                row.append(start)
+                start += aligned(int(np.prod(shape)))
+            rows.append(row)
+        return np.asarray(rows, np.int64)
+
+    @property
+    def kernel_shape(self) -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
+        """Ranks and SH coefficients as tuples whose lengths the compiler sees (bodies.py)."""
+        return (0,) * self.shape.density_rank, (0,) * self.shape.colour_rank, (0,) * self.shape.coefficients
+
+    @cached_property
+    def arrays(self) -> VMArrays:
+        """What kernels read; `params` is shared, not copied."""
+        real = self.params.numpy().dtype
+        to_unit, to_object = [], []
+        for block in self.blocks:
+            box = self.tensors[block.tensor].aabb
+            field_to_object = np.linalg.inv(block.object_to_field)
+            to_object.append(field_to_object[:3, :3])
+            scale = np.diag(1.0 / (box[3:] - box[:3]))
+            to_unit.append(np.concatenate([scale @ field_to_object[:3, :3], (scale @ (field_to_object[:3, 3] - box[:3]))[:, None]], 1))
+        none = np.zeros((0, 0, 0), np.uint8)
+        first, second = self.owners if self.owners is not None else (none, none)
+        return VMArrays(
+            self.params.detach().numpy(),
+            self.layout,
+            np.asarray([t.resolution for t in self.tensors], np.int64),
+            np.ascontiguousarray(to_unit, np.float64),
+            np.ascontiguousarray(to_object, np.float64),
+            np.asarray([b.tensor for b in self.blocks], np.int64),
+            np.asarray([[t.scale, t.shift] for t in self.tensors], real),
+            first,
+            second,
+        )
+
+    @property
+    def grid(self) -> GridArrays:
+        """The occupancy's arrays."""
+        return self.occupancy.arrays
+
+    def query(self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not differentiable (see autograd.py)."""
+        sigma = np.empty(len(points), self.arrays.params.dtype)
+        rgb = np.empty((len(points), 3), self.arrays.params.dtype)
+        cpu.query(*self.kernel_shape, self.arrays, self.grid, points.numpy(), dirs.numpy(), with_colour, sigma, rgb)
+        return torch.from_numpy(sigma), torch.from_numpy(rgb)
+
+    def render_rays(
+        self, rays_o: np.ndarray, rays_d: np.ndarray, near: float, step: float, early_stop: float, out: np.ndarray
+    ) -> None:
+        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same columns in out (N, 5)."""
+        cpu.render(*self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, step, early_stop, out)
+
+    # -- storing -----------------------------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """Arrays and metadata for a bundle; the occupancy is stored as packed bits, owners only in its occupied cells."""
+        arrays = {
+            f"tensor_{t}.{name}": view.detach().numpy() for t in range(len(self.tensors)) for name, view in self.sections(t).items()
+        }
+        arrays["occupancy"] = np.packbits(self.occupancy.occupied)
+        if self.owners is not None:
+            arrays["owner_first"], arrays["owner_second"] = (o[self.occupancy.occupied] for o in self.owners)
+        metadata = {
+            "aabb": self.aabb.tolist(),
+            "shape": {"density_rank": self.shape.density_rank, "colour_rank": self.shape.colour_rank, "sh_degree": self.shape.sh_degree},
+            "tensors": [
+                {"resolution": list(t.resolution), "aabb": t.aabb.tolist(), "scale": t.scale, "shift": t.shift} for t in self.tensors
+            ],
+            "blocks": [{"tensor": b.tensor, "object_to_field": b.object_to_field.tolist(), "name": b.name} for b in self.blocks],
+            "occupancy": list(self.occupancy.occupied.shape),
+        }
+        return arrays, metadata
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
+        """Inverse of `state`."""
+        shape = VMShape(**metadata["shape"])
+        tensors = tuple(
+            VMTensor(tuple(t["resolution"]), np.asarray(t["aabb"], np.float64), t["scale"], t["shift"]) for t in metadata["tensors"]
+        )
+        blocks = tuple(Block(b["tensor"], np.asarray(b["object_to_field"], np.float64), b["name"]) for b in metadata["blocks"])
+        occupied = unpack_bits(arrays["occupancy"], metadata["occupancy"])
+        owners = None
+        if "owner_first" in arrays:
+            owners = tuple(scatter_owner(occupied, arrays[key]) for key in ("owner_first", "owner_second"))
+        params = torch.zeros(sum(shape.size(t.resolution) for t in tensors))
+        field = cls(shape, tensors, blocks, params, OccupancyGrid(np.asarray(metadata["aabb"], np.float64), occupied), owners)
+        for t in range(len(tensors)):
+            for name, view in field.sections(t).items():
+                found = arrays.get(f"tensor_{t}.{name}")
+                if found is None or found.shape != tuple(view.shape):
+                    have = "nothing" if found is None else list(found.shape)
+                    raise ValueError(f"array 'tensor_{t}.{name}' should have shape {list(view.shape)}, found {have}")
+                view.copy_(torch.from_numpy(np.ascontiguousarray(found, np.float32)))
+        return field
+
+
+def unit_texels(aabb: np.ndarray, old_aabb: np.ndarray, axis: int, count: int) -> torch.Tensor:
+    """(count,) float64 positions of a box's texels on one axis, in unit coordinates of another box."""
+    at = torch.linspace(float(aabb[axis]), float(aabb[axis + 3]), count, dtype=torch.float64)
+    return (at - old_aabb[axis]) / (old_aabb[axis + 3] - old_aabb[axis])
+
+
+def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> torch.Tensor:
+    """Linear interpolation of values along one axis at unit coordinates, corners aligned; 0 outside [0, 1]."""
+    n = values.shape[axis]
+    position = unit * (n - 1)
+    lower = position.floor().clamp(0, n - 2).long()
+    fraction = (position - lower).to(values.dtype)
+    inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)
+    shape = [-1 if a == axis else 1 for a in range(values.dim())]
+    fraction, inside = fraction.view(shape), inside.view(shape)
+    return inside * ((1 - fraction) * values.index_select(axis, lower) + fraction * values.index_select(axis, lower + 1))
+
+
+def unpack_bits(packed: np.ndarray, shape: list[int]) -> np.ndarray:
+    """Inverse of np.packbits for a grid of a known shape."""
+    count = int(np.prod(shape))
+    if packed.size != -(-count // 8):
+        raise ValueError(f"array 'occupancy' should have {-(-count // 8)} bytes for a grid of {shape}, found {packed.size}")
+    return np.unpackbits(packed, count=count).reshape(shape).astype(bool)
+
+
+def scatter_owner(occupied: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """An ownership grid from its values in the occupied cells."""
+    grid = np.full(occupied.shape, NO_BLOCK, np.uint8)
+    if owner.size != int(occupied.sum()):
+        raise ValueError(f"an ownership array should have {int(occupied.sum())} values, found {owner.size}")
+    grid[occupied] = owner
+    return grid

@@ -1,0 +1,386 @@
+"""CPU loops over the scalar bodies: each part of the work runs on one core and writes only what is its own.
+
+Rays are (N, 3) float64 in the field's frame, directions of unit length. A loop over `parts` is the parallel one: part p owns the
+p-th slice of the rays and row p of every scratch and gradient array, so nothing races and a sum over rows has one order.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from fusedrf_cli.engine.kernels.bodies import (
+    COLOUR_FROM,
+    colour_features,
+    density_feature,
+    directional_basis,
+    dot_row,
+    hit_box,
+    next_sample,
+    object_direction,
+    scatter_basis,
+    scatter_colour,
+    scatter_density,
+    sigmoid,
+    softplus,
+    unit_point,
+    winning_block,
+)
+
+loop = njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
+# A task is the serial work of one core. Without the reference counting of array arguments (_nrt) it is up to eight times
+# faster, so tasks allocate nothing: the loops around them hand in the scratch.
+task = njit(fastmath=True, error_model="numpy", cache=True, _nrt=False)
+
+POINTS_PER_TASK = 2048
+RAYS_PER_TASK = 256
+
+
+@task
+def query_task(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, low, high, features, basis, sh, sigma, rgb):
+    """`query` for points low..high."""
+    for i in range(low, high):
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
+        sigma[i] = 0
+        rgb[i, 0], rgb[i, 1], rgb[i, 2] = 0, 0, 0
+        if not occupied(grid, x, y, z):
+            continue
+        b, s, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+        sigma[i] = s
+        if with_colour and s > 0:
+            u, v, w, _ = unit_point(vm, b, x, y, z)
+            directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
+            colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, 0)
+            for c in range(3):
+                rgb[i, c] = sigmoid(dot_row(colour_ranks, basis, c, features, 0))
+
+
+@loop
+def query(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, sigma, rgb):
+    """σ (1/length) and rgb of a VM field at points (N, 3) seen along dirs (N, 3); both 0 where the grid is empty."""
+    n = points.shape[0]
+    width = 3 * len(colour_ranks)
+    for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        kind = vm.params.dtype
+        features, basis, sh = np.empty(width, kind), np.empty(3 * width, kind), np.empty(16, kind)
+        low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
+        query_task(
+            ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, low, high, features, basis, sh, sigma, rgb
+        )
+
+
+@task
+def occupied(grid, x, y, z):
+    """Whether a point lies in the grid's box, in a cell that is not empty."""
+    nx, ny, nz = grid.skip.shape
+    i = int(math.floor((x - grid.lo[0]) / grid.cell[0]))
+    j = int(math.floor((y - grid.lo[1]) / grid.cell[1]))
+    m = int(math.floor((z - grid.lo[2]) / grid.cell[2]))
+    return 0 <= i < nx and 0 <= j < ny and 0 <= m < nz and grid.skip[i, j, m] == 0
+
+
+@task
+def query_backward_task(
+    ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, low, high, grad, features, d_features, basis, d_basis, sh,
+    d_f, scratch,
+):  # fmt: skip
+    """`query_backward` for points low..high, into one row of gradients."""
+    for i in range(low, high):
+        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
+        dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
+        if not occupied(grid, x, y, z):
+            continue
+        b, s, f = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+        u, v, w, inside = unit_point(vm, b, x, y, z)
+        if not inside:
+            continue
+        t = vm.tensor[b]
+        stretch = object_direction(vm, b, dx, dy, dz)[3]
+        d_f[0] = d_sigma[i] * stretch * vm.density[t, 0] * sigmoid(f + vm.density[t, 1])
+        scatter_density(ranks, vm, grad, t, u, v, w, d_f, 0, scratch)
+        if s > 0 and (d_rgb[i, 0] != 0 or d_rgb[i, 1] != 0 or d_rgb[i, 2] != 0):
+            directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
+            colour_features(colour_ranks, vm, t, u, v, w, features, 0)
+            clear(d_basis)
+            shade_backward(colour_ranks, basis, features, 0, d_rgb[i, 0], d_rgb[i, 1], d_rgb[i, 2], d_features, d_basis)
+            scatter_colour(colour_ranks, vm, grad, t, u, v, w, d_features, 0, scratch)
+            scatter_basis(colour_ranks, coefficients, vm, grad, b, sh, d_basis)
+
+
+@task
+def clear(values):
+    """Set a vector to zero."""
+    for i in range(values.shape[0]):
+        values[i] = 0
+
+
+@loop
+def query_backward(ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, grads):
+    """Adjoint of `query`: adds to row p of grads (parts, P) what d_sigma (N,), d_rgb (N, 3) of part p's points send back."""
+    n = points.shape[0]
+    parts = grads.shape[0]
+    width = 3 * len(colour_ranks)
+    for p in prange(parts):
+        kind = vm.params.dtype
+        query_backward_task(
+            ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, p * n // parts, (p + 1) * n // parts, grads[p],
+            np.empty(width, kind), np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
+            np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind),
+        )  # fmt: skip
+
+
+@task
+def shade_backward(colour_ranks, basis, features, base, d_r, d_g, d_b, d_features, d_basis):
+    """Adjoint of rgb_c = sigmoid(<basis_c, features[base:]>): sets d_features, adds to d_basis."""
+    width = 3 * len(colour_ranks)
+    real = basis.dtype.type
+    start = np.uint64(base)
+    for c in range(3):
+        rgb = sigmoid(dot_row(colour_ranks, basis, c, features, base))
+        d = d_r if c == 0 else (d_g if c == 1 else d_b)
+        d_logit = real(d * rgb * (1 - rgb))
+        row = np.uint64(c * width)
+        if c == 0:
+            for r in range(np.uint64(width)):
+                d_features[r] = d_logit * basis[row + r]
+        else:
+            for r in range(np.uint64(width)):
+                d_features[r] += d_logit * basis[row + r]
+        for r in range(np.uint64(width)):
+            d_basis[row + r] += d_logit * features[start + r]
+
+
+@task
+def render_task(
+    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, low, high, features, basis, sh, out
+):  # fmt: skip
+    """`render` for rays low..high."""
+    for i in range(low, high):
+        ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
+        dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
+        t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
+        t0 = max(t0, near) + 0.5 * step
+        red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
+        trans = 1.0
+        current = -1
+        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
+        while k >= 0 and trans > early_stop:
+            t = t0 + k * step
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            b, s, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+            alpha = 1.0 - math.exp(-s * step)
+            weight = trans * alpha
+            trans -= weight
+            depth += weight * t
+            if weight > COLOUR_FROM:
+                if b != current:
+                    directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
+                    current = b
+                u, v, w, _ = unit_point(vm, b, x, y, z)
+                colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, 0)
+                red += weight * sigmoid(dot_row(colour_ranks, basis, 0, features, 0))
+                green += weight * sigmoid(dot_row(colour_ranks, basis, 1, features, 0))
+                blue += weight * sigmoid(dot_row(colour_ranks, basis, 2, features, 0))
+            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
+
+
+@loop
+def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, out):
+    """March, shade and composite rays in one pass: out (N, 5) is premultiplied rgb, opacity, and Σ w t (over opacity: mean depth).
+
+    Stops at a remaining transmittance of `early_stop`; samples sit at the middle of each step.
+    """
+    n = rays_o.shape[0]
+    width = 3 * len(colour_ranks)
+    for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
+        kind = vm.params.dtype
+        features, basis, sh = np.empty(width, kind), np.empty(3 * width, kind), np.empty(16, kind)
+        low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
+        render_task(
+            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, low, high, features, basis, sh, out
+        )
+
+
+@task
+def train_task(
+    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background, opacity_weight, low, high,
+    ts, pre, weights, rgbs, blocks, slots, features, d_features, basis, d_basis, sh, d_f, scratch, grad, loss,
+):  # fmt: skip
+    """`train_rays` for rays low..high, into one row of gradients and losses."""
+    n = rays_o.shape[0]
+    width = 3 * len(colour_ranks)
+    real = vm.params.dtype.type
+    for i in range(low, high):
+        ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
+        dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
+        t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
+        t0 = max(t0, near) + jitter[i] * step
+        red, green, blue = 0.0, 0.0, 0.0
+        trans = 1.0
+        current = -1
+        count = 0
+        shaded = 0
+        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
+        while k >= 0 and trans > early_stop and count < ts.shape[0]:
+            t = t0 + k * step
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            b, s, f = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+            weight = trans * (1.0 - math.exp(-s * step))
+            trans -= weight
+            ts[count], pre[count], weights[count], blocks[count], slots[count] = t, f, weight, b, -1
+            if weight > COLOUR_FROM:
+                if b != current:
+                    directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
+                    current = b
+                u, v, w, _ = unit_point(vm, b, x, y, z)
+                base = shaded * width
+                colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, base)
+                rgbs[count, 0] = sigmoid(dot_row(colour_ranks, basis, 0, features, base))
+                rgbs[count, 1] = sigmoid(dot_row(colour_ranks, basis, 1, features, base))
+                rgbs[count, 2] = sigmoid(dot_row(colour_ranks, basis, 2, features, base))
+                red += weight * rgbs[count, 0]
+                green += weight * rgbs[count, 1]
+                blue += weight * rgbs[count, 2]
+                slots[count] = base
+                shaded += 1
+            count += 1
+            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
+
+        e_r = red + trans * background[i, 0] - target[i, 0]
+        e_g = green + trans * background[i, 1] - target[i, 1]
+        e_b = blue + trans * background[i, 2] - target[i, 2]
+        e_a = (1.0 - trans) - target[i, 3]
+        loss[0] += (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0
+        loss[1] += e_a * e_a
+        if count == 0:
+            continue
+        scale = 2.0 / (3.0 * n)
+        g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
+        g_t = g_r * background[i, 0] + g_g * background[i, 1] + g_b * background[i, 2] - 2.0 / n * opacity_weight * e_a
+
+        # Backwards along the ray: `behind` is the gradient's share of all that lies behind the sample, the background too.
+        behind = trans * g_t
+        after = trans
+        clear(d_basis)
+        for q in range(count - 1, -1, -1):
+            b = blocks[q]
+            t = ts[q]
+            own = 0.0
+            u, v, w, inside = unit_point(vm, b, ox + t * dx, oy + t * dy, oz + t * dz)
+            if slots[q] >= 0:
+                own = g_r * rgbs[q, 0] + g_g * rgbs[q, 1] + g_b * rgbs[q, 2]
+                if b != current:
+                    scatter_basis(colour_ranks, coefficients, vm, grad, current, sh, d_basis)
+                    directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
+                    clear(d_basis)
+                    current = b
+                wq = weights[q]
+                shade_backward(colour_ranks, basis, features, slots[q], g_r * wq, g_g * wq, g_b * wq, d_features, d_basis)
+                scatter_colour(colour_ranks, vm, grad, vm.tensor[b], u, v, w, d_features, 0, scratch)
+            d_sigma = step * (after * own - behind)
+            behind += weights[q] * own
+            after += weights[q]
+            if inside:
+                tensor = vm.tensor[b]
+                slope = object_direction(vm, b, dx, dy, dz)[3] * vm.density[tensor, 0]
+                d_f[0] = real(d_sigma * slope * sigmoid(pre[q] + vm.density[tensor, 1]))
+                if d_f[0] != 0:
+                    scatter_density(ranks, vm, grad, tensor, u, v, w, d_f, 0, scratch)
+        if shaded > 0:
+            scatter_basis(colour_ranks, coefficients, vm, grad, current, sh, d_basis)
+
+
+@loop
+def train_rays(
+    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background, opacity_weight,
+    max_samples, grads, loss,
+):  # fmt: skip
+    """One pass over rays: render, compare, and add the gradient of the loss to row p of grads (parts, P).
+
+    The loss of a ray is mean_c (C_c + (1 - A) background_c - target_c)^2 + opacity_weight (A - target_3)^2, with A the opacity;
+    target is (N, 4): rgb over the ray's background (N, 3), and the captured alpha. loss (parts, 2) gains (sum of the colour
+    term, sum of the opacity term). jitter (N,) in [0, 1) shifts the samples by a share of a step.
+    """
+    n = rays_o.shape[0]
+    parts = grads.shape[0]
+    width = 3 * len(colour_ranks)
+    for p in prange(parts):
+        kind = vm.params.dtype
+        ts, pre, weights = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
+        blocks, slots = np.empty(max_samples, np.int64), np.empty(max_samples, np.int64)
+        train_task(
+            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background, opacity_weight,
+            p * n // parts, (p + 1) * n // parts, ts, pre, weights, np.empty((max_samples, 3)), blocks, slots,
+            np.empty(max_samples * width, kind), np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
+            np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind), grads[p], loss[p],
+        )  # fmt: skip
+
+
+@loop
+def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2, shrink):
+    """Adam (Kingma and Ba 2015, alg. 1) on params[low:high], summing and clearing the rows of grads; untouched entries are skipped.
+
+    An entry is untouched when its gradient is exactly 0: its moments then keep their values (lazy Adam), since samples touch
+    few entries per step. `shrink` adds an L1 pull of that size to touched entries.
+    """
+    size = high - low
+    block = 16384
+    for task in prange((size + block - 1) // block):
+        for i in range(low + task * block, min(high, low + (task + 1) * block)):
+            g = grads[0, i]
+            for p in range(1, grads.shape[0]):
+                g += grads[p, i]
+            if g != 0:
+                for p in range(grads.shape[0]):
+                    grads[p, i] = 0
+                if params[i] > 0:
+                    g += shrink
+                elif params[i] < 0:
+                    g -= shrink
+                m = beta1 * moment1[i] + (1 - beta1) * g
+                v = beta2 * moment2[i] + (1 - beta2) * g * g
+                moment1[i], moment2[i] = m, v
+                params[i] -= rate * (m * correction1) / (math.sqrt(v * correction2) + eps)
+
+
+@task
+def density_at_cells_task(ranks, vm, lo, cell, i, offsets, out):
+    """`density_at_cells` for one slab of cells."""
+    for j in range(out.shape[1]):
+        for m in range(out.shape[2]):
+            best = 0.0
+            for q in range(offsets.shape[0]):
+                x, y, z = lo[0] + (i + offsets[q, 0]) * cell[0], lo[1] + (j + offsets[q, 1]) * cell[1], lo[2] + (m + offsets[q, 2]) * cell[2]
+                u, v, w, inside = unit_point(vm, 0, x, y, z)
+                if inside:
+                    f = density_feature(ranks, vm, 0, u, v, w)
+                    best = max(best, vm.density[0, 0] * softplus(f + vm.density[0, 1]))
+            out[i, j, m] = best
+
+
+@loop
+def density_at_cells(ranks, vm, lo, cell, offsets, out):
+    """Largest σ of a one-block field over `offsets` (K, 3), in cells, at every cell of a grid: out (X, Y, Z)."""
+    for i in prange(out.shape[0]):
+        density_at_cells_task(ranks, vm, lo, cell, i, offsets, out)
+
+
+@loop
+def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
+    """The next samples of every living ray: ts (N, K) distances, counts (N,); start (N,) int64 is where to go on, -1 at the end."""
+    for i in prange(rays_o.shape[0]):
+        counts[i] = 0
+        if not alive[i] or start[i] < 0:
+            continue
+        ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
+        dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
+        t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
+        t0 = max(t0, near) + jitter[i] * step
+        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, start[i])
+        while k >= 0 and counts[i] < ts.shape[1]:
+            ts[i, counts[i]] = t0 + k * step
+            counts[i] += 1
+            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
+        start[i] = k

@@ -1,0 +1,106 @@
+"""Pinhole cameras with Brown-Conrady distortion: pixels to rays.
+
+Axes are OpenGL's: +x right, +y up, looking along -z. Pixel (i, j) is column i, row j from the top, its centre at (i + 0.5, j + 0.5).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One view: where it is and how it projects."""
+
+    camera_to_world: np.ndarray
+    """(4, 4) float64."""
+    fl_x: float
+    fl_y: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, k3, p1, p2."""
+    name: str = ""
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view on another raster."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(
+            self.camera_to_world, self.fl_x * sx, self.fl_y * sy, self.cx * sx, self.cy * sy, width, height, self.distortion, self.name
+        )
+
+    @property
+    def intrinsics(self) -> tuple[float, ...]:
+        """All that shapes the camera's own ray directions, as a key."""
+        return (self.fl_x, self.fl_y, self.cx, self.cy, self.width, self.height, *self.distortion)
+
+    def local_directions(self, rows: slice = slice(None)) -> np.ndarray:
+        """(rows, width, 3) float64 directions in the camera's frame, z = -1."""
+        columns = (np.arange(self.width) + 0.5 - self.cx) / self.fl_x
+        lines = (np.arange(self.height)[rows] + 0.5 - self.cy) / self.fl_y
+        x, y = np.meshgrid(columns, lines)
+        if any(self.distortion):
+            x, y = undistort(x, y, self.distortion)
+        return np.stack([x, -y, -np.ones_like(x)], -1)
+
+    def rays(self, rows: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """rays_o, rays_d, each (rows * width, 3) float64 in world space, rays_d of unit length, row by row."""
+        d = self.local_directions(rows).reshape(-1, 3) @ self.camera_to_world[:3, :3].T
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        return np.broadcast_to(self.camera_to_world[:3, 3], d.shape).copy(), d
+
+
+def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Invert the Brown-Conrady model by fixed-point iteration: distorted to ideal normalised image coordinates (y down)."""
+    k1, k2, k3, p1, p2 = distortion
+    u, v = x, y
+    for _ in range(12):
+        r2 = u * u + v * v
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        du = 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+        dv = p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+        u, v = (x - du) / radial, (y - dv) / radial
+    return u, v
+
+
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(4, 4) camera_to_world of a camera at eye that looks at target, its +y as near to up as can be."""
+    back = np.asarray(eye, np.float64) - target
+    back = back / np.linalg.norm(back)
+    right = np.cross(up, back)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
+    return pose
+
+
+FRAMING_FOV = 0.6911112  # radians, horizontal: the field of view of NeRF-Synthetic's cameras
+
+
+def framing_camera(aabb: np.ndarray, azimuth: float, elevation: float, width: int, height: int, name: str = "view") -> Camera:
+    """A camera outside a box (6,) that frames its bounding ball; azimuth from +x about +z, elevation above the xy plane, radians."""
+    centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
+    focal = 0.5 * width / np.tan(FRAMING_FOV / 2)
+    narrow = np.arctan(0.5 * min(width, height) / focal)
+    away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    eye = centre + away * (0.92 * radius / np.sin(narrow))
+    pose = look_at(eye, centre, np.array([0.0, 0.0, 1.0]))
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height, name=name)
+
+
+def orbit(aabb: np.ndarray, count: int, width: int, height: int, elevation: float = 0.45) -> list[Camera]:
+    """`count` cameras evenly around a box, all at one elevation."""
+    return [
+        framing_camera(aabb, 2 * np.pi * i / count + 0.9, elevation, width, height, name=f"orbit_{i:04d}") for i in range(count)
+    ]
+
+
+def scattered(aabb: np.ndarray, count: int, width: int, height: int, seed: int, lowest: float = 0.05) -> list[Camera]:
+    """`count` cameras at seeded random azimuths and elevations above `lowest` radians: the views nothing is trained on."""
+    rng = np.random.default_rng(seed)
+    spots = zip(rng.uniform(0, 2 * np.pi, count), rng.uniform(lowest, 1.3, count), strict=True)
+    return [framing_camera(aabb, a, e, width, height, name=f"view_{i:04d}") for i, (a, e) in enumerate(spots)]

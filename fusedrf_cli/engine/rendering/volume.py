@@ -1,0 +1,133 @@
+"""Volume rendering (NeRF, eq. 3): alpha_i = 1 - exp(-σ_i δ), w_i = T_i alpha_i, C = Σ w_i c_i, with T_i the product before the sample."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.kernels import cpu
+from fusedrf_cli.engine.rendering.cameras import Camera
+
+STEP_PER_VOXEL = 0.5
+EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
+RAYS_AT_ONCE = 1 << 16
+SAMPLES_PER_WAVE = 32
+ROWS_AT_ONCE_PIXELS = 1 << 18
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """Float32 pictures of one view."""
+
+    rgb: np.ndarray
+    """(H, W, 3), premultiplied by the opacity."""
+    opacity: np.ndarray
+    """(H, W) in [0, 1]."""
+    depth: np.ndarray
+    """(H, W) mean distance along the ray in world units; inf where nothing is hit."""
+
+    def over(self, background: tuple[float, float, float]) -> np.ndarray:
+        """(H, W, 3) composited over a colour, in [0, 1]."""
+        return np.clip(self.rgb + (1 - self.opacity[..., None]) * np.asarray(background, np.float32), 0, 1)
+
+
+def render_rays(
+    field: RadianceField,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    *,
+    near: float = 0.0,
+    step: float | None = None,
+    early_stop: float = EARLY_STOP,
+) -> np.ndarray:
+    """Render rays (N, 3) float64 of the field's frame: (N, 5) float32 premultiplied rgb, opacity, Σ w t."""
+    step = step or STEP_PER_VOXEL * field.voxel_size
+    out = np.zeros((len(rays_o), 5), np.float32)
+    fast = getattr(field, "render_rays", None)
+    if fast is not None:
+        fast(rays_o, rays_d, near, step, early_stop, out)
+        return out
+    for start in range(0, len(rays_o), RAYS_AT_ONCE):
+        part = slice(start, start + RAYS_AT_ONCE)
+        march_rays(field, rays_o[part], rays_d[part], near, step, early_stop, out[part])
+    return out
+
+
+def march_rays(
+    field: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray, near: float, step: float, early_stop: float, out: np.ndarray
+) -> None:
+    """The general path for any field: waves of at most SAMPLES_PER_WAVE samples per living ray, into out (N, 5)."""
+    n = len(rays_o)
+    trans = np.ones(n, np.float32)
+    total = np.zeros((n, 5), np.float32)
+    for ray, ts, counts in waves(field, rays_o, rays_d, near, np.full(n, 0.5), step, lambda: trans > early_stop):
+        mask = np.arange(ts.shape[1]) < counts[:, None]
+        points = rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None]
+        dirs = np.broadcast_to(rays_d[ray][:, None], points.shape)
+        sigma = np.zeros(ts.shape, np.float32)
+        found, _ = field.query(torch.from_numpy(points[mask]), torch.from_numpy(dirs[mask]), with_colour=False)
+        sigma[mask] = found.numpy()
+        weights, trans[ray] = weights_from_sigma(sigma, step, trans[ray])
+        seen = weights > cpu.COLOUR_FROM
+        colour = np.zeros((*ts.shape, 3), np.float32)
+        if seen.any():
+            colour[seen] = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))[1].numpy()
+        total[ray, :3] += (weights[..., None] * colour).sum(1)
+        total[ray, 4] += (weights * ts).sum(1)
+    total[:, 3] = 1 - trans
+    out[:] = total
+
+
+def weights_from_sigma(sigma: np.ndarray, step: float, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (N, K) of consecutive samples that start with transmittance trans (N,), and the transmittance behind them."""
+    transmittance = trans[:, None] * np.exp(-np.cumsum(sigma, 1) * step)
+    before = np.concatenate([trans[:, None], transmittance[:, :-1]], 1)
+    return before - transmittance, transmittance[:, -1]
+
+
+def waves(
+    field: RadianceField,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    near: float,
+    jitter: np.ndarray,
+    step: float,
+    alive: Callable[[], np.ndarray],
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """March rays in waves: yields (indices of rays with samples (M,), distances (M, K), how many of them count (M,))."""
+    n = len(rays_o)
+    start = np.zeros(n, np.int64)
+    ts, counts = np.zeros((n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
+    while True:
+        cpu.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), ts, counts)
+        ray = np.flatnonzero(counts)
+        if not len(ray):
+            return
+        longest = counts.max()
+        yield ray, ts[ray, :longest], counts[ray]
+
+
+def render_image(
+    field: RadianceField,
+    camera: Camera,
+    *,
+    origin: np.ndarray | None = None,
+    near: float = 0.0,
+    step: float | None = None,
+    early_stop: float = EARLY_STOP,
+) -> RenderedImage:
+    """Render one view in bands of rows; origin (3,) is the world position of the field's frame origin (float64, so far scenes hold)."""
+    shift = np.zeros(3) if origin is None else origin
+    pixels = np.empty((camera.height * camera.width, 5), np.float32)
+    rows = max(1, ROWS_AT_ONCE_PIXELS // camera.width)
+    for top in range(0, camera.height, rows):
+        rays_o, rays_d = camera.rays(slice(top, top + rows))
+        start = top * camera.width
+        pixels[start : start + len(rays_o)] = render_rays(field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop)
+    pixels = pixels.reshape(camera.height, camera.width, 5)
+    opacity = pixels[..., 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(opacity > 1e-3, pixels[..., 4] / opacity, np.inf).astype(np.float32)
+    return RenderedImage(pixels[..., :3], opacity, depth)

@@ -1,0 +1,327 @@
+"""Options that several commands share, and the types of their values; each type checks what it converts.
+
+Lengths are in world units, angles in degrees, times in seconds.
+"""
+
+import contextlib
+import functools
+import math
+import os
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+
+import click
+
+from formats.errors import FormatWarning, MissingFile
+from fusedrf_cli.errors import FusedRFError
+from fusedrf_cli.progress import Progress
+from fusedrf_cli.report import emit
+
+DEBUG = "fusedrf.debug"  # key in click's context.meta
+STDIO = "-"
+MAX_PIXELS_PER_SIDE = 32768
+MAX_AFFINE_TEXT = 65536
+
+_SEPARATORS = re.compile(r"[\s,\[\]]+")
+_BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?", re.IGNORECASE)
+
+
+# --- types --------------------------------------------------------------------------------------------------
+
+
+class _Text(click.ParamType):
+    """A type that reads text; `parse` raises ValueError with what was expected."""
+
+    expected = ""
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):  # a default, converted already
+            return value
+        try:
+            return self.parse(value)
+        except (ValueError, OverflowError):
+            self.fail(f"{value[:80]!r} is not {self.expected}", param, ctx)
+
+    def parse(self, text: str):
+        raise NotImplementedError
+
+
+def _numbers(text: str, counts: tuple[int, ...]) -> tuple[float, ...]:
+    """Finite numbers between commas, blanks or brackets; ValueError if not as many as one of `counts`."""
+    found = tuple(float(word) for word in _SEPARATORS.split(text) if word)
+    if len(found) not in counts or not all(map(math.isfinite, found)):
+        raise ValueError(text)
+    return found
+
+
+class PositiveType(_Text):
+    """A finite number above 0."""
+
+    name, expected = "NUMBER", "a finite number above 0"
+
+    def parse(self, text):
+        (number,) = _numbers(text, (1,))
+        if number <= 0:
+            raise ValueError(text)
+        return number
+
+
+class SizeType(_Text):
+    """'WxH' -> (width, height) in pixels."""
+
+    name, expected = "WxH", f"a size such as 800x600, of 1 to {MAX_PIXELS_PER_SIDE} pixels a side"
+
+    def parse(self, text):
+        match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+        width, height = map(int, match.groups()) if match else (0, 0)
+        if not (1 <= width <= MAX_PIXELS_PER_SIDE and 1 <= height <= MAX_PIXELS_PER_SIDE):
+            raise ValueError(text)
+        return width, height
+
+
+class BytesType(_Text):
+    """'25MB' -> 25,000,000; kB, MB, GB and TB are powers of 1000, KiB, MiB, GiB and TiB of 1024."""
+
+    name, expected = "BYTES", "a number of bytes above 0, such as 25MB, 500kB or 1GiB"
+
+    def parse(self, text):
+        match = _BYTES.fullmatch(text.strip())
+        if not match or (match[3] and not match[2]):
+            raise ValueError(text)
+        count = int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2].lower() or " "))
+        if count < 1:
+            raise ValueError(text)
+        return count
+
+
+class VectorType(_Text):
+    """'x,y,z' -> three floats."""
+
+    name, expected = "x,y,z", "three finite numbers, x,y,z"
+
+    def parse(self, text):
+        return _numbers(text, (3,))
+
+
+class ScaleType(_Text):
+    """'k' or 'x,y,z' -> three floats, none of them 0; a negative one mirrors."""
+
+    name, expected = "k|x,y,z", "one number or three, x,y,z, none of them 0"
+
+    def parse(self, text):
+        factors = _numbers(text, (1, 3))
+        if 0 in factors:
+            raise ValueError(text)
+        return factors * 3 if len(factors) == 1 else factors
+
+
+class BoxType(_Text):
+    """Six numbers -> (xmin, ymin, zmin, xmax, ymax, zmax)."""
+
+    name, expected = "AABB", "a box xmin,ymin,zmin,xmax,ymax,zmax with each minimum below its maximum"
+
+    def parse(self, text):
+        box = _numbers(text, (6,))
+        if any(low >= high for low, high in zip(box[:3], box[3:], strict=True)):
+            raise ValueError(text)
+        return box
+
+
+class ColourType(_Text):
+    """A name or #rrggbb -> (r, g, b) in [0, 1]; transparent -> None."""
+
+    name, expected = "COLOUR", "white, black, transparent or #rrggbb"
+    named = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "transparent": None}
+
+    def parse(self, text):
+        if text.lower() in self.named:
+            return self.named[text.lower()]
+        if not re.fullmatch("#[0-9a-fA-F]{6}", text):
+            raise ValueError(text)
+        return tuple(byte / 255 for byte in bytes.fromhex(text[1:]))
+
+
+class AffineType(_Text):
+    """16 numbers, a file that holds them, or '-' for stdin -> four rows of four; the last row is 0 0 0 1."""
+
+    name, expected = "MATRIX", "an affine: 16 numbers by rows, the last row 0,0,0,1, or a file of them, or -"
+
+    def parse(self, text):
+        entries = _numbers(self._read(text), (16,))
+        if entries[12:] != (0, 0, 0, 1):
+            raise ValueError(text)
+        return tuple(entries[row : row + 4] for row in range(0, 16, 4))
+
+    @staticmethod
+    def _read(text: str) -> str:
+        if text == STDIO:
+            return sys.stdin.read(MAX_AFFINE_TEXT)
+        if os.path.exists(text):
+            with open(text, encoding="utf-8") as file:
+                return file.read(MAX_AFFINE_TEXT)
+        return text
+
+
+class InputType(click.Path):
+    """A path that must be there, checked before any slow import; '-' passes where a command takes it."""
+
+    name = "path"
+
+    def __init__(self, *, stdin: bool = False):
+        super().__init__(allow_dash=stdin)
+
+    def convert(self, value, param, ctx):
+        if not (value == STDIO and self.allow_dash) and not os.path.exists(value):
+            raise MissingFile(f"{value}: no such file; check the spelling and the folder it is relative to")
+        return value
+
+
+POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
+AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
+INPUT, SCENE = InputType(), InputType(stdin=True)
+
+
+# --- options ------------------------------------------------------------------------------------------------
+
+
+def _remember_debug(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        ctx.meta[DEBUG] = True
+
+
+debug = click.option(
+    "--debug",
+    is_flag=True,
+    expose_value=False,
+    callback=_remember_debug,
+    help="Show the traceback of an error.",
+)
+overwrite = click.option("-w", "--overwrite", is_flag=True, help="Replace the output if it exists.")
+precision = click.option(
+    "--precision",
+    type=click.Choice(["float16", "float32"]),
+    default="float16",
+    show_default=True,
+    help="How numbers are stored.",
+)
+time_budget = click.option("--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds.")
+max_size = click.option("--max-size", type=BYTES, help="Largest output file, such as 25MB.")
+target_psnr = click.option(
+    "--target-psnr", type=POSITIVE, metavar="DB", help="Quality to reach, else exit code 7."
+)
+resume = click.option("--resume", is_flag=True, help="Go on from the checkpoint of an interrupted run.")
+rgb = click.option("--rgb/--no-rgb", default=True, show_default=True, help="Finish on rendered views.")
+size = click.option("--size", type=SIZE, help="Picture size in pixels; default: the cameras' own.")
+allow_outside = click.option(
+    "--allow-outside", is_flag=True, help="Let a scene name sources outside its own folder."
+)
+PLACEMENT = {  # flags -> what click.option takes; `compose` has them once per input
+    ("-t", "--translate"): {"type": VECTOR, "help": "Move by x,y,z."},
+    ("-r", "--rotate"): {"type": VECTOR, "help": "Turn by degrees about the world's x, then y, then z axis."},
+    ("-s", "--scale"): {"type": SCALE, "help": "Scale by k, or by x,y,z; applied before turn and move."},
+    ("--matrix",): {"type": AFFINE, "help": "Any affine instead: 16 numbers by rows, a file of them, or -."},
+}
+_RUNNING = (
+    click.option(
+        "--device",
+        type=click.Choice(["auto", "cpu", "cuda"]),
+        default="auto",
+        show_default=True,
+        help="Where to compute.",
+    ),
+    click.option("--threads", type=click.IntRange(1, 4096), help="CPU threads; default: all."),
+)
+_seed = click.option(
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    default=0,
+    show_default=True,
+    help="Same seed, same device: same bytes.",
+)
+_REPORTING = (
+    click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout."),
+    click.option("-q", "--quiet", is_flag=True, help="No progress and no summary; warnings and errors only."),
+    click.option("-v", "--verbose", is_flag=True, help="Say more on stderr."),
+    debug,
+)
+
+
+def _stack(options: tuple[Callable, ...]) -> Callable:
+    """One decorator that adds `options` in this order."""
+    return lambda command: functools.reduce(lambda inner, option: option(inner), reversed(options), command)
+
+
+placement = _stack(tuple(click.option(*flags, **words) for flags, words in PLACEMENT.items()))
+running = _stack(_RUNNING)
+seeded = _stack((*_RUNNING, _seed))
+
+
+def writing(what: str) -> Callable:
+    """-o/--output (`what` it is) and -w; an output that is in the way or cannot be written is refused."""
+
+    def decorate(command: Callable) -> Callable:
+        @functools.wraps(command)
+        def checked(*, output: str, overwrite: bool, **words):
+            from formats.atomic import check_writable
+
+            if output != STDIO:
+                check_writable(output, overwrite)
+            return command(output=output, overwrite=overwrite, **words)
+
+        return click.option("-o", "--output", required=True, type=click.Path(), help=what)(overwrite(checked))
+
+    return decorate
+
+
+def reporting(
+    command: Callable[..., dict] | None = None, *, brief: Callable[[dict], dict] = dict
+) -> Callable:
+    """--json -q -v --debug; gives `command` a `progress` and prints the dict that it returns, if any.
+
+    `brief` makes of the dict what people see. The report of an error (FusedRFError.report) is printed
+    before the error goes on its way.
+    """
+    if command is None:
+        return functools.partial(reporting, brief=brief)
+
+    @functools.wraps(command)
+    def run(*, as_json: bool, quiet: bool, verbose: bool, **words) -> None:
+        def tell(report: dict | None) -> None:
+            if report:
+                full = {**report, "warnings": report.get("warnings", progress.warnings)}
+                emit(full if as_json else brief(full), as_json=as_json, quiet=quiet)
+
+        progress = Progress(quiet=quiet, verbose=verbose)
+        try:
+            with progress, _warnings_to(progress):
+                report = command(progress=progress, **words)
+        except FusedRFError as error:
+            tell(error.report)
+            raise
+        tell(report)
+
+    return _stack(_REPORTING)(run)
+
+
+def stdin_scene():
+    """The scene graph on stdin, and its bytes; sources in it are relative to the current folder."""
+    from formats.scene import MAX_SCENE_BYTES, parse_scene
+
+    data = sys.stdin.buffer.read(MAX_SCENE_BYTES + 1)
+    return parse_scene(data, "standard input"), data
+
+
+@contextlib.contextmanager
+def _warnings_to(progress: Progress) -> Iterator[None]:
+    """Python's warnings as lines of progress: those of `formats` always, other libraries' with -v."""
+
+    def show(message, category, *where) -> None:
+        tell = progress.warn if issubclass(category, FormatWarning) else progress.note
+        tell(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", FormatWarning)
+        warnings.showwarning = show
+        yield

@@ -1,0 +1,42 @@
+"""Where an object stands, from the words of the command line to those of a scene's node."""
+
+import math
+
+from fusedrf_cli.errors import UsageProblem
+
+Vector = tuple[float, float, float]
+
+
+def node_words(
+    translate: Vector | None, rotate: Vector | None, scale: Vector | None, matrix: tuple | None
+) -> dict[str, tuple]:
+    """Keywords of `formats.scene.make_node`: scaled, then turned, then moved; or `matrix` does it all.
+
+    Raises UsageProblem where `matrix` comes with another word.
+    """
+    words = {
+        "translation": translate,
+        "rotation": rotate and quaternion(rotate),
+        "scale": scale,
+        "matrix": matrix,
+    }
+    given = {word: value for word, value in words.items() if value is not None}
+    if matrix is not None and len(given) > 1:
+        raise UsageProblem("--matrix says it all; leave out -t, -r and -s, or leave out --matrix")
+    return given
+
+
+def quaternion(degrees: Vector) -> tuple[float, float, float, float]:
+    """Unit quaternion (x, y, z, w) of a turn about the world's x axis, then its y axis, then its z axis.
+
+    >>> [round(part, 3) for part in quaternion((0, 0, 90))]
+    [0.0, 0.0, 0.707, 0.707]
+    """
+    halves = [math.radians(math.remainder(angle, 720)) / 2 for angle in degrees]
+    (cx, cy, cz), (sx, sy, sz) = map(math.cos, halves), map(math.sin, halves)
+    return (
+        sx * cy * cz - cx * sy * sz,
+        cx * sy * cz + sx * cy * sz,
+        cx * cy * sz - sx * sy * cz,
+        cx * cy * cz + sx * sy * sz,
+    )

@@ -1,0 +1,99 @@
+"""What a command tells when it is done: a dict, for people or as one JSON object."""
+
+import json
+import math
+from collections.abc import Iterator
+
+import click
+
+from formats.errors import printable
+
+_UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
+_LONGEST_LIST = 12
+
+
+def emit(report: dict, *, as_json: bool, quiet: bool = False) -> None:
+    """Print `report` on stdout. With `quiet`, people are not told what was written, only what they asked."""
+    if as_json:
+        click.echo(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False))
+    elif not (quiet and "output" in report):
+        for line in lines(report):
+            click.echo(printable(line))
+
+
+def lines(report: dict) -> Iterator[str]:
+    """The report for people, one fact per line. Warnings are left out: stderr has had them."""
+    facts = {key: value for key, value in _plain(report, strict=False).items() if key != "warnings"}
+    if "output" in facts:
+        size = f" ({_size(facts.pop('bytes'))})" if "bytes" in facts else ""
+        yield f"wrote {facts.pop('output')}{size}"
+    yield from _lines(facts, "")
+
+
+def _lines(facts: dict, indent: str) -> Iterator[str]:
+    for key, value in facts.items():
+        label = f"{indent}{key.replace('_', ' ')}"
+        if value is None or value == [] or value == {}:
+            continue
+        if _is_table(value):
+            yield f"{label}:"
+            yield from (f"{indent}  {row}" for row in _table(value))
+        elif isinstance(value, dict) and any(isinstance(part, dict | list) for part in value.values()):
+            yield f"{label}:"
+            yield from _lines(value, indent + "  ")
+        else:
+            yield f"{label}: {_phrase(key, value)}"
+
+
+def _phrase(key: str, value: object) -> str:
+    """One value on one line; `key` tells its unit."""
+    if isinstance(value, dict):
+        parts = ((name.replace("_", " "), _phrase(f"{key} {name}", part)) for name, part in value.items())
+        return ", ".join(f"{name} {phrase}" for name, phrase in parts)
+    if isinstance(value, list):
+        shown = value if len(value) <= _LONGEST_LIST else value[:_LONGEST_LIST]
+        rest = f" and {len(value) - len(shown)} more" if len(shown) < len(value) else ""
+        return " ".join(_phrase(key, part) for part in shown) + rest
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if key.split(" ")[0] == "bytes" or key.endswith("_bytes"):
+        return _size(value)
+    if isinstance(value, float):
+        unit = " s" if "seconds" in key else " dB" if "psnr" in key and not key.endswith("views") else ""
+        return f"{value + 0.0:.4g}{unit}"  # + 0.0: no "-0"
+    return str(value)
+
+
+def _size(count: int) -> str:
+    for scale, unit in _UNITS:
+        if count >= scale:
+            return f"{count / scale:.3g} {unit}"
+    return f"{count} bytes"
+
+
+def _is_table(value: object) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(row, dict) for row in value)
+
+
+def _table(rows: list[dict]) -> Iterator[str]:
+    columns = list(dict.fromkeys(key for row in rows for key, cell in row.items() if cell is not None))
+    cells = [[_phrase(key, row[key]) if row.get(key) is not None else "" for key in columns] for row in rows]
+    table = [[key.replace("_", " ") for key in columns], *cells]
+    widths = [max(len(row[i]) for row in table) for i in range(len(columns))]
+    for row in table:
+        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+
+
+def _plain(value: object, *, strict: bool = True) -> object:
+    """`value` in JSON's types: arrays to lists, paths to text and, where `strict`, NaN and inf to null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(part, strict=strict) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part, strict=strict) for part in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist(), strict=strict)
+    if isinstance(value, float):
+        return value if math.isfinite(value) or not strict else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)

@@ -1,0 +1,272 @@
+import itertools
+import json
+import warnings
+
+import click
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from formats.errors import FormatWarning
+from formats.scene import make_node
+from fusedrf_cli import options
+from fusedrf_cli.errors import QualityNotReached, UsageProblem
+from fusedrf_cli.placement import node_words, quaternion
+
+IDENTITY = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+SPELLED = "1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1"
+
+
+@pytest.mark.parametrize(
+    "kind, text, value",
+    [
+        (options.POSITIVE, "0.5", 0.5),
+        (options.SIZE, "800x600", (800, 600)),
+        (options.SIZE, "1X1", (1, 1)),
+        (options.BYTES, "25MB", 25_000_000),
+        (options.BYTES, "1.5kib", 1536),
+        (options.BYTES, "300", 300),
+        (options.VECTOR, "1,-2.5,3e2", (1.0, -2.5, 300.0)),
+        (options.SCALE, "2", (2.0, 2.0, 2.0)),
+        (options.SCALE, "1,-1,1", (1.0, -1.0, 1.0)),
+        (options.AABB, "-1,-1,-1,1,1,2", (-1.0, -1.0, -1.0, 1.0, 1.0, 2.0)),
+        (options.COLOUR, "white", (1.0, 1.0, 1.0)),
+        (options.COLOUR, "#ff0033", (1.0, 0.0, 0.2)),
+        (options.COLOUR, "transparent", None),
+        (options.AFFINE, SPELLED, IDENTITY),
+        (options.AFFINE, str([list(row) for row in IDENTITY]), IDENTITY),
+    ],
+)
+def test_a_type_reads_what_it_should(kind, text, value):
+    assert kind(text) == value
+
+
+@pytest.mark.parametrize(
+    "kind, texts",
+    [
+        (options.POSITIVE, ["0", "-1", "nan", "inf", "1,2", "", "x"]),
+        (options.SIZE, ["800", "0x1", "1x99999", "-1x2", "1.5x2", "1x2x3", ""]),
+        (options.BYTES, ["0", "-1", "1XB", "MB", "1ib", "nan", "9" * 400, ""]),
+        (options.VECTOR, ["1,2", "1,2,3,4", "1,2,nan", "1,2,inf", "1,2,1e999", "a,b,c", ""]),
+        (options.SCALE, ["0", "1,0,1", "1,2", "nan", ""]),
+        (options.AABB, ["0,0,0,1,1", "0,0,0,0,1,1", "1,1,1,0,0,0", "0,0,0,1,1,inf"]),
+        (options.COLOUR, ["#fff", "#gggggg", "red", "", "#ff00331"]),
+        (options.AFFINE, ["1,2,3", SPELLED + ",0", SPELLED[:-1] + "2", SPELLED.replace("1", "nan", 1), ""]),
+    ],
+)
+def test_a_type_refuses_what_it_should_not_read(kind, texts):
+    for text in texts:
+        with pytest.raises(click.BadParameter, match="is not"):
+            kind.convert(text, None, None)
+
+
+@pytest.mark.parametrize("text", [SPELLED, json.dumps(IDENTITY), SPELLED.replace(",", " ")])
+def test_an_affine_may_lie_in_a_file(tmp_path, text):
+    path = tmp_path / "matrix"
+    path.write_text(text)
+    assert options.AFFINE(str(path)) == IDENTITY
+
+
+def test_an_affine_may_come_by_pipe(run, bridge):
+    words = ("add", "chair.rfpack", "table.rfpack", "-o", "out", "--name", "a", "--matrix", "-")
+    assert run(*words, stdin=SPELLED.replace("1,0,0,0,", "1,0,0,5,")).exit_code == 0
+    assert bridge.call[2]["object_to_world"][0].tolist() == [1, 0, 0, 5]
+
+
+# --- placement ----------------------------------------------------------------------------------------------
+
+
+def about(axis: int, degrees: float) -> np.ndarray:
+    """Right-handed turn about a world axis, written out."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    rotation = np.eye(3)
+    one, two = (axis + 1) % 3, (axis + 2) % 3
+    rotation[[one, one, two, two], [one, two, one, two]] = c, -s, s, c
+    return rotation
+
+
+@given(st.tuples(*[st.floats(-1000, 1000)] * 3))
+def test_a_rotation_turns_about_x_then_y_then_z(degrees):
+    expected = about(2, degrees[2]) @ about(1, degrees[1]) @ about(0, degrees[0])
+    placed = make_node("a", rotation=quaternion(degrees)).node_to_parent[:3, :3]
+    np.testing.assert_allclose(placed, expected, atol=1e-12)
+
+
+def test_an_object_is_scaled_then_turned_then_moved():
+    words = node_words((1, 2, 3), (0, 0, 90), (2, 1, 1), None)
+    tip = make_node("a", **words).node_to_parent @ [1, 0, 0, 1]
+    np.testing.assert_allclose(tip, [1, 4, 3, 1], atol=1e-12)
+
+
+def test_a_matrix_goes_with_no_other_word():
+    words = [(1, 0, 0), (0, 0, 90), (2, 2, 2)]
+    for given_words in itertools.product(*[(None, word) for word in words]):
+        if any(given_words):
+            with pytest.raises(UsageProblem, match="--matrix"):
+                node_words(*given_words, IDENTITY)
+    assert node_words(None, None, None, IDENTITY) == {"matrix": IDENTITY}
+
+
+# --- commands and their bridge ------------------------------------------------------------------------------
+
+COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False}
+
+
+def test_train_hands_on_what_was_asked(run, bridge):
+    run("train", "chair.rfpack", "-o", "out", "--max-size", "1MB", "--aabb", "0,0,0,1,1,1", "--holdout", "8")
+    name, words, given_options = bridge.call
+    given_options.pop("progress")
+    assert (name, words) == ("train", ("chair.rfpack", "out"))
+    assert given_options == COMMON | {
+        "kind": "vm",
+        "colour": "sh",
+        "sh_degree": 2,
+        "max_size": 1_000_000,
+        "target_psnr": None,
+        "time_budget": 300.0,
+        "holdout": 8,
+        "precision": "float16",
+        "aabb": (0, 0, 0, 1, 1, 1),
+        "resume": False,
+    }
+
+
+def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
+    run("fuse", "-", "-o", "out", "--no-rgb", "--device", "cpu", "--threads", "2", "--seed", "5")
+    name, words, given_options = bridge.call
+    given_options.pop("progress")
+    assert (name, words) == ("fuse", ("-", "out"))
+    assert given_options == COMMON | {
+        "device": "cpu",
+        "threads": 2,
+        "seed": 5,
+        "kind": "auto",
+        "max_size": None,
+        "target_psnr": None,
+        "time_budget": None,
+        "rgb": False,
+        "from_scratch": False,
+        "keep_sources": False,
+        "precision": "float16",
+        "resume": False,
+        "allow_outside": False,
+    }
+
+
+def test_add_hands_on_one_matrix(run, bridge):
+    run("add", "chair.rfpack", "table.rfpack", "-o", "out", "--name", "a", "-t", "1,0,0", "-s", "2")
+    name, words, given_options = bridge.call
+    assert (name, words) == ("add", ("chair.rfpack", "table.rfpack", "out"))
+    matrix = given_options.pop("object_to_world")
+    assert matrix.tolist() == [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
+    assert set(given_options) == {*COMMON, "name", "time_budget", "rgb", "precision", "progress"}
+
+
+def test_delete_hands_on_its_names(run, bridge):
+    run("delete", "chair.rfpack", "a", "b", "-o", "out")
+    name, words, given_options = bridge.call
+    assert (name, words) == ("delete", ("chair.rfpack", ("a", "b"), "out"))
+    assert set(given_options) == {*COMMON, "time_budget", "rgb", "precision", "allow_outside", "progress"}
+
+
+@pytest.mark.parametrize(
+    "colour, background", [("transparent", None), ("black", (0, 0, 0)), (None, (1.0, 1.0, 1.0))]
+)
+def test_render_hands_on_a_background(run, bridge, colour, background):
+    run("render", "chair.rfpack", "-o", "out.png", *(["--background", colour] if colour else []))
+    name, words, given_options = bridge.call
+    assert (name, words) == ("render", ("chair.rfpack", "out.png"))
+    assert given_options.pop("background") == background
+    others = {"cameras", "path", "orbit", "size", "depth", "fps", "allow_outside", "progress"}
+    assert set(given_options) == {*COMMON, *others}
+
+
+def test_render_takes_one_choice_of_views(run, bridge):
+    result = run("render", "chair.rfpack", "-o", "out", "--orbit", "3", "--cameras", "table.rfpack")
+    assert result.exit_code == 2 and bridge.call is None
+
+
+def test_eval_hands_on_both_sides(run, bridge):
+    run("eval", "chair.rfpack", "--against", "table.rfpack", "--size", "40x30")
+    name, words, given_options = bridge.call
+    assert (name, words, given_options["size"]) == ("evaluate", ("chair.rfpack", "table.rfpack"), (40, 30))
+    assert set(given_options) == {"split", "size", "allow_outside", "device", "threads", "progress"}
+
+
+# --- what every command does --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("output, code", [("table.rfpack", 1), ("nowhere/out.rfpack", 5)])
+def test_an_output_in_the_way_is_refused_before_any_work(run, bridge, folder, output, code):
+    before = (folder / "table.rfpack").read_bytes()
+    result = run("fuse", "chair.rfpack", "-o", output)
+    assert result.exit_code == code and bridge.call is None
+    assert (folder / "table.rfpack").read_bytes() == before
+
+
+def test_overwrite_lets_an_output_be_replaced(run, bridge):
+    assert run("fuse", "chair.rfpack", "-o", "table.rfpack", "-w").exit_code == 0
+    assert bridge.call[2]["overwrite"] is True
+
+
+REPORT = {
+    "output": "out.rfpack",
+    "bytes": 1_234_567,
+    "seconds": {"load": 0.5, "learn": 61.25},
+    "psnr": {"before_rgb": 31.234567, "after_rgb": float("inf"), "views": 4},
+    "holdout": None,
+    "views": [{"name": "r_0", "psnr": 30.5}, {"name": "r_10", "psnr": np.float32(31.5)}],
+}
+
+
+def test_a_report_for_people_has_units(run, bridge):
+    bridge.report = REPORT
+    assert run("fuse", "chair.rfpack", "-o", "out.rfpack").stdout.splitlines() == [
+        "wrote out.rfpack (1.23 MB)",
+        "seconds: load 0.5 s, learn 61.25 s",
+        "psnr: before rgb 31.23 dB, after rgb inf dB, views 4",
+        "views:",
+        "  name  psnr",
+        "  r_0   30.5 dB",
+        "  r_10  31.5 dB",
+    ]
+
+
+def test_a_report_as_json_is_one_object_and_nothing_else(run, bridge):
+    bridge.report = REPORT
+    result = run("fuse", "chair.rfpack", "-o", "out.rfpack", "--json")
+    psnr = {**REPORT["psnr"], "after_rgb": None}  # JSON has no infinity
+    views = [REPORT["views"][0], {"name": "r_10", "psnr": 31.5}]
+    assert json.loads(result.stdout) == {**REPORT, "psnr": psnr, "views": views, "warnings": []}
+
+
+def test_quiet_keeps_the_answer_and_drops_the_summary(run, bridge):
+    bridge.report = REPORT
+    assert run("fuse", "chair.rfpack", "-o", "out.rfpack", "-q").stdout == ""
+    bridge.report = {"mean": {"psnr": 31.0}}
+    assert run("eval", "chair.rfpack", "--against", "chair.rfpack", "-q").stdout == "mean: psnr 31 dB\n"
+
+
+def test_the_report_of_an_error_is_printed_before_it(run, bridge):
+    bridge.error = QualityNotReached("31 dB of 40 dB", report={"psnr": 31.0})
+    result = run("fuse", "chair.rfpack", "-o", "out.rfpack", "--target-psnr", "40", "--json")
+    assert (result.exit_code, result.stderr) == (7, "Error: 31 dB of 40 dB\n")
+    assert json.loads(result.stdout) == {"psnr": 31.0, "warnings": []}
+
+
+@pytest.mark.parametrize(
+    "category, flags, shown",
+    [
+        (FormatWarning, [], "Warning: odd\n"),
+        (FormatWarning, ["-q"], "Warning: odd\n"),
+        (UserWarning, ["-v"], "odd\n"),
+    ],
+)
+def test_warnings_of_libraries_become_lines(run, bridge, category, flags, shown):
+    bridge.fuse = lambda *words, **given_options: warnings.warn("odd", category, stacklevel=1) or {"a": 1}
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        result = run("fuse", "chair.rfpack", "-o", "out", "--json", *flags)
+    assert result.stderr == shown
+    assert json.loads(result.stdout)["warnings"] == (["odd"] if category is FormatWarning else [])

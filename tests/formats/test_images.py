@@ -1,0 +1,167 @@
+"""Pictures and films: what is written comes back, what is broken gets a sentence, nothing appears half."""
+
+import struct
+import sys
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from formats.errors import BadImage, LimitExceeded, MissingExtra, MissingFile, NoViews
+from formats.images import check_film, read_image, read_image_header, write_depth_png, write_film, write_png
+
+RANDOM = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (7, 13), (1, 40)])
+def test_png_round_trip(tmp_path, size, channels):
+    pixels = RANDOM.integers(0, 256, (*size, channels), np.uint8)
+    write_png(tmp_path / "a.png", pixels)
+    back = read_image(tmp_path / "a.png")
+    assert (back[..., :channels] == pixels).all()
+    assert (back[..., 3] == 255).all() or channels == 4
+    assert read_image_header(tmp_path / "a.png") == (size[1], size[0], channels == 4)
+
+
+@pytest.mark.parametrize(
+    "mode, expected", [("L", (90, 90, 90, 255)), ("LA", (90, 90, 90, 40)), ("P", (90, 90, 90, 255))]
+)
+def test_other_modes_become_rgba(tmp_path, mode, expected):
+    picture = Image.new("LA", (4, 3), (90, 40)).convert(mode)
+    picture.save(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png")[1, 1].tolist() == list(expected)
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "gif"])
+@pytest.mark.parametrize("kept", [0, 10, 0.5])
+def test_truncated(tmp_path, ending, kept):
+    path = tmp_path / f"a.{ending}"
+    Image.fromarray(RANDOM.integers(0, 256, (64, 64, 3), np.uint8)).save(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data)) if kept < 1 else kept])
+    with pytest.raises(BadImage, match=rf"a\.{ending}"):
+        read_image(path)
+
+
+def test_every_flipped_byte_reads_or_is_refused(tmp_path):
+    path = tmp_path / "a.png"
+    write_png(path, RANDOM.integers(0, 256, (6, 5, 4), np.uint8))
+    data = path.read_bytes()
+    for i in range(len(data)):
+        path.write_bytes(data[:i] + bytes([data[i] ^ 0x41]) + data[i + 1 :])
+        try:
+            read_image(path)
+        except (BadImage, LimitExceeded):
+            pass
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    """A PNG whose header claims a size that its data do not have."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 64))
+        + chunk(b"IEND", b"")
+    )
+
+
+@pytest.mark.parametrize("size", [(16385, 1), (1, 16385), (2**31 - 1, 2**31 - 1), (16384, 16384)])
+def test_size_is_checked_before_decoding(tmp_path, size):
+    path = tmp_path / "huge.png"
+    path.write_bytes(png_of_size(*size))
+    for read in (read_image_header, read_image):
+        with pytest.raises(LimitExceeded, match=r"huge\.png"):
+            read(path)
+
+
+def test_longest_side_is_read(tmp_path):
+    write_png(tmp_path / "a.png", np.zeros((1, 16384, 3), np.uint8))
+    assert read_image(tmp_path / "a.png").shape == (1, 16384, 4)
+
+
+def test_deep_pictures_are_refused(tmp_path):
+    Image.fromarray(np.full((3, 3), 40000, np.uint16)).save(tmp_path / "a.png")
+    with pytest.raises(BadImage, match="8 bits"):
+        read_image(tmp_path / "a.png")
+
+
+def test_missing(tmp_path):
+    with pytest.raises(MissingFile, match=r"no\.png"):
+        read_image(tmp_path / "no.png")
+
+
+def test_depth_round_trip(tmp_path):
+    depth = RANDOM.uniform(0.01, 9, (5, 7))
+    depth[0, :4] = [0, np.inf, np.nan, 1e-9]
+    report = write_depth_png(tmp_path / "d.png", depth)
+    with Image.open(tmp_path / "d.png") as picture:
+        levels, text = np.array(picture), picture.text["depth"]
+    back = levels * report["scale"]
+    assert levels[0, :3].tolist() == [0, 0, 0]
+    assert levels[0, 3] == 1  # something is there, however near
+    assert np.abs(back[1:] - depth[1:]).max() <= report["scale"] * 0.51
+    assert repr(report["scale"]) in text
+
+
+def test_depth_of_nothing(tmp_path):
+    report = write_depth_png(tmp_path / "d.png", np.zeros((2, 2)))
+    assert report["scale"] > 0
+    with Image.open(tmp_path / "d.png") as picture:
+        assert not np.array(picture).any()
+
+
+def frames(n: int, size=(12, 9)):
+    for i in range(n):
+        yield np.full((*size, 3), 25 * i, np.uint8)
+
+
+def test_gif(tmp_path):
+    write_film(tmp_path / "f.gif", frames(5), 25)
+    with Image.open(tmp_path / "f.gif") as film:
+        assert (film.n_frames, film.size, film.info["loop"], film.info["duration"]) == (5, (9, 12), 0, 40)
+        film.seek(4)
+        assert film.convert("RGB").getpixel((3, 3)) == (100, 100, 100)
+
+
+def test_film_of_nothing(tmp_path):
+    with pytest.raises(NoViews):
+        write_film(tmp_path / "f.gif", iter([]), 25)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_fails_leaves_nothing(tmp_path):
+    def failing():
+        yield from frames(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_film(tmp_path / "f.gif", failing(), 25)
+    assert not list(tmp_path.iterdir())
+
+
+def test_unknown_film(tmp_path):
+    with pytest.raises(BadImage, match=r"\.gif or \.mp4"):
+        check_film(tmp_path / "f.avi")
+
+
+def test_mp4_without_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtra) as caught:
+        write_film(tmp_path / "f.mp4", frames(2), 25)
+    assert 'pip install "fusedrf[video]"' in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_mp4(tmp_path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra [video]")
+    write_film(tmp_path / "f.mp4", frames(6, (33, 47)), 12)
+    reader = ffmpeg.read_frames(str(tmp_path / "f.mp4"))
+    about = next(reader)
+    assert (about["size"], about["fps"], sum(1 for _ in reader)) == ((48, 34), 12, 6)
