@@ -67,13 +67,12 @@ def paint_ground(angle: np.ndarray, radius: np.ndarray, z: np.ndarray) -> np.nda
     distance = np.hypot(x[:, None] - stones[:, 0], y[:, None] - stones[:, 1])
     nearest = np.argsort(distance, 1)[:, :2]
     gap = np.diff(np.take_along_axis(distance, nearest, 1), axis=1)[:, 0]
-    whirl = np.sin(5 * angle + 5 * radius)
     brook = np.abs(y - 1.25 - 0.18 * np.sin(2.5 * x))
     return where(
         (brook < 0.13, [0.20, 0.50, 0.74]),
         (brook < 0.20, [0.86, 0.79, 0.58]),
         (radius < 0.16, GOLD),
-        ((radius < 0.80) & (whirl > 0), [0.16, 0.42, 0.45]),
+        ((radius < 0.80) & (np.sin(5 * angle + 5 * radius) > 0), [0.16, 0.42, 0.45]),
         (radius < 0.80, [0.90, 0.84, 0.70]),
         (radius < 0.86, RED),
         (radius > 1.93, [0.45, 0.40, 0.36]),
@@ -140,11 +139,10 @@ def arch() -> trimesh.Trimesh:
     random = np.random.default_rng(3)
     ivy = np.array([0.24, 0.46, 0.20])
     parts = []
-    for side in (-1, 1):
+    for low, high in ((-0.48, -0.24), (0.24, 0.48)):
         for row in range(5):
-            low, high = sorted((side * 0.24, side * 0.48))
             tint = STONE * random.uniform(0.8, 1.15)
-            colour = ivy * random.uniform(0.8, 1.3) if side < 0 and row in (0, 1, 3) else tint
+            colour = ivy * random.uniform(0.8, 1.3) if low < 0 and row in (0, 1, 3) else tint
             parts.append(block([low, -0.14, 0.1 * row], [high, 0.14, 0.1 * row + 0.1], colour))
     for wedge in range(11):
         colour = GOLD if wedge == 5 else STONE * random.uniform(0.8, 1.15) * [1.05, 0.97, 0.9]
@@ -187,16 +185,14 @@ def ball() -> trimesh.Trimesh:
 
 def main(arguments: list[str]) -> None:
     if arguments in (["-h"], ["--help"]):
-        print(__doc__)
-        return
+        return print(__doc__)
     if len(arguments) != 1:
         sys.exit("usage: python examples/make_scene.py OUT_FOLDER")
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
     for make in (ground, tower, arch, ball):
-        mesh = make()
-        mesh.export(folder / f"{make.__name__}.glb")
-        print(f"{folder / make.__name__}.glb: {len(mesh.faces)} triangles")
+        make().export(folder / f"{make.__name__}.glb")
+        print(folder / f"{make.__name__}.glb")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -125,11 +125,13 @@ def _read_transforms(path: Path) -> Capture:
     return _capture(path, "transforms", *parts, aabb=_stated_aabb(path, document))
 
 
+@dataclass(frozen=True)
 class _Part:
     """The views of one split, whether any has alpha, and how many frames have no photo."""
 
-    def __init__(self, views: tuple[View, ...] = (), alpha: bool = False, missing: int = 0):
-        self.views, self.alpha, self.missing = views, alpha, missing
+    views: tuple[View, ...] = ()
+    alpha: bool = False
+    missing: int = 0
 
 
 def _capture(path: Path, kind: str, train: _Part, test: _Part, aabb: np.ndarray | None) -> Capture:

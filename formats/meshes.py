@@ -139,6 +139,7 @@ def _placed_geometries(path: Path | str) -> list[tuple]:
     """(trimesh geometry, geometry_to_world) for every placed surface with faces."""
     import trimesh
 
+    open_input(path).close()  # a path that leads nowhere gets its own sentence
     kind = mesh_type(path)
     if kind is None:
         raise BadMesh(f"{path}: no mesh that can be read; expected .glb, .gltf, .obj or .ply with faces")

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from formats import captures
 from formats.captures import (
     View,
     hold_out,
@@ -491,7 +490,3 @@ def test_fox():
     assert load_images(capture.train[:2]).shape == (2, 480, 270, 4)
     with pytest.raises(FormatError):
         read_capture(real("fox") / "LICENSE.txt")
-
-
-def test_public_names_exist():
-    assert all(hasattr(captures, name) for name in captures.__all__)

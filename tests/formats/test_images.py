@@ -159,6 +159,8 @@ def test_mp4_without_its_extra(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+# imageio-ffmpeg leaves its pipes to the garbage collector.
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_mp4(tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra [video]")
     write_film(tmp_path / "f.mp4", frames(6, (33, 47)), 12)

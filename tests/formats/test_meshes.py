@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from formats.captures import is_capture, load_images, read_capture
-from formats.errors import BadMesh
+from formats.errors import BadMesh, MissingFile
 from formats.meshes import is_mesh, mesh_capture
 
 RED, BLUE, GREEN = [200, 30, 60], [10, 90, 220], [40, 180, 70]
@@ -200,6 +200,8 @@ def test_told_apart_by_content(tmp_path):
     assert len(mesh_capture(tmp_path / "box.data", **FEW).train) == 8
     with pytest.raises(BadMesh, match=r"points\.ply"):
         mesh_capture(tmp_path / "points.ply")
+    with pytest.raises(MissingFile, match=r"no\.obj"):
+        mesh_capture(tmp_path / "no.obj")
 
 
 BROKEN = {

@@ -190,6 +190,56 @@ def mode_products(ranks, params, plane, line, na, nb, nc, a, b, c, out, base):
 
 
 @body
+def add_scaled_8(out, o, weight, values, v):
+    """out[o : o + 8] += weight * values[v : v + 8].
+
+    All loads stand before all stores: only then may the compiler, which must fear that the arrays overlap, use vectors.
+    """
+    e0 = out[o] + weight * values[v]
+    e1 = out[o + np.uint64(1)] + weight * values[v + np.uint64(1)]
+    e2 = out[o + np.uint64(2)] + weight * values[v + np.uint64(2)]
+    e3 = out[o + np.uint64(3)] + weight * values[v + np.uint64(3)]
+    e4 = out[o + np.uint64(4)] + weight * values[v + np.uint64(4)]
+    e5 = out[o + np.uint64(5)] + weight * values[v + np.uint64(5)]
+    e6 = out[o + np.uint64(6)] + weight * values[v + np.uint64(6)]
+    e7 = out[o + np.uint64(7)] + weight * values[v + np.uint64(7)]
+    store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7)
+
+
+@body
+def store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7):
+    """out[o : o + 8] = e0 .. e7."""
+    out[o] = e0
+    out[o + np.uint64(1)] = e1
+    out[o + np.uint64(2)] = e2
+    out[o + np.uint64(3)] = e3
+    out[o + np.uint64(4)] = e4
+    out[o + np.uint64(5)] = e5
+    out[o + np.uint64(6)] = e6
+    out[o + np.uint64(7)] = e7
+
+
+@body
+def add_scaled(ranks, out, o, weight, values, v):
+    """out[o : o + rank] += weight * values[v : v + rank]; the rank is a multiple of 8."""
+    for tile in range(np.uint64(len(ranks) // 8)):
+        at = tile * np.uint64(8)
+        add_scaled_8(out, o + at, weight, values, v + at)
+
+
+@body
+def bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r):
+    """One component of a plane at four corners' offsets and weights."""
+    return w00 * params[o00 + r] + w01 * params[o01 + r] + w10 * params[o10 + r] + w11 * params[o11 + r]
+
+
+@body
+def linear(params, l0, l1, t, r):
+    """One component of a line between two texels."""
+    return params[l0 + r] + t * (params[l1 + r] - params[l0 + r])
+
+
+@body
 def mode_scatter(ranks, params, grads, plane, line, na, nb, nc, a, b, c, d_out, base, stride, scratch):
     """Adjoint of `mode_products`: adds into grads what d_out[base + r * stride] sends to plane and line."""
     rank = len(ranks)
@@ -209,25 +259,37 @@ def mode_scatter(ranks, params, grads, plane, line, na, nb, nc, a, b, c, d_out, 
     start = np.uint64(base)
     jump = np.uint64(stride)
     half = np.uint64(rank)
-    # Two phases, because stores into grads may alias the loads: only then do the loops vectorise.
-    for r in range(np.uint64(rank)):
-        d = d_out[start + r * jump]
-        p = w00 * params[o00 + r] + w01 * params[o01 + r] + w10 * params[o10 + r] + w11 * params[o11 + r]
-        scratch[r] = d * (params[l0 + r] + tc * (params[l1 + r] - params[l0 + r]))
-        scratch[half + r] = d * p
-    for r in range(np.uint64(rank)):
-        grads[o00 + r] += w00 * scratch[r]
-    for r in range(np.uint64(rank)):
-        grads[o01 + r] += w01 * scratch[r]
-    for r in range(np.uint64(rank)):
-        grads[o10 + r] += w10 * scratch[r]
-    for r in range(np.uint64(rank)):
-        grads[o11 + r] += w11 * scratch[r]
-    uc = params.dtype.type(1) - tc
-    for r in range(np.uint64(rank)):
-        grads[l0 + r] += uc * scratch[half + r]
-    for r in range(np.uint64(rank)):
-        grads[l1 + r] += tc * scratch[half + r]
+    for tile in range(np.uint64(rank // 8)):
+        r = tile * np.uint64(8)
+        d0, d1 = d_out[start + r * jump], d_out[start + (r + np.uint64(1)) * jump]
+        d2, d3 = d_out[start + (r + np.uint64(2)) * jump], d_out[start + (r + np.uint64(3)) * jump]
+        d4, d5 = d_out[start + (r + np.uint64(4)) * jump], d_out[start + (r + np.uint64(5)) * jump]
+        d6, d7 = d_out[start + (r + np.uint64(6)) * jump], d_out[start + (r + np.uint64(7)) * jump]
+        e0 = d0 * linear(params, l0, l1, tc, r)
+        e1 = d1 * linear(params, l0, l1, tc, r + np.uint64(1))
+        e2 = d2 * linear(params, l0, l1, tc, r + np.uint64(2))
+        e3 = d3 * linear(params, l0, l1, tc, r + np.uint64(3))
+        e4 = d4 * linear(params, l0, l1, tc, r + np.uint64(4))
+        e5 = d5 * linear(params, l0, l1, tc, r + np.uint64(5))
+        e6 = d6 * linear(params, l0, l1, tc, r + np.uint64(6))
+        e7 = d7 * linear(params, l0, l1, tc, r + np.uint64(7))
+        store_8(scratch, r, e0, e1, e2, e3, e4, e5, e6, e7)
+        e0 = d0 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r)
+        e1 = d1 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(1))
+        e2 = d2 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(2))
+        e3 = d3 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(3))
+        e4 = d4 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(4))
+        e5 = d5 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(5))
+        e6 = d6 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(6))
+        e7 = d7 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(7))
+        store_8(scratch, half + r, e0, e1, e2, e3, e4, e5, e6, e7)
+    zero = np.uint64(0)
+    add_scaled(ranks, grads, o00, w00, scratch, zero)
+    add_scaled(ranks, grads, o01, w01, scratch, zero)
+    add_scaled(ranks, grads, o10, w10, scratch, zero)
+    add_scaled(ranks, grads, o11, w11, scratch, zero)
+    add_scaled(ranks, grads, l0, params.dtype.type(1) - tc, scratch, half)
+    add_scaled(ranks, grads, l1, tc, scratch, half)
 
 
 @body
