@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -18,9 +18,11 @@ RATE_DECAY = 0.05  # the last step's share of the first's rate
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3
 EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
-RESOLUTION_STAGES = ((0.0, 0.25), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))  # (share of the run, share of final voxels per axis)
+RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))  # (share of the run, share of final voxels per axis)
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)  # shares of the run after which the occupancy is built anew
-SHRINK_AT = 0.06
+RAYS_PER_STEP = (512, 1 << 14)
+SHRINK_BELOW = 0.8  # share of the box's volume that its occupied part must fall under for the box to be cut down
+QUARTERS = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)  # where a cell is probed
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,8 @@ class FitSettings:
     longest: int = 256
     """Texels on the longest axis at the end."""
     steps: int = 3000
-    batch: int = 8192
-    """Rays per step."""
+    samples: int = 1 << 16
+    """Samples per step that the number of rays is steered to."""
     time_budget: float | None = None
     """Seconds; when given, the schedule follows the clock and `steps` is not used."""
     opacity_weight: float = 0.1
@@ -92,7 +94,7 @@ def fit(
         run.step(share)
         if run.steps % 20 == 0:
             advance(share, {"psnr": run.psnr})
-    run.refresh_occupancy(shrink=False)
+    run.refresh_occupancy()
     return run.field
 
 
@@ -105,7 +107,7 @@ class _FitRun:
         self.optimiser = Adam(field, self.parts)
         self.started, self.steps = time.monotonic(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), list(OCCUPANCY_AT)
-        self.mse = None
+        self.mse, self.rays = None, RAYS_PER_STEP[0]
 
     @property
     def psnr(self) -> float:
@@ -121,21 +123,21 @@ class _FitRun:
     def refresh(self, share: float) -> None:
         """Occupancy, box and resolution changes that are due."""
         if self.refreshes and share >= self.refreshes[0]:
-            due = self.refreshes.pop(0)
-            self.refresh_occupancy(shrink=due == SHRINK_AT)
+            self.refreshes.pop(0)
+            self.refresh_occupancy()
         if self.stages and share >= self.stages[0][0]:
             _, part = self.stages.pop(0)
             self.resize(self.field.tensors[0].aabb, round(self.settings.longest * part))
 
-    def refresh_occupancy(self, shrink: bool) -> None:
-        """Mark the cells that hold matter, and with `shrink` cut the box down to them."""
+    def refresh_occupancy(self) -> None:
+        """Mark the cells that hold matter, and cut the box down to them where that saves much."""
         occupancy = occupancy_of(self.field)
         if not occupancy.occupied.any():
             return
         self.field = self.field.with_occupancy(occupancy)
         self.optimiser.field = self.field
-        if shrink:
-            tight = occupancy.tight_aabb()
+        tight = occupancy.tight_aabb()
+        if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
             self.resize(tight, max(self.field.tensors[0].resolution))
             occupancy = occupancy_of(self.field)
             self.field = self.field.with_occupancy(occupancy)
@@ -149,13 +151,14 @@ class _FitRun:
     def step(self, share: float) -> None:
         """One batch of rays and one optimiser step."""
         settings, field = self.settings, self.field
-        rays_o, rays_d, pixels = self.pool.draw(settings.batch)
+        dense = len(self.refreshes) == len(OCCUPANCY_AT)  # nothing is known to be empty yet: long steps
+        rays_o, rays_d, pixels = self.pool.draw(self.rays)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         background = np.ones((len(rays_o), 3), np.float32)
         target = pixels.clone()
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
-        step = STEP_PER_VOXEL * field.voxel_size
-        loss = np.zeros((self.parts, 2))
+        step = (1.0 if dense else STEP_PER_VOXEL) * field.voxel_size
+        loss = np.zeros((self.parts, 3))
         diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
         cpu.train_rays(
             *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, settings.near, jitter, step, EARLY_STOP, target.numpy(), background,
@@ -164,7 +167,14 @@ class _FitRun:
         self.optimiser.step(RATE * RATE_DECAY**share)
         mse = loss[:, 0].sum() / len(rays_o)
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
+        per_ray = max(loss[:, 2].sum() / len(rays_o), 1.0)
+        self.rays = int(np.clip(0.9 * self.rays + 0.1 * settings.samples / per_ray, *RAYS_PER_STEP))
         self.steps += 1
+
+
+def volume(aabb: np.ndarray) -> float:
+    """Volume of a box (6,)."""
+    return float(np.prod(aabb[3:] - aabb[:3]))
 
 
 def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
@@ -172,12 +182,18 @@ def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     return tuple(max(2, n) for n in cell_counts(aabb, longest))
 
 
-def occupancy_of(field: VMField, cells: int = 128) -> OccupancyGrid:
-    """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell."""
+def occupancy_of(field: VMField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
+    """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
+
+    Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
+    """
     box = field.tensors[0].aabb
-    counts = cell_counts(box, cells)
-    sigma = np.zeros(counts, np.float32)
+    counts = cell_counts(box, min(cells, max(field.tensors[0].resolution)))
     cell = (box[3:] - box[:3]) / counts
-    offsets = (np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)).astype(np.float64)
-    cpu.density_at_cells(field.kernel_shape[0], field.arrays, box[:3].copy(), cell, offsets, sigma)
-    return OccupancyGrid(box, sigma * cell.min() > EMPTY_BELOW).dilated()
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
+    index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
+    sigma = np.zeros(len(index), np.float32)
+    cpu.density_at_cells(field.kernel_shape[0], field.arrays, box[:3].copy(), cell, index, QUARTERS, sigma)
+    occupied = np.zeros(counts, bool)
+    occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
+    return OccupancyGrid(box, occupied).dilated()

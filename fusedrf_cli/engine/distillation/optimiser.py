@@ -24,7 +24,7 @@ class Adam:
         self.moment1, self.moment2 = np.zeros(size, np.float32), np.zeros(size, np.float32)
         self.steps = 0
 
-    def step(self, rate: float, shrink: float = 0.0) -> None:
+    def step(self, rate: float) -> None:
         """Apply and clear the gradients: rate for factors, BASIS_RATE_RATIO of it for colour bases."""
         self.steps += 1
         correction1, correction2 = 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
@@ -32,7 +32,7 @@ class Adam:
         for low, high, ratio in self.slices():
             cpu.adam(
                 params, self.grads, self.moment1, self.moment2, np.float32(rate * ratio), low, high, np.float32(BETA1), np.float32(BETA2),
-                np.float32(EPS), np.float32(correction1), np.float32(correction2), np.float32(shrink if ratio == 1 else 0),
+                np.float32(EPS), np.float32(correction1), np.float32(correction2),
             )  # fmt: skip
 
     def slices(self) -> list[tuple[int, int, float]]:

@@ -424,9 +424,9 @@ def directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh):
             basis[row + r] = zero
         for k in range(count):
             source = start + np.uint64((c * count + k) * width)
-            y_k = sh[k]
-            for r in range(np.uint64(width)):
-                basis[row + r] += y_k * vm.params[source + r]
+            for mode in range(np.uint64(3)):
+                at = mode * np.uint64(len(colour_ranks))
+                add_scaled(colour_ranks, basis, row + at, sh[k], vm.params, source + at)
 
 
 @body
@@ -439,9 +439,9 @@ def scatter_basis(colour_ranks, coefficients, vm, grads, b, sh, d_basis):
         row = np.uint64(c * width)
         for k in range(count):
             target = start + np.uint64((c * count + k) * width)
-            y_k = sh[k]
-            for r in range(np.uint64(width)):
-                grads[target + r] += y_k * d_basis[row + r]
+            for mode in range(np.uint64(3)):
+                at = mode * np.uint64(len(colour_ranks))
+                add_scaled(colour_ranks, grads, target + at, sh[k], d_basis, row + at)
 
 
 @body

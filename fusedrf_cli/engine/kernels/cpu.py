@@ -11,6 +11,7 @@ from numba import njit, prange
 
 from fusedrf_cli.engine.kernels.bodies import (
     COLOUR_FROM,
+    add_scaled,
     colour_features,
     density_feature,
     directional_basis,
@@ -34,6 +35,8 @@ task = njit(fastmath=True, error_model="numpy", cache=True, _nrt=False)
 
 POINTS_PER_TASK = 2048
 RAYS_PER_TASK = 256
+ENTRIES_PER_TASK = 1 << 16
+LINE = 16  # floats in a cache line
 
 
 @task
@@ -133,22 +136,19 @@ def query_backward(ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_
 @task
 def shade_backward(colour_ranks, basis, features, base, d_r, d_g, d_b, d_features, d_basis):
     """Adjoint of rgb_c = sigmoid(<basis_c, features[base:]>): sets d_features, adds to d_basis."""
-    width = 3 * len(colour_ranks)
+    rank = len(colour_ranks)
     real = basis.dtype.type
-    start = np.uint64(base)
+    for r in range(np.uint64(3 * rank)):
+        d_features[r] = 0
     for c in range(3):
         rgb = sigmoid(dot_row(colour_ranks, basis, c, features, base))
         d = d_r if c == 0 else (d_g if c == 1 else d_b)
         d_logit = real(d * rgb * (1 - rgb))
-        row = np.uint64(c * width)
-        if c == 0:
-            for r in range(np.uint64(width)):
-                d_features[r] = d_logit * basis[row + r]
-        else:
-            for r in range(np.uint64(width)):
-                d_features[r] += d_logit * basis[row + r]
-        for r in range(np.uint64(width)):
-            d_basis[row + r] += d_logit * features[start + r]
+        for mode in range(3):
+            at = np.uint64(mode * rank)
+            row = np.uint64(3 * c * rank) + at
+            add_scaled(colour_ranks, d_features, at, d_logit, basis, row)
+            add_scaled(colour_ranks, d_basis, row, d_logit, features, np.uint64(base) + at)
 
 
 @task
@@ -252,6 +252,7 @@ def train_task(
         e_g = green + trans * background[i, 1] - target[i, 1]
         e_b = blue + trans * background[i, 2] - target[i, 2]
         e_a = (1.0 - trans) - target[i, 3]
+        loss[2] += count
         loss[0] += (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0
         loss[1] += e_a * e_a
         if count == 0:
@@ -300,8 +301,8 @@ def train_rays(
     """One pass over rays: render, compare, and add the gradient of the loss to row p of grads (parts, P).
 
     The loss of a ray is mean_c (C_c + (1 - A) background_c - target_c)^2 + opacity_weight (A - target_3)^2, with A the opacity;
-    target is (N, 4): rgb over the ray's background (N, 3), and the captured alpha. loss (parts, 2) gains (sum of the colour
-    term, sum of the opacity term). jitter (N,) in [0, 1) shifts the samples by a share of a step.
+    target is (N, 4): rgb over the ray's background (N, 3), and the captured alpha. loss (parts, 3) gains the sums of the colour
+    term, of the opacity term and of the samples taken. jitter (N,) in [0, 1) shifts the samples by a share of a step.
     """
     n = rays_o.shape[0]
     parts = grads.shape[0]
@@ -318,53 +319,71 @@ def train_rays(
         )  # fmt: skip
 
 
-@loop
-def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2, shrink):
-    """Adam (Kingma and Ba 2015, alg. 1) on params[low:high], summing and clearing the rows of grads; untouched entries are skipped.
+@task
+def adam_task(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
+    """`adam` for entries low..high, a cache line at a time; lines that no part touched cost one read."""
+    real = params.dtype.type
+    one, zero = real(1), real(0)
+    for line in range(low, high, LINE):
+        start = np.uint64(line)
+        touched = zero
+        for p in range(grads.shape[0]):
+            for i in range(np.uint64(LINE)):
+                touched += abs(grads[p, start + i])
+        if touched == zero:
+            continue
+        for p in range(1, grads.shape[0]):
+            for i in range(np.uint64(LINE)):
+                grads[0, start + i] += grads[p, start + i]
+                grads[p, start + i] = zero
+        for i in range(np.uint64(LINE)):
+            g = grads[0, start + i]
+            m, v = moment1[start + i], moment2[start + i]
+            m_new = beta1 * m + (one - beta1) * g
+            v_new = beta2 * v + (one - beta2) * g * g
+            moment1[start + i] = m_new if g != zero else m
+            moment2[start + i] = v_new if g != zero else v
+            change = rate * (m_new * correction1) / (math.sqrt(v_new * correction2) + eps)
+            params[start + i] -= change if g != zero else zero
+            grads[0, start + i] = zero
 
-    An entry is untouched when its gradient is exactly 0: its moments then keep their values (lazy Adam), since samples touch
-    few entries per step. `shrink` adds an L1 pull of that size to touched entries.
+
+@loop
+def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
+    """Adam (Kingma and Ba 2015, alg. 1) on params[low:high], whole cache lines, summing and clearing the rows of grads (parts, P).
+
+    An entry whose gradient is exactly 0 was touched by no sample: it and its moments keep their values (lazy Adam).
     """
-    size = high - low
-    block = 16384
-    for task in prange((size + block - 1) // block):
-        for i in range(low + task * block, min(high, low + (task + 1) * block)):
-            g = grads[0, i]
-            for p in range(1, grads.shape[0]):
-                g += grads[p, i]
-            if g != 0:
-                for p in range(grads.shape[0]):
-                    grads[p, i] = 0
-                if params[i] > 0:
-                    g += shrink
-                elif params[i] < 0:
-                    g -= shrink
-                m = beta1 * moment1[i] + (1 - beta1) * g
-                v = beta2 * moment2[i] + (1 - beta2) * g * g
-                moment1[i], moment2[i] = m, v
-                params[i] -= rate * (m * correction1) / (math.sqrt(v * correction2) + eps)
+    parts = (high - low + ENTRIES_PER_TASK - 1) // ENTRIES_PER_TASK
+    for part in prange(parts):
+        start = low + part * ENTRIES_PER_TASK
+        end = min(high, start + ENTRIES_PER_TASK)
+        adam_task(params, grads, moment1, moment2, rate, start, end, beta1, beta2, eps, correction1, correction2)
 
 
 @task
-def density_at_cells_task(ranks, vm, lo, cell, i, offsets, out):
-    """`density_at_cells` for one slab of cells."""
-    for j in range(out.shape[1]):
-        for m in range(out.shape[2]):
-            best = 0.0
-            for q in range(offsets.shape[0]):
-                x, y, z = lo[0] + (i + offsets[q, 0]) * cell[0], lo[1] + (j + offsets[q, 1]) * cell[1], lo[2] + (m + offsets[q, 2]) * cell[2]
-                u, v, w, inside = unit_point(vm, 0, x, y, z)
-                if inside:
-                    f = density_feature(ranks, vm, 0, u, v, w)
-                    best = max(best, vm.density[0, 0] * softplus(f + vm.density[0, 1]))
-            out[i, j, m] = best
+def density_at_cells_task(ranks, vm, lo, cell, cells, low, high, offsets, out):
+    """`density_at_cells` for cells low..high."""
+    for i in range(low, high):
+        best = 0.0
+        for q in range(offsets.shape[0]):
+            x = lo[0] + (cells[i, 0] + offsets[q, 0]) * cell[0]
+            y = lo[1] + (cells[i, 1] + offsets[q, 1]) * cell[1]
+            z = lo[2] + (cells[i, 2] + offsets[q, 2]) * cell[2]
+            u, v, w, inside = unit_point(vm, 0, x, y, z)
+            if inside:
+                f = density_feature(ranks, vm, 0, u, v, w)
+                best = max(best, vm.density[0, 0] * softplus(f + vm.density[0, 1]))
+        out[i] = best
 
 
 @loop
-def density_at_cells(ranks, vm, lo, cell, offsets, out):
-    """Largest σ of a one-block field over `offsets` (K, 3), in cells, at every cell of a grid: out (X, Y, Z)."""
-    for i in prange(out.shape[0]):
-        density_at_cells_task(ranks, vm, lo, cell, i, offsets, out)
+def density_at_cells(ranks, vm, lo, cell, cells, offsets, out):
+    """Largest σ of a one-block field over `offsets` (K, 3), in cells, in each of `cells` (N, 3) int64: out (N,)."""
+    n = cells.shape[0]
+    for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
+        density_at_cells_task(ranks, vm, lo, cell, cells, low, high, offsets, out)
 
 
 @loop
