@@ -8,8 +8,10 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.passes import PASSES, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
-from fusedrf_cli.engine.fields.vm import VMField, VMShape
+from fusedrf_cli.engine.fields.vm import PROBES, VMField, VMShape
+from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import Camera
 
@@ -18,11 +20,26 @@ RATE_DECAY = 0.05  # the last step's share of the first's rate
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3
 EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
-RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))  # (share of the run, share of final voxels per axis)
-OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)  # shares of the run after which the occupancy is built anew
+RESOLUTION_STAGES = (
+    (0.0, 0.22),
+    (0.05, 0.36),
+    (0.12, 0.5),
+    (0.22, 0.7),
+    (0.36, 1.0),
+)  # (share of the run, share of final voxels per axis)
+OCCUPANCY_AT = (
+    0.03,
+    0.06,
+    0.13,
+    0.24,
+    0.38,
+    0.6,
+)  # shares of the run after which the occupancy is built anew
 RAYS_PER_STEP = (512, 1 << 14)
-SHRINK_BELOW = 0.8  # share of the box's volume that its occupied part must fall under for the box to be cut down
-QUARTERS = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)  # where a cell is probed
+SHRINK_BELOW = (
+    0.8  # share of the box's volume that its occupied part must fall under for the box to be cut down
+)
+COLOURS = {"sh": VMField, "mlp": VMMLPField}  # what a colour is asked for by, and the field it needs
 
 
 @dataclass(frozen=True)
@@ -41,18 +58,24 @@ class FitSettings:
     """Weight of the captured alpha against the colour; 0 for opaque photos."""
     near: float = 0.0
     seed: int = 0
+    colour: str = "sh"
+    """One of COLOURS: spherical harmonics, or a shallow network over features."""
 
 
 class RayPool:
     """Random pixels of posed pictures as rays with target colours."""
 
-    def __init__(self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator, origin: np.ndarray):
+    def __init__(
+        self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator, origin: np.ndarray
+    ):
         """images (n, H, W, 4) uint8 straight alpha; origin (3,) is subtracted from the ray origins."""
         self.images = torch.from_numpy(images).reshape(-1, 4)
         self.generator, self.pixels = generator, images.shape[1] * images.shape[2]
         keys = {camera.intrinsics: camera for camera in cameras}
         index = {key: i for i, key in enumerate(keys)}
-        self.local = torch.stack([torch.from_numpy(c.local_directions()).reshape(-1, 3).float() for c in keys.values()])
+        self.local = torch.stack(
+            [torch.from_numpy(c.local_directions()).reshape(-1, 3).float() for c in keys.values()]
+        )
         self.map = torch.tensor([index[c.intrinsics] for c in cameras])
         poses = np.stack([c.camera_to_world for c in cameras])
         self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
@@ -79,7 +102,7 @@ def fit(
     settings: FitSettings,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
     name: str = "",
-) -> VMField:
+) -> VMField | VMMLPField:
     """Train a VM field on pictures (n, H, W, 4) uint8 with straight alpha, inside aabb (6,).
 
     `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is given, so that
@@ -87,7 +110,13 @@ def fit(
     """
     generator = torch.Generator().manual_seed(settings.seed)
     pool = RayPool(cameras, images, generator, np.zeros(3))
-    field = VMField.create(aabb, texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1]))), settings.shape, generator, name)
+    field = COLOURS[settings.colour].create(
+        aabb,
+        texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1]))),
+        settings.shape,
+        generator,
+        name,
+    )
     run = _FitRun(field, pool, settings, generator)
     while (share := run.share()) < 1.0:
         run.refresh(share)
@@ -101,10 +130,11 @@ def fit(
 class _FitRun:
     """The moving parts of one fit."""
 
-    def __init__(self, field: VMField, pool: RayPool, settings: FitSettings, generator: torch.Generator):
+    def __init__(self, field: VMField | VMMLPField, pool: RayPool, settings: FitSettings, generator: torch.Generator):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.parts = torch.get_num_threads()
         self.optimiser = Adam(field, self.parts)
+        self.rays_pass = PASSES[field.kind](field)
         self.started, self.steps = time.monotonic(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), list(OCCUPANCY_AT)
         self.mse, self.rays = None, RAYS_PER_STEP[0]
@@ -158,16 +188,16 @@ class _FitRun:
         target = pixels.clone()
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
         step = (1.0 if dense else STEP_PER_VOXEL) * field.voxel_size
-        loss = np.zeros((self.parts, 3))
-        diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
-        cpu.train_rays(
-            *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, settings.near, jitter, step, EARLY_STOP, target.numpy(), background,
-            settings.opacity_weight, int(diagonal / step) + 2, self.optimiser.grads, loss,
-        )  # fmt: skip
-        self.optimiser.step(RATE * RATE_DECAY**share)
-        mse = loss[:, 0].sum() / len(rays_o)
+        batch = Batch(
+            rays_o, rays_d, jitter, target.numpy(), background, settings.opacity_weight, settings.near, step, EARLY_STOP
+        )
+        sums = self.rays_pass.gradient(field, batch, self.optimiser.grads)
+        decay = RATE_DECAY**share
+        self.optimiser.step(RATE * decay)
+        self.rays_pass.step(decay)
+        mse = sums[0] / len(rays_o)
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
-        per_ray = max(loss[:, 2].sum() / len(rays_o), 1.0)
+        per_ray = max(sums[2] / len(rays_o), 1.0)
         self.rays = int(np.clip(0.9 * self.rays + 0.1 * settings.samples / per_ray, *RAYS_PER_STEP))
         self.steps += 1
 
@@ -182,7 +212,7 @@ def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     return tuple(max(2, n) for n in cell_counts(aabb, longest))
 
 
-def occupancy_of(field: VMField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
+def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
     """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
@@ -193,7 +223,7 @@ def occupancy_of(field: VMField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
     sigma = np.zeros(len(index), np.float32)
-    cpu.density_at_cells(field.kernel_shape[0], field.arrays, box[:3].copy(), cell, index, QUARTERS, sigma)
+    cpu.density_at_cells(field.kernel_shape[0], field.arrays, 0, box[:3].copy(), cell, index, PROBES, sigma)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
     return OccupancyGrid(box, occupied).dilated()

@@ -58,7 +58,9 @@ class OccupancyGrid:
         """The grid with every occupied region grown by a number of cells."""
         from scipy.ndimage import binary_dilation
 
-        return OccupancyGrid(self.aabb, binary_dilation(self.occupied, np.ones((3, 3, 3), bool), iterations=cells))
+        return OccupancyGrid(
+            self.aabb, binary_dilation(self.occupied, np.ones((3, 3, 3), bool), iterations=cells)
+        )
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool: which points (N, 3) lie in an occupied cell."""
@@ -78,3 +80,49 @@ def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     """Cells per axis of near-cubic cells, `longest` of them on the longest axis."""
     extent = np.asarray(aabb, np.float64)[3:] - np.asarray(aabb, np.float64)[:3]
     return tuple(int(n) for n in np.maximum(np.ceil(extent / extent.max() * longest - 1e-9), 1))
+
+
+def placed_occupancy(
+    placed: list[tuple[OccupancyGrid, np.ndarray]], longest: int
+) -> tuple[OccupancyGrid, list[np.ndarray]]:
+    """One grid over several placed ones, and which of its cells each of them may reach (conservative by up to a cell).
+
+    placed are (grid, (4, 4) object_to_field); the new grid has near-cubic cells, `longest` on its longest axis. Where nothing is
+    occupied at all, the boxes themselves give the extent.
+    """
+    boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in placed])
+    lo, hi = boxes[:, :3].min(0), boxes[:, 3:].max(0)
+    margin = (hi - lo).max() / longest
+    aabb = np.concatenate([lo - margin, hi + margin])
+    marks = [marked_cells(grid, matrix, aabb, longest) for grid, matrix in placed]
+    return OccupancyGrid(aabb, np.any(marks, axis=0)), marks
+
+
+def marked_cells(
+    grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, longest: int
+) -> np.ndarray:
+    """(X, Y, Z) bool: cells of a field's box that a placed grid's occupied cells reach, grown by one."""
+    counts = np.array(cell_counts(aabb, longest))
+    cell = (aabb[3:] - aabb[:3]) / counts
+    points = (
+        np.maximum(
+            np.ceil(np.linalg.norm(object_to_field[:3, :3], axis=0) * grid.cell / cell.min()), 1
+        ).astype(int)
+        + 1
+    )
+    steps = np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in points], indexing="ij"), -1).reshape(-1, 3)
+    corners = grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell
+    found = np.zeros(counts, bool)
+    for step in steps:  # few steps, many cells
+        at = (corners + step * grid.cell) @ object_to_field[:3, :3].T + object_to_field[:3, 3]
+        index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
+        found[tuple(index.T)] = True
+    return OccupancyGrid(aabb, found).dilated().occupied
+
+
+def transformed_aabb(aabb: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """(6,) box around a box's eight corners after a (4, 4) affine."""
+    lo, hi = aabb[:3], aabb[3:]
+    corners = np.stack(np.meshgrid(*zip(lo, hi, strict=True), indexing="ij"), -1).reshape(-1, 3)
+    moved = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.concatenate([moved.min(0), moved.max(0)])

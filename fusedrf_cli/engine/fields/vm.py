@@ -12,9 +12,14 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import register
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
+OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
+PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(
+    -1, 3
+)  # where in a cell its density is probed
+NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 SECTION_ALIGN = 16  # floats: a section starts on a cache line
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
@@ -32,6 +37,17 @@ class VMTensor:
     scale: float
     """σ_object = scale * softplus(feature + shift), in 1/length of the object's frame."""
     shift: float = DENSITY_SHIFT
+    occupied: np.ndarray | None = None
+    """(X, Y, Z) bool cells of the box that hold matter; None: all. What the tensor says elsewhere was never learnt."""
+
+    @property
+    def occupancy(self) -> OccupancyGrid:
+        """The occupancy grid in the object's frame."""
+        return (
+            OccupancyGrid.full(self.aabb)
+            if self.occupied is None
+            else OccupancyGrid(self.aabb, self.occupied)
+        )
 
     @property
     def voxel_size(self) -> np.ndarray:
@@ -109,7 +125,12 @@ class VMField:
 
     @classmethod
     def create(
-        cls, aabb: np.ndarray, resolution: tuple[int, int, int], shape: VMShape, generator: torch.Generator, name: str = ""
+        cls,
+        aabb: np.ndarray,
+        resolution: tuple[int, int, int],
+        shape: VMShape,
+        generator: torch.Generator,
+        name: str = "",
     ) -> "VMField":
         """An untrained field: factors N(0, 0.1²) as TensoRF's, colour basis uniform as a linear layer's."""
         aabb = np.asarray(aabb, np.float64)
@@ -122,8 +143,27 @@ class VMField:
         return field
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "VMField":
-        """The same numbers under another occupancy grid (of the same cells where there are several blocks)."""
-        return VMField(self.shape, self.tensors, self.blocks, self.params, occupancy, self.owners)
+        """The same numbers of a one-block field under another occupancy grid of its box."""
+        tensor = replace(self.tensors[0], occupied=occupancy.occupied)
+        return VMField(self.shape, (tensor,), self.blocks, self.params, occupancy)
+
+    @classmethod
+    def assembled(
+        cls, shape: VMShape, tensors: tuple[VMTensor, ...], blocks: tuple[Block, ...], params: torch.Tensor
+    ) -> "VMField":
+        """A field whose occupancy and ownership follow from its blocks: each cell is owned by the one or two densest there."""
+        if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
+            return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
+        occupancy, marks = placed_occupancy(
+            [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks], OWNERSHIP_CELLS
+        )
+        first, second = (
+            np.full(occupancy.occupied.shape, NO_BLOCK, np.uint8),
+            np.full(occupancy.occupied.shape, NO_BLOCK, np.uint8),
+        )
+        unsettled = cls(shape, tensors, blocks, params, occupancy, (first, second))
+        settle_owners(unsettled, marks, first, second)
+        return unsettled
 
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
         """A one-block field on another box and resolution: planes and lines are interpolated, outside the old box they are 0."""
@@ -131,13 +171,20 @@ class VMField:
         aabb = np.asarray(aabb, np.float64)
         params = torch.zeros(self.shape.size(resolution), dtype=self.params.dtype)
         new = VMField(
-            self.shape, (replace(tensor, resolution=resolution, aabb=aabb),), (block,), params, self.occupancy, None
+            self.shape,
+            (replace(tensor, resolution=resolution, aabb=aabb),),
+            (block,),
+            params,
+            self.occupancy,
+            None,
         )
         at = [unit_texels(aabb, tensor.aabb, axis, resolution[axis]) for axis in range(3)]
         old, target = self.sections(0), new.sections(0)
         for what in ("density", "colour"):
             for m, (a, b, c) in enumerate(MODES):
-                target[f"{what}_plane_{m}"].copy_(interpolate_axis(interpolate_axis(old[f"{what}_plane_{m}"], 0, at[a]), 1, at[b]))
+                target[f"{what}_plane_{m}"].copy_(
+                    interpolate_axis(interpolate_axis(old[f"{what}_plane_{m}"], 0, at[a]), 1, at[b])
+                )
                 target[f"{what}_line_{m}"].copy_(interpolate_axis(old[f"{what}_line_{m}"], 0, at[c]))
         target["colour_basis"].copy_(old["colour_basis"])
         return new
@@ -161,7 +208,9 @@ class VMField:
     def sections(self, tensor: int) -> dict[str, torch.Tensor]:
         """Views of the parameters of one tensor, by name."""
         offsets, found = self.layout[tensor], {}
-        for offset, (name, shape) in zip(offsets, self.shape.sections(self.tensors[tensor].resolution), strict=True):
+        for offset, (name, shape) in zip(
+            offsets, self.shape.sections(self.tensors[tensor].resolution), strict=True
+        ):
             found[name] = self.params[int(offset) : int(offset) + int(np.prod(shape))].view(shape)
         return found
 
@@ -192,9 +241,13 @@ class VMField:
             field_to_object = np.linalg.inv(block.object_to_field)
             to_object.append(field_to_object[:3, :3])
             scale = np.diag(1.0 / (box[3:] - box[:3]))
-            to_unit.append(np.concatenate([scale @ field_to_object[:3, :3], (scale @ (field_to_object[:3, 3] - box[:3]))[:, None]], 1))
-        none = np.zeros((0, 0, 0), np.uint8)
-        first, second = self.owners if self.owners is not None else (none, none)
+            to_unit.append(
+                np.concatenate(
+                    [scale @ field_to_object[:3, :3], (scale @ (field_to_object[:3, 3] - box[:3]))[:, None]],
+                    1,
+                )
+            )
+        first, second = self.owners if self.owners is not None else NO_OWNERS
         return VMArrays(
             self.params.detach().numpy(),
             self.layout,
@@ -205,6 +258,8 @@ class VMField:
             np.asarray([[t.scale, t.shift] for t in self.tensors], real),
             first,
             second,
+            np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).astype(np.uint8),
+            occupied_layout(self.tensors),
         )
 
     @property
@@ -212,15 +267,25 @@ class VMField:
         """The occupancy's arrays."""
         return self.occupancy.arrays
 
-    def query(self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not differentiable (see autograd.py)."""
         sigma = np.empty(len(points), self.arrays.params.dtype)
         rgb = np.empty((len(points), 3), self.arrays.params.dtype)
-        cpu.query(*self.kernel_shape, self.arrays, self.grid, points.numpy(), dirs.numpy(), with_colour, sigma, rgb)
+        cpu.query(
+            *self.kernel_shape, self.arrays, self.grid, points.numpy(), dirs.numpy(), with_colour, sigma, rgb
+        )
         return torch.from_numpy(sigma), torch.from_numpy(rgb)
 
     def render_rays(
-        self, rays_o: np.ndarray, rays_d: np.ndarray, near: float, step: float, early_stop: float, out: np.ndarray
+        self,
+        rays_o: np.ndarray,
+        rays_d: np.ndarray,
+        near: float,
+        step: float,
+        early_stop: float,
+        out: np.ndarray,
     ) -> None:
         """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same columns in out (N, 5)."""
         cpu.render(*self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, step, early_stop, out)
@@ -228,21 +293,35 @@ class VMField:
     # -- storing -----------------------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Arrays and metadata for a bundle; the occupancy is stored as packed bits, owners only in its occupied cells."""
+        """Arrays and metadata for a bundle; the tensors' occupancies are stored as packed bits, ownership follows from them."""
         arrays = {
-            f"tensor_{t}.{name}": view.detach().numpy() for t in range(len(self.tensors)) for name, view in self.sections(t).items()
+            f"tensor_{t}.{name}": view.detach().numpy()
+            for t in range(len(self.tensors))
+            for name, view in self.sections(t).items()
         }
-        arrays["occupancy"] = np.packbits(self.occupancy.occupied)
-        if self.owners is not None:
-            arrays["owner_first"], arrays["owner_second"] = (o[self.occupancy.occupied] for o in self.owners)
+        grids = [t.occupancy.occupied for t in self.tensors]
+        arrays |= {f"tensor_{t}.occupancy": np.packbits(grid) for t, grid in enumerate(grids)}
         metadata = {
             "aabb": self.aabb.tolist(),
-            "shape": {"density_rank": self.shape.density_rank, "colour_rank": self.shape.colour_rank, "sh_degree": self.shape.sh_degree},
+            "shape": {
+                "density_rank": self.shape.density_rank,
+                "colour_rank": self.shape.colour_rank,
+                "sh_degree": self.shape.sh_degree,
+            },
             "tensors": [
-                {"resolution": list(t.resolution), "aabb": t.aabb.tolist(), "scale": t.scale, "shift": t.shift} for t in self.tensors
+                {
+                    "resolution": list(t.resolution),
+                    "aabb": t.aabb.tolist(),
+                    "scale": t.scale,
+                    "shift": t.shift,
+                    "occupancy": list(g.shape),
+                }
+                for t, g in zip(self.tensors, grids, strict=True)
             ],
-            "blocks": [{"tensor": b.tensor, "object_to_field": b.object_to_field.tolist(), "name": b.name} for b in self.blocks],
-            "occupancy": list(self.occupancy.occupied.shape),
+            "blocks": [
+                {"tensor": b.tensor, "object_to_field": b.object_to_field.tolist(), "name": b.name}
+                for b in self.blocks
+            ],
         }
         return arrays, metadata
 
@@ -251,23 +330,29 @@ class VMField:
         """Inverse of `state`."""
         shape = VMShape(**metadata["shape"])
         tensors = tuple(
-            VMTensor(tuple(t["resolution"]), np.asarray(t["aabb"], np.float64), t["scale"], t["shift"]) for t in metadata["tensors"]
+            VMTensor(
+                tuple(t["resolution"]), np.asarray(t["aabb"], np.float64), t["scale"], t["shift"],
+                unpack_bits(arrays, f"tensor_{i}.occupancy", t["occupancy"]),
+            )
+            for i, t in enumerate(metadata["tensors"])
+        )  # fmt: skip
+        blocks = tuple(
+            Block(b["tensor"], np.asarray(b["object_to_field"], np.float64), b["name"])
+            for b in metadata["blocks"]
         )
-        blocks = tuple(Block(b["tensor"], np.asarray(b["object_to_field"], np.float64), b["name"]) for b in metadata["blocks"])
-        occupied = unpack_bits(arrays["occupancy"], metadata["occupancy"])
-        owners = None
-        if "owner_first" in arrays:
-            owners = tuple(scatter_owner(occupied, arrays[key]) for key in ("owner_first", "owner_second"))
         params = torch.zeros(sum(shape.size(t.resolution) for t in tensors))
-        field = cls(shape, tensors, blocks, params, OccupancyGrid(np.asarray(metadata["aabb"], np.float64), occupied), owners)
+        box = np.asarray(metadata["aabb"], np.float64)
+        field = cls(shape, tensors, blocks, params, OccupancyGrid.full(box), NO_OWNERS)
         for t in range(len(tensors)):
             for name, view in field.sections(t).items():
                 found = arrays.get(f"tensor_{t}.{name}")
                 if found is None or found.shape != tuple(view.shape):
                     have = "nothing" if found is None else list(found.shape)
-                    raise ValueError(f"array 'tensor_{t}.{name}' should have shape {list(view.shape)}, found {have}")
+                    raise ValueError(
+                        f"array 'tensor_{t}.{name}' should have shape {list(view.shape)}, found {have}"
+                    )
                 view.copy_(torch.from_numpy(np.ascontiguousarray(found, np.float32)))
-        return field
+        return cls.assembled(shape, tensors, blocks, params)
 
 
 def unit_texels(aabb: np.ndarray, old_aabb: np.ndarray, axis: int, count: int) -> torch.Tensor:
@@ -285,21 +370,44 @@ def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> tor
     inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)
     shape = [-1 if a == axis else 1 for a in range(values.dim())]
     fraction, inside = fraction.view(shape), inside.view(shape)
-    return inside * ((1 - fraction) * values.index_select(axis, lower) + fraction * values.index_select(axis, lower + 1))
+    return inside * (
+        (1 - fraction) * values.index_select(axis, lower) + fraction * values.index_select(axis, lower + 1)
+    )
 
 
-def unpack_bits(packed: np.ndarray, shape: list[int]) -> np.ndarray:
-    """Inverse of np.packbits for a grid of a known shape."""
+def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> np.ndarray:
+    """Inverse of np.packbits for the named array, a grid of a known shape."""
     count = int(np.prod(shape))
-    if packed.size != -(-count // 8):
-        raise ValueError(f"array 'occupancy' should have {-(-count // 8)} bytes for a grid of {shape}, found {packed.size}")
+    packed = arrays.get(name)
+    if packed is None or packed.shape != (-(-count // 8),):
+        have = "nothing" if packed is None else list(packed.shape)
+        raise ValueError(
+            f"array '{name}' should have shape {[-(-count // 8)]} for a grid of {shape}, found {have}"
+        )
     return np.unpackbits(packed, count=count).reshape(shape).astype(bool)
 
 
-def scatter_owner(occupied: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """An ownership grid from its values in the occupied cells."""
-    grid = np.full(occupied.shape, NO_BLOCK, np.uint8)
-    if owner.size != int(occupied.sum()):
-        raise ValueError(f"an ownership array should have {int(occupied.sum())} values, found {owner.size}")
-    grid[occupied] = owner
-    return grid
+def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
+    """(T, 4) int64: offset of a tensor's cells in the concatenated occupancies, and cells per axis."""
+    shapes = [t.occupancy.occupied.shape for t in tensors]
+    offsets = np.cumsum([0, *[int(np.prod(s)) for s in shapes]])[:-1]
+    return np.asarray([[o, *s] for o, s in zip(offsets, shapes, strict=True)], np.int64)
+
+
+def settle_owners(field: VMField, marks: list[np.ndarray], first: np.ndarray, second: np.ndarray) -> None:
+    """Write the ownership grids: lower block first where one or two have matter in a cell, the two densest where more have."""
+    count = np.sum(marks, axis=0, dtype=np.uint8)
+    for b, mark in enumerate(marks):
+        second[mark & (first != NO_BLOCK) & (second == NO_BLOCK)] = b
+        first[mark & (first == NO_BLOCK)] = b
+    crowded = np.argwhere(count > 2)
+    if not len(crowded):
+        return
+    grid = field.occupancy
+    peak = np.zeros((len(marks), len(crowded)), np.float32)
+    for b in range(len(marks)):
+        cpu.density_at_cells(
+            field.kernel_shape[0], field.arrays, b, grid.aabb[:3].copy(), grid.cell, crowded, PROBES, peak[b]
+        )
+    densest = np.sort(np.argsort(-peak, axis=0, kind="stable")[:2], axis=0).astype(np.uint8)
+    first[tuple(crowded.T)], second[tuple(crowded.T)] = densest

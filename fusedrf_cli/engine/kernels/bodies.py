@@ -33,6 +33,8 @@ class VMArrays(NamedTuple):
     density: object  # (T, 2) float, scale (1/length of the object frame) and shift of the softplus
     first: object  # (X, Y, Z) uint8, owning block of a cell; shape (0, 0, 0) when there is one block
     second: object  # (X, Y, Z) uint8, the other block that has matter in the cell, or NO_BLOCK
+    occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
+    occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
 
 
 class GridArrays(NamedTuple):
@@ -347,7 +349,9 @@ def scatter_colour(ranks, vm, grads, t, u, v, w, d_features, base, scratch):
     p = vm.params
     mode_scatter(ranks, p, grads, off[6], off[9], nx, ny, nz, u, v, w, d_features, base, 1, scratch)
     mode_scatter(ranks, p, grads, off[7], off[10], nx, nz, ny, u, w, v, d_features, base + rank, 1, scratch)
-    mode_scatter(ranks, p, grads, off[8], off[11], ny, nz, nx, v, w, u, d_features, base + 2 * rank, 1, scratch)
+    mode_scatter(
+        ranks, p, grads, off[8], off[11], ny, nz, nx, v, w, u, d_features, base + 2 * rank, 1, scratch
+    )
 
 
 @body
@@ -382,8 +386,18 @@ def block_density(ranks, vm, b, x, y, z, stretch):
     if not inside:
         return 0.0, 0.0
     t = vm.tensor[b]
+    if vm.first.shape[0] != 0 and not matter_at(vm, t, u, v, w):
+        return 0.0, 0.0
     f = density_feature(ranks, vm, t, u, v, w)
     return float(stretch * vm.density[t, 0] * softplus(f + vm.density[t, 1])), float(f)
+
+
+@body
+def matter_at(vm, t, u, v, w):
+    """Whether a unit point lies in an occupied cell of tensor t; what a tensor says elsewhere was never learnt."""
+    nx, ny, nz = vm.occupied_at[t, 1], vm.occupied_at[t, 2], vm.occupied_at[t, 3]
+    i, j, m = min(int(u * nx), nx - 1), min(int(v * ny), ny - 1), min(int(w * nz), nz - 1)
+    return vm.occupied[np.uint64(vm.occupied_at[t, 0] + (i * ny + j) * nz + m)] != 0
 
 
 @body

@@ -12,8 +12,8 @@ from numba import njit, prange
 from fusedrf_cli.engine.kernels.bodies import (
     COLOUR_FROM,
     add_scaled,
+    block_density,
     colour_features,
-    density_feature,
     directional_basis,
     dot_row,
     hit_box,
@@ -23,7 +23,6 @@ from fusedrf_cli.engine.kernels.bodies import (
     scatter_colour,
     scatter_density,
     sigmoid,
-    softplus,
     unit_point,
     winning_block,
 )
@@ -40,7 +39,23 @@ LINE = 16  # floats in a cache line
 
 
 @task
-def query_task(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, low, high, features, basis, sh, sigma, rgb):
+def query_task(
+    ranks,
+    colour_ranks,
+    coefficients,
+    vm,
+    grid,
+    points,
+    dirs,
+    with_colour,
+    low,
+    high,
+    features,
+    basis,
+    sh,
+    sigma,
+    rgb,
+):
     """`query` for points low..high."""
     for i in range(low, high):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
@@ -69,7 +84,21 @@ def query(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour
         features, basis, sh = np.empty(width, kind), np.empty(3 * width, kind), np.empty(16, kind)
         low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
         query_task(
-            ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, low, high, features, basis, sh, sigma, rgb
+            ranks,
+            colour_ranks,
+            coefficients,
+            vm,
+            grid,
+            points,
+            dirs,
+            with_colour,
+            low,
+            high,
+            features,
+            basis,
+            sh,
+            sigma,
+            rgb,
         )
 
 
@@ -106,7 +135,9 @@ def query_backward_task(
             directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
             colour_features(colour_ranks, vm, t, u, v, w, features, 0)
             clear(d_basis)
-            shade_backward(colour_ranks, basis, features, 0, d_rgb[i, 0], d_rgb[i, 1], d_rgb[i, 2], d_features, d_basis)
+            shade_backward(
+                colour_ranks, basis, features, 0, d_rgb[i, 0], d_rgb[i, 1], d_rgb[i, 2], d_features, d_basis
+            )
             scatter_colour(colour_ranks, vm, grad, t, u, v, w, d_features, 0, scratch)
             scatter_basis(colour_ranks, coefficients, vm, grad, b, sh, d_basis)
 
@@ -199,7 +230,22 @@ def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, st
         features, basis, sh = np.empty(width, kind), np.empty(3 * width, kind), np.empty(16, kind)
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
         render_task(
-            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, low, high, features, basis, sh, out
+            ranks,
+            colour_ranks,
+            coefficients,
+            vm,
+            grid,
+            rays_o,
+            rays_d,
+            near,
+            step,
+            early_stop,
+            low,
+            high,
+            features,
+            basis,
+            sh,
+            out,
         )
 
 
@@ -259,7 +305,12 @@ def train_task(
             continue
         scale = 2.0 / (3.0 * n)
         g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
-        g_t = g_r * background[i, 0] + g_g * background[i, 1] + g_b * background[i, 2] - 2.0 / n * opacity_weight * e_a
+        g_t = (
+            g_r * background[i, 0]
+            + g_g * background[i, 1]
+            + g_b * background[i, 2]
+            - 2.0 / n * opacity_weight * e_a
+        )
 
         # Backwards along the ray: `behind` is the gradient's share of all that lies behind the sample, the background too.
         behind = trans * g_t
@@ -278,7 +329,9 @@ def train_task(
                     clear(d_basis)
                     current = b
                 wq = weights[q]
-                shade_backward(colour_ranks, basis, features, slots[q], g_r * wq, g_g * wq, g_b * wq, d_features, d_basis)
+                shade_backward(
+                    colour_ranks, basis, features, slots[q], g_r * wq, g_g * wq, g_b * wq, d_features, d_basis
+                )
                 scatter_colour(colour_ranks, vm, grad, vm.tensor[b], u, v, w, d_features, 0, scratch)
             d_sigma = step * (after * own - behind)
             behind += weights[q] * own
@@ -358,11 +411,13 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     for part in prange(parts):
         start = low + part * ENTRIES_PER_TASK
         end = min(high, start + ENTRIES_PER_TASK)
-        adam_task(params, grads, moment1, moment2, rate, start, end, beta1, beta2, eps, correction1, correction2)
+        adam_task(
+            params, grads, moment1, moment2, rate, start, end, beta1, beta2, eps, correction1, correction2
+        )
 
 
 @task
-def density_at_cells_task(ranks, vm, lo, cell, cells, low, high, offsets, out):
+def density_at_cells_task(ranks, vm, b, lo, cell, cells, low, high, offsets, out):
     """`density_at_cells` for cells low..high."""
     for i in range(low, high):
         best = 0.0
@@ -370,20 +425,17 @@ def density_at_cells_task(ranks, vm, lo, cell, cells, low, high, offsets, out):
             x = lo[0] + (cells[i, 0] + offsets[q, 0]) * cell[0]
             y = lo[1] + (cells[i, 1] + offsets[q, 1]) * cell[1]
             z = lo[2] + (cells[i, 2] + offsets[q, 2]) * cell[2]
-            u, v, w, inside = unit_point(vm, 0, x, y, z)
-            if inside:
-                f = density_feature(ranks, vm, 0, u, v, w)
-                best = max(best, vm.density[0, 0] * softplus(f + vm.density[0, 1]))
+            best = max(best, block_density(ranks, vm, b, x, y, z, 1.0)[0])
         out[i] = best
 
 
 @loop
-def density_at_cells(ranks, vm, lo, cell, cells, offsets, out):
-    """Largest σ of a one-block field over `offsets` (K, 3), in cells, in each of `cells` (N, 3) int64: out (N,)."""
+def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
+    """Largest σ of block b, as if unstretched, over `offsets` (K, 3) in each of `cells` (N, 3) int64 of a grid: out (N,)."""
     n = cells.shape[0]
     for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
         low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
-        density_at_cells_task(ranks, vm, lo, cell, cells, low, high, offsets, out)
+        density_at_cells_task(ranks, vm, b, lo, cell, cells, low, high, offsets, out)
 
 
 @loop
@@ -403,3 +455,46 @@ def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
             counts[i] += 1
             k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
         start[i] = k
+
+
+@task
+def features_task(colour_ranks, vm, block, points, low, high, out):
+    """`features` for points low..high."""
+    width = 3 * len(colour_ranks)
+    for i in range(low, high):
+        u, v, w, inside = unit_point(vm, block, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
+        if inside:
+            colour_features(colour_ranks, vm, vm.tensor[block], u, v, w, out, i * width)
+        else:
+            for r in range(np.uint64(width)):
+                out[np.uint64(i * width) + r] = 0
+
+
+@loop
+def features(colour_ranks, vm, block, points, out):
+    """Colour products of one block at points (N, 3): out (N * 3 rank,), 0 outside the block's box."""
+    n = points.shape[0]
+    for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
+        features_task(colour_ranks, vm, block, points, low, high, out)
+
+
+@task
+def features_backward_task(colour_ranks, vm, block, points, d_features, low, high, grad, scratch):
+    """`features_backward` for points low..high, into one row of gradients."""
+    width = 3 * len(colour_ranks)
+    for i in range(low, high):
+        u, v, w, inside = unit_point(vm, block, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
+        if inside:
+            scatter_colour(colour_ranks, vm, grad, vm.tensor[block], u, v, w, d_features, i * width, scratch)
+
+
+@loop
+def features_backward(colour_ranks, vm, block, points, d_features, grads):
+    """Adjoint of `features`: adds to row p of grads (parts, P) what d_features (N * 3 rank,) of part p's points send back."""
+    n = points.shape[0]
+    parts = grads.shape[0]
+    for p in prange(parts):
+        scratch = np.empty(2 * len(colour_ranks), vm.params.dtype)
+        low, high = p * n // parts, (p + 1) * n // parts
+        features_backward_task(colour_ranks, vm, block, points, d_features, low, high, grads[p], scratch)

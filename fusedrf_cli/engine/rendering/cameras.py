@@ -28,7 +28,15 @@ class Camera:
         """The same view on another raster."""
         sx, sy = width / self.width, height / self.height
         return Camera(
-            self.camera_to_world, self.fl_x * sx, self.fl_y * sy, self.cx * sx, self.cy * sy, width, height, self.distortion, self.name
+            self.camera_to_world,
+            self.fl_x * sx,
+            self.fl_y * sy,
+            self.cx * sx,
+            self.cy * sy,
+            width,
+            height,
+            self.distortion,
+            self.name,
         )
 
     @property
@@ -81,12 +89,16 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 FRAMING_FOV = 0.6911112  # radians, horizontal: the field of view of NeRF-Synthetic's cameras
 
 
-def framing_camera(aabb: np.ndarray, azimuth: float, elevation: float, width: int, height: int, name: str = "view") -> Camera:
+def framing_camera(
+    aabb: np.ndarray, azimuth: float, elevation: float, width: int, height: int, name: str = "view"
+) -> Camera:
     """A camera outside a box (6,) that frames its bounding ball; azimuth from +x about +z, elevation above the xy plane, radians."""
     centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
     focal = 0.5 * width / np.tan(FRAMING_FOV / 2)
     narrow = np.arctan(0.5 * min(width, height) / focal)
-    away = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
+    away = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
     eye = centre + away * (0.92 * radius / np.sin(narrow))
     pose = look_at(eye, centre, np.array([0.0, 0.0, 1.0]))
     return Camera(pose, focal, focal, width / 2, height / 2, width, height, name=name)
@@ -95,11 +107,14 @@ def framing_camera(aabb: np.ndarray, azimuth: float, elevation: float, width: in
 def orbit(aabb: np.ndarray, count: int, width: int, height: int, elevation: float = 0.45) -> list[Camera]:
     """`count` cameras evenly around a box, all at one elevation."""
     return [
-        framing_camera(aabb, 2 * np.pi * i / count + 0.9, elevation, width, height, name=f"orbit_{i:04d}") for i in range(count)
+        framing_camera(aabb, 2 * np.pi * i / count + 0.9, elevation, width, height, name=f"orbit_{i:04d}")
+        for i in range(count)
     ]
 
 
-def scattered(aabb: np.ndarray, count: int, width: int, height: int, seed: int, lowest: float = 0.05) -> list[Camera]:
+def scattered(
+    aabb: np.ndarray, count: int, width: int, height: int, seed: int, lowest: float = 0.05
+) -> list[Camera]:
     """`count` cameras at seeded random azimuths and elevations above `lowest` radians: the views nothing is trained on."""
     rng = np.random.default_rng(seed)
     spots = zip(rng.uniform(0, 2 * np.pi, count), rng.uniform(lowest, 1.3, count), strict=True)

@@ -56,24 +56,36 @@ def render_rays(
 
 
 def march_rays(
-    field: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray, near: float, step: float, early_stop: float, out: np.ndarray
+    field: RadianceField,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    near: float,
+    step: float,
+    early_stop: float,
+    out: np.ndarray,
 ) -> None:
     """The general path for any field: waves of at most SAMPLES_PER_WAVE samples per living ray, into out (N, 5)."""
     n = len(rays_o)
     trans = np.ones(n, np.float32)
     total = np.zeros((n, 5), np.float32)
-    for ray, ts, counts in waves(field, rays_o, rays_d, near, np.full(n, 0.5), step, lambda: trans > early_stop):
+    for ray, ts, counts in waves(
+        field, rays_o, rays_d, near, np.full(n, 0.5), step, lambda: trans > early_stop
+    ):
         mask = np.arange(ts.shape[1]) < counts[:, None]
         points = rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None]
         dirs = np.broadcast_to(rays_d[ray][:, None], points.shape)
         sigma = np.zeros(ts.shape, np.float32)
-        found, _ = field.query(torch.from_numpy(points[mask]), torch.from_numpy(dirs[mask]), with_colour=False)
+        found, _ = field.query(
+            torch.from_numpy(points[mask]), torch.from_numpy(dirs[mask]), with_colour=False
+        )
         sigma[mask] = found.numpy()
         weights, trans[ray] = weights_from_sigma(sigma, step, trans[ray])
         seen = weights > cpu.COLOUR_FROM
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
-            colour[seen] = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))[1].numpy()
+            colour[seen] = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))[
+                1
+            ].numpy()
         total[ray, :3] += (weights[..., None] * colour).sum(1)
         total[ray, 4] += (weights * ts).sum(1)
     total[:, 3] = 1 - trans
@@ -125,7 +137,9 @@ def render_image(
     for top in range(0, camera.height, rows):
         rays_o, rays_d = camera.rays(slice(top, top + rows))
         start = top * camera.width
-        pixels[start : start + len(rays_o)] = render_rays(field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop)
+        pixels[start : start + len(rays_o)] = render_rays(
+            field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop
+        )
     pixels = pixels.reshape(camera.height, camera.width, 5)
     opacity = pixels[..., 3]
     with np.errstate(divide="ignore", invalid="ignore"):

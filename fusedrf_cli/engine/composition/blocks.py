@@ -1,0 +1,125 @@
+"""Blocks: a composed scene of VM fields as one VM field, each tensor in its object's own axes.
+
+Nothing is optimised here: tensors keep their numbers (or are resampled when the whole must be smaller), and the ownership grid of the
+field says per cell which block is asked. So a turned object costs no rank, copies of one object share a tensor, and appending or
+dropping a block leaves all others bit for bit as they were.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+
+BYTES_PER_NUMBER = {"float16": 2, "float32": 4}
+MAX_BLOCKS = 255
+
+
+def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str = "float16") -> VMField:
+    """One VM field that answers as the max composition of placed VM fields does, in their common frame.
+
+    With `max_bytes` the tensors are resampled to the finest common voxel (in the common frame) whose numbers fit. Raises ValueError
+    when a placed field is no VM field or there are more than MAX_BLOCKS blocks.
+    """
+    for p in placed:
+        if type(p.field) is not VMField:
+            raise ValueError(f"blocks are made of vm fields only, but '{p.name}' is of kind '{p.field.kind}'")
+    fields = {id(p.field): p.field for p in placed}
+    shape = common_shape([f.shape for f in fields.values()])
+    first, tensors, params = {}, [], []
+    for key, field in fields.items():
+        first[key] = len(tensors)
+        wide = reshaped(field, shape)
+        tensors += wide.tensors
+        params.append(wide.params)
+    blocks = [
+        Block(first[id(p.field)] + b.tensor, p.object_to_world @ b.object_to_field, b.name if len(p.field.blocks) > 1 else p.name)
+        for p in placed
+        for b in p.field.blocks
+    ]
+    if len(blocks) > MAX_BLOCKS:
+        raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, this scene has {len(blocks)}")
+    field = VMField.assembled(shape, tuple(tensors), tuple(blocks), torch.cat(params))
+    return field if max_bytes is None else shrunk(field, max_bytes // BYTES_PER_NUMBER[precision])
+
+
+def without(field: VMField, names: set[str]) -> VMField | None:
+    """The field without the blocks of those names and the tensors that only they used; None when nothing is left."""
+    kept = [b for b in field.blocks if b.name not in names]
+    if not kept:
+        return None
+    used = sorted({b.tensor for b in kept})
+    sizes = [field.shape.size(field.tensors[t].resolution) for t in used]
+    params = torch.cat([field.params[field.layout[t, 0] : field.layout[t, 0] + n] for t, n in zip(used, sizes, strict=True)])
+    blocks = tuple(replace(b, tensor=used.index(b.tensor)) for b in kept)
+    return VMField.assembled(field.shape, tuple(field.tensors[t] for t in used), blocks, params)
+
+
+def common_shape(shapes: list[VMShape]) -> VMShape:
+    """The smallest shape that holds all of the given ones."""
+    return VMShape(*(max(getattr(s, name) for s in shapes) for name in ("density_rank", "colour_rank", "sh_degree")))
+
+
+def reshaped(field: VMField, shape: VMShape) -> VMField:
+    """The same field with more components and coefficients, the new ones zero."""
+    if field.shape == shape:
+        return field
+    params = torch.zeros(sum(shape.size(t.resolution) for t in field.tensors), dtype=field.params.dtype)
+    wide = VMField(shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
+    for t in range(len(field.tensors)):
+        target = wide.sections(t)
+        for name, old in field.sections(t).items():
+            if name == "colour_basis":
+                for mode in range(3):
+                    source = old[..., mode * field.shape.colour_rank : (mode + 1) * field.shape.colour_rank]
+                    at = mode * shape.colour_rank
+                    target[name][:, : source.shape[1], at : at + source.shape[2]] = source
+            else:
+                target[name][..., : old.shape[-1]] = old
+    return wide
+
+
+def shrunk(field: VMField, numbers: int) -> VMField:
+    """The field with its tensors resampled to the finest common voxel at which all numbers together are at most `numbers`."""
+    stretch = [
+        max(np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[0] for b in field.blocks if b.tensor == t)
+        for t in range(len(field.tensors))
+    ]
+
+    def resolutions(voxel: float) -> list[tuple[int, int, int]]:
+        found = []
+        for tensor, scale in zip(field.tensors, stretch, strict=True):
+            wanted = np.ceil((tensor.aabb[3:] - tensor.aabb[:3]) * scale / voxel).astype(int) + 1
+            found.append(tuple(int(n) for n in np.clip(wanted, 2, tensor.resolution)))
+        return found
+
+    def count(voxel: float) -> int:
+        return sum(field.shape.size(r) for r in resolutions(voxel))
+
+    fine, coarse = field.voxel_size / 8, float((field.aabb[3:] - field.aabb[:3]).max())
+    if count(fine) <= numbers:
+        return field
+    for _ in range(40):
+        middle = (fine * coarse) ** 0.5
+        fine, coarse = (fine, middle) if count(middle) <= numbers else (middle, coarse)
+    return resampled_tensors(field, resolutions(coarse))
+
+
+def resampled_tensors(field: VMField, resolutions: list[tuple[int, int, int]]) -> VMField:
+    """The field with every tensor at another resolution of its own box."""
+    tensors, params = [], []
+    for t, resolution in enumerate(resolutions):
+        single = tensor_field(field, t).resampled(field.tensors[t].aabb, resolution)
+        tensors.append(replace(field.tensors[t], resolution=resolution))
+        params.append(single.params)
+    return VMField.assembled(field.shape, tuple(tensors), field.blocks, torch.cat(params))
+
+
+def tensor_field(field: VMField, t: int) -> VMField:
+    """One tensor of a field as a field of its own, in its object's frame."""
+    tensor: VMTensor = field.tensors[t]
+    start = int(field.layout[t, 0])
+    params = field.params[start : start + field.shape.size(tensor.resolution)].clone()
+    return VMField(field.shape, (tensor,), (Block(0, np.eye(4), ""),), params, tensor.occupancy)

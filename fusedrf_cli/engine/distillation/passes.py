@@ -1,0 +1,145 @@
+"""One pass over a batch of rays per field kind: render, compare with the pictures, leave the gradient in the optimiser's rows.
+
+The loss of a batch of n rays is mean (C + (1 - A) background - target)² over rays and channels, plus opacity_weight times
+mean (A - alpha)², with A the opacity. Every pass returns the sums (3,) of the colour term (a ray's mean over channels), of the
+opacity term, and of the samples taken.
+"""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
+from fusedrf_cli.engine.kernels import autograd, cpu
+from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
+
+NETWORK_RATE = 1e-3  # TensoRF's
+BETAS = (0.9, 0.99)
+
+
+class Batch(NamedTuple):
+    """Rays, what they should show, and how they are sampled."""
+
+    rays_o: np.ndarray  # (n, 3) float64, in the field's frame
+    rays_d: np.ndarray  # (n, 3) float64, unit length
+    jitter: np.ndarray  # (n,) float64 in [0, 1), shift of a ray's samples in steps
+    target: np.ndarray  # (n, 4) float32, rgb over the background, and the captured alpha
+    background: np.ndarray  # (n, 3) float32
+    opacity_weight: float
+    near: float
+    step: float
+    early_stop: float
+
+
+class Pass(Protocol):
+    """What a fit asks of a field kind."""
+
+    def gradient(self, field, batch: Batch, grads: np.ndarray) -> np.ndarray:
+        """Add the gradient of `field.params` to the rows of grads (parts, P); returns the sums (3,)."""
+        ...
+
+    def step(self, decay: float) -> None:
+        """Move what is not in `field.params`, at `decay` times the first rate."""
+        ...
+
+
+class FusedPass:
+    """The `vm` kind's: forward and backward of a ray in one kernel."""
+
+    def __init__(self, field: VMField):
+        pass
+
+    def gradient(self, field: VMField, batch: Batch, grads: np.ndarray) -> np.ndarray:
+        """See Pass."""
+        loss = np.zeros((len(grads), 3))
+        diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
+        cpu.train_rays(
+            *field.kernel_shape, field.arrays, field.grid, batch.rays_o, batch.rays_d, batch.near, batch.jitter,
+            batch.step, batch.early_stop, batch.target, batch.background, batch.opacity_weight,
+            int(diagonal / batch.step) + 2, grads, loss,
+        )  # fmt: skip
+        return loss.sum(0)
+
+    def step(self, decay: float) -> None:
+        """Nothing: all is in `params`."""
+
+
+class PackedPass:
+    """The `vm-mlp` kind's: samples of all rays in one list, colours by one run of the network over those that are seen."""
+
+    def __init__(self, field: VMMLPField):
+        self.optimiser = torch.optim.Adam(field.network.parameters(), NETWORK_RATE, BETAS)
+
+    def gradient(self, field: VMMLPField, batch: Batch, grads: np.ndarray) -> np.ndarray:
+        """See Pass; the network's gradient stays with its weights until `step`."""
+        n = len(batch.rays_o)
+        ray, ts = visible_samples(field, batch)
+        dirs = batch.rays_d[ray]
+        points = torch.from_numpy(batch.rays_o[ray] + ts[:, None] * dirs)
+        ray, dirs = torch.from_numpy(ray), torch.from_numpy(dirs)
+        params = field.params.detach().requires_grad_()
+        basis = field.basis.detach().requires_grad_()  # a leaf of its own: a slice's gradient is as large as params
+
+        sigma = autograd.density(field, params, points, dirs, grads)
+        weights, opacity = composite(sigma * batch.step, ray, n)
+        seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]
+        rgb = field.shade(autograd.features(field, params, points[seen], grads), dirs[seen], basis)
+        colour = rgb.new_zeros(n, 3).index_add(0, ray[seen], weights[seen, None] * rgb)
+
+        target = torch.from_numpy(batch.target)
+        error = colour + (1 - opacity)[:, None] * torch.from_numpy(batch.background) - target[:, :3]
+        losses = (error**2).mean(1).sum(), ((opacity - target[:, 3]) ** 2).sum()
+        self.optimiser.zero_grad(set_to_none=True)
+        ((losses[0] + batch.opacity_weight * losses[1]) / n).backward()
+        start = int(field.layout[0, 12])
+        grads[0, start : start + basis.numel()] += basis.grad.flatten().numpy()
+        return np.array([losses[0].item(), losses[1].item(), len(ts)])
+
+    def step(self, decay: float) -> None:
+        """One step of Adam on the network."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = NETWORK_RATE * decay
+        self.optimiser.step()
+
+
+PASSES: dict[str, type[Pass]] = {VMField.kind: FusedPass, VMMLPField.kind: PackedPass}
+
+
+def visible_samples(field: VMMLPField, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (S,) int64, ascending, and distances (S,), ascending on a ray, of the samples up to where a ray is opaque."""
+    trans = np.ones(len(batch.rays_o), np.float32)
+    rays, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
+    rest = batch.near, batch.jitter, batch.step
+    for ray, ts, counts in waves(field, batch.rays_o, batch.rays_d, *rest, lambda: trans > batch.early_stop):
+        row, slot = np.nonzero(np.arange(ts.shape[1]) < counts[:, None])
+        dirs = batch.rays_d[ray[row]]
+        points = batch.rays_o[ray[row]] + ts[row, slot, None] * dirs
+        sigma = np.zeros(ts.shape, np.float32)
+        found = field.query(torch.from_numpy(points), torch.from_numpy(dirs), with_colour=False)[0]
+        sigma[row, slot] = found.numpy()
+        weights, after = weights_from_sigma(sigma, batch.step, trans[ray])
+        before = trans[ray, None] - (np.cumsum(weights, 1) - weights)
+        kept = before[row, slot] > batch.early_stop
+        trans[ray] = after
+        rays.append(ray[row[kept]])
+        distances.append(ts[row[kept], slot[kept]])
+    ray, ts = np.concatenate(rays), np.concatenate(distances)
+    order = np.argsort(ray, kind="stable")
+    return ray[order], ts[order]
+
+
+def composite(depth: torch.Tensor, ray: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Weights (S,) of packed samples of optical depths (S,), and opacities (n,) of their rays (S,), ascending.
+
+    The depth before a sample is the running sum over all samples less its value at the ray's first, hence float64.
+    """
+    exact = depth.double()
+    before = exact.cumsum(0) - exact
+    counts = torch.bincount(ray, minlength=n)
+    first = (counts.cumsum(0) - counts)[ray]
+    trans = torch.exp(before[first] - before)
+    weights = trans * -torch.expm1(-exact)
+    opacity = exact.new_zeros(n).index_add(0, ray, weights)
+    return weights.to(depth.dtype), opacity.to(depth.dtype)

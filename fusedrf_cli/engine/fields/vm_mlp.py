@@ -1,0 +1,201 @@
+"""The `vm-mlp` field: one VM tensor whose colour is a shallow network over features and view (TensoRF's MLP_Fea).
+
+The factors are a `VMField` of one block, used for density, occupancy, resampling and storage. Its colour basis (3, 9, 3 rank),
+read as the (27, 3 rank) matrix B, makes the 27 features f = B (P ∘ L), as in TensoRF; no SH is evaluated.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.base import register
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
+
+FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
+FREQUENCIES = (1.0, 2.0)
+WIDTH = 64
+POINTS_AT_ONCE = 1 << 15  # 20 MB of network inputs
+
+
+class ColourNetwork(torch.nn.Module):
+    """[f, d, PE(f), PE(d)] -> width -> width -> 3, ReLU between, sigmoid at the end; the order of inputs is TensoRF's."""
+
+    def __init__(self, features: int, width: int = WIDTH, generator: torch.Generator | None = None):
+        """Weights uniform as a linear layer's, the last bias 0."""
+        super().__init__()
+        inputs = (features + 3) * (1 + 2 * len(FREQUENCIES))
+        sizes = ((inputs, width), (width, width), (width, 3))
+        self.layers = torch.nn.ModuleList(torch.nn.utils.skip_init(torch.nn.Linear, a, b) for a, b in sizes)
+        with torch.no_grad():
+            for layer in self.layers:
+                bound = layer.in_features**-0.5
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                layer.bias.uniform_(-bound, bound, generator=generator)
+            self.layers[-1].bias.zero_()
+
+    def forward(self, features: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
+        """rgb (N, 3) in [0, 1] from features (N, F) and unit directions (N, 3) of the object's frame."""
+        first, second, last = self.layers
+        x = torch.cat([features, dirs, encoding(features), encoding(dirs)], 1)
+        return torch.sigmoid(last(torch.relu_(second(torch.relu_(first(x))))))
+
+
+def encoding(x: torch.Tensor) -> torch.Tensor:
+    """(N, 2 K D) sines, then cosines, of x (N, D) times each of the K frequencies, a component's frequencies side by side."""
+    angles = (x[..., None] * x.new_tensor(FREQUENCIES)).flatten(1)
+    return torch.cat([angles.sin(), angles.cos()], 1)
+
+
+@register
+class VMMLPField:
+    """One VM tensor and a colour network; immutable but for the factors' `params` and the network's weights.
+
+    It has no `render_rays`: shading is batched matrix products, which the renderer's general path feeds well.
+    """
+
+    kind = "vm-mlp"
+
+    def __init__(self, factors: VMField, network: ColourNetwork):
+        if len(factors.blocks) != 1:
+            raise ValueError(f"a vm-mlp field has one block, found {len(factors.blocks)}")
+        self.factors, self.network = factors, network
+
+    # -- making ------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def create(
+        cls,
+        aabb: np.ndarray,
+        resolution: tuple[int, int, int],
+        shape: VMShape,
+        generator: torch.Generator,
+        name: str = "",
+        width: int = WIDTH,
+    ) -> "VMMLPField":
+        """An untrained field of the shape's ranks; its SH degree is not used."""
+        shape = replace(shape, sh_degree=FEATURE_DEGREE)
+        factors = VMField.create(aabb, resolution, shape, generator, name)
+        return cls(factors, ColourNetwork(3 * shape.coefficients, width, generator))
+
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "VMMLPField":
+        """The same numbers under another occupancy grid."""
+        return VMMLPField(self.factors.with_occupancy(occupancy), self.network)
+
+    def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMMLPField":
+        """The field on another box and resolution, with the same network."""
+        return VMMLPField(self.factors.resampled(aabb, resolution), self.network)
+
+    # -- reading: the factors' ---------------------------------------------------------------------------------------
+
+    @property
+    def shape(self) -> VMShape:
+        """Ranks; the degree stands for the number of features."""
+        return self.factors.shape
+
+    @property
+    def tensors(self) -> tuple[VMTensor, ...]:
+        """The one tensor."""
+        return self.factors.tensors
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """The one block."""
+        return self.factors.blocks
+
+    @property
+    def params(self) -> torch.Tensor:
+        """(P,) factors and colour basis; the network's weights are not among them."""
+        return self.factors.params
+
+    @property
+    def occupancy(self) -> OccupancyGrid:
+        """The factors' grid."""
+        return self.factors.occupancy
+
+    @property
+    def aabb(self) -> np.ndarray:
+        """(6,) float64 box in the field's frame."""
+        return self.factors.aabb
+
+    @property
+    def voxel_size(self) -> float:
+        """Finest texel spacing, in the field's frame."""
+        return self.factors.voxel_size
+
+    @property
+    def layout(self) -> np.ndarray:
+        """(1, 13) int64 offsets of the sections in params."""
+        return self.factors.layout
+
+    @property
+    def kernel_shape(self) -> tuple[tuple[int, ...], ...]:
+        """Ranks as the kernels take them."""
+        return self.factors.kernel_shape
+
+    @property
+    def arrays(self) -> VMArrays:
+        """What kernels read; `params` is shared, not copied."""
+        return self.factors.arrays
+
+    @property
+    def grid(self) -> GridArrays:
+        """The occupancy's arrays."""
+        return self.factors.grid
+
+    @property
+    def basis(self) -> torch.Tensor:
+        """(27, 3 rank) view of the matrix that makes features of products."""
+        return self.factors.sections(0)["colour_basis"].flatten(0, 1)
+
+    # -- answering ---------------------------------------------------------------------------------------------------
+
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not differentiable."""
+        sigma, rgb = self.factors.query(points, dirs, with_colour=False)
+        if with_colour:
+            with torch.no_grad():
+                for some in torch.nonzero(sigma > 0)[:, 0].split(POINTS_AT_ONCE):
+                    products = autograd.features(self, self.params, points[some])
+                    rgb[some] = self.shade(products, dirs[some], self.basis)
+        return sigma, rgb
+
+    def shade(self, products: torch.Tensor, dirs: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
+        """rgb (N, 3) from colour products (N, 3 rank) and unit dirs (N, 3) of the field's frame; differentiable."""
+        to_object = torch.from_numpy(self.arrays.to_object[0])
+        local = torch.nn.functional.normalize(dirs.double() @ to_object.T, dim=1).to(products.dtype)
+        return self.network(products @ basis.T, local)
+
+    # -- storing -----------------------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """The factors' arrays and metadata, and the network's weights."""
+        arrays, metadata = self.factors.state()
+        weights = {name: values.detach().numpy() for name, values in named_weights(self.network)}
+        return arrays | weights, metadata
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMMLPField":
+        """Inverse of `state`; the network's width is that of its first bias."""
+        factors = VMField.from_state(arrays, metadata)
+        width = arrays.get("network.0.bias")
+        if width is None or width.ndim != 1:
+            raise ValueError("array 'network.0.bias' is missing or not a vector")
+        network = ColourNetwork(3 * factors.shape.coefficients, len(width))
+        with torch.no_grad():
+            for name, values in named_weights(network):
+                found = arrays.get(name)
+                if found is None or found.shape != tuple(values.shape):
+                    have = "nothing" if found is None else list(found.shape)
+                    raise ValueError(f"array '{name}' should have shape {list(values.shape)}, found {have}")
+                values.copy_(torch.from_numpy(np.ascontiguousarray(found, np.float32)))
+        return cls(factors, network)
+
+
+def named_weights(network: ColourNetwork) -> list[tuple[str, torch.nn.Parameter]]:
+    """Names in a bundle and values of the network's weights: `network.<layer>.weight` (out, in) and `.bias` (out,)."""
+    return [(f"network.{name.removeprefix('layers.')}", values) for name, values in network.named_parameters()]
