@@ -27,13 +27,15 @@ from fusedrf_cli import options
 @options.max_size
 @options.target_psnr
 @click.option(
-    "--time-budget",
-    type=options.POSITIVE,
-    metavar="S",
-    default=300.0,
+    "--quality",
+    type=click.Choice(["draft", "normal", "high"]),
+    default="normal",
     show_default=True,
-    help="Stop optimising after S seconds.",
+    help="How fine, and how long to train.",
 )
+@options.time_budget
+@click.option("--views", type=click.IntRange(2, 1000), default=100, show_default=True, help="Views taken of a mesh.")
+@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels a side of a mesh's views.")
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
 @options.precision

@@ -7,8 +7,9 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
+from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
 
-OCCUPANCY_CELLS = 192
+OCCUPANCY_CELLS = OWNERSHIP_CELLS  # so that a scene and what it is fused to are framed alike
 RULES = ("max", "add")
 
 

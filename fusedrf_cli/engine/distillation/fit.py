@@ -1,5 +1,6 @@
 """Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy grid is set."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ OCCUPANCY_AT = (
     0.38,
     0.6,
 )  # shares of the run after which the occupancy is built anew
+TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
+THINNEST = 12
 RAYS_PER_STEP = (512, 1 << 14)
 SHRINK_BELOW = (
     0.8  # share of the box's volume that its occupied part must fall under for the box to be cut down
@@ -57,6 +60,8 @@ class FitSettings:
     opacity_weight: float = 0.1
     """Weight of the captured alpha against the colour; 0 for opaque photos."""
     near: float = 0.0
+    target_psnr: float | None = None
+    """dB of the training rays, less a margin, at which the fit may stop early."""
     seed: int = 0
     colour: str = "sh"
     """One of COLOURS: spherical harmonics, or a shallow network over features."""
@@ -66,9 +71,9 @@ class RayPool:
     """Random pixels of posed pictures as rays with target colours."""
 
     def __init__(
-        self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator, origin: np.ndarray
+        self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator
     ):
-        """images (n, H, W, 4) uint8 straight alpha; origin (3,) is subtracted from the ray origins."""
+        """images (n, H, W, 4) uint8 straight alpha."""
         self.images = torch.from_numpy(images).reshape(-1, 4)
         self.generator, self.pixels = generator, images.shape[1] * images.shape[2]
         keys = {camera.intrinsics: camera for camera in cameras}
@@ -79,13 +84,24 @@ class RayPool:
         self.map = torch.tensor([index[c.intrinsics] for c in cameras])
         poses = np.stack([c.camera_to_world for c in cameras])
         self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
-        self.position = torch.from_numpy(poses[:, :3, 3] - origin)
+        self.position = torch.from_numpy(poses[:, :3, 3].copy())
+        self.random_of_order = generator.get_state()
         self.order, self.at = None, 0
+
+    def resume(self, random_of_order: torch.Tensor, at: int) -> None:
+        """Go on in the order that was drawn from a saved generator state, after its first `at` pixels."""
+        self.generator.set_state(random_of_order)
+        self._shuffle()
+        self.at = at
+
+    def _shuffle(self) -> None:
+        self.random_of_order = self.generator.get_state()
+        self.order, self.at = torch.randperm(len(self.images), generator=self.generator), 0
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
         """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel once before any comes again."""
         if self.order is None or self.at + count > len(self.order):
-            self.order, self.at = torch.randperm(len(self.images), generator=self.generator), 0
+            self._shuffle()
         chosen = self.order[self.at : self.at + count]
         self.at += count
         view, pixel = chosen // self.pixels, chosen % self.pixels
@@ -108,27 +124,11 @@ def fit(
     `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is given, so that
     the same seed and number of threads gives the same numbers.
     """
-    generator = torch.Generator().manual_seed(settings.seed)
-    pool = RayPool(cameras, images, generator, np.zeros(3))
-    field = COLOURS[settings.colour].create(
-        aabb,
-        texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1]))),
-        settings.shape,
-        generator,
-        name,
-    )
-    run = _FitRun(field, pool, settings, generator)
-    while (share := run.share()) < 1.0:
-        run.refresh(share)
-        run.step(share)
-        if run.steps % 20 == 0:
-            advance(share, {"psnr": run.psnr})
-    run.refresh_occupancy()
-    return run.field
+    return FitRun.start(cameras, images, aabb, settings, name).finish(advance)
 
 
-class _FitRun:
-    """The moving parts of one fit."""
+class FitRun:
+    """The moving parts of one fit, which can be saved between two steps and taken up again."""
 
     def __init__(self, field: VMField | VMMLPField, pool: RayPool, settings: FitSettings, generator: torch.Generator):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
@@ -138,6 +138,71 @@ class _FitRun:
         self.started, self.steps = time.monotonic(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), list(OCCUPANCY_AT)
         self.mse, self.rays = None, RAYS_PER_STEP[0]
+
+    @classmethod
+    def start(
+        cls, cameras: list[Camera], images: np.ndarray, aabb: np.ndarray, settings: FitSettings, name: str = ""
+    ) -> "FitRun":
+        """A fit before its first step; the arguments are those of `fit`."""
+        generator = torch.Generator().manual_seed(settings.seed)
+        pool = RayPool(cameras, images, generator)
+        coarse = texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1])))
+        field = COLOURS[settings.colour].create(aabb, coarse, settings.shape, generator, name)
+        return cls(field, pool, settings, generator)
+
+    def finish(
+        self, advance: Callable[[float, dict], None] = lambda share, figures: None
+    ) -> VMField | VMMLPField:
+        """Run to the end, or to the target PSNR of the training rays where there is one. Raises FloatingPointError on divergence."""
+        while (share := self.share()) < 1.0 and not self.reached():
+            self.refresh(share)
+            self.step(share)
+            if self.steps % 20 == 0:
+                if not math.isfinite(self.mse):
+                    raise FloatingPointError(f"the loss is {self.mse} after {self.steps} steps")
+                advance(share, {"psnr": self.psnr})
+        self.refresh_occupancy()
+        return self.field
+
+    def reached(self) -> bool:
+        """Whether the training rays show the asked PSNR at full resolution, by a margin for unseen views."""
+        target = self.settings.target_psnr
+        return target is not None and not self.stages and self.psnr > target + TARGET_MARGIN
+
+    def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
+        """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
+        arrays, metadata = self.field.state()
+        arrays = {f"field.{name}": np.asarray(value) for name, value in arrays.items()}
+        arrays |= {"moment1": self.optimiser.moment1, "moment2": self.optimiser.moment2}
+        arrays |= {"random": self.generator.get_state().numpy(), "random_of_order": self.pool.random_of_order.numpy()}
+        state = {
+            "command": "train",
+            "field": metadata,
+            "steps": self.steps,
+            "elapsed": time.monotonic() - self.started,
+            "adam_steps": self.optimiser.steps,
+            "stages": len(self.stages),
+            "refreshes": len(self.refreshes),
+            "mse": self.mse,
+            "rays": self.rays,
+            "drawn": self.pool.at,
+        }
+        return arrays, state
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
+        """Take up a run that `checkpoint` saved, over the same pictures and settings."""
+        saved = {name.removeprefix("field."): value for name, value in arrays.items() if name.startswith("field.")}
+        self.field = type(self.field).from_state(saved, state["field"])
+        self.rays_pass = PASSES[self.field.kind](self.field)
+        self.optimiser = Adam(self.field, self.parts)
+        self.optimiser.moment1[:], self.optimiser.moment2[:] = arrays["moment1"], arrays["moment2"]
+        self.optimiser.steps, self.steps = state["adam_steps"], state["steps"]
+        self.stages = self.stages[len(self.stages) - state["stages"] :]
+        self.refreshes = self.refreshes[len(self.refreshes) - state["refreshes"] :]
+        self.mse, self.rays = state["mse"], state["rays"]
+        self.started = time.monotonic() - state["elapsed"]
+        self.pool.resume(torch.from_numpy(arrays["random_of_order"]), state["drawn"])
+        self.generator.set_state(torch.from_numpy(arrays["random"]))
 
     @property
     def psnr(self) -> float:
@@ -208,8 +273,8 @@ def volume(aabb: np.ndarray) -> float:
 
 
 def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
-    """Texels per axis of near-cubic voxels, `longest` on the longest axis, at least 2."""
-    return tuple(max(2, n) for n in cell_counts(aabb, longest))
+    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets THINNEST across."""
+    return tuple(max(min(THINNEST, longest), n) for n in cell_counts(aabb, longest))
 
 
 def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:

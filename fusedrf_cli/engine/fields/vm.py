@@ -76,6 +76,15 @@ class VMShape:
     """Components per mode of the colour features."""
     sh_degree: int = 2
 
+    def __post_init__(self):
+        """Refuse what the kernels were not written for: they work on runs of eight components and on four SH bands."""
+        for name in ("density_rank", "colour_rank"):
+            rank = getattr(self, name)
+            if rank < 8 or rank % 8:
+                raise ValueError(f"'{name}' should be a multiple of 8, found {rank}")
+        if self.sh_degree not in range(4):
+            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
+
     @property
     def coefficients(self) -> int:
         """SH coefficients per channel."""

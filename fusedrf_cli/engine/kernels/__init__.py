@@ -1,5 +1,6 @@
 """Compiled kernels. Import `fusedrf_cli.engine.kernels` only when numbers are to be crunched: it loads numba."""
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
@@ -8,16 +9,20 @@ import numba
 
 
 def kernel_cache() -> Path:
-    """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be written."""
+    """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be written.
+
+    It is named for the text of bodies.py: numba only looks for changes in the file of the loop, not of what the loop inlines.
+    """
+    bodies = hashlib.sha256(Path(__file__).with_name("bodies.py").read_bytes()).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    wanted = Path(home) / "fusedrf" / "kernels"
+    wanted = Path(home) / "fusedrf" / "kernels" / bodies
     try:
         wanted.mkdir(parents=True, exist_ok=True)
         probe = tempfile.TemporaryFile(dir=wanted)
         probe.close()
         return wanted
     except OSError:
-        fallback = Path(tempfile.gettempdir()) / f"fusedrf-kernels-{os.getuid()}"
+        fallback = Path(tempfile.gettempdir()) / f"fusedrf-kernels-{os.getuid()}-{bodies}"
         fallback.mkdir(exist_ok=True)
         return fallback
 
@@ -30,4 +35,17 @@ numba.config.SLP_VECTORIZE = 1
 from fusedrf_cli.engine.kernels import cpu  # noqa: E402  (compiles under the settings above)
 from fusedrf_cli.engine.kernels.bodies import NO_BLOCK, GridArrays, VMArrays  # noqa: E402
 
-__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "kernel_cache"]
+
+
+def set_threads(count: int) -> None:
+    """Use that many cores, at most as many as numba started with."""
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+
+
+def is_cold() -> bool:
+    """Whether nothing has been compiled yet into the cache folder."""
+    folder = Path(numba.config.CACHE_DIR or os.environ["NUMBA_CACHE_DIR"])
+    return not folder.is_dir() or not any(folder.iterdir())
+
+
+__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "is_cold", "kernel_cache", "set_threads"]

@@ -19,6 +19,8 @@ body = njit(fastmath=True, error_model="numpy", cache=True, forceinline=True, _n
 
 NO_BLOCK = 255  # in the ownership grids: nobody is asked here
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
+EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
+FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must not be jumped over by rounding
 
 
 class VMArrays(NamedTuple):
@@ -104,7 +106,7 @@ def next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k):
             exit_distance(x, dx, lo[0], cell[0], i, s),
             min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
         )
-        k = max(k + 1, int(math.ceil((t + away - t0) / step)))
+        k = max(k + 1, int(math.ceil((t + away - t0) / step - FACE_TOLERANCE)))
 
 
 @body
@@ -302,7 +304,8 @@ def unit_point(vm, b, x, y, z):
     u = to_unit[b, 0, 0] * x + to_unit[b, 0, 1] * y + to_unit[b, 0, 2] * z + to_unit[b, 0, 3]
     v = to_unit[b, 1, 0] * x + to_unit[b, 1, 1] * y + to_unit[b, 1, 2] * z + to_unit[b, 1, 3]
     w = to_unit[b, 2, 0] * x + to_unit[b, 2, 1] * y + to_unit[b, 2, 2] * z + to_unit[b, 2, 3]
-    inside = u >= 0 and v >= 0 and w >= 0 and u <= 1 and v <= 1 and w <= 1
+    lo, hi = -EDGE, 1 + EDGE
+    inside = u >= lo and v >= lo and w >= lo and u <= hi and v <= hi and w <= hi
     return real(u), real(v), real(w), inside
 
 

@@ -125,7 +125,7 @@ def query_backward_task(
             continue
         b, s, f = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
         u, v, w, inside = unit_point(vm, b, x, y, z)
-        if not inside:
+        if not inside or s == 0:
             continue
         t = vm.tensor[b]
         stretch = object_direction(vm, b, dx, dy, dz)[3]
@@ -336,7 +336,7 @@ def train_task(
             d_sigma = step * (after * own - behind)
             behind += weights[q] * own
             after += weights[q]
-            if inside:
+            if inside and weights[q] > 0.0:  # where no block is asked, none learns
                 tensor = vm.tensor[b]
                 slope = object_direction(vm, b, dx, dy, dz)[3] * vm.density[tensor, 0]
                 d_f[0] = real(d_sigma * slope * sigmoid(pre[q] + vm.density[tensor, 1]))

@@ -79,7 +79,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     back = back / np.linalg.norm(back)
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-6:
-        right = np.cross([0.0, 1.0, 0.0], back)
+        right = np.cross([0.0, 1.0, 0.0] if abs(back[1]) < 0.9 else [1.0, 0.0, 0.0], back)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye

@@ -1,0 +1,233 @@
+"""`add` and `delete`: edits of a fused bundle that leave everything outside the touched region as it was."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from formats.bundle import Bundle, is_bundle, read_bundle, sha256_of
+from formats.records import FieldRecord
+from fusedrf_cli.bridge.fuse import stored
+from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.scene import history_nodes, load_scene, make_field, write_field
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.blocks import blocks_of, without
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.region import ClippedField, cleared, region_of
+from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
+from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.errors import InvalidInput
+
+REGION_SETTINGS = DistillSettings(max_numbers=2_000_000, rays=120_000, points=1_500_000, steps=500, rgb_steps=500, view_size=160)
+
+
+def add(
+    fused: str, source: str, output: str, *, name: str, object_to_world: np.ndarray, time_budget: float | None, rgb: bool, precision: str,
+    overwrite: bool, seed: int, device: str, threads: int | None, progress,
+) -> dict:  # fmt: skip
+    """Put one more object into a fused field. Its blocks are appended; cells that it does not reach keep their owner and numbers."""
+    with engine(device, threads, progress):
+        started = time.monotonic()
+        progress.phase("reading", None)
+        bundle, node, field = read_fused(fused)
+        if name in names_in(bundle, field, node.name):
+            raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
+        new = load_scene(source)
+        origin = node.object_to_world[:3, 3]
+        objects = [Placed(name, p.field, object_to_world @ p.object_to_world).moved(origin) for p in new.placed]
+        settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
+        progress.phase("adding", 1.0)
+        objects = [as_vm(p, settings, rgb, progress) for p in objects]
+        base = Placed(node.name, field, np.eye(4))
+        try:
+            result = blocks_of([base, *objects])
+        except ValueError as error:
+            raise InvalidInput(f"{fused}: {error}") from error
+        box = enclosing([transformed_aabb(p.field.occupancy.tight_aabb(0), p.object_to_world) for p in objects])
+        progress.phase("measuring", None)
+        truth = ComposedField([base, *objects])
+        reached = Judge(truth, settings.views, settings.view_size, seed)(moved_frame(stored(result, precision), truth.origin))
+        entry = {
+            "event": "added", "nodes": [placed_note(n, object_to_world, name) for n in history_nodes(new, output, {})], "psnr": reached,
+        }  # fmt: skip
+        history = (*bundle.scene.history, entry)
+        size = write_field(
+            output, result, node.name, precision=precision, overwrite=overwrite, origin=origin, history=history, kept=others(bundle, node)
+        )
+    return edit_report(output, size, fused, name, box + np.tile(origin, 2), result, {"psnr": {"before_rgb": reached}}, started)
+
+
+def delete(
+    fused: str, names: tuple[str, ...], output: str, *, time_budget: float | None, rgb: bool, precision: str, allow_outside: bool,
+    overwrite: bool, seed: int, device: str, threads: int | None, progress,
+) -> dict:  # fmt: skip
+    """Take objects out of a fused field: their blocks are dropped; out of a distilled tensor only the cells they reached are cut.
+
+    What an object hid inside the tensor is learned again from the remaining sources where these are known, else left empty.
+    """
+    with engine(device, threads, progress):
+        started = time.monotonic()
+        progress.phase("reading", None)
+        bundle, node, field = read_fused(fused)
+        known = names_in(bundle, field, node.name)
+        for name in names:
+            if name not in known:
+                raise InvalidInput(f"{fused}: there is no '{name}' to delete; it holds {', '.join(sorted(known)) or 'nothing that has a name'}")
+        if set(names) == known:
+            raise InvalidInput(f"{fused}: deleting {', '.join(sorted(names))} would leave nothing; keep one object, or delete the file")
+        origin = node.object_to_world[:3, 3]
+        own = {b.name for b in field.blocks}
+        boxes = [transformed_aabb(field.tensors[b.tensor].occupancy.tight_aabb(0), b.object_to_field) for b in field.blocks if b.name in names]
+        result = without(field, set(names) & own) if own & set(names) else field
+        figures = {"restored": True, "seconds": {}}
+        inside = [entry for entry in graph_nodes(bundle) if entry["name"] in names and entry["name"] not in own]
+        for entry in inside:
+            progress.phase(f"deleting {entry['name']}", 1.0)
+            box = np.asarray(entry["aabb"], np.float64) - np.tile(origin, 2)
+            boxes.append(box)
+            rest = remaining(bundle, Path(fused), names, origin, allow_outside, progress)
+            settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
+            result, learned = cut(result, box, rest, settings, rgb, progress)
+            figures["restored"] &= rest is not None
+            figures |= learned
+        history = (*bundle.scene.history, {"event": "deleted", "names": list(names), "restored": figures["restored"]})
+        size = write_field(
+            output, result, node.name, precision=precision, overwrite=overwrite, origin=origin, history=history, kept=others(bundle, node)
+        )
+    return edit_report(output, size, fused, ", ".join(names), enclosing(boxes) + np.tile(origin, 2), result, figures, started)
+
+
+def read_fused(path: str) -> tuple[Bundle, object, VMField]:
+    """A bundle of one field, its leaf, and the field; InvalidInput when it is something else."""
+    if not is_bundle(path):
+        raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
+    bundle = read_bundle(path)
+    leaves = [leaf for leaf in bundle.scene.leaves() if leaf.field is not None]
+    if len(leaves) != 1:
+        raise InvalidInput(f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first")
+    field = make_field(bundle.fields[leaves[0].field], path)
+    if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
+        raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
+    return bundle, leaves[0], field
+
+
+def graph_nodes(bundle: Bundle) -> list[dict]:
+    """The named objects that the history says are in the field now."""
+    nodes: dict[str, dict] = {}
+    for entry in bundle.scene.history:
+        for node in entry.get("nodes", ()):
+            nodes[node["name"]] = node
+        for name in entry.get("names", ()):
+            nodes.pop(name, None)
+    return list(nodes.values())
+
+
+def names_in(bundle: Bundle, field: VMField, whole: str) -> set[str]:
+    """Names that can be deleted: of the history and of the blocks."""
+    return {n["name"] for n in graph_nodes(bundle)} | {b.name for b in field.blocks} - {whole, "", "fused"}
+
+
+def others(bundle: Bundle, node) -> dict[str, FieldRecord]:
+    """The kept sources of a bundle: every member but the fused field itself."""
+    return {name: record for name, record in bundle.fields.items() if name != node.field}
+
+
+def as_vm(placed: Placed, settings: DistillSettings, rgb: bool, progress) -> Placed:
+    """A placed VM field with the same content: itself, or what distilling another kind gives, in the object's own frame."""
+    if type(placed.field) is VMField:
+        return placed
+    teacher = ComposedField([Placed(placed.name, placed.field, np.eye(4))])
+    student = empty_student(teacher, settings, torch.Generator().manual_seed(settings.seed), placed.name)
+    student, _ = distill(teacher, student, [teacher.occupancy.tight_aabb(0)], settings, rgb, advance=lambda s, f: progress.advance(s, **f))
+    back = placed.object_to_world.copy()
+    back[:3, 3] += back[:3, :3] @ teacher.origin
+    return Placed(placed.name, student, back)
+
+
+def moved_frame(field: VMField, origin: np.ndarray) -> VMField:
+    """The same field in a frame whose origin is at `origin` (3,) of its own."""
+    shift = np.eye(4)
+    shift[:3, 3] = -origin
+    blocks = tuple(replace(b, object_to_field=shift @ b.object_to_field) for b in field.blocks)
+    return VMField.assembled(field.shape, field.tensors, blocks, field.params)
+
+
+def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
+    """A history node of an added object, in the world it was added to."""
+    return node | {
+        "name": name,
+        "object_to_world": (object_to_world @ np.asarray(node["object_to_world"])).tolist(),
+        "aabb": transformed_aabb(np.asarray(node["aabb"]), object_to_world).tolist(),
+    }
+
+
+def remaining(bundle: Bundle, path: Path, gone: tuple[str, ...], origin: np.ndarray, allow_outside: bool, progress) -> list[Placed] | None:
+    """The other objects of the graph as placed fields, from inside the bundle or from their files; None, with a warning, where one is not
+    to be had."""
+    found = []
+    for node in graph_nodes(bundle):
+        if node["name"] in gone:
+            continue
+        record = bundle.fields.get(node["field"]) or record_from_file(node, path, allow_outside)
+        if record is None:
+            progress.warn(f"the source of '{node['name']}' is not to be had, so what the deleted objects hid stays empty")
+            return None
+        field = make_field(record, node["name"])
+        found.append(Placed(node["name"], field, np.asarray(node["object_to_world"], np.float64)).moved(origin))
+    return found
+
+
+def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord | None:
+    """A source's field from the file the history names, if it is still there, unchanged, and may be read."""
+    source = (path.resolve().parent / node.get("source", "")).resolve()
+    inside = source.is_relative_to(path.resolve().parent)
+    if "source" not in node or not source.is_file() or not (inside or allow_outside) or sha256_of(source) != node["sha256"]:
+        return None
+    return read_bundle(source).fields.get(node["field"])
+
+
+def cut(
+    field: VMField, box: np.ndarray, rest: list[Placed] | None, settings: DistillSettings, rgb: bool, progress
+) -> tuple[VMField, dict]:
+    """Empty the cells of a box in the distilled tensor, and fill them with a tensor of their own that holds what the rest shows there."""
+    region = region_of(field, box)
+    emptied = cleared(field, region)
+    rest = [p for p in rest or [] if overlaps(p.aabb, region)]
+    if not rest:
+        return emptied, {}
+    teacher = ComposedField(rest)
+    local = ClippedField(teacher, region - np.tile(teacher.origin, 2))
+    if not local.occupancy.occupied.any():
+        return emptied, {}
+    student = empty_student(local, settings, torch.Generator().manual_seed(settings.seed), "restored")
+    student, did = distill(
+        local, student, [local.occupancy.tight_aabb(0)], settings, rgb, advance=lambda s, f: progress.advance(s, **f)
+    )
+    back = np.eye(4)
+    back[:3, 3] = teacher.origin
+    whole = blocks_of([Placed("fused", emptied, np.eye(4)), Placed("restored", student, back)])
+    return whole, {"psnr": {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb}, "seconds": did.seconds}
+
+
+def overlaps(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two boxes (6,) share a volume."""
+    return bool((a[:3] < b[3:]).all() and (b[:3] < a[3:]).all())
+
+
+def enclosing(boxes: list[np.ndarray]) -> np.ndarray:
+    """(6,) the box around boxes."""
+    return np.concatenate([np.min([b[:3] for b in boxes], 0), np.max([b[3:] for b in boxes], 0)])
+
+
+def edit_report(output: str, size: int, before: str, names: str, box: np.ndarray, field: VMField, figures: dict, started: float) -> dict:
+    """The report of an edit."""
+    extent = box[3:] - box[:3]
+    whole = field.occupancy.aabb[3:] - field.occupancy.aabb[:3]
+    return {
+        "output": output, "bytes": size, "source_bytes": Path(before).stat().st_size,
+        "touched": {"names": names, "aabb": box.tolist(), "blocks": len(field.blocks), "share_of_box": float(min(1.0, np.prod(extent / whole)))},
+        **figures, "total_seconds": time.monotonic() - started,
+    }  # fmt: skip

@@ -1,0 +1,62 @@
+"""`eval`: PSNR and SSIM against photos or another scene."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from formats.captures import is_capture, load_images, read_capture
+from fusedrf_cli.bridge.render import renderable
+from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.bridge.train import WHITE, camera_of, over_white
+from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
+from fusedrf_cli.engine.rendering.cameras import Camera, scattered
+from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.errors import InvalidInput
+
+SCENE_VIEWS = 8
+SCENE_SIZE = (400, 400)
+SCENE_SEED = 1_000
+
+
+def evaluate(
+    bundle: str, against: str, *, split: str, size: tuple[int, int] | None, allow_outside: bool, seed: int, device: str, threads: int | None,
+    progress,
+) -> dict:  # fmt: skip
+    """Compare a bundle, over white, with a capture's views or with another scene on seeded views that fusing never uses."""
+    with engine(device, threads, progress):
+        progress.phase("reading", None)
+        field, origin = renderable(load_scene(bundle, allow_outside))
+        pairs = capture_pairs(against, split, size) if is_capture(against) else scene_pairs(against, size, allow_outside, seed)
+        views = []
+        for i, (camera, truth, total) in enumerate(pairs):
+            if i == 0:
+                progress.phase("rendering", total)
+            shot = render_image(field, camera, origin=origin).over(WHITE)
+            views.append({"name": camera.name, "psnr": psnr(shot, truth), "ssim": ssim(shot, truth)})
+            progress.advance(i + 1, psnr=views[-1]["psnr"])
+    return {
+        "bundle": bundle, "against": against, "mean": {k: float(np.mean([v[k] for v in views])) for k in ("psnr", "ssim")}, "views": views,
+    }  # fmt: skip
+
+
+def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Iterator[tuple[Camera, np.ndarray, int]]:
+    """(camera, (H, W, 3) truth over white, how many) of a capture's photos."""
+    capture = read_capture(against)
+    views = {"test": capture.test, "train": capture.train, "all": (*capture.train, *capture.test)}[split]
+    if not views:
+        raise InvalidInput(f"{against}: the capture has no {split} views; choose another --split")
+    if size is not None and size != (views[0].width, views[0].height):
+        raise InvalidInput(f"{against}: the photos are {views[0].width}x{views[0].height}; leave --size out to compare with them")
+    for view in views:
+        yield camera_of(view), over_white(load_images([view]))[0], len(views)
+
+
+def scene_pairs(against: str, size: tuple[int, int] | None, allow_outside: bool, seed: int) -> Iterator[tuple[Camera, np.ndarray, int]]:
+    """(camera, truth, how many) of another scene, seen from views around it."""
+    field, origin = renderable(load_scene(against, allow_outside))
+    box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
+    width, height = size or SCENE_SIZE
+    for camera in scattered(box, SCENE_VIEWS, width, height, seed=JUDGED_SEED + SCENE_SEED + seed):
+        yield camera, render_image(field, camera, origin=origin).over(WHITE), SCENE_VIEWS

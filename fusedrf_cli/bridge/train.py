@@ -1,0 +1,115 @@
+"""`train`: photos or a mesh to one field."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from formats.captures import hold_out, is_mesh, load_images, read_capture
+from formats.meshes import mesh_capture
+from formats.views import Capture, View
+from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, save_checkpoint
+from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, texels
+from fusedrf_cli.engine.fields.vm import VMShape
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.errors import QualityNotReached
+
+QUALITY = {
+    "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
+    "normal": FitSettings(longest=224, steps=4000, samples=1 << 14),
+    "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
+}
+WHITE = (1.0, 1.0, 1.0)
+BYTES_PER_NUMBER = {"float16": 2, "float32": 4}
+
+
+def train(
+    source: str, output: str, *, kind: str, colour: str, sh_degree: int, quality: str, max_size: int | None, target_psnr: float | None,
+    time_budget: float | None, holdout: int | None, views: int, size: int, precision: str, aabb: tuple[float, ...] | None, resume: bool, overwrite: bool,
+    seed: int, device: str, threads: int | None, progress,
+) -> dict:  # fmt: skip
+    """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
+    with engine(device, threads, progress):
+        saved = load_checkpoint(output, "train") if resume else None
+        progress.phase("reading", None)
+        capture = mesh_capture(source, n_train=views, size=size, seed=seed) if is_mesh(source) else read_capture(source)
+        if capture.missing:
+            progress.warn(f"{source}: {capture.missing} frames have no photo and were left out")
+        if holdout:
+            capture = hold_out(capture, holdout)
+        box = np.asarray(aabb if aabb is not None else capture.aabb, np.float64)
+        shape = VMShape(sh_degree=0 if colour == "mlp" else sh_degree)
+        settings = replace(
+            QUALITY[quality], shape=shape, seed=seed, time_budget=time_budget, colour=colour, target_psnr=target_psnr,
+            opacity_weight=0.0 if capture.opaque else 0.1, near=0.0,
+        )  # fmt: skip
+        settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
+        cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
+        run = FitRun.start(cameras, images, box, settings, Path(source).resolve().stem)
+        if saved:
+            run.restore(*saved)
+        field, seconds = _run(run, output, progress)
+        progress.phase("measuring", None)
+        measured = measure(field, capture) if holdout else None
+        size = write_field(output, field, Path(output).stem, precision=precision, overwrite=overwrite)
+        checkpoint_path(output).unlink(missing_ok=True)
+    reached = measured["psnr"] if measured else run.psnr
+    report = {
+        "output": output, "bytes": size, "kind": field.kind, "views": len(capture.train), "steps": run.steps,
+        "resolution": list(field.tensors[0].resolution), "seconds": {"training": seconds}, "training_psnr": run.psnr, "holdout": measured,
+    }  # fmt: skip
+    if target_psnr is not None and reached < target_psnr:
+        raise QualityNotReached(
+            f"{output}: reached {reached:.2f} dB where --target-psnr asked for {target_psnr:g}; give more --time-budget or --quality high",
+            report=report,
+        )
+    return report
+
+
+def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
+    """Train to the end; an interrupt leaves a checkpoint and goes on its way."""
+    progress.phase("training", 1.0)
+    started = time.monotonic()
+    try:
+        field = run.finish(lambda share, figures: progress.advance(share, **figures))
+    except KeyboardInterrupt as interrupt:
+        path = save_checkpoint(output, *run.checkpoint())
+        interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
+        raise
+    return field, time.monotonic() - started
+
+
+def fitting_longest(aabb: np.ndarray, settings: FitSettings, max_size: int | None, precision: str) -> int:
+    """Texels on the longest axis, fewer than the settings' where the file would grow past max_size (bytes)."""
+    longest = settings.longest
+    while max_size and longest > 16 and settings.shape.size(texels(aabb, longest)) * BYTES_PER_NUMBER[precision] > max_size:
+        longest -= 4
+    return longest
+
+
+def camera_of(view: View) -> Camera:
+    """A capture's view as the engine's camera."""
+    return Camera(
+        view.camera_to_world, view.fl_x, view.fl_y, view.cx, view.cy, view.width, view.height, tuple(view.distortion), view.name
+    )
+
+
+def measure(field, capture: Capture) -> dict:
+    """Mean PSNR and SSIM of the held-out views over white."""
+    truth = over_white(load_images(capture.test))
+    shots = [render_image(field, camera_of(v)).over(WHITE) for v in capture.test]
+    return {
+        "psnr": float(np.mean([psnr(a, b) for a, b in zip(shots, truth, strict=True)])),
+        "ssim": float(np.mean([ssim(a, b) for a, b in zip(shots, truth, strict=True)])),
+        "views": len(shots),
+    }
+
+
+def over_white(images: np.ndarray) -> np.ndarray:
+    """(n, H, W, 4) uint8 straight alpha to (n, H, W, 3) float32 over white."""
+    values = images.astype(np.float32) / 255
+    return values[..., :3] * values[..., 3:] + 1 - values[..., 3:]

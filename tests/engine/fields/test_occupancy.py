@@ -1,0 +1,86 @@
+"""Occupancy grids: the skip distance against a search of all cells, boxes, growth, and grids placed in another."""
+
+import numpy as np
+import pytest
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts, placed_occupancy
+from tests.engine.conftest import BOX, points_in
+
+UNIT = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 9, 2), (6, 5, 7)])
+@pytest.mark.parametrize("share", [0.02, 0.3])
+def test_skip_is_the_chebyshev_distance(shape, share):
+    occupied = np.random.default_rng(1).random(shape) < share
+    occupied[0, 0, 0] = True
+    cells, matter = np.argwhere(np.ones(shape)), np.argwhere(occupied)
+    wanted = np.abs(cells[:, None] - matter).max(2).min(1).reshape(shape)
+    grid = OccupancyGrid(BOX, occupied)
+    assert grid.skip.dtype == np.uint8 and np.array_equal(grid.skip, wanted)
+
+
+def test_skip_of_empty_full_and_long_grids():
+    assert (OccupancyGrid(BOX, np.zeros((2, 3, 4), bool)).skip == 255).all()
+    assert (OccupancyGrid(BOX, np.ones((2, 3, 4), bool)).skip == 0).all()
+    long = np.zeros((600, 1, 1), bool)
+    long[0] = True
+    assert np.array_equal(OccupancyGrid(BOX, long).skip[:, 0, 0], np.minimum(np.arange(600), 255))
+
+
+def test_cell_counts_are_near_cubic():
+    assert cell_counts([0, 0, 0, 1, 2, 4], 8) == (2, 4, 8)
+    assert cell_counts([0, 0, 0, 1e-6, 1, 1], 16) == (1, 16, 16)
+    assert cell_counts([-1, -1, -1, 1, 1, 1], 3) == (3, 3, 3)
+
+
+def test_tight_box():
+    occupied = np.zeros((4, 4, 4), bool)
+    occupied[1, 2, 3] = True
+    grid = OccupancyGrid(UNIT, occupied)
+    np.testing.assert_allclose(grid.tight_aabb(0), [0.25, 0.5, 0.75, 0.5, 0.75, 1])
+    np.testing.assert_allclose(grid.tight_aabb(1), [0, 0.25, 0.5, 0.75, 1, 1])
+    assert np.array_equal(OccupancyGrid(UNIT, np.zeros((2, 2, 2), bool)).tight_aabb(), UNIT)
+
+
+def test_dilation_reaches_diagonals():
+    occupied = np.zeros((5, 5, 5), bool)
+    occupied[2, 2, 2] = True
+    grid = OccupancyGrid(UNIT, occupied)
+    assert grid.dilated().occupied.sum() == 27 and grid.dilated(2).occupied.all()
+
+
+def test_contains_is_half_open_and_skip_zero():
+    grid = OccupancyGrid(BOX, np.random.default_rng(2).random((4, 3, 5)) < 0.5)
+    points = points_in(BOX, 500, margin=0.3)
+    index = np.floor((points - BOX[:3]) / grid.cell).astype(int)
+    wanted = [
+        all(0 <= i < n for i, n in zip(at, (4, 3, 5), strict=True)) and bool(grid.skip[tuple(at)] == 0) for at in index
+    ]
+    assert np.array_equal(grid.contains(points), wanted)
+    full = OccupancyGrid.full(UNIT, 4)
+    assert full.contains(np.array([[0.0, 0, 0], [1, 0.5, 0.5], [0.5, 1, 0.5]])).tolist() == [True, False, False]
+    assert full.contains(np.zeros((0, 3))).shape == (0,)
+
+
+def test_centres_are_contained():
+    grid = OccupancyGrid(BOX, np.random.default_rng(3).random((4, 3, 5)) < 0.4)
+    centres = grid.centres()
+    assert len(centres) == grid.occupied.sum() and grid.contains(centres).all()
+    assert not OccupancyGrid(BOX, ~grid.occupied).contains(centres).any()
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.0, 6.0])
+def test_placed_grids_cover_their_matter(scale):
+    """Every point of a placed occupied cell lies in a marked cell, however small, turned or sheared it is."""
+    rng = np.random.default_rng(4)
+    one, two = (OccupancyGrid(BOX, rng.random((5, 6, 4)) < 0.1) for _ in range(2))
+    matrix = np.array([[0.6, -0.8, 0, 3], [0.8, 0.6, 0.4, 0], [0, 0, -1, 0.5], [0, 0, 0, 1]])
+    matrix[:3, :3] *= scale
+    grid, marks = placed_occupancy([(one, np.eye(4)), (two, matrix)], 40)
+    assert np.array_equal(grid.occupied, marks[0] | marks[1])
+    for own, mark, placing in ((one, marks[0], np.eye(4)), (two, marks[1], matrix)):
+        points = points_in(BOX, 5000)
+        points = points[own.contains(points)] @ placing[:3, :3].T + placing[:3, 3]
+        assert len(points) > 100 and OccupancyGrid(grid.aabb, mark).contains(points).all()
+    assert grid.occupied.mean() < 0.8

@@ -1,0 +1,577 @@
+"""The compiled loops against the readable reference: values, gradients, marching, and the optimiser's step."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, cpu, reference
+from tests.engine.conftest import (
+    BOX,
+    DIRECTIONS_26,
+    SIXTY_FOUR,
+    THIRTY_TWO,
+    chord_of_box,
+    points_in,
+    random_vm,
+    rays_at,
+    unit,
+)
+
+TURN = np.array([[0.0, -1.0, 0.0, 0.2], [1.0, 0.0, 0.0, -0.1], [0.0, 0.0, 1.0, 0.3], [0, 0, 0, 1]])
+MIRROR = np.diag([-1.0, 0.8, 1.3, 1.0])
+SHEAR = np.array([[1.0, 0.8, 0.0, 0.0], [0.0, 0.5, 0.2, 0.1], [0.1, 0.0, 2.0, 0.0], [0, 0, 0, 1]])
+
+
+def with_params(field: VMField, params: torch.Tensor) -> VMField:
+    """The same field over other numbers."""
+    return VMField(field.shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
+
+
+def query(field: VMField, points: np.ndarray, dirs: np.ndarray, **options) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(a.numpy() for a in field.query(torch.from_numpy(points), torch.from_numpy(dirs), **options))
+
+
+def expected(field: VMField, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(a.numpy() for a in reference.field_query(field, torch.from_numpy(points), torch.from_numpy(dirs)))
+
+
+# -- query ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("resolution", [(5, 8, 7), (2, 2, 2), (3, 17, 2)])
+@pytest.mark.parametrize(
+    "shape, dtype, error",
+    [
+        (SIXTY_FOUR, torch.float64, 1e-12),
+        (THIRTY_TWO, torch.float32, 1e-5),
+        (VMShape(24, 24, 2), torch.float32, 1e-5),
+        (VMShape(8, 8, 0), torch.float32, 1e-5),
+    ],
+)
+def test_query_is_the_reference(shape, dtype, error, resolution):
+    field = random_vm(shape, resolution, dtype, cells=3)
+    points = points_in(BOX, 500, margin=0.1)
+    dirs = unit(np.random.default_rng(1).normal(size=(500, 3)))
+    sigma, rgb = query(field, points, dirs)
+    sigma_wanted, rgb_wanted = expected(with_params(field, field.params.double()), points, dirs)
+    assert 0.1 < (sigma_wanted > 0).mean() < 0.5
+    np.testing.assert_allclose(sigma, sigma_wanted, rtol=0, atol=error * sigma_wanted.max())
+    np.testing.assert_allclose(rgb, rgb_wanted, rtol=0, atol=error * 3)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_query_of_few_points(count):
+    field = random_vm()
+    points, dirs = points_in(BOX, count), DIRECTIONS_26[:count]
+    sigma, rgb = query(field, points, dirs)
+    assert sigma.shape == (count,) and rgb.shape == (count, 3)
+    np.testing.assert_allclose(sigma, expected(field, points, dirs)[0], rtol=1e-12)
+
+
+def test_box_is_half_open():
+    field = random_vm()
+    centre = (BOX[:3] + BOX[3:]) / 2
+    lower, upper = np.tile(centre, (3, 1)), np.tile(centre, (3, 1))
+    lower[range(3), range(3)], upper[range(3), range(3)] = BOX[:3], BOX[3:]
+    beneath, below = np.minimum(upper, BOX[3:] - 1e-9), np.maximum(lower, BOX[:3])
+    below[range(3), range(3)] -= 1e-9
+    sigma, rgb = query(field, np.concatenate([lower, beneath, upper, below]), DIRECTIONS_26[:12].copy())
+    assert (sigma[:6] > 0).all() and (rgb[:6] > 0).all()
+    assert (sigma[6:] == 0).all() and (rgb[6:] == 0).all()
+
+
+def test_query_on_texels_reads_them():
+    """At a texel the feature is the plain sum over ranks and modes, without interpolation."""
+    field = random_vm(resolution=(4, 3, 5))
+    s, tensor = field.sections(0), field.tensors[0]
+    index = np.array([(1, 1, 2), (0, 0, 0), (2, 1, 3)])
+    points = BOX[:3] + index * tensor.voxel_size + 1e-13
+    sigma, _ = query(field, points, DIRECTIONS_26[:3].copy(), with_colour=False)
+    for (i, j, k), found in zip(index, sigma, strict=True):
+        feature = (s["density_plane_0"][i, j] * s["density_line_0"][k]).sum()
+        feature += (s["density_plane_1"][i, k] * s["density_line_1"][j]).sum()
+        feature += (s["density_plane_2"][j, k] * s["density_line_2"][i]).sum()
+        assert found == pytest.approx(tensor.scale * np.log1p(np.exp(float(feature) + tensor.shift)), rel=1e-9)
+
+
+def test_extreme_densities_are_finite():
+    field = random_vm(scale=1.0, shift=0.0)
+    for factor in (30.0, -30.0):
+        sections = field.sections(0)
+        for name, view in sections.items():
+            view.fill_(1.0 if "line" in name else factor)
+        sigma, rgb = query(field, points_in(BOX, 50), unit(points_in(BOX, 50)))
+        assert np.isfinite(sigma).all() and np.isfinite(rgb).all()
+        wanted = 3 * 8 * factor if factor > 0 else 0.0
+        np.testing.assert_allclose(sigma, wanted, rtol=1e-12, atol=1e-300)
+
+
+@pytest.mark.parametrize("matrix", [TURN, MIRROR, SHEAR])
+def test_placed_block(matrix):
+    """σ is |A d| times the object's and the direction turns with it; the optical depth of a ray is the object's own."""
+    field = random_vm(matrix=matrix)
+    corners = np.stack(np.meshgrid(*zip(BOX[:3], BOX[3:], strict=True)), -1).reshape(-1, 3)
+    corners = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    box = np.concatenate([corners.min(0), corners.max(0)])
+    placed = VMField(field.shape, field.tensors, field.blocks, field.params, OccupancyGrid.full(box))
+    points, dirs = points_in(box, 300), unit(np.random.default_rng(2).normal(size=(300, 3)))
+    for found, wanted in zip(query(placed, points, dirs), expected(placed, points, dirs), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    inverse = np.linalg.inv(matrix)
+    own = random_vm()
+    x, v = points @ inverse[:3, :3].T + inverse[:3, 3], dirs @ inverse[:3, :3].T
+    sigma, rgb = query(own, x, unit(v))
+    np.testing.assert_allclose(query(placed, points, dirs)[0], sigma * np.linalg.norm(v, axis=1), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(query(placed, points, dirs)[1], rgb, rtol=1e-9, atol=1e-12)
+
+
+# -- several blocks --------------------------------------------------------------------------------------------------------
+
+
+def two_blocks(second: np.ndarray, same: bool = False) -> VMField:
+    """Two tensors (or one used twice) in one field; every cell asks both, the lower first."""
+    one, two = random_vm(), random_vm(resolution=(6, 3, 4), seed=5, scale=2.0)
+    matrices = (TURN, TURN) if same else (TURN, second)
+    tensors = one.tensors if same else one.tensors + two.tensors
+    params = one.params if same else torch.cat([one.params, two.params])
+    blocks = (Block(0, matrices[0], "a"), Block(0 if same else 1, matrices[1], "b"))
+    box = np.array([-2.5, -2.0, -1.5, 2.0, 2.0, 3.0])
+    cells = (4, 5, 6)
+    owners = np.zeros(cells, np.uint8), np.ones(cells, np.uint8)
+    return VMField(one.shape, tensors, blocks, params, OccupancyGrid(box, np.ones(cells, bool)), owners)
+
+
+def by_the_max_rule(field: VMField, x: np.ndarray, d: np.ndarray) -> tuple[float, np.ndarray, int]:
+    """σ, rgb and block at one point, block after block: the densest wins, ties go to the lower."""
+    best, colour, winner = 0.0, np.zeros(3), 0
+    for b, block in enumerate(field.blocks):
+        tensor = field.tensors[block.tensor]
+        inverse = np.linalg.inv(block.object_to_field)
+        v = inverse[:3, :3] @ d
+        at = (inverse[:3, :3] @ x + inverse[:3, 3] - tensor.aabb[:3]) / (tensor.aabb[3:] - tensor.aabb[:3])
+        sigma, rgb = reference.vm_query(
+            field.sections(block.tensor),
+            torch.from_numpy(at[None]),
+            torch.from_numpy(v[None] / np.linalg.norm(v)),
+            tensor.scale,
+            tensor.shift,
+        )
+        sigma = float(sigma[0]) * np.linalg.norm(v)
+        if sigma > best:
+            best, colour, winner = sigma, rgb[0].numpy(), b
+    return best, colour, winner
+
+
+@pytest.mark.parametrize("second", [MIRROR, SHEAR, np.diag([0.3, 0.3, 0.3, 1.0])], ids=["mirror", "shear", "small"])
+def test_densest_block_wins(second):
+    field = two_blocks(second)
+    points, dirs = points_in(field.aabb, 150), unit(np.random.default_rng(3).normal(size=(150, 3)))
+    sigma, rgb = query(field, points, dirs)
+    slow = [by_the_max_rule(field, x, d) for x, d in zip(points, dirs, strict=True)]
+    winners = [w for s, _, w in slow if s > 0]
+    assert 0 < np.mean(winners) < 1
+    np.testing.assert_allclose(sigma, [s for s, _, _ in slow], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(rgb, [c for _, c, _ in slow], rtol=1e-9, atol=1e-12)
+
+
+def test_ties_go_to_the_lower_block():
+    """Two equal densities of different colours: the lower block's colour shows, whichever the grids name first as `first`."""
+    field = two_blocks(TURN, same=True)
+    points, dirs = points_in(BOX, 100), unit(np.random.default_rng(4).normal(size=(100, 3)))
+    single = VMField(field.shape, field.tensors, field.blocks[:1], field.params, field.occupancy)
+    for found, wanted in zip(query(field, points, dirs), query(single, points, dirs), strict=True):
+        assert (found == wanted).all()
+    grads = backward(field, points, dirs, np.ones(100), np.zeros((100, 3)))
+    np.testing.assert_array_equal(grads, backward(single, points, dirs, np.ones(100), np.zeros((100, 3))))
+
+
+def test_only_owners_are_asked():
+    field = two_blocks(SHEAR)
+    first, second = (np.full(field.occupancy.occupied.shape, NO_BLOCK, np.uint8) for _ in range(2))
+    first[:2] = 1  # the first cells along x ask block 1 alone, the others nobody
+    alone = VMField(field.shape, field.tensors, field.blocks, field.params, field.occupancy, (first, second))
+    points, dirs = points_in(field.aabb, 300), unit(np.random.default_rng(5).normal(size=(300, 3)))
+    sigma, _ = query(alone, points, dirs)
+    asked = points[:, 0] < field.aabb[0] + 2 * field.occupancy.cell[0]
+    assert (sigma[~asked] == 0).all()
+    for i in np.flatnonzero(asked):
+        others = VMField(field.shape, field.tensors, field.blocks[1:], field.params, field.occupancy)
+        assert sigma[i] == pytest.approx(by_the_max_rule(others, points[i], dirs[i])[0], rel=1e-9)
+    grads = backward(alone, points[~asked], dirs[~asked], np.ones((~asked).sum()), np.ones(((~asked).sum(), 3)))
+    assert (grads == 0).all()
+    *_, grads, _ = train(alone, *rays_at(field.aabb, 20, away=5.0), step=0.2)
+    assert (grads[: field.layout[1, 0]] == 0).all()  # block 0 is asked nowhere
+    assert (grads[field.layout[1, 0] :] != 0).any()
+
+
+def test_a_block_is_silent_where_its_tensor_is_empty():
+    """Between several blocks a tensor's own occupancy counts: what it says in empty cells was never learnt."""
+    field = two_blocks(SHEAR)
+    occupied = np.zeros((2, 2, 2), bool)
+    occupied[1] = True  # the upper half along the object's x
+    tensors = (VMTensor(**{**vars(field.tensors[0]), "occupied": occupied}), field.tensors[1])
+    half = VMField(field.shape, tensors, field.blocks, field.params, field.occupancy, field.owners)
+    nobody = np.full(field.occupancy.occupied.shape, NO_BLOCK, np.uint8)
+    half.owners = (half.owners[0], nobody)
+    whole = VMField(field.shape, field.tensors, field.blocks[:1], field.params, field.occupancy)
+    points, dirs = points_in(field.aabb, 200), unit(np.random.default_rng(6).normal(size=(200, 3)))
+    inverse = np.linalg.inv(TURN)
+    upper = (points @ inverse[:3, :3].T + inverse[:3, 3])[:, 0] > (BOX[0] + BOX[3]) / 2
+    assert (query(half, points, dirs)[0] == np.where(upper, query(whole, points, dirs)[0], 0)).all()
+
+
+# -- gradients -------------------------------------------------------------------------------------------------------------
+
+
+def backward(field, points, dirs, d_sigma, d_rgb, parts: int = 3) -> np.ndarray:
+    grads = np.zeros((parts, field.params.numel()), field.arrays.params.dtype)
+    cpu.query_backward(*field.kernel_shape, field.arrays, field.grid, points, dirs, d_sigma, d_rgb, grads)
+    return grads.sum(0)
+
+
+def test_query_backward_is_autograd():
+    field = random_vm(cells=4)
+    points, dirs = points_in(BOX, 80, margin=0.05), unit(np.random.default_rng(1).normal(size=(80, 3)))
+    rng = np.random.default_rng(2)
+    d_sigma, d_rgb = rng.normal(size=80), rng.normal(size=(80, 3))
+    found = backward(field, points, dirs, d_sigma, d_rgb)
+    params = field.params.clone().requires_grad_()
+    outputs = reference.field_query(with_params(field, params), torch.from_numpy(points), torch.from_numpy(dirs))
+    torch.autograd.backward(outputs, (torch.from_numpy(d_sigma), torch.from_numpy(d_rgb)))
+    np.testing.assert_allclose(found, params.grad.numpy(), rtol=1e-10, atol=1e-12)
+
+
+def test_query_backward_of_no_and_one_point():
+    field = random_vm()
+    for count in (0, 1):
+        points, dirs = points_in(BOX, count), DIRECTIONS_26[:count].copy()
+        grads = backward(field, points, dirs, np.ones(count), np.ones((count, 3)))
+        assert (grads != 0).any() == bool(count)
+
+
+def slopes_along(function, params: torch.Tensor, directions: np.ndarray, h: float = 1e-5) -> list[float]:
+    """Central differences of a scalar function of params along directions."""
+    return [float(function(params + h * d) - function(params - h * d)) / (2 * h) for d in torch.from_numpy(directions)]
+
+
+def test_query_backward_of_several_blocks_is_finite_differences():
+    field = two_blocks(SHEAR)
+    points, dirs = points_in(field.aabb, 60), unit(np.random.default_rng(8).normal(size=(60, 3)))
+    rng = np.random.default_rng(9)
+    d_sigma, d_rgb = rng.normal(size=60), rng.normal(size=(60, 3))
+
+    def total(params):
+        sigma, rgb = query(with_params(field, params), points, dirs)
+        return (sigma * d_sigma).sum() + (rgb * d_rgb).sum()
+
+    directions = rng.normal(size=(6, field.params.numel()))
+    wanted = slopes_along(total, field.params, directions)
+    np.testing.assert_allclose(directions @ backward(field, points, dirs, d_sigma, d_rgb), wanted, rtol=1e-5)
+
+
+def train(field, rays_o, rays_d, step, early_stop=0.0, near=0.0, parts=2, opacity_weight=0.3, seed=0, max_samples=400):
+    """train_rays with random targets, backgrounds and jitter: (target, background, jitter, gradients (P,), loss (3,))."""
+    n, rng = len(rays_o), np.random.default_rng(seed)
+    real = field.arrays.params.dtype
+    target, background = rng.random((n, 4)).astype(real), rng.random((n, 3)).astype(real)
+    jitter = rng.random(n)
+    grads, loss = np.zeros((parts, field.params.numel()), real), np.zeros((parts, 3))
+    cpu.train_rays(
+        *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, near, jitter, step, early_stop, target, background,
+        opacity_weight, max_samples, grads, loss,
+    )  # fmt: skip
+    return target, background, jitter, grads.sum(0), loss.sum(0)
+
+
+def reference_loss(field, rays_o, rays_d, step, target, background, jitter, early_stop=0.0, opacity_weight=0.3):
+    """The loss that train_rays differentiates: (total, sums of the colour and the opacity term), by the reference."""
+    out = reference.render_rays(
+        field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, step, early_stop, torch.from_numpy(jitter), cpu.COLOUR_FROM
+    )  # fmt: skip
+    target, background = torch.from_numpy(target), torch.from_numpy(background)
+    shown = out[:, :3] + (1 - out[:, 3:4]) * background
+    colour = ((shown - target[:, :3]) ** 2).mean(1).sum()
+    opacity = ((out[:, 3] - target[:, 3]) ** 2).sum()
+    return (colour + opacity_weight * opacity) / len(rays_o), float(colour.detach()), float(opacity.detach())
+
+
+@pytest.mark.parametrize("early_stop, scale", [(0.0, 3.0), (1e-2, 20.0)])
+def test_train_rays_is_autograd(early_stop, scale):
+    field = random_vm(cells=5, scale=scale)
+    rays_o, rays_d = rays_at(BOX, 30)
+    target, background, jitter, grads, loss = train(field, rays_o, rays_d, 0.05, early_stop)
+    params = field.params.clone().requires_grad_()
+    same = with_params(field, params)
+    total, colour, opacity = reference_loss(same, rays_o, rays_d, 0.05, target, background, jitter, early_stop)
+    total.backward()
+    np.testing.assert_allclose(loss[:2], [colour, opacity], rtol=1e-10)
+    # The reference takes the derivative of 1 - exp, the kernel of its logarithm; both see every sample the same.
+    np.testing.assert_allclose(grads, params.grad.numpy(), rtol=1e-7, atol=1e-11)
+
+
+def test_train_rays_of_float32_is_close_to_float64():
+    field = random_vm(THIRTY_TWO, dtype=torch.float32, cells=5)
+    rays_o, rays_d = rays_at(BOX, 30)
+    target, background, jitter, grads, _ = train(field, rays_o, rays_d, 0.05)
+    params = field.params.double().requires_grad_()
+    target, background = target.astype(float), background.astype(float)
+    total, *_ = reference_loss(with_params(field, params), rays_o, rays_d, 0.05, target, background, jitter)
+    total.backward()
+    np.testing.assert_allclose(grads, params.grad.numpy(), rtol=0, atol=2e-5 * float(params.grad.abs().max()))
+
+
+def test_train_rays_of_several_blocks_is_finite_differences():
+    field = two_blocks(np.diag([0.7, 0.7, 0.7, 1.0]))
+    rays_o, rays_d = rays_at(np.array([-1.0, -1, -1, 1, 1, 1]), 12, away=4.0)
+    *_, grads, loss = train(field, rays_o, rays_d, 0.11)
+
+    def total(params):
+        *_, loss = train(with_params(field, params), rays_o, rays_d, 0.11)
+        return (loss[0] + 0.3 * loss[1]) / len(rays_o)
+
+    assert total(field.params) == pytest.approx((loss[0] + 0.3 * loss[1]) / 12)
+    directions = np.random.default_rng(1).normal(size=(5, field.params.numel()))
+    np.testing.assert_allclose(directions @ grads, slopes_along(total, field.params, directions, 1e-6), rtol=1e-4)
+
+
+def test_rays_that_meet_nothing_teach_nothing():
+    field = random_vm()
+    rays_o, rays_d = rays_at(BOX, 5)
+    target, background, _, grads, loss = train(field, rays_o, -rays_d, 0.05)
+    assert (grads == 0).all() and loss[2] == 0
+    assert loss[0] == pytest.approx(((background - target[:, :3]) ** 2).mean(1).sum())
+    assert loss[1] == pytest.approx((target[:, 3] ** 2).sum())
+
+
+def test_parts_only_split_the_work():
+    field = random_vm()
+    rays_o, rays_d = rays_at(BOX, 11)
+    *_, one, loss = train(field, rays_o, rays_d, 0.05, parts=1)
+    *_, many, losses = train(field, rays_o, rays_d, 0.05, parts=16)
+    np.testing.assert_allclose(one, many, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(loss, losses, rtol=1e-12)
+
+
+# -- rendering -------------------------------------------------------------------------------------------------------------
+
+
+def render(field, rays_o, rays_d, near=0.0, step=0.05, early_stop=0.0, grid=None) -> np.ndarray:
+    out = np.full((len(rays_o), 5), np.nan)
+    grid = field.grid if grid is None else grid
+    cpu.render(*field.kernel_shape, field.arrays, grid, rays_o, rays_d, near, step, early_stop, out)
+    return out
+
+
+@pytest.mark.parametrize("cells", [None, 5])
+@pytest.mark.parametrize("early_stop", [0.0, 0.05])
+def test_render_is_the_reference(cells, early_stop):
+    field = random_vm(cells=cells)
+    rays_o, rays_d = rays_at(BOX, 60)
+    rays_o[:10] = points_in(BOX, 10)  # from inside
+    rays_d[10:36], rays_o[10:36] = DIRECTIONS_26, points_in(BOX, 26, 3)
+    rays_d[36:40] *= -1  # and some that miss
+    found = render(field, rays_o, rays_d, early_stop=early_stop)
+    rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
+    wanted = reference.render_rays(field, *rays, 0.0, 0.05, early_stop, colour_from=cpu.COLOUR_FROM).numpy()
+    assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.8
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_near_cuts_what_lies_before():
+    field = random_vm()
+    rays_o, rays_d = rays_at(BOX, 20)
+    later = render(field, rays_o + 3.1 * rays_d, rays_d)
+    cut = render(field, rays_o, rays_d, near=3.1)
+    np.testing.assert_allclose(cut[:, :4], later[:, :4], rtol=1e-6, atol=1e-9)
+
+
+# -- marching --------------------------------------------------------------------------------------------------------------
+
+
+def march(grid: GridArrays, rays_o, rays_d, step, near=0.0, jitter=0.5, wave=1000) -> list[np.ndarray]:
+    """Every ray's sample distances, gathered in waves."""
+    n = len(rays_o)
+    start, alive = np.zeros(n, np.int64), np.ones(n, bool)
+    found = [[] for _ in range(n)]
+    while (start >= 0).any():
+        ts, counts = np.zeros((n, wave)), np.zeros(n, np.int64)
+        cpu.march(grid, rays_o, rays_d, near, np.full(n, jitter), step, start, alive, ts, counts)
+        for i in range(n):
+            found[i].append(ts[i, : counts[i]])
+    return [np.concatenate(parts) for parts in found]
+
+
+def stepping(grid: GridArrays, skip: int) -> GridArrays:
+    """The grid with leaps of at most so many cells; with 0 every cell counts as occupied."""
+    return GridArrays(np.minimum(grid.skip, skip), grid.lo, grid.hi, grid.cell)
+
+
+def random_grid(rng, share=0.08) -> OccupancyGrid:
+    shape = rng.integers(2, 14, 3)
+    cell, lo = rng.choice([0.1, 0.05, 1 / 3, 0.25]), rng.choice([-1, 0, 0.1, -0.7], 3)
+    return OccupancyGrid(np.concatenate([lo, lo + shape * cell]), rng.random(shape) < share)
+
+
+def cells_of(grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
+    """(N, 3) real-valued cell coordinates."""
+    return (points - grid.aabb[:3]) / grid.cell
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_march_visits_the_lattice_samples_of_occupied_cells(seed):
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng)
+    rays_o, rays_d = rays_at(grid.aabb, 30, seed)
+    rays_o[:8] = points_in(grid.aabb, 8, seed)
+    step = 0.31 * grid.cell.min()
+    leaping, all_samples = march(grid.arrays, rays_o, rays_d, step), march(stepping(grid.arrays, 0), rays_o, rays_d, step)
+    chords = chord_of_box(grid.aabb[:3], grid.aabb[3:], rays_o, rays_d)
+    for o, d, found, ts, chord in zip(rays_o, rays_d, leaping, all_samples, chords, strict=True):
+        assert len(ts) in (round(chord / step), int(chord / step), int(chord / step) + 1)
+        np.testing.assert_allclose(np.diff(ts), step, rtol=1e-6)
+        index = np.clip(cells_of(grid, o + ts[:, None] * d).astype(int), 0, np.array(grid.occupied.shape) - 1)
+        assert np.array_equal(found, ts[grid.occupied[tuple(index.T)]])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_leaps_skip_no_sample_on_a_face(seed):
+    """Axis-parallel rays whose samples fall on faces of cells, where rounding decides: leaps and single cells agree to the bit."""
+    rng = np.random.default_rng(seed)
+    grid = random_grid(rng)
+    n, cell = 64, grid.cell
+    rays_d = np.repeat(DIRECTIONS_26[np.abs(DIRECTIONS_26).max(1) == 1], n, 0)
+    start = rng.integers(0, grid.occupied.shape, (len(rays_d), 3)) + rng.choice([0.0, 0.25, 0.5], (len(rays_d), 3))
+    rays_o = grid.aabb[:3] + start * cell - rays_d * cell * rng.integers(0, 20, (len(rays_d), 1))
+    for parts in (2, 3, 4, 10):
+        for jitter in (0.0, 0.5):
+            leaping, creeping = (
+                march(stepping(grid.arrays, most), rays_o, rays_d, cell.min() / parts, jitter=jitter) for most in (255, 1)
+            )
+            assert all(np.array_equal(a, b) for a, b in zip(leaping, creeping, strict=True))
+
+
+def test_directions_from_points_on_faces():
+    """Half open like the cells: from the lower face inward rays see the box, along it too; along the upper face nothing."""
+    grid = OccupancyGrid.full(np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]), 4)
+    for axis in range(3):
+        for side in (0.0, 1.0):
+            origin = np.full((26, 3), 0.4)
+            origin[:, axis] = side
+            wanted = chord_of_box(np.zeros(3), np.ones(3), origin, DIRECTIONS_26)
+            found = march(grid.arrays, origin, DIRECTIONS_26, 1e-3, wave=3000)
+            np.testing.assert_allclose([len(ts) * 1e-3 for ts in found], wanted, atol=1.01e-3)
+            assert all((ts > 0).all() for ts in found)
+
+
+@pytest.mark.parametrize("wave", [1, 7, 32])
+def test_waves_of_any_length_take_the_same_samples(wave):
+    grid = random_grid(np.random.default_rng(3), share=0.3)
+    rays_o, rays_d = rays_at(grid.aabb, 20)
+    step = 0.3 * grid.cell.min()
+    whole, pieces = march(grid.arrays, rays_o, rays_d, step), march(grid.arrays, rays_o, rays_d, step, wave=wave)
+    for a, b in zip(whole, pieces, strict=True):
+        assert np.array_equal(a, b) and len(np.unique(a)) == len(a)
+
+
+def test_dead_rays_rest():
+    grid = OccupancyGrid.full(BOX)
+    rays_o, rays_d = rays_at(BOX, 4)
+    ts, counts, start = np.zeros((4, 5)), np.ones(4, np.int64), np.zeros(4, np.int64)
+    alive = np.array([True, False, True, False])
+    cpu.march(grid.arrays, rays_o, rays_d, 0.0, np.full(4, 0.5), 0.1, start, alive, ts, counts)
+    assert counts.tolist() == [5, 0, 5, 0] and start.tolist() == [5, 0, 5, 0]
+
+
+@pytest.mark.parametrize("occupied", [False, True])
+def test_an_empty_and_a_full_grid(occupied):
+    grid = OccupancyGrid(BOX, np.full((3, 4, 5), occupied))
+    rays_o, rays_d = rays_at(BOX, 10)
+    counts = [len(ts) for ts in march(grid.arrays, rays_o, rays_d, 0.05)]
+    chords = chord_of_box(BOX[:3], BOX[3:], rays_o, rays_d)
+    np.testing.assert_allclose(counts, occupied * chords / 0.05, atol=1)
+
+
+def test_skipping_leaves_every_bit_of_the_image():
+    field = random_vm(cells=9)
+    rays_o, rays_d = rays_at(BOX, 200)
+    rays_d[:26], rays_o[:26] = DIRECTIONS_26, points_in(BOX, 26) - 2 * DIRECTIONS_26
+    whole = render(field, rays_o, rays_d, step=0.03)
+    creeping = render(field, rays_o, rays_d, step=0.03, grid=stepping(field.grid, 1))
+    assert (whole == creeping).all() and whole[:, 3].max() > 0.5
+
+
+# -- density at cells ------------------------------------------------------------------------------------------------------
+
+
+def test_density_at_cells_is_the_largest_of_the_probes():
+    field = random_vm(cells=6)
+    grid = OccupancyGrid.full(BOX, 5)
+    cells, offsets = np.argwhere(grid.occupied), np.array([[0.25, 0.25, 0.25], [0.75, 0.5, 0.1]])
+    out = np.zeros(len(cells), np.float32)
+    cpu.density_at_cells(field.kernel_shape[0], field.arrays, 0, BOX[:3].copy(), grid.cell, cells, offsets, out)
+    tensor = field.tensors[0]
+    wanted = []
+    for offset in offsets:
+        at = torch.from_numpy((cells + offset) / grid.occupied.shape)
+        feature = reference.vm_density_feature(field.sections(0), at)
+        wanted.append(reference.density(feature, tensor.scale, tensor.shift).numpy())
+    np.testing.assert_allclose(out, np.max(wanted, 0), rtol=1e-6)
+
+
+# -- Adam ------------------------------------------------------------------------------------------------------------------
+
+
+def adam(params, gradients, rate=0.1, beta1=0.9, beta2=0.99, eps=1e-8, parts=3) -> SimpleNamespace:
+    """Steps of the kernel, each gradient split into parts at random."""
+    size = len(params)
+    run = SimpleNamespace(params=params.copy(), moment1=np.zeros(size, np.float32), moment2=np.zeros(size, np.float32))
+    run.grads = np.zeros((parts, size), np.float32)
+    rng = np.random.default_rng(0)
+    f = np.float32
+    for step, gradient in enumerate(gradients, 1):
+        share = rng.dirichlet(np.ones(parts), size).T
+        run.grads[:] = share * gradient
+        cpu.adam(
+            run.params, run.grads, run.moment1, run.moment2, f(rate), 0, size, f(beta1), f(beta2), f(eps),
+            f(1 / (1 - beta1**step)), f(1 / (1 - beta2**step)),
+        )  # fmt: skip
+        assert (run.grads == 0).all()
+    return run
+
+
+def test_adam_is_torchs_where_every_entry_is_touched(rng):
+    start = rng.normal(size=160).astype(np.float32)
+    gradients = rng.normal(size=(25, 160)) * 10.0 ** rng.integers(-6, 3, 160)
+    found = adam(start, gradients)
+    parameter = torch.from_numpy(start.astype(float)).requires_grad_()
+    optimiser = torch.optim.Adam([parameter], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    for gradient in gradients:
+        parameter.grad = torch.from_numpy(gradient)
+        optimiser.step()
+    np.testing.assert_allclose(found.params, parameter.detach().numpy(), rtol=1e-4, atol=1e-4)
+
+
+def test_adam_leaves_untouched_entries_alone(rng):
+    """No gradient, no change: neither entry nor moments, in a line of its own or beside touched ones."""
+    start = rng.normal(size=64).astype(np.float32)
+    first, second = rng.normal(size=64) + 5, np.zeros(64)
+    second[40] = 2.0
+    before, after = adam(start, [first]), adam(start, [first, second])
+    same = np.arange(64) != 40
+    for name in ("params", "moment1", "moment2"):
+        assert (getattr(before, name)[same] == getattr(after, name)[same]).all()
+        assert getattr(before, name)[40] != getattr(after, name)[40]
+
+
+def test_adam_of_a_slice_stays_in_it(rng):
+    size, f = 96, np.float32
+    params, grads = np.zeros(size, np.float32), np.ones((2, size), np.float32)
+    moment1, moment2 = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    cpu.adam(params, grads, moment1, moment2, f(0.5), 32, 64, f(0.9), f(0.99), f(1e-15), f(10), f(100))
+    inside = (np.arange(size) >= 32) & (np.arange(size) < 64)
+    np.testing.assert_allclose(params, np.where(inside, -0.5, 0), rtol=1e-5)
+    assert (grads[:, inside] == 0).all() and (grads[:, ~inside] == 1).all()
