@@ -1,1 +1,2 @@
-"""The numeric engine: fields, composition, rendering, distillation. Knows torch and the kernels, never click or files."""
+"""The numeric engine: fields, composition, rendering, distillation. Knows torch and the kernels, never click
+or files."""

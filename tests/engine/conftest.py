@@ -1,4 +1,5 @@
-"""Fields whose answers are known: analytic ones with exact line integrals, small random VM fields, and rays to send at them."""
+"""Fields whose answers are known: analytic ones with exact line integrals, small random VM fields, and rays
+to send at them."""
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ THIRTY_TWO = VMShape(16, 8, 1)  # and the one of float32 kernels: few shapes, si
 
 
 class AnalyticField:
-    """A `RadianceField` given by a density with a closed line integral; its colour is a smooth function of place and view."""
+    """A `RadianceField` given by a density with a closed line integral; its colour is a smooth function of
+    place and view."""
 
     kind = "analytic"
     voxel_size = 0.02
@@ -137,15 +139,15 @@ def random_vm(
     scale: float = 3.0,
     shift: float = -1.0,
 ) -> VMField:
-    """A one-block VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so many cells."""
+    """A one-block VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so
+    many cells."""
     generator = torch.Generator().manual_seed(seed)
     params = torch.randn(shape.size(resolution), generator=generator, dtype=torch.float64) * 0.5
-    tensor = VMTensor(resolution, np.asarray(aabb, np.float64), scale, shift)
-    block = Block(0, np.eye(4) if matrix is None else matrix, "one")
-    grid = OccupancyGrid.full(tensor.aabb, cells or 1)
+    grid = OccupancyGrid.full(aabb, cells or 1)
     if cells is not None:
-        rng = np.random.default_rng(seed)
-        grid = OccupancyGrid(tensor.aabb, rng.random(grid.occupied.shape) < 0.3)
+        grid = OccupancyGrid(grid.aabb, np.random.default_rng(seed).random(grid.occupied.shape) < 0.3)
+    tensor = VMTensor(resolution, grid.aabb, scale, shift, None if cells is None else grid.occupied)
+    block = Block(0, np.eye(4) if matrix is None else matrix, "one")
     return VMField(shape, (tensor,), (block,), params.to(dtype), grid)
 
 
@@ -169,7 +171,10 @@ def rays_at(aabb, count: int, seed: int = 0, away: float = 3.0) -> tuple[np.ndar
 
 
 DIRECTIONS_26 = unit(
-    np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)], float)
+    np.array(
+        [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)],
+        float,
+    )
 )
 
 

@@ -1,4 +1,5 @@
-"""Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy grid is set."""
+"""Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy
+grid is set."""
 
 import math
 import time
@@ -21,27 +22,15 @@ RATE_DECAY = 0.05  # the last step's share of the first's rate
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3
 EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
-RESOLUTION_STAGES = (
-    (0.0, 0.22),
-    (0.05, 0.36),
-    (0.12, 0.5),
-    (0.22, 0.7),
-    (0.36, 1.0),
-)  # (share of the run, share of final voxels per axis)
-OCCUPANCY_AT = (
-    0.03,
-    0.06,
-    0.13,
-    0.24,
-    0.38,
-    0.6,
-)  # shares of the run after which the occupancy is built anew
+# (share of the run, share of final voxels per axis)
+RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
+# shares of the run after which the occupancy is built anew
+OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
 THINNEST = 12
 RAYS_PER_STEP = (512, 1 << 14)
-SHRINK_BELOW = (
-    0.8  # share of the box's volume that its occupied part must fall under for the box to be cut down
-)
+# share of the box's volume that its occupied part must fall under for the box to be cut down
+SHRINK_BELOW = 0.8
 COLOURS = {"sh": VMField, "mlp": VMMLPField}  # what a colour is asked for by, and the field it needs
 
 
@@ -99,7 +88,8 @@ class RayPool:
         self.order, self.at = torch.randperm(len(self.images), generator=self.generator), 0
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel once before any comes again."""
+        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel once before
+        any comes again."""
         if self.order is None or self.at + count > len(self.order):
             self._shuffle()
         chosen = self.order[self.at : self.at + count]
@@ -121,8 +111,8 @@ def fit(
 ) -> VMField | VMMLPField:
     """Train a VM field on pictures (n, H, W, 4) uint8 with straight alpha, inside aabb (6,).
 
-    `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is given, so that
-    the same seed and number of threads gives the same numbers.
+    `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is
+    given, so that the same seed and number of threads gives the same numbers.
     """
     return FitRun.start(cameras, images, aabb, settings, name).finish(advance)
 
@@ -130,7 +120,13 @@ def fit(
 class FitRun:
     """The moving parts of one fit, which can be saved between two steps and taken up again."""
 
-    def __init__(self, field: VMField | VMMLPField, pool: RayPool, settings: FitSettings, generator: torch.Generator):
+    def __init__(
+        self,
+        field: VMField | VMMLPField,
+        pool: RayPool,
+        settings: FitSettings,
+        generator: torch.Generator,
+    ):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.parts = torch.get_num_threads()
         self.optimiser = Adam(field, self.parts)
@@ -141,7 +137,12 @@ class FitRun:
 
     @classmethod
     def start(
-        cls, cameras: list[Camera], images: np.ndarray, aabb: np.ndarray, settings: FitSettings, name: str = ""
+        cls,
+        cameras: list[Camera],
+        images: np.ndarray,
+        aabb: np.ndarray,
+        settings: FitSettings,
+        name: str = "",
     ) -> "FitRun":
         """A fit before its first step; the arguments are those of `fit`."""
         generator = torch.Generator().manual_seed(settings.seed)
@@ -153,7 +154,8 @@ class FitRun:
     def finish(
         self, advance: Callable[[float, dict], None] = lambda share, figures: None
     ) -> VMField | VMMLPField:
-        """Run to the end, or to the target PSNR of the training rays where there is one. Raises FloatingPointError on divergence."""
+        """Run to the end, or to the target PSNR of the training rays where there is one. Raises
+        FloatingPointError on divergence."""
         while (share := self.share()) < 1.0 and not self.reached():
             self.refresh(share)
             self.step(share)
@@ -174,7 +176,10 @@ class FitRun:
         arrays, metadata = self.field.state()
         arrays = {f"field.{name}": np.asarray(value) for name, value in arrays.items()}
         arrays |= {"moment1": self.optimiser.moment1, "moment2": self.optimiser.moment2}
-        arrays |= {"random": self.generator.get_state().numpy(), "random_of_order": self.pool.random_of_order.numpy()}
+        arrays |= {
+            "random": self.generator.get_state().numpy(),
+            "random_of_order": self.pool.random_of_order.numpy(),
+        }
         state = {
             "command": "train",
             "field": metadata,
@@ -191,7 +196,9 @@ class FitRun:
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
-        saved = {name.removeprefix("field."): value for name, value in arrays.items() if name.startswith("field.")}
+        saved = {
+            name.removeprefix("field."): value for name, value in arrays.items() if name.startswith("field.")
+        }
         self.field = type(self.field).from_state(saved, state["field"])
         self.rays_pass = PASSES[self.field.kind](self.field)
         self.optimiser = Adam(self.field, self.parts)
@@ -254,7 +261,8 @@ class FitRun:
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
         step = (1.0 if dense else STEP_PER_VOXEL) * field.voxel_size
         batch = Batch(
-            rays_o, rays_d, jitter, target.numpy(), background, settings.opacity_weight, settings.near, step, EARLY_STOP
+            rays_o, rays_d, jitter, target.numpy(), background, settings.opacity_weight, settings.near, step,
+            EARLY_STOP,
         )
         sums = self.rays_pass.gradient(field, batch, self.optimiser.grads)
         decay = RATE_DECAY**share
@@ -273,12 +281,14 @@ def volume(aabb: np.ndarray) -> float:
 
 
 def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
-    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets THINNEST across."""
+    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets THINNEST
+    across."""
     return tuple(max(min(THINNEST, longest), n) for n in cell_counts(aabb, longest))
 
 
 def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
-    """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
+    """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW
+    somewhere, grown by one cell.
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
     """

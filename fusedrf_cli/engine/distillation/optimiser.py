@@ -1,4 +1,5 @@
-"""Adam over a VM field's flat parameters, with per-part gradients and no work on entries that no sample touched."""
+"""Adam over a VM field's flat parameters, with per-part gradients and no work on entries that no sample
+touched."""
 
 from dataclasses import dataclass
 
@@ -31,8 +32,9 @@ class Adam:
         params = self.field.arrays.params
         for low, high, ratio in self.slices():
             cpu.adam(
-                params, self.grads, self.moment1, self.moment2, np.float32(rate * ratio), low, high, np.float32(BETA1), np.float32(BETA2),
-                np.float32(EPS), np.float32(correction1), np.float32(correction2),
+                params, self.grads, self.moment1, self.moment2, np.float32(rate * ratio), low, high,
+                np.float32(BETA1), np.float32(BETA2), np.float32(EPS), np.float32(correction1),
+                np.float32(correction2),
             )  # fmt: skip
 
     def slices(self) -> list[tuple[int, int, float]]:

@@ -2,7 +2,7 @@
 
 The loss of a batch of n rays is mean (C + (1 - A) background - target)² over rays and channels, plus opacity_weight times
 mean (A - alpha)², with A the opacity. Every pass returns the sums (3,) of the colour term (a ray's mean over channels), of the
-opacity term, and of the samples taken.
+opacity term, and of the work done, in samples of the `vm` kind.
 """
 
 from typing import NamedTuple, Protocol
@@ -17,6 +17,9 @@ from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 NETWORK_RATE = 1e-3  # TensoRF's
 BETAS = (0.9, 0.99)
+THIN_BELOW = 1 / 64  # weight under which only some samples are shaded, each for several; 0: all
+SCATTER = 7919.0  # makes of a ray's jitter another random number
+SHADING_COST = 8  # of the network at a sample, forward and backward, over that of the rest: keeps steps short and many
 
 
 class Batch(NamedTuple):
@@ -84,9 +87,9 @@ class PackedPass:
 
         sigma = autograd.density(field, params, points, dirs, grads)
         weights, opacity = composite(sigma * batch.step, ray, n)
-        seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]
+        seen, share = shaded_samples(weights.detach(), ray, torch.from_numpy(batch.jitter))
         rgb = field.shade(autograd.features(field, params, points[seen], grads), dirs[seen], basis)
-        colour = rgb.new_zeros(n, 3).index_add(0, ray[seen], weights[seen, None] * rgb)
+        colour = rgb.new_zeros(n, 3).index_add(0, ray[seen], (weights[seen] / share)[:, None] * rgb)
 
         target = torch.from_numpy(batch.target)
         error = colour + (1 - opacity)[:, None] * torch.from_numpy(batch.background) - target[:, :3]
@@ -95,7 +98,7 @@ class PackedPass:
         ((losses[0] + batch.opacity_weight * losses[1]) / n).backward()
         start = int(field.layout[0, 12])
         grads[0, start : start + basis.numel()] += basis.grad.flatten().numpy()
-        return np.array([losses[0].item(), losses[1].item(), len(ts)])
+        return np.array([losses[0].item(), losses[1].item(), len(ts) + SHADING_COST * len(seen)])
 
     def step(self, decay: float) -> None:
         """One step of Adam on the network."""
@@ -128,6 +131,21 @@ def visible_samples(field: VMMLPField, batch: Batch) -> tuple[np.ndarray, np.nda
     ray, ts = np.concatenate(rays), np.concatenate(distances)
     order = np.argsort(ray, kind="stable")
     return ray[order], ts[order]
+
+
+def shaded_samples(weights: torch.Tensor, ray: torch.Tensor, jitter: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Indices (M,) of samples whose colour is asked, each with the share min(1, weight / THIN_BELOW) of its chance.
+
+    Samples of weights under THIN_BELOW stand for their neighbours: along a ray one is taken each time the running sum passes
+    another multiple of it. In the untrained haze, where every sample has a little weight, that is one in twenty.
+    """
+    if not THIN_BELOW:
+        seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]
+        return seen, torch.ones_like(weights[seen])
+    total = weights.double().cumsum(0) / THIN_BELOW + (jitter * SCATTER % 1)[ray]
+    crossed = total.floor() > (total - weights.double() / THIN_BELOW).floor()
+    seen = torch.nonzero(crossed & (weights > cpu.COLOUR_FROM))[:, 0]
+    return seen, (weights[seen] / THIN_BELOW).clamp(max=1)
 
 
 def composite(depth: torch.Tensor, ray: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:

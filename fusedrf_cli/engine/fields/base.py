@@ -28,7 +28,8 @@ class RadianceField(Protocol):
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """σ (N,) per unit of length and rgb (N, 3) in [0, 1] at points (N, 3), seen along unit dirs (N, 3)."""
+        """σ (N,) per unit of length and rgb (N, 3) in [0, 1] at points (N, 3), seen along unit dirs (N,
+        3)."""
         ...
 
 

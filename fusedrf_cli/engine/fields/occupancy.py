@@ -1,4 +1,5 @@
-"""The occupancy grid of a field: which cells of its box hold matter, and how far away the next such cell is."""
+"""The occupancy grid of a field: which cells of its box hold matter, and how far away the next such cell
+is."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,7 +32,8 @@ class OccupancyGrid:
 
     @cached_property
     def skip(self) -> np.ndarray:
-        """(X, Y, Z) uint8: 0 in an occupied cell, else the Chebyshev distance in cells to the nearest occupied one (at most 255)."""
+        """(X, Y, Z) uint8: 0 in an occupied cell, else the Chebyshev distance in cells to the nearest
+        occupied one (at most 255)."""
         if not self.occupied.any():
             return np.full(self.occupied.shape, 255, np.uint8)
         if self.occupied.all():
@@ -46,7 +48,8 @@ class OccupancyGrid:
         return GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
 
     def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
-        """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where all is empty."""
+        """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where
+        all is empty."""
         if not self.occupied.any():
             return self.aabb
         index = np.argwhere(self.occupied)
@@ -85,10 +88,11 @@ def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
 def placed_occupancy(
     placed: list[tuple[OccupancyGrid, np.ndarray]], longest: int
 ) -> tuple[OccupancyGrid, list[np.ndarray]]:
-    """One grid over several placed ones, and which of its cells each of them may reach (conservative by up to a cell).
+    """One grid over several placed ones, and which of its cells each of them may reach (conservative by up to
+    a cell).
 
-    placed are (grid, (4, 4) object_to_field); the new grid has near-cubic cells, `longest` on its longest axis. Where nothing is
-    occupied at all, the boxes themselves give the extent.
+    placed are (grid, (4, 4) object_to_field); the new grid has near-cubic cells, `longest` on its longest
+    axis. Where nothing is occupied at all, the boxes themselves give the extent.
     """
     boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in placed])
     lo, hi = boxes[:, :3].min(0), boxes[:, 3:].max(0)

@@ -1,8 +1,10 @@
-"""The `vm` field: vector-matrix decomposed grids (TensoRF, Chen et al. ECCV 2022) with spherical-harmonic colour.
+"""The `vm` field: vector-matrix decomposed grids (TensoRF, Chen et al. ECCV 2022) with spherical-harmonic
+colour.
 
-A VM field is one or more VM *tensors*, each in its own object frame, and *blocks* that place them in the field's frame. With
-one block it is TensoRF's. With several, an ownership grid says per cell which block is asked (two where they meet; the denser
-wins), so that a query costs the same however many there are, and an edit appends or drops a block and leaves the rest as it is.
+A VM field is one or more VM *tensors*, each in its own object frame, and *blocks* that place them in the
+field's frame. With one block it is TensoRF's. With several, an ownership grid says per cell which block is
+asked (two where they meet; the denser wins), so that a query costs the same however many there are, and an
+edit appends or drops a block and leaves the rest as it is.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +18,8 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
 OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
-PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(
-    -1, 3
-)  # where in a cell its density is probed
+# where in a cell its density is probed
+PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 SECTION_ALIGN = 16  # floats: a section starts on a cache line
@@ -38,7 +39,8 @@ class VMTensor:
     """σ_object = scale * softplus(feature + shift), in 1/length of the object's frame."""
     shift: float = DENSITY_SHIFT
     occupied: np.ndarray | None = None
-    """(X, Y, Z) bool cells of the box that hold matter; None: all. What the tensor says elsewhere was never learnt."""
+    """(X, Y, Z) bool cells of the box that hold matter; None: all. What the tensor says elsewhere was never
+    learnt."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
@@ -77,7 +79,8 @@ class VMShape:
     sh_degree: int = 2
 
     def __post_init__(self):
-        """Refuse what the kernels were not written for: they work on runs of eight components and on four SH bands."""
+        """Refuse what the kernels were not written for: they work on runs of eight components and on four SH
+        bands."""
         for name in ("density_rank", "colour_rank"):
             rank = getattr(self, name)
             if rank < 8 or rank % 8:
@@ -111,7 +114,8 @@ def aligned(count: int) -> int:
 
 @register
 class VMField:
-    """One or more placed VM tensors; see the module's docstring. Immutable but for `params`, which optimisers update in place."""
+    """One or more placed VM tensors; see the module's docstring. Immutable but for `params`, which optimisers
+    update in place."""
 
     kind = "vm"
 
@@ -124,13 +128,14 @@ class VMField:
         occupancy: OccupancyGrid,
         owners: tuple[np.ndarray, np.ndarray] | None = None,
     ):
-        """params (P,) float; owners are two (X, Y, Z) uint8 grids on the occupancy's cells, needed with more than one block."""
+        """params (P,) float; owners are two (X, Y, Z) uint8 grids on the occupancy's cells, needed with more
+        than one block."""
         if len(blocks) > 1 and owners is None:
             raise ValueError("a vm field of several blocks needs its ownership grids")
         self.shape, self.tensors, self.blocks, self.params = shape, tensors, blocks, params
         self.occupancy, self.owners = occupancy, owners
 
-    # -- making ------------------------------------------------------------------------------------------------------------
+    # -- making ----------------------------------------------------------------------------------------------
 
     @classmethod
     def create(
@@ -160,7 +165,8 @@ class VMField:
     def assembled(
         cls, shape: VMShape, tensors: tuple[VMTensor, ...], blocks: tuple[Block, ...], params: torch.Tensor
     ) -> "VMField":
-        """A field whose occupancy and ownership follow from its blocks: each cell is owned by the one or two densest there."""
+        """A field whose occupancy and ownership follow from its blocks: each cell is owned by the one or two
+        densest there."""
         if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
         occupancy, marks = placed_occupancy(
@@ -175,7 +181,8 @@ class VMField:
         return unsettled
 
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
-        """A one-block field on another box and resolution: planes and lines are interpolated, outside the old box they are 0."""
+        """A one-block field on another box and resolution: planes and lines are interpolated, outside the old
+        box they are 0."""
         (tensor,), (block,) = self.tensors, self.blocks
         aabb = np.asarray(aabb, np.float64)
         params = torch.zeros(self.shape.size(resolution), dtype=self.params.dtype)
@@ -198,7 +205,7 @@ class VMField:
         target["colour_basis"].copy_(old["colour_basis"])
         return new
 
-    # -- reading -----------------------------------------------------------------------------------------------------------
+    # -- reading ---------------------------------------------------------------------------------------------
 
     @property
     def aabb(self) -> np.ndarray:
@@ -279,7 +286,8 @@ class VMField:
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not differentiable (see autograd.py)."""
+        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not
+        differentiable (see autograd.py)."""
         sigma = np.empty(len(points), self.arrays.params.dtype)
         rgb = np.empty((len(points), 3), self.arrays.params.dtype)
         cpu.query(
@@ -296,13 +304,15 @@ class VMField:
         early_stop: float,
         out: np.ndarray,
     ) -> None:
-        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same columns in out (N, 5)."""
+        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same
+        columns in out (N, 5)."""
         cpu.render(*self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, step, early_stop, out)
 
-    # -- storing -----------------------------------------------------------------------------------------------------------
+    # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Arrays and metadata for a bundle; the tensors' occupancies are stored as packed bits, ownership follows from them."""
+        """Arrays and metadata for a bundle; the tensors' occupancies are stored as packed bits, ownership
+        follows from them."""
         arrays = {
             f"tensor_{t}.{name}": view.detach().numpy()
             for t in range(len(self.tensors))
@@ -371,7 +381,8 @@ def unit_texels(aabb: np.ndarray, old_aabb: np.ndarray, axis: int, count: int) -
 
 
 def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> torch.Tensor:
-    """Linear interpolation of values along one axis at unit coordinates, corners aligned; 0 outside [0, 1]."""
+    """Linear interpolation of values along one axis at unit coordinates, corners aligned; 0 outside [0,
+    1]."""
     n = values.shape[axis]
     position = unit * (n - 1)
     lower = position.floor().clamp(0, n - 2).long()
@@ -404,7 +415,8 @@ def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
 
 
 def settle_owners(field: VMField, marks: list[np.ndarray], first: np.ndarray, second: np.ndarray) -> None:
-    """Write the ownership grids: lower block first where one or two have matter in a cell, the two densest where more have."""
+    """Write the ownership grids: lower block first where one or two have matter in a cell, the two densest
+    where more have."""
     count = np.sum(marks, axis=0, dtype=np.uint8)
     for b, mark in enumerate(marks):
         second[mark & (first != NO_BLOCK) & (second == NO_BLOCK)] = b

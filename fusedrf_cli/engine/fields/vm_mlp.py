@@ -15,18 +15,21 @@ from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
-FREQUENCIES = (1.0, 2.0)
 WIDTH = 64
 POINTS_AT_ONCE = 1 << 15  # 20 MB of network inputs
 
 
 class ColourNetwork(torch.nn.Module):
-    """[f, d, PE(f), PE(d)] -> width -> width -> 3, ReLU between, sigmoid at the end; the order of inputs is TensoRF's."""
+    """x = [f, d] -> [x, sin x, sin 2x, cos x, cos 2x] -> width -> width -> 3, ReLU between, sigmoid at the end.
+
+    TensoRF's inputs, in blocks as wide as x, where TensoRF interleaves frequencies and keeps f and d apart: an importer
+    permutes the columns of the first layer.
+    """
 
     def __init__(self, features: int, width: int = WIDTH, generator: torch.Generator | None = None):
         """Weights uniform as a linear layer's, the last bias 0."""
         super().__init__()
-        inputs = (features + 3) * (1 + 2 * len(FREQUENCIES))
+        inputs = (features + 3) * 5
         sizes = ((inputs, width), (width, width), (width, 3))
         self.layers = torch.nn.ModuleList(torch.nn.utils.skip_init(torch.nn.Linear, a, b) for a, b in sizes)
         with torch.no_grad():
@@ -39,14 +42,31 @@ class ColourNetwork(torch.nn.Module):
     def forward(self, features: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
         """rgb (N, 3) in [0, 1] from features (N, F) and unit directions (N, 3) of the object's frame."""
         first, second, last = self.layers
-        x = torch.cat([features, dirs, encoding(features), encoding(dirs)], 1)
+        x = Encoding.apply(torch.cat([features, dirs], 1))
         return torch.sigmoid(last(torch.relu_(second(torch.relu_(first(x))))))
 
 
-def encoding(x: torch.Tensor) -> torch.Tensor:
-    """(N, 2 K D) sines, then cosines, of x (N, D) times each of the K frequencies, a component's frequencies side by side."""
-    angles = (x[..., None] * x.new_tensor(FREQUENCIES)).flatten(1)
-    return torch.cat([angles.sin(), angles.cos()], 1)
+class Encoding(torch.autograd.Function):
+    """(N, 5 D) blocks x, sin x, sin 2x, cos x, cos 2x of x (N, D): one sine and cosine each, and a backward without copies."""
+
+    @staticmethod
+    def forward(ctx, x):
+        sin, cos = x.sin(), x.cos()
+        out = torch.cat([x, sin, 2 * sin * cos, cos, 1 - 2 * sin * sin], 1)
+        ctx.save_for_backward(out)
+        return out
+
+    @staticmethod
+    def backward(ctx, d_out):
+        (out,) = ctx.saved_tensors
+        _, sin, sin2, cos, cos2 = out.view(len(out), 5, -1).unbind(1)
+        d_x, d_sin, d_sin2, d_cos, d_cos2 = d_out.view(len(out), 5, -1).unbind(1)
+        return (
+            torch.addcmul(d_x, d_sin, cos)
+            .addcmul_(d_cos, sin, value=-1)
+            .addcmul_(d_sin2, cos2, value=2)
+            .addcmul_(d_cos2, sin2, value=-2)
+        )
 
 
 @register

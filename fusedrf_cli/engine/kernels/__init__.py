@@ -1,4 +1,5 @@
-"""Compiled kernels. Import `fusedrf_cli.engine.kernels` only when numbers are to be crunched: it loads numba."""
+"""Compiled kernels. Import `fusedrf_cli.engine.kernels` only when numbers are to be crunched: it loads
+numba."""
 
 import hashlib
 import os
@@ -9,9 +10,11 @@ import numba
 
 
 def kernel_cache() -> Path:
-    """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be written.
+    """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
+    written.
 
-    It is named for the text of bodies.py: numba only looks for changes in the file of the loop, not of what the loop inlines.
+    It is named for the text of bodies.py: numba only looks for changes in the file of the loop, not of what
+    the loop inlines.
     """
     bodies = hashlib.sha256(Path(__file__).with_name("bodies.py").read_bytes()).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
@@ -29,12 +32,12 @@ def kernel_cache() -> Path:
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(kernel_cache())
-# The gradient scatter adds short runs of floats; only superword vectorisation turns those into vector instructions (8x).
+# The gradient scatter adds short runs of floats; only superword vectorisation turns those into vector
+# instructions (8x).
 numba.config.SLP_VECTORIZE = 1
 
 from fusedrf_cli.engine.kernels import cpu  # noqa: E402  (compiles under the settings above)
 from fusedrf_cli.engine.kernels.bodies import NO_BLOCK, GridArrays, VMArrays  # noqa: E402
-
 
 
 def set_threads(count: int) -> None:

@@ -1,11 +1,15 @@
-"""Scalar bodies of every kernel, written once: called from the CPU loops in `cpu.py` and from GPU kernels alike.
+"""Scalar bodies of every kernel, written once: called from the CPU loops in `cpu.py` and from GPU kernels
+alike.
 
 Notation for the whole file.
     x, y, z      a point in the frame of the field; u, v, w the same point in the unit cube of one VM tensor
-    ranks        a tuple whose *length* is the rank: the length is part of the type, so the compiler unrolls the loops over it
-    params       flat float vector holding all tensors of a field; `layout[t]` are the offsets of tensor t's sections in it:
-                 0-2 density planes, 3-5 density lines, 6-8 colour planes, 9-11 colour lines, 12 colour basis
-    modes        mode 0 = plane xy, line z; mode 1 = plane xz, line y; mode 2 = plane yz, line x (TensoRF, eq. 5)
+    ranks        a tuple whose *length* is the rank: the length is part of the type, so the compiler unrolls
+                 the loops over it
+    params       flat float vector holding all tensors of a field; `layout[t]` are the offsets of tensor t's
+                 sections in it: 0-2 density planes, 3-5 density lines, 6-8 colour planes, 9-11 colour lines,
+                 12 colour basis
+    modes        mode 0 = plane xy, line z; mode 1 = plane xz, line y; mode 2 = plane yz, line x (TensoRF, eq.
+                 5)
 Offsets are unsigned: a signed index costs a wrap-around test per load, a factor of five in all.
 """
 
@@ -40,7 +44,8 @@ class VMArrays(NamedTuple):
 
 
 class GridArrays(NamedTuple):
-    """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next one."""
+    """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
+    one."""
 
     skip: object  # (X, Y, Z) uint8
     lo: object  # (3,) float, lower corner
@@ -50,7 +55,8 @@ class GridArrays(NamedTuple):
 
 @body
 def hit_box(ox, oy, oz, dx, dy, dz, lo, hi):
-    """Interval [t0, t1] in which a ray is inside a box; t1 < t0 when it misses. A zero component is tested apart (0 * inf)."""
+    """Interval [t0, t1] in which a ray is inside a box; t1 < t0 when it misses. A zero component is tested
+    apart (0 * inf)."""
     t0 = 0.0
     t1 = 1e30
     for axis in range(3):
@@ -85,9 +91,11 @@ def exit_distance(p, d, lo, cell, i, s):
 
 @body
 def next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k):
-    """First k' >= k whose sample t0 + k' step lies in an occupied cell, or -1 when the ray leaves the box before one.
+    """First k' >= k whose sample t0 + k' step lies in an occupied cell, or -1 when the ray leaves the box
+    before one.
 
-    Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is the same.
+    Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
+    the same.
     """
     skip, lo, cell = grid.skip, grid.lo, grid.cell
     nx, ny, nz = skip.shape
@@ -111,7 +119,8 @@ def next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k):
 
 @body
 def sh_basis(degree_1_squared, x, y, z, out, base):
-    """Real spherical harmonics of a unit direction into out[base:], orders l then m = -l..l, orthonormal on the sphere.
+    """Real spherical harmonics of a unit direction into out[base:], orders l then m = -l..l, orthonormal on
+    the sphere.
 
     Signs follow the habit of Plenoxels and 3D Gaussian splatting (Condon-Shortley phase kept).
     """
@@ -197,7 +206,8 @@ def mode_products(ranks, params, plane, line, na, nb, nc, a, b, c, out, base):
 def add_scaled_8(out, o, weight, values, v):
     """out[o : o + 8] += weight * values[v : v + 8].
 
-    All loads stand before all stores: only then may the compiler, which must fear that the arrays overlap, use vectors.
+    All loads stand before all stores: only then may the compiler, which must fear that the arrays overlap,
+    use vectors.
     """
     e0 = out[o] + weight * values[v]
     e1 = out[o + np.uint64(1)] + weight * values[v + np.uint64(1)]
@@ -373,7 +383,8 @@ def sigmoid(f):
 
 @body
 def object_direction(vm, b, dx, dy, dz):
-    """The unit direction in block b's object frame and |A d|, which keeps the optical depth (σ_field = σ_object |A d|)."""
+    """The unit direction in block b's object frame and |A d|, which keeps the optical depth (σ_field =
+    σ_object |A d|)."""
     m = vm.to_object
     x = m[b, 0, 0] * dx + m[b, 0, 1] * dy + m[b, 0, 2] * dz
     y = m[b, 1, 0] * dx + m[b, 1, 1] * dy + m[b, 1, 2] * dz
@@ -397,7 +408,8 @@ def block_density(ranks, vm, b, x, y, z, stretch):
 
 @body
 def matter_at(vm, t, u, v, w):
-    """Whether a unit point lies in an occupied cell of tensor t; what a tensor says elsewhere was never learnt."""
+    """Whether a unit point lies in an occupied cell of tensor t; what a tensor says elsewhere was never
+    learnt."""
     nx, ny, nz = vm.occupied_at[t, 1], vm.occupied_at[t, 2], vm.occupied_at[t, 3]
     i, j, m = min(int(u * nx), nx - 1), min(int(v * ny), ny - 1), min(int(w * nz), nz - 1)
     return vm.occupied[np.uint64(vm.occupied_at[t, 0] + (i * ny + j) * nz + m)] != 0
@@ -428,7 +440,8 @@ def winning_block(ranks, vm, grid, x, y, z, dx, dy, dz):
 
 @body
 def directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh):
-    """Fold SH into the colour basis once per ray: basis[c, :] = sum_k Y_k(d_object) B[c, k, :] (SH is linear)."""
+    """Fold SH into the colour basis once per ray: basis[c, :] = sum_k Y_k(d_object) B[c, k, :] (SH is
+    linear)."""
     width = 3 * len(colour_ranks)
     count = len(coefficients)
     x, y, z, _ = object_direction(vm, b, dx, dy, dz)

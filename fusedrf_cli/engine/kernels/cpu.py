@@ -1,7 +1,8 @@
 """CPU loops over the scalar bodies: each part of the work runs on one core and writes only what is its own.
 
-Rays are (N, 3) float64 in the field's frame, directions of unit length. A loop over `parts` is the parallel one: part p owns the
-p-th slice of the rays and row p of every scratch and gradient array, so nothing races and a sum over rows has one order.
+Rays are (N, 3) float64 in the field's frame, directions of unit length. A loop over `parts` is the parallel
+one: part p owns the p-th slice of the rays and row p of every scratch and gradient array, so nothing races
+and a sum over rows has one order.
 """
 
 import math
@@ -28,8 +29,8 @@ from fusedrf_cli.engine.kernels.bodies import (
 )
 
 loop = njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
-# A task is the serial work of one core. Without the reference counting of array arguments (_nrt) it is up to eight times
-# faster, so tasks allocate nothing: the loops around them hand in the scratch.
+# A task is the serial work of one core. Without the reference counting of array arguments (_nrt) it is up to
+# eight times faster, so tasks allocate nothing: the loops around them hand in the scratch.
 task = njit(fastmath=True, error_model="numpy", cache=True, _nrt=False)
 
 POINTS_PER_TASK = 2048
@@ -76,7 +77,8 @@ def query_task(
 
 @loop
 def query(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, sigma, rgb):
-    """σ (1/length) and rgb of a VM field at points (N, 3) seen along dirs (N, 3); both 0 where the grid is empty."""
+    """σ (1/length) and rgb of a VM field at points (N, 3) seen along dirs (N, 3); both 0 where the grid is
+    empty."""
     n = points.shape[0]
     width = 3 * len(colour_ranks)
     for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
@@ -114,8 +116,8 @@ def occupied(grid, x, y, z):
 
 @task
 def query_backward_task(
-    ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, low, high, grad, features, d_features, basis, d_basis, sh,
-    d_f, scratch,
+    ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, low, high, grad, features,
+    d_features, basis, d_basis, sh, d_f, scratch,
 ):  # fmt: skip
     """`query_backward` for points low..high, into one row of gradients."""
     for i in range(low, high):
@@ -151,16 +153,18 @@ def clear(values):
 
 @loop
 def query_backward(ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, grads):
-    """Adjoint of `query`: adds to row p of grads (parts, P) what d_sigma (N,), d_rgb (N, 3) of part p's points send back."""
+    """Adjoint of `query`: adds to row p of grads (parts, P) what d_sigma (N,), d_rgb (N, 3) of part p's
+    points send back."""
     n = points.shape[0]
     parts = grads.shape[0]
     width = 3 * len(colour_ranks)
     for p in prange(parts):
         kind = vm.params.dtype
         query_backward_task(
-            ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, p * n // parts, (p + 1) * n // parts, grads[p],
-            np.empty(width, kind), np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
-            np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind),
+            ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, p * n // parts,
+            (p + 1) * n // parts, grads[p], np.empty(width, kind), np.empty(width, kind),
+            np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind), np.empty(1, kind),
+            np.empty(2 * max(len(ranks), len(colour_ranks)), kind),
         )  # fmt: skip
 
 
@@ -184,7 +188,8 @@ def shade_backward(colour_ranks, basis, features, base, d_r, d_g, d_b, d_feature
 
 @task
 def render_task(
-    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, low, high, features, basis, sh, out
+    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, low, high,
+    features, basis, sh, out,
 ):  # fmt: skip
     """`render` for rays low..high."""
     for i in range(low, high):
@@ -219,7 +224,8 @@ def render_task(
 
 @loop
 def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, out):
-    """March, shade and composite rays in one pass: out (N, 5) is premultiplied rgb, opacity, and Σ w t (over opacity: mean depth).
+    """March, shade and composite rays in one pass: out (N, 5) is premultiplied rgb, opacity, and Σ w t (over
+    opacity: mean depth).
 
     Stops at a remaining transmittance of `early_stop`; samples sit at the middle of each step.
     """
@@ -251,8 +257,9 @@ def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, st
 
 @task
 def train_task(
-    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background, opacity_weight, low, high,
-    ts, pre, weights, rgbs, blocks, slots, features, d_features, basis, d_basis, sh, d_f, scratch, grad, loss,
+    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
+    background, opacity_weight, low, high, ts, pre, weights, rgbs, blocks, slots, features, d_features,
+    basis, d_basis, sh, d_f, scratch, grad, loss,
 ):  # fmt: skip
     """`train_rays` for rays low..high, into one row of gradients and losses."""
     n = rays_o.shape[0]
@@ -312,7 +319,8 @@ def train_task(
             - 2.0 / n * opacity_weight * e_a
         )
 
-        # Backwards along the ray: `behind` is the gradient's share of all that lies behind the sample, the background too.
+        # Backwards along the ray: `behind` is the gradient's share of all that lies behind the sample, the
+        # background too.
         behind = trans * g_t
         after = trans
         clear(d_basis)
@@ -348,14 +356,15 @@ def train_task(
 
 @loop
 def train_rays(
-    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background, opacity_weight,
-    max_samples, grads, loss,
+    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
+    background, opacity_weight, max_samples, grads, loss,
 ):  # fmt: skip
     """One pass over rays: render, compare, and add the gradient of the loss to row p of grads (parts, P).
 
-    The loss of a ray is mean_c (C_c + (1 - A) background_c - target_c)^2 + opacity_weight (A - target_3)^2, with A the opacity;
-    target is (N, 4): rgb over the ray's background (N, 3), and the captured alpha. loss (parts, 3) gains the sums of the colour
-    term, of the opacity term and of the samples taken. jitter (N,) in [0, 1) shifts the samples by a share of a step.
+    The loss of a ray is mean_c (C_c + (1 - A) background_c - target_c)^2 + opacity_weight (A - target_3)^2,
+    with A the opacity; target is (N, 4): rgb over the ray's background (N, 3), and the captured alpha. loss
+    (parts, 3) gains the sums of the colour term, of the opacity term and of the samples taken. jitter (N,) in
+    [0, 1) shifts the samples by a share of a step.
     """
     n = rays_o.shape[0]
     parts = grads.shape[0]
@@ -365,9 +374,10 @@ def train_rays(
         ts, pre, weights = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
         blocks, slots = np.empty(max_samples, np.int64), np.empty(max_samples, np.int64)
         train_task(
-            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background, opacity_weight,
-            p * n // parts, (p + 1) * n // parts, ts, pre, weights, np.empty((max_samples, 3)), blocks, slots,
-            np.empty(max_samples * width, kind), np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
+            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop,
+            target, background, opacity_weight, p * n // parts, (p + 1) * n // parts, ts, pre, weights,
+            np.empty((max_samples, 3)), blocks, slots, np.empty(max_samples * width, kind),
+            np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
             np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind), grads[p], loss[p],
         )  # fmt: skip
 
@@ -403,9 +413,11 @@ def adam_task(params, grads, moment1, moment2, rate, low, high, beta1, beta2, ep
 
 @loop
 def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
-    """Adam (Kingma and Ba 2015, alg. 1) on params[low:high], whole cache lines, summing and clearing the rows of grads (parts, P).
+    """Adam (Kingma and Ba 2015, alg. 1) on params[low:high], whole cache lines, summing and clearing the rows
+    of grads (parts, P).
 
-    An entry whose gradient is exactly 0 was touched by no sample: it and its moments keep their values (lazy Adam).
+    An entry whose gradient is exactly 0 was touched by no sample: it and its moments keep their values (lazy
+    Adam).
     """
     parts = (high - low + ENTRIES_PER_TASK - 1) // ENTRIES_PER_TASK
     for part in prange(parts):
@@ -431,7 +443,8 @@ def density_at_cells_task(ranks, vm, b, lo, cell, cells, low, high, offsets, out
 
 @loop
 def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
-    """Largest σ of block b, as if unstretched, over `offsets` (K, 3) in each of `cells` (N, 3) int64 of a grid: out (N,)."""
+    """Largest σ of block b, as if unstretched, over `offsets` (K, 3) in each of `cells` (N, 3) int64 of a
+    grid: out (N,)."""
     n = cells.shape[0]
     for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
         low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
@@ -440,7 +453,8 @@ def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
 
 @loop
 def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
-    """The next samples of every living ray: ts (N, K) distances, counts (N,); start (N,) int64 is where to go on, -1 at the end."""
+    """The next samples of every living ray: ts (N, K) distances, counts (N,); start (N,) int64 is where to go
+    on, -1 at the end."""
     for i in prange(rays_o.shape[0]):
         counts[i] = 0
         if not alive[i] or start[i] < 0:
@@ -491,7 +505,8 @@ def features_backward_task(colour_ranks, vm, block, points, d_features, low, hig
 
 @loop
 def features_backward(colour_ranks, vm, block, points, d_features, grads):
-    """Adjoint of `features`: adds to row p of grads (parts, P) what d_features (N * 3 rank,) of part p's points send back."""
+    """Adjoint of `features`: adds to row p of grads (parts, P) what d_features (N * 3 rank,) of part p's
+    points send back."""
     n = points.shape[0]
     parts = grads.shape[0]
     for p in prange(parts):

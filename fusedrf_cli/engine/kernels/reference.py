@@ -1,7 +1,9 @@
-"""The readable truth of the kernels: the same maths in plain torch, for any float dtype and device, differentiable, and slow.
+"""The readable truth of the kernels: the same maths in plain torch, for any float dtype and device,
+differentiable, and slow.
 
-Notation as in bodies.py. `sections` names a tensor's parameters as `VMField.sections` does; `unit` (N, 3) are points in the unit cube
-of the tensor. Gradients flow to the sections, not to points or directions. Fields are of one block here.
+Notation as in bodies.py. `sections` names a tensor's parameters as `VMField.sections` does; `unit` (N, 3) are
+points in the unit cube of the tensor. Gradients flow to the sections, not to points or directions. Fields are
+of one block here.
 """
 
 import torch
@@ -54,7 +56,8 @@ def density(feature: torch.Tensor, scale: float, shift: float) -> torch.Tensor:
 def vm_query(
     sections: dict[str, torch.Tensor], unit: torch.Tensor, dirs: torch.Tensor, scale: float, shift: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """σ (N,) in the object's frame and rgb (N, 3) along unit dirs (N, 3) of that frame; both 0 outside the unit cube."""
+    """σ (N,) in the object's frame and rgb (N, 3) along unit dirs (N, 3) of that frame; both 0 outside the
+    unit cube."""
     inside = ((unit >= 0) & (unit <= 1)).all(1)
     unit = unit.clamp(0, 1)
     sigma = density(vm_density_feature(sections, unit), scale, shift)
@@ -65,7 +68,8 @@ def vm_query(
 
 
 def sh_basis(count: int, dirs: torch.Tensor) -> torch.Tensor:
-    """(N, count) real spherical harmonics of unit dirs (N, 3), count 1, 4, 9 or 16, orders l then m = -l..l."""
+    """(N, count) real spherical harmonics of unit dirs (N, 3), count 1, 4, 9 or 16, orders l then m =
+    -l..l."""
     x, y, z = dirs.unbind(1)
     xx, yy, zz = x * x, y * y, z * z
     values = [
@@ -98,7 +102,8 @@ def composite_weights(sigma: torch.Tensor, step: float) -> torch.Tensor:
 
 
 def field_query(field, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """σ (N,) in the frame of a one-block VM field, |A d| σ_object with A from field to object, and rgb (N, 3).
+    """σ (N,) in the frame of a one-block VM field, |A d| σ_object with A from field to object, and rgb (N,
+    3).
 
     A box is half open, as cells are: nothing is at its upper faces.
     """
@@ -116,7 +121,8 @@ def field_query(field, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.
 
 
 def lattice(field, rays_o, rays_d, near: float, step: float, jitter) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distances (N, K) of every ray's samples t_0 + (k + jitter) δ in the field's box, and which (N, K) lie in occupied cells."""
+    """Distances (N, K) of every ray's samples t_0 + (k + jitter) δ in the field's box, and which (N, K) lie
+    in occupied cells."""
     lo, hi = torch.as_tensor(field.aabb[:3]), torch.as_tensor(field.aabb[3:])
     parallel = rays_d == 0
     held = (~parallel | ((rays_o >= lo) & (rays_o < hi))).all(1)
@@ -126,7 +132,7 @@ def lattice(field, rays_o, rays_d, near: float, step: float, jitter) -> tuple[to
     leave = torch.where(parallel, torch.inf, torch.maximum(a, b)).amin(1)
     length = torch.where(held, leave - enter, 0).clamp_min(0)
     count = int(torch.ceil(length.max() / step)) + 1 if len(length) else 1
-    ts = (enter + jitter * step)[:, None] + step * torch.arange(count)
+    ts = (enter + jitter * step)[:, None] + step * torch.arange(count, dtype=torch.float64)
     inside = held[:, None] & (ts < leave[:, None])
     points = rays_o[:, None] + ts[..., None] * rays_d[:, None]
     occupied = torch.from_numpy(field.occupancy.occupied)
@@ -136,14 +142,22 @@ def lattice(field, rays_o, rays_d, near: float, step: float, jitter) -> tuple[to
 
 
 def render_rays(
-    field, rays_o, rays_d, near: float, step: float, early_stop: float = 0.0, jitter=0.5, colour_from: float = 0.0
+    field,
+    rays_o,
+    rays_d,
+    near: float,
+    step: float,
+    early_stop: float = 0.0,
+    jitter=0.5,
+    colour_from: float = 0.0,
 ) -> torch.Tensor:
     """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) float64 through a one-block VM field.
 
-    Every sample of the lattice is asked. A sample counts while the transmittance before it is over early_stop, and its colour
-    where its weight is over colour_from: both thresholds are the kernels' own, 0 leaves them out.
+    Every sample of the lattice is asked. A sample counts while the transmittance before it is over
+    early_stop, and its colour where its weight is over colour_from: both thresholds are the kernels' own, 0
+    leaves them out.
     """
-    ts, taken = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter))
+    ts, taken = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter, dtype=torch.float64))
     points = (rays_o[:, None] + ts[..., None] * rays_d[:, None])[taken]
     dirs = rays_d[:, None].expand(*ts.shape, 3)[taken]
     found, colour = field_query(field, points, dirs)
@@ -153,5 +167,9 @@ def render_rays(
         before = torch.exp(-step * (torch.cumsum(sigma, 1) - sigma))
     weights = composite_weights(torch.where(before > early_stop, sigma, 0), step)
     shown = torch.where(weights > colour_from, weights, 0)
-    columns = [(shown[..., None] * rgb).sum(1), weights.sum(1, keepdim=True), (weights * ts).sum(1, keepdim=True)]
+    columns = [
+        (shown[..., None] * rgb).sum(1),
+        weights.sum(1, keepdim=True),
+        (weights * ts).sum(1, keepdim=True),
+    ]
     return torch.cat([c.to(found.dtype) for c in columns], 1)

@@ -1,6 +1,7 @@
 """Pinhole cameras with Brown-Conrady distortion: pixels to rays.
 
-Axes are OpenGL's: +x right, +y up, looking along -z. Pixel (i, j) is column i, row j from the top, its centre at (i + 0.5, j + 0.5).
+Axes are OpenGL's: +x right, +y up, looking along -z. Pixel (i, j) is column i, row j from the top, its centre
+at (i + 0.5, j + 0.5).
 """
 
 from dataclasses import dataclass
@@ -54,14 +55,16 @@ class Camera:
         return np.stack([x, -y, -np.ones_like(x)], -1)
 
     def rays(self, rows: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """rays_o, rays_d, each (rows * width, 3) float64 in world space, rays_d of unit length, row by row."""
+        """rays_o, rays_d, each (rows * width, 3) float64 in world space, rays_d of unit length, row by
+        row."""
         d = self.local_directions(rows).reshape(-1, 3) @ self.camera_to_world[:3, :3].T
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         return np.broadcast_to(self.camera_to_world[:3, 3], d.shape).copy(), d
 
 
 def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Invert the Brown-Conrady model by fixed-point iteration: distorted to ideal normalised image coordinates (y down)."""
+    """Invert the Brown-Conrady model by fixed-point iteration: distorted to ideal normalised image
+    coordinates (y down)."""
     k1, k2, k3, p1, p2 = distortion
     u, v = x, y
     for _ in range(12):
@@ -92,7 +95,8 @@ FRAMING_FOV = 0.6911112  # radians, horizontal: the field of view of NeRF-Synthe
 def framing_camera(
     aabb: np.ndarray, azimuth: float, elevation: float, width: int, height: int, name: str = "view"
 ) -> Camera:
-    """A camera outside a box (6,) that frames its bounding ball; azimuth from +x about +z, elevation above the xy plane, radians."""
+    """A camera outside a box (6,) that frames its bounding ball; azimuth from +x about +z, elevation above
+    the xy plane, radians."""
     centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
     focal = 0.5 * width / np.tan(FRAMING_FOV / 2)
     narrow = np.arctan(0.5 * min(width, height) / focal)
@@ -115,7 +119,8 @@ def orbit(aabb: np.ndarray, count: int, width: int, height: int, elevation: floa
 def scattered(
     aabb: np.ndarray, count: int, width: int, height: int, seed: int, lowest: float = 0.05
 ) -> list[Camera]:
-    """`count` cameras at seeded random azimuths and elevations above `lowest` radians: the views nothing is trained on."""
+    """`count` cameras at seeded random azimuths and elevations above `lowest` radians: the views nothing is
+    trained on."""
     rng = np.random.default_rng(seed)
     spots = zip(rng.uniform(0, 2 * np.pi, count), rng.uniform(lowest, 1.3, count), strict=True)
     return [framing_camera(aabb, a, e, width, height, name=f"view_{i:04d}") for i, (a, e) in enumerate(spots)]

@@ -1,4 +1,5 @@
-"""Volume rendering (NeRF, eq. 3): alpha_i = 1 - exp(-σ_i δ), w_i = T_i alpha_i, C = Σ w_i c_i, with T_i the product before the sample."""
+"""Volume rendering (NeRF, eq. 3): alpha_i = 1 - exp(-σ_i δ), w_i = T_i alpha_i, C = Σ w_i c_i, with T_i the
+product before the sample."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -64,7 +65,8 @@ def march_rays(
     early_stop: float,
     out: np.ndarray,
 ) -> None:
-    """The general path for any field: waves of at most SAMPLES_PER_WAVE samples per living ray, into out (N, 5)."""
+    """The general path for any field: waves of at most SAMPLES_PER_WAVE samples per living ray, into out (N,
+    5)."""
     n = len(rays_o)
     trans = np.ones(n, np.float32)
     total = np.zeros((n, 5), np.float32)
@@ -83,9 +85,8 @@ def march_rays(
         seen = weights > cpu.COLOUR_FROM
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
-            colour[seen] = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))[
-                1
-            ].numpy()
+            _, found = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
+            colour[seen] = found.numpy()
         total[ray, :3] += (weights[..., None] * colour).sum(1)
         total[ray, 4] += (weights * ts).sum(1)
     total[:, 3] = 1 - trans
@@ -93,7 +94,8 @@ def march_rays(
 
 
 def weights_from_sigma(sigma: np.ndarray, step: float, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (N, K) of consecutive samples that start with transmittance trans (N,), and the transmittance behind them."""
+    """Weights (N, K) of consecutive samples that start with transmittance trans (N,), and the transmittance
+    behind them."""
     transmittance = trans[:, None] * np.exp(-np.cumsum(sigma, 1) * step)
     before = np.concatenate([trans[:, None], transmittance[:, :-1]], 1)
     return before - transmittance, transmittance[:, -1]
@@ -108,7 +110,8 @@ def waves(
     step: float,
     alive: Callable[[], np.ndarray],
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """March rays in waves: yields (indices of rays with samples (M,), distances (M, K), how many of them count (M,))."""
+    """March rays in waves: yields (indices of rays with samples (M,), distances (M, K), how many of them
+    count (M,))."""
     n = len(rays_o)
     start = np.zeros(n, np.int64)
     ts, counts = np.zeros((n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
@@ -130,7 +133,8 @@ def render_image(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> RenderedImage:
-    """Render one view in bands of rows; origin (3,) is the world position of the field's frame origin (float64, so far scenes hold)."""
+    """Render one view in bands of rows; origin (3,) is the world position of the field's frame origin
+    (float64, so far scenes hold)."""
     shift = np.zeros(3) if origin is None else origin
     pixels = np.empty((camera.height * camera.width, 5), np.float32)
     rows = max(1, ROWS_AT_ONCE_PIXELS // camera.width)

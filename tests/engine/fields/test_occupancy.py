@@ -1,4 +1,5 @@
-"""Occupancy grids: the skip distance against a search of all cells, boxes, growth, and grids placed in another."""
+"""Occupancy grids: the skip distance against a search of all cells, boxes, growth, and grids placed in
+another."""
 
 import numpy as np
 import pytest
@@ -55,11 +56,16 @@ def test_contains_is_half_open_and_skip_zero():
     points = points_in(BOX, 500, margin=0.3)
     index = np.floor((points - BOX[:3]) / grid.cell).astype(int)
     wanted = [
-        all(0 <= i < n for i, n in zip(at, (4, 3, 5), strict=True)) and bool(grid.skip[tuple(at)] == 0) for at in index
+        all(0 <= i < n for i, n in zip(at, (4, 3, 5), strict=True)) and bool(grid.skip[tuple(at)] == 0)
+        for at in index
     ]
     assert np.array_equal(grid.contains(points), wanted)
     full = OccupancyGrid.full(UNIT, 4)
-    assert full.contains(np.array([[0.0, 0, 0], [1, 0.5, 0.5], [0.5, 1, 0.5]])).tolist() == [True, False, False]
+    assert full.contains(np.array([[0.0, 0, 0], [1, 0.5, 0.5], [0.5, 1, 0.5]])).tolist() == [
+        True,
+        False,
+        False,
+    ]
     assert full.contains(np.zeros((0, 3))).shape == (0,)
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from fusedrf_cli.engine.distillation import passes
 from fusedrf_cli.engine.distillation.fit import FitSettings, fit
 from fusedrf_cli.engine.distillation.passes import Batch, PackedPass, composite
 from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm_mlp import ColourNetwork, VMMLPField, encoding
+from fusedrf_cli.engine.fields.vm_mlp import ColourNetwork, Encoding, VMMLPField
 from fusedrf_cli.engine.kernels import autograd, cpu
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -31,9 +32,8 @@ def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
     x = [float(row @ products) for row in field.basis.numpy()]
     local = field.arrays.to_object[0] @ direction
     local = local / np.linalg.norm(local)
-    values = [*x, *local]
-    for part in (x, local):
-        values += [np.sin(f * v) for v in part for f in (1, 2)] + [np.cos(f * v) for v in part for f in (1, 2)]
+    x = [*x, *local]
+    values = x + [np.sin(f * v) for f in (1, 2) for v in x] + [np.cos(f * v) for f in (1, 2) for v in x]
     for i, layer in enumerate(field.network.layers):
         weights, bias = layer.weight.detach().numpy(), layer.bias.detach().numpy()
         values = [float(np.dot(w, values) + b) for w, b in zip(weights, bias, strict=True)]
@@ -47,10 +47,11 @@ def test_is_a_stored_field_kind_without_a_fused_renderer():
     assert not hasattr(VMMLPField, "render_rays")
 
 
-def test_encoding_keeps_a_component_s_frequencies_together():
-    x = torch.tensor([[0.3, -0.7]])
-    expected = np.array([0.3, 0.6, -0.7, -1.4])
-    np.testing.assert_allclose(encoding(x)[0], np.concatenate([np.sin(expected), np.cos(expected)]), atol=1e-6)
+def test_encoding_and_its_gradient():
+    x = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1), requires_grad=True)
+    expected = torch.cat([x, x.sin(), (2 * x).sin(), x.cos(), (2 * x).cos()], 1)
+    torch.testing.assert_close(Encoding.apply(x), expected)
+    assert torch.autograd.gradcheck(Encoding.apply, x)
 
 
 @pytest.mark.parametrize("matrix", [None, np.diag([2.0, -1.5, 0.5, 1.0])])
@@ -138,6 +139,18 @@ def test_composite_of_packed_samples_equals_a_loop_and_its_gradient():
     assert torch.autograd.gradcheck(lambda x: composite(x, ray, 5), depth)
 
 
+def test_thinned_samples_stand_for_all():
+    generator = torch.Generator().manual_seed(2)
+    weights = torch.rand(20_000, generator=generator) ** 6 / 20
+    ray, jitter = torch.arange(20_000) // 10, torch.rand(2000, generator=generator, dtype=torch.float64)
+    seen, share = passes.shaded_samples(weights, ray, jitter)
+    assert set(torch.nonzero(weights > 1.001 * passes.THIN_BELOW)[:, 0].tolist()) <= set(seen.tolist())
+    assert len(seen) < 0.5 * int((weights > cpu.COLOUR_FROM).sum())
+    values = torch.rand(20_000, generator=generator)
+    found = ((weights[seen] / share) * values[seen]).sum() / (weights * values).sum()
+    assert float(found) == pytest.approx(1, abs=0.03)
+
+
 def batch_at(field, count=24) -> Batch:
     """Rays at a field with random targets; they never stop early, since the loss jumps where one does."""
     rng = np.random.default_rng(1)
@@ -154,6 +167,7 @@ def loss_of(field, batch) -> float:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_whole_pass_s_gradient_against_finite_differences(seed, monkeypatch):
     monkeypatch.setattr(cpu, "COLOUR_FROM", 0.0)  # the loss jumps where a sample crosses it
+    monkeypatch.setattr(passes, "THIN_BELOW", 0.0)
     field = random_field(seed=seed, cells=4)
     batch = batch_at(field)
     rows = np.zeros((2, field.params.numel()))

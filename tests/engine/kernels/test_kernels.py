@@ -7,7 +7,8 @@ from fusedrf_cli.engine import kernels
 
 
 def test_cache_is_the_users_and_named_for_the_bodies(tmp_path, monkeypatch):
-    """numba does not notice that an inlined function of another file changed: a new bodies.py needs another folder."""
+    """numba does not notice that an inlined function of another file changed: a new bodies.py needs another
+    folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     bodies = Path(kernels.__file__).with_name("bodies.py").read_bytes()
     folder = kernels.kernel_cache()

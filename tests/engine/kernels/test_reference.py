@@ -34,7 +34,9 @@ def test_spherical_harmonics_are_orthonormal():
     dirs = torch.from_numpy(np.stack([r * np.cos(angle), r * np.sin(angle), z], 1))
     basis = reference.sh_basis(16, dirs)
     area = torch.from_numpy(np.repeat(weights, 16) * 2 * np.pi / 16)
-    torch.testing.assert_close(basis.T @ (area[:, None] * basis), torch.eye(16, dtype=torch.float64), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        basis.T @ (area[:, None] * basis), torch.eye(16, dtype=torch.float64), rtol=0, atol=1e-12
+    )
 
 
 def test_spherical_harmonics_of_the_opposite_direction():
@@ -64,7 +66,10 @@ def test_compositing_is_the_product_of_transparencies():
 
 def test_query_is_differentiable():
     field = random_vm(SIXTY_FOUR, (2, 3, 2))
-    at, dirs = torch.rand(3, 3, dtype=torch.float64), torch.from_numpy(unit(np.random.default_rng(0).normal(size=(3, 3))))
+    at, dirs = (
+        torch.rand(3, 3, dtype=torch.float64),
+        torch.from_numpy(unit(np.random.default_rng(0).normal(size=(3, 3)))),
+    )
     names, values = zip(*field.sections(0).items(), strict=True)
 
     def query(*values):

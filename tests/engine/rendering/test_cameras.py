@@ -14,7 +14,9 @@ def distort(u, v, distortion):
     k1, k2, k3, p1, p2 = distortion
     r2 = u * u + v * v
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+    return u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (
+        r2 + 2 * v * v
+    ) + 2 * p2 * u * v
 
 
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -31,7 +33,7 @@ def camera_at(distortion=(0.0,) * 5, width=23, height=17) -> Camera:
 
 @pytest.mark.parametrize("distortion", [(0.0,) * 5, DISTORTION, (0.2, 0, 0, 0, 0)])
 def test_undistort_inverts(distortion):
-    u, v = (np.random.default_rng(0).uniform(-0.6, 0.6, (2, 400)))
+    u, v = np.random.default_rng(0).uniform(-0.6, 0.6, (2, 400))
     found = undistort(*distort(u, v, distortion), distortion)
     np.testing.assert_allclose(found, (u, v), atol=1e-6)
 
@@ -70,7 +72,9 @@ def test_resizing_keeps_the_view():
     camera = camera_at()
     other = camera.resized(46, 51)
     points = points_in(BOX, 20)
-    np.testing.assert_allclose(project(other, points) / [46, 51], project(camera, points) / [23, 17], rtol=1e-12)
+    np.testing.assert_allclose(
+        project(other, points) / [46, 51], project(camera, points) / [23, 17], rtol=1e-12
+    )
     assert camera.resized(23, 17).intrinsics == camera.intrinsics
 
 
@@ -88,7 +92,12 @@ def test_look_at_is_a_rotation_towards_the_target(up):
 
 def test_framing_cameras_see_the_whole_box():
     corners = np.stack(np.meshgrid(*zip(BOX[:3], BOX[3:], strict=True)), -1).reshape(-1, 3)
-    cameras = [framing_camera(BOX, a, e, w, h) for a in (0, 2) for e in (-1.2, 0.0, 1.5) for w, h in ((40, 30), (15, 31))]
+    cameras = [
+        framing_camera(BOX, a, e, w, h)
+        for a in (0, 2)
+        for e in (-1.2, 0.0, 1.5)
+        for w, h in ((40, 30), (15, 31))
+    ]
     for camera in [*cameras, *orbit(BOX, 3, 31, 17), *scattered(BOX, 3, 16, 16, seed=1)]:
         at = project(camera, 0.9 * corners + 0.1 * corners.mean(0))
         assert (at > 0).all() and (at < [camera.width, camera.height]).all()

@@ -1,0 +1,97 @@
+"""Fitting a field to pictures of a ball: quality, sameness, and the parts of the loop."""
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.engine.distillation.fit import THINNEST, FitSettings, RayPool, fit, occupancy_of, texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.rendering.cameras import orbit, scattered
+from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.rendering.volume import render_image
+from tests.engine.conftest import BOX, THIRTY_TWO, Ball, random_vm
+
+SETTINGS = FitSettings(shape=THIRTY_TWO, longest=32, steps=200, samples=1 << 13)
+
+
+def pictures(cameras) -> np.ndarray:
+    """(n, H, W, 4) uint8 straight alpha pictures of a coloured ball."""
+    ball = Ball(density=40.0, radius=0.7)
+    views = [render_image(ball, camera, step=0.02) for camera in cameras]
+    alpha = np.stack([v.opacity for v in views])[..., None]
+    rgb = np.stack([v.rgb for v in views]) / np.maximum(alpha, 1e-6)
+    return np.round(255 * np.clip(np.concatenate([rgb, alpha], -1), 0, 1)).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def capture():
+    cameras = orbit(BOX, 5, 24, 24) + orbit(BOX, 3, 24, 24, elevation=-0.5)
+    return cameras, pictures(cameras)
+
+
+def test_a_ball_is_learnt(capture):
+    """Eight pictures of 24 x 24 give views never seen at 24 dB, and the box is cut down to the ball."""
+    told = []
+    field = fit(*capture, BOX, SETTINGS, lambda share, figures: told.append((share, figures["psnr"])), "ball")
+    unseen = scattered(BOX, 4, 24, 24, seed=3)
+    white = pictures(unseen) / 255
+    white = white[..., :3] * white[..., 3:] + 1 - white[..., 3:]
+    seen = np.stack([render_image(field, camera).over((1, 1, 1)) for camera in unseen])
+    assert psnr(seen, white) > 24
+    assert field.blocks[0].name == "ball" and max(field.tensors[0].resolution) == 32
+    assert np.prod(field.aabb[3:] - field.aabb[:3]) < 0.8 * np.prod(BOX[3:] - BOX[:3])
+    assert 0.02 < field.occupancy.occupied.mean() < 0.9
+    shares, quality = zip(*told, strict=True)
+    assert list(shares) == sorted(shares) and quality[-1] > quality[0] + 5
+
+
+def test_the_same_seed_gives_the_same_bits(capture):
+    def numbers(seed):
+        return fit(
+            *capture, BOX, FitSettings(shape=THIRTY_TWO, longest=24, steps=25, samples=1 << 12, seed=seed)
+        ).params
+
+    first, again, other = numbers(1), numbers(1), numbers(2)
+    assert torch.equal(first, again)
+    assert first.shape != other.shape or not torch.equal(first, other)
+
+
+def test_every_pixel_comes_once_an_epoch(capture):
+    cameras, images = capture
+    numbered = images.copy()
+    numbered.reshape(-1, 4)[:, 0] = np.arange(images[..., 0].size) % 251
+    numbered.reshape(-1, 4)[:, 1] = np.arange(images[..., 0].size) // 251
+    pool = RayPool(cameras, numbered, torch.Generator().manual_seed(0))
+    size = images[..., 0].size
+    drawn = [pool.draw(size // 4) for _ in range(4)]
+    found = np.concatenate([np.rint(pixels.numpy()[:, :2] * 255) for _, _, pixels in drawn]) @ [1, 251]
+    assert np.array_equal(np.sort(found), np.arange(size))
+    everything = [camera.rays() for camera in cameras]
+    for column in range(2):
+        rays = np.concatenate([part[column] for part in drawn])
+        wanted = np.concatenate([rays_of[column] for rays_of in everything])
+        np.testing.assert_allclose(rays, wanted[found.astype(int)], atol=1e-6)
+
+
+def test_more_rays_than_pixels_are_as_many_as_there_are(capture):
+    cameras, images = capture
+    pool = RayPool(cameras[:1], images[:1], torch.Generator().manual_seed(0))
+    rays_o, rays_d, pixels = pool.draw(5000)
+    assert rays_o.shape == rays_d.shape == (576, 3) and pixels.shape == (576, 4)
+    np.testing.assert_allclose(rays_o, np.tile(cameras[0].camera_to_world[:3, 3], (576, 1)))
+
+
+def test_texels_are_near_cubic_but_for_flat_boxes():
+    assert texels(np.array([0.0, 0, 0, 1, 2, 4]), 64) == (16, 32, 64)
+    assert texels(np.array([0.0, 0, 0, 1e-3, 2, 4]), 64) == (THINNEST, 32, 64)
+
+
+def test_occupancy_finds_matter_and_forgets_nothing_known_empty():
+    """All of a dense field is occupied; where the grid already said empty it stays so."""
+    field = random_vm(THIRTY_TWO, dtype=torch.float32, scale=100.0)
+    assert occupancy_of(field, 8).occupied.all()
+    left = np.zeros((8, 8, 8), bool)
+    left[:3] = True
+    again = occupancy_of(field.with_occupancy(OccupancyGrid(BOX, left)), 8)
+    assert not again.occupied[-2:].any() and again.occupied[:2].all()
+    assert not occupancy_of(random_vm(THIRTY_TWO, dtype=torch.float32, scale=1e-6), 8).occupied.any()

@@ -1,0 +1,26 @@
+"""The protocol and the registry of field kinds."""
+
+import torch
+
+from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
+from fusedrf_cli.engine.fields.vm import VMField
+from tests.engine.conftest import BOX, Ball, points_in, random_vm
+
+
+def test_kinds_are_registered_and_can_be_stored():
+    kinds = field_kinds()
+    assert kinds["vm"] is VMField
+    assert all(kind.kind == name for name, kind in kinds.items())
+    assert all(hasattr(kind, "state") and hasattr(kind, "from_state") for kind in kinds.values())
+
+
+def test_fields_keep_the_protocol():
+    points = torch.from_numpy(points_in(BOX, 9))
+    dirs = torch.nn.functional.normalize(points)
+    for field in (random_vm(), Ball()):
+        assert isinstance(field, RadianceField)
+        sigma, rgb = field.query(points, dirs)
+        assert sigma.shape == (9,) and rgb.shape == (9, 3)
+        assert (sigma >= 0).all() and (rgb >= 0).all() and (rgb <= 1).all()
+        assert torch.equal(field.query(points, dirs, with_colour=False)[0], sigma)
+        assert field.aabb.shape == (6,) and field.voxel_size > 0
