@@ -199,6 +199,7 @@ def render_task(
         t0 = max(t0, near) + 0.5 * step
         red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
         trans = 1.0
+        waiting = 0.0  # as in train_task
         current = -1
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
         while k >= 0 and trans > early_stop:
@@ -209,15 +210,17 @@ def render_task(
             weight = trans * alpha
             trans -= weight
             depth += weight * t
-            if weight > COLOUR_FROM:
+            waiting += weight
+            if waiting > COLOUR_FROM:
                 if b != current:
                     directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
                     current = b
                 u, v, w, _ = unit_point(vm, b, x, y, z)
                 colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, 0)
-                red += weight * sigmoid(dot_row(colour_ranks, basis, 0, features, 0))
-                green += weight * sigmoid(dot_row(colour_ranks, basis, 1, features, 0))
-                blue += weight * sigmoid(dot_row(colour_ranks, basis, 2, features, 0))
+                red += waiting * sigmoid(dot_row(colour_ranks, basis, 0, features, 0))
+                green += waiting * sigmoid(dot_row(colour_ranks, basis, 1, features, 0))
+                blue += waiting * sigmoid(dot_row(colour_ranks, basis, 2, features, 0))
+                waiting = 0.0
             k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
 
@@ -258,7 +261,7 @@ def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, st
 @task
 def train_task(
     ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-    background, opacity_weight, low, high, ts, pre, weights, rgbs, blocks, slots, features, d_features,
+    background, opacity_weight, low, high, ts, pre, weights, carried, rgbs, blocks, slots, features, d_features,
     basis, d_basis, sh, d_f, scratch, grad, loss,
 ):  # fmt: skip
     """`train_rays` for rays low..high, into one row of gradients and losses."""
@@ -275,6 +278,7 @@ def train_task(
         current = -1
         count = 0
         shaded = 0
+        waiting = 0.0  # weight of samples too light to be shaded alone; the next shaded one gives them its colour
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
         while k >= 0 and trans > early_stop and count < ts.shape[0]:
             t = t0 + k * step
@@ -283,7 +287,8 @@ def train_task(
             weight = trans * (1.0 - math.exp(-s * step))
             trans -= weight
             ts[count], pre[count], weights[count], blocks[count], slots[count] = t, f, weight, b, -1
-            if weight > COLOUR_FROM:
+            waiting += weight
+            if waiting > COLOUR_FROM:
                 if b != current:
                     directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
                     current = b
@@ -293,10 +298,12 @@ def train_task(
                 rgbs[count, 0] = sigmoid(dot_row(colour_ranks, basis, 0, features, base))
                 rgbs[count, 1] = sigmoid(dot_row(colour_ranks, basis, 1, features, base))
                 rgbs[count, 2] = sigmoid(dot_row(colour_ranks, basis, 2, features, base))
-                red += weight * rgbs[count, 0]
-                green += weight * rgbs[count, 1]
-                blue += weight * rgbs[count, 2]
+                red += waiting * rgbs[count, 0]
+                green += waiting * rgbs[count, 1]
+                blue += waiting * rgbs[count, 2]
                 slots[count] = base
+                carried[count] = waiting
+                waiting = 0.0
                 shaded += 1
             count += 1
             k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
@@ -323,11 +330,11 @@ def train_task(
         # background too.
         behind = trans * g_t
         after = trans
+        own = 0.0
         clear(d_basis)
         for q in range(count - 1, -1, -1):
             b = blocks[q]
             t = ts[q]
-            own = 0.0
             u, v, w, inside = unit_point(vm, b, ox + t * dx, oy + t * dy, oz + t * dz)
             if slots[q] >= 0:
                 own = g_r * rgbs[q, 0] + g_g * rgbs[q, 1] + g_b * rgbs[q, 2]
@@ -336,7 +343,7 @@ def train_task(
                     directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
                     clear(d_basis)
                     current = b
-                wq = weights[q]
+                wq = carried[q]
                 shade_backward(
                     colour_ranks, basis, features, slots[q], g_r * wq, g_g * wq, g_b * wq, d_features, d_basis
                 )
@@ -376,7 +383,7 @@ def train_rays(
         train_task(
             ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop,
             target, background, opacity_weight, p * n // parts, (p + 1) * n // parts, ts, pre, weights,
-            np.empty((max_samples, 3)), blocks, slots, np.empty(max_samples * width, kind),
+            np.empty(max_samples), np.empty((max_samples, 3)), blocks, slots, np.empty(max_samples * width, kind),
             np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
             np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind), grads[p], loss[p],
         )  # fmt: skip

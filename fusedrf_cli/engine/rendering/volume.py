@@ -13,6 +13,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera
 
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
+SEEN_WEIGHT = 1e-6  # samples lighter than this stay black
 RAYS_AT_ONCE = 1 << 16
 SAMPLES_PER_WAVE = 32
 ROWS_AT_ONCE_PIXELS = 1 << 18
@@ -82,7 +83,7 @@ def march_rays(
         )
         sigma[mask] = found.numpy()
         weights, trans[ray] = weights_from_sigma(sigma, step, trans[ray])
-        seen = weights > cpu.COLOUR_FROM
+        seen = weights > SEEN_WEIGHT
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
             _, found = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
