@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 HERE = Path(__file__).parent
-DRAFT = ["--quality", "draft", "--views", "50", "--size", "200", "--overwrite"]
+DRAFT = ["--quality", "draft", "--time-budget", "20", "--views", "50", "--size", "200", "--overwrite"]
 TRAINED = ("ground", "tower", "ball")
 STAND = 0.06  # height of the ground's top
 
@@ -46,7 +46,7 @@ def build(folder: Path) -> dict[str, dict]:
     reports["turn.gif"] = fusedrf(
         folder, "render", "more.rfpack", "--orbit", "12", "--size", "240x240", "--fps", "8", "-o", "turn.gif", "--overwrite"
     )
-    reports["eval"] = fusedrf(folder, "eval", "fused.rfpack", "--against", "scene.json", "--size", "200x200")
+    reports["eval"] = fusedrf(folder, "eval", "fused.rfpack", "--against", "scene.json", "--size", "160x160")
     return reports
 
 

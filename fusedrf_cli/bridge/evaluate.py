@@ -21,14 +21,14 @@ SCENE_SEED = 1_000
 
 
 def evaluate(
-    bundle: str, against: str, *, split: str, size: tuple[int, int] | None, allow_outside: bool, seed: int, device: str, threads: int | None,
+    bundle: str, against: str, *, split: str, size: tuple[int, int] | None, allow_outside: bool, device: str, threads: int | None,
     progress,
 ) -> dict:  # fmt: skip
     """Compare a bundle, over white, with a capture's views or with another scene on seeded views that fusing never uses."""
     with engine(device, threads, progress):
         progress.phase("reading", None)
         field, origin = renderable(load_scene(bundle, allow_outside))
-        pairs = capture_pairs(against, split, size) if is_capture(against) else scene_pairs(against, size, allow_outside, seed)
+        pairs = capture_pairs(against, split, size) if is_capture(against) else scene_pairs(against, size, allow_outside)
         views = []
         for i, (camera, truth, total) in enumerate(pairs):
             if i == 0:
@@ -53,10 +53,10 @@ def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Ite
         yield camera_of(view), over_white(load_images([view]))[0], len(views)
 
 
-def scene_pairs(against: str, size: tuple[int, int] | None, allow_outside: bool, seed: int) -> Iterator[tuple[Camera, np.ndarray, int]]:
+def scene_pairs(against: str, size: tuple[int, int] | None, allow_outside: bool) -> Iterator[tuple[Camera, np.ndarray, int]]:
     """(camera, truth, how many) of another scene, seen from views around it."""
     field, origin = renderable(load_scene(against, allow_outside))
     box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
     width, height = size or SCENE_SIZE
-    for camera in scattered(box, SCENE_VIEWS, width, height, seed=JUDGED_SEED + SCENE_SEED + seed):
+    for camera in scattered(box, SCENE_VIEWS, width, height, seed=JUDGED_SEED + SCENE_SEED):
         yield camera, render_image(field, camera, origin=origin).over(WHITE), SCENE_VIEWS

@@ -85,13 +85,14 @@ def fuse_blocks(loaded: LoadedScene, composed: ComposedField, limit: int, precis
     field = blocks_of(composed.placed, int(0.99 * limit) - sum(occupancies.values()) - 65536, precision)
     seconds = {"blocks": time.monotonic() - started}
     progress.phase("measuring", None)
-    reached = Judge(composed, 6, 200, seed)(stored(field, precision))
+    views = DistillSettings.views
+    reached = Judge(composed, views, DistillSettings.view_size, seed)(stored(field, precision))
     seconds["measuring"] = time.monotonic() - started - seconds["blocks"]
     whole = len({id(p.field) for p in composed.placed})
     resolution = [list(t.resolution) for t in field.tensors]
     why = f"{len(field.blocks)} blocks over {whole} tensors, each in its object's own axes, under {limit} bytes"
     return field, {
-        "psnr": {"before_rgb": reached, "after_rgb": None, "views": 6}, "seconds": seconds,
+        "psnr": {"before_rgb": reached, "after_rgb": None, "views": views}, "seconds": seconds,
         "chosen": {"resolution": resolution, "ranks": [field.shape.density_rank, field.shape.colour_rank], "why": why},
     }  # fmt: skip
 

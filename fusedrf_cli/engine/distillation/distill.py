@@ -50,8 +50,8 @@ class DistillSettings:
     time_budget: float | None = None
     """Seconds for the 3D phase; the RGB phase gets as much again. None: the steps decide, and equal seeds give equal bytes."""
     seed: int = 0
-    views: int = 6
-    view_size: int = 200
+    views: int = 4
+    view_size: int = 160
 
 
 @dataclass

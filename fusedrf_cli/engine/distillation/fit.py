@@ -159,6 +159,8 @@ class FitRun:
         while (share := self.share()) < 1.0 and not self.reached():
             self.refresh(share)
             self.step(share)
+            if self.steps == 1:
+                self.started = time.monotonic()  # a first run compiles in its first step; that is not the budget's
             if self.steps % 20 == 0:
                 if not math.isfinite(self.mse):
                     raise FloatingPointError(f"the loss is {self.mse} after {self.steps} steps")
@@ -175,6 +177,7 @@ class FitRun:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
         arrays, metadata = self.field.state()
         arrays = {f"field.{name}": np.asarray(value) for name, value in arrays.items()}
+        arrays |= {f"pass.{name}": value for name, value in self.rays_pass.state().items()}
         arrays |= {"moment1": self.optimiser.moment1, "moment2": self.optimiser.moment2}
         arrays |= {
             "random": self.generator.get_state().numpy(),
@@ -196,11 +199,9 @@ class FitRun:
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
-        saved = {
-            name.removeprefix("field."): value for name, value in arrays.items() if name.startswith("field.")
-        }
-        self.field = type(self.field).from_state(saved, state["field"])
+        self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
         self.rays_pass = PASSES[self.field.kind](self.field)
+        self.rays_pass.restore(part_of(arrays, "pass."))
         self.optimiser = Adam(self.field, self.parts)
         self.optimiser.moment1[:], self.optimiser.moment2[:] = arrays["moment1"], arrays["moment2"]
         self.optimiser.steps, self.steps = state["adam_steps"], state["steps"]
@@ -273,6 +274,11 @@ class FitRun:
         per_ray = max(sums[2] / len(rays_o), 1.0)
         self.rays = int(np.clip(0.9 * self.rays + 0.1 * settings.samples / per_ray, *RAYS_PER_STEP))
         self.steps += 1
+
+
+def part_of(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
 
 
 def volume(aabb: np.ndarray) -> float:

@@ -1,8 +1,8 @@
-"""One pass over a batch of rays per field kind: render, compare with the pictures, leave the gradient in the optimiser's rows.
+"""One pass over a batch of rays per field kind: render, compare with the pictures, leave the gradient.
 
-The loss of a batch of n rays is mean (C + (1 - A) background - target)² over rays and channels, plus opacity_weight times
-mean (A - alpha)², with A the opacity. Every pass returns the sums (3,) of the colour term (a ray's mean over channels), of the
-opacity term, and of the work done, in samples of the `vm` kind.
+The loss of a batch of n rays is mean (C + (1 - A) background - target)² over rays and channels, plus
+opacity_weight times mean (A - alpha)², with A the opacity. Every pass returns the sums (3,) of the colour
+term (a ray's mean over channels), of the opacity term, and of the work done, in samples of the `vm` kind.
 """
 
 from typing import NamedTuple, Protocol
@@ -17,9 +17,9 @@ from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 NETWORK_RATE = 1e-3  # TensoRF's
 BETAS = (0.9, 0.99)
-THIN_BELOW = 1 / 64  # weight under which only some samples are shaded, each for several; 0: all
+THIN_BELOW = 1 / 64  # weight under which some samples are shaded for all; 0: every one is
 SCATTER = 7919.0  # makes of a ray's jitter another random number
-SHADING_COST = 8  # of the network at a sample, forward and backward, over that of the rest: keeps steps short and many
+SHADING_COST = 8  # a sample with the network over one without: keeps steps short and many
 
 
 class Batch(NamedTuple):
@@ -47,6 +47,14 @@ class Pass(Protocol):
         """Move what is not in `field.params`, at `decay` times the first rate."""
         ...
 
+    def state(self) -> dict[str, np.ndarray]:
+        """What a checkpoint has to keep besides the field."""
+        ...
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Inverse of `state`."""
+        ...
+
 
 class FusedPass:
     """The `vm` kind's: forward and backward of a ray in one kernel."""
@@ -59,8 +67,8 @@ class FusedPass:
         loss = np.zeros((len(grads), 3))
         diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
         cpu.train_rays(
-            *field.kernel_shape, field.arrays, field.grid, batch.rays_o, batch.rays_d, batch.near, batch.jitter,
-            batch.step, batch.early_stop, batch.target, batch.background, batch.opacity_weight,
+            *field.kernel_shape, field.arrays, field.grid, batch.rays_o, batch.rays_d, batch.near,
+            batch.jitter, batch.step, batch.early_stop, batch.target, batch.background, batch.opacity_weight,
             int(diagonal / batch.step) + 2, grads, loss,
         )  # fmt: skip
         return loss.sum(0)
@@ -68,9 +76,16 @@ class FusedPass:
     def step(self, decay: float) -> None:
         """Nothing: all is in `params`."""
 
+    def state(self) -> dict[str, np.ndarray]:
+        """Nothing."""
+        return {}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Nothing."""
+
 
 class PackedPass:
-    """The `vm-mlp` kind's: samples of all rays in one list, colours by one run of the network over those that are seen."""
+    """The `vm-mlp` kind's: samples of all rays in one list, one run of the network over those seen."""
 
     def __init__(self, field: VMMLPField):
         self.optimiser = torch.optim.Adam(field.network.parameters(), NETWORK_RATE, BETAS)
@@ -83,7 +98,9 @@ class PackedPass:
         points = torch.from_numpy(batch.rays_o[ray] + ts[:, None] * dirs)
         ray, dirs = torch.from_numpy(ray), torch.from_numpy(dirs)
         params = field.params.detach().requires_grad_()
-        basis = field.basis.detach().requires_grad_()  # a leaf of its own: a slice's gradient is as large as params
+        basis = (
+            field.basis.detach().requires_grad_()
+        )  # a leaf of its own: a slice's gradient is as large as params
 
         sigma = autograd.density(field, params, points, dirs, grads)
         weights, opacity = composite(sigma * batch.step, ray, n)
@@ -106,12 +123,25 @@ class PackedPass:
             group["lr"] = NETWORK_RATE * decay
         self.optimiser.step()
 
+    def state(self) -> dict[str, np.ndarray]:
+        """Adam's moments and step of each of the network's weights, by `<weight>.<name>`."""
+        held = self.optimiser.state_dict()["state"]
+        return {f"{i}.{name}": value.numpy() for i, own in held.items() for name, value in own.items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Inverse of `state`."""
+        held = {}
+        for key, value in arrays.items():
+            i, name = key.split(".")
+            held.setdefault(int(i), {})[name] = torch.from_numpy(value.copy())
+        self.optimiser.load_state_dict(self.optimiser.state_dict() | {"state": held})
+
 
 PASSES: dict[str, type[Pass]] = {VMField.kind: FusedPass, VMMLPField.kind: PackedPass}
 
 
 def visible_samples(field: VMMLPField, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-    """Rays (S,) int64, ascending, and distances (S,), ascending on a ray, of the samples up to where a ray is opaque."""
+    """Rays (S,) int64 and distances (S,) of the samples up to where a ray is opaque, in order."""
     trans = np.ones(len(batch.rays_o), np.float32)
     rays, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
     rest = batch.near, batch.jitter, batch.step
@@ -133,11 +163,13 @@ def visible_samples(field: VMMLPField, batch: Batch) -> tuple[np.ndarray, np.nda
     return ray[order], ts[order]
 
 
-def shaded_samples(weights: torch.Tensor, ray: torch.Tensor, jitter: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Indices (M,) of samples whose colour is asked, each with the share min(1, weight / THIN_BELOW) of its chance.
+def shaded_samples(
+    weights: torch.Tensor, ray: torch.Tensor, jitter: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Indices (M,) of samples whose colour is asked, and their chances of it, min(1, weight / THIN_BELOW).
 
-    Samples of weights under THIN_BELOW stand for their neighbours: along a ray one is taken each time the running sum passes
-    another multiple of it. In the untrained haze, where every sample has a little weight, that is one in twenty.
+    Samples of weights under THIN_BELOW stand for their neighbours: along a ray one is taken each time the running
+    sum passes another multiple of it. In the untrained haze, where all have a little, it is one in twenty.
     """
     if not THIN_BELOW:
         seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]
@@ -149,9 +181,9 @@ def shaded_samples(weights: torch.Tensor, ray: torch.Tensor, jitter: torch.Tenso
 
 
 def composite(depth: torch.Tensor, ray: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Weights (S,) of packed samples of optical depths (S,), and opacities (n,) of their rays (S,), ascending.
+    """Weights (S,) of packed samples of optical depths (S,), and opacities (n,); rays (S,) ascend.
 
-    The depth before a sample is the running sum over all samples less its value at the ray's first, hence float64.
+    The depth before a sample is the running sum over all less its value at the ray's first, hence float64.
     """
     exact = depth.double()
     before = exact.cumsum(0) - exact

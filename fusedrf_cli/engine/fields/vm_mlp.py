@@ -1,7 +1,7 @@
-"""The `vm-mlp` field: one VM tensor whose colour is a shallow network over features and view (TensoRF's MLP_Fea).
+"""The `vm-mlp` field: colour by a shallow network over a VM tensor's features and view (TensoRF's MLP_Fea).
 
-The factors are a `VMField` of one block, used for density, occupancy, resampling and storage. Its colour basis (3, 9, 3 rank),
-read as the (27, 3 rank) matrix B, makes the 27 features f = B (P ∘ L), as in TensoRF; no SH is evaluated.
+The factors are a `VMField` of one block, used for density, occupancy, resampling and storage. Its colour
+basis (3, 9, 3 rank), read as the (27, 3 rank) matrix B, makes the features f = B (P ∘ L); SH is not used.
 """
 
 from dataclasses import replace
@@ -20,10 +20,10 @@ POINTS_AT_ONCE = 1 << 15  # 20 MB of network inputs
 
 
 class ColourNetwork(torch.nn.Module):
-    """x = [f, d] -> [x, sin x, sin 2x, cos x, cos 2x] -> width -> width -> 3, ReLU between, sigmoid at the end.
+    """x = [f, d] -> [x, sin x, sin 2x, cos x, cos 2x] -> width -> width -> 3, ReLU, sigmoid at the end.
 
-    TensoRF's inputs, in blocks as wide as x, where TensoRF interleaves frequencies and keeps f and d apart: an importer
-    permutes the columns of the first layer.
+    TensoRF's inputs, in blocks as wide as x, where TensoRF interleaves frequencies and keeps f and d
+    apart: an importer permutes the columns of the first layer.
     """
 
     def __init__(self, features: int, width: int = WIDTH, generator: torch.Generator | None = None):
@@ -47,7 +47,7 @@ class ColourNetwork(torch.nn.Module):
 
 
 class Encoding(torch.autograd.Function):
-    """(N, 5 D) blocks x, sin x, sin 2x, cos x, cos 2x of x (N, D): one sine and cosine each, and a backward without copies."""
+    """(N, 5 D) blocks x, sin x, sin 2x, cos x, cos 2x of x (N, D), by one sine and one cosine for each x."""
 
     @staticmethod
     def forward(ctx, x):
@@ -59,8 +59,8 @@ class Encoding(torch.autograd.Function):
     @staticmethod
     def backward(ctx, d_out):
         (out,) = ctx.saved_tensors
-        _, sin, sin2, cos, cos2 = out.view(len(out), 5, -1).unbind(1)
-        d_x, d_sin, d_sin2, d_cos, d_cos2 = d_out.view(len(out), 5, -1).unbind(1)
+        _, sin, sin2, cos, cos2 = out.chunk(5, 1)
+        d_x, d_sin, d_sin2, d_cos, d_cos2 = d_out.chunk(5, 1)
         return (
             torch.addcmul(d_x, d_sin, cos)
             .addcmul_(d_cos, sin, value=-1)
@@ -83,7 +83,7 @@ class VMMLPField:
             raise ValueError(f"a vm-mlp field has one block, found {len(factors.blocks)}")
         self.factors, self.network = factors, network
 
-    # -- making ------------------------------------------------------------------------------------------------------
+    # -- making ----------------------------------------------------------------------------------------------
 
     @classmethod
     def create(
@@ -108,7 +108,7 @@ class VMMLPField:
         """The field on another box and resolution, with the same network."""
         return VMMLPField(self.factors.resampled(aabb, resolution), self.network)
 
-    # -- reading: the factors' ---------------------------------------------------------------------------------------
+    # -- reading: the factors' -------------------------------------------------------------------------------
 
     @property
     def shape(self) -> VMShape:
@@ -170,12 +170,12 @@ class VMMLPField:
         """(27, 3 rank) view of the matrix that makes features of products."""
         return self.factors.sections(0)["colour_basis"].flatten(0, 1)
 
-    # -- answering ---------------------------------------------------------------------------------------------------
+    # -- answering -------------------------------------------------------------------------------------------
 
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not differentiable."""
+        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); 0 in empty cells. No gradient."""
         sigma, rgb = self.factors.query(points, dirs, with_colour=False)
         if with_colour:
             with torch.no_grad():
@@ -185,12 +185,12 @@ class VMMLPField:
         return sigma, rgb
 
     def shade(self, products: torch.Tensor, dirs: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
-        """rgb (N, 3) from colour products (N, 3 rank) and unit dirs (N, 3) of the field's frame; differentiable."""
+        """rgb (N, 3) from colour products (N, 3 rank) and unit dirs (N, 3), field's frame; differentiable."""
         to_object = torch.from_numpy(self.arrays.to_object[0])
         local = torch.nn.functional.normalize(dirs.double() @ to_object.T, dim=1).to(products.dtype)
         return self.network(products @ basis.T, local)
 
-    # -- storing -----------------------------------------------------------------------------------------------------
+    # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """The factors' arrays and metadata, and the network's weights."""
@@ -217,5 +217,7 @@ class VMMLPField:
 
 
 def named_weights(network: ColourNetwork) -> list[tuple[str, torch.nn.Parameter]]:
-    """Names in a bundle and values of the network's weights: `network.<layer>.weight` (out, in) and `.bias` (out,)."""
-    return [(f"network.{name.removeprefix('layers.')}", values) for name, values in network.named_parameters()]
+    """The network's weights by name: `network.<layer>.weight` (out, in) and `.bias` (out,)."""
+    return [
+        (f"network.{name.removeprefix('layers.')}", values) for name, values in network.named_parameters()
+    ]

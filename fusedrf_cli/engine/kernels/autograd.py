@@ -1,8 +1,8 @@
-"""Density and colour features of a VM field as torch functions of its parameters, by the kernels and their adjoints.
+"""Density and colour features of a VM field as torch functions of its parameters, by the kernels.
 
-`field` is anything with a VM field's `kernel_shape`, `arrays` and `grid`. Nothing here is differentiable in the points. Where
-`grads` (parts, P) is given, backward adds to its rows and `params.grad` stays None: a step of training then neither allocates
-nor sums a gradient as large as the field, most of which is 0.
+`field` is anything with a VM field's `kernel_shape`, `arrays` and `grid`. Nothing here is differentiable in
+the points. Where `grads` (parts, P) is given, backward adds to its rows and `params.grad` stays None: a step
+of training then neither allocates nor sums a gradient as large as the field, most of which is 0.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ def density(
 def features(
     field, params: torch.Tensor, points: torch.Tensor, grads: np.ndarray | None = None, block: int = 0
 ) -> torch.Tensor:
-    """(N, 3 rank) products P_r(a, b) L_r(c) of one block's colour factors at points (N, 3); 0 outside its box."""
+    """(N, 3 rank) products P_r(a, b) L_r(c) of a block's colour at points (N, 3); 0 outside its box."""
     return _Features.apply(params, field, points.numpy(), grads, block)
 
 

@@ -1,11 +1,11 @@
-"""The vm-mlp field: its network against a slow loop, storage, the general rendering path, gradients and a tiny fit."""
+"""The vm-mlp field: its network against a slow loop, storage, general rendering, gradients, a tiny fit."""
 
 import numpy as np
 import pytest
 import torch
 
 from fusedrf_cli.engine.distillation import passes
-from fusedrf_cli.engine.distillation.fit import FitSettings, fit
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, fit
 from fusedrf_cli.engine.distillation.passes import Batch, PackedPass, composite
 from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -18,7 +18,9 @@ from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
 
 
-def random_field(dtype=torch.float64, seed=0, cells=None, matrix=None, shape=SIXTY_FOUR, width=8) -> VMMLPField:
+def random_field(
+    dtype=torch.float64, seed=0, cells=None, matrix=None, shape=SIXTY_FOUR, width=8
+) -> VMMLPField:
     """A vm-mlp field of random numbers whose colours differ."""
     shape = type(shape)(shape.density_rank, shape.colour_rank, 2)
     generator = torch.Generator().manual_seed(seed)
@@ -57,11 +59,17 @@ def test_encoding_and_its_gradient():
 @pytest.mark.parametrize("matrix", [None, np.diag([2.0, -1.5, 0.5, 1.0])])
 def test_query_equals_a_slow_loop(matrix):
     field = random_field(matrix=matrix)
-    low, high = BOX[:3] * np.diag(field.blocks[0].object_to_field)[:3], BOX[3:] * np.diag(field.blocks[0].object_to_field)[:3]
+    low, high = (
+        BOX[:3] * np.diag(field.blocks[0].object_to_field)[:3],
+        BOX[3:] * np.diag(field.blocks[0].object_to_field)[:3],
+    )
     box = np.concatenate([np.minimum(low, high), np.maximum(low, high)])
     field = VMMLPField(field.factors, field.network)
     field.factors.occupancy = OccupancyGrid.full(box)
-    points, dirs = points_in(box, 20, margin=0.05), unit(points_in(np.array([-1.0] * 3 + [1.0] * 3), 20, seed=5))
+    points, dirs = (
+        points_in(box, 20, margin=0.05),
+        unit(points_in(np.array([-1.0] * 3 + [1.0] * 3), 20, seed=5)),
+    )
     sigma, rgb = field.query(torch.from_numpy(points), torch.from_numpy(dirs))
     assert torch.equal(sigma, field.factors.query(torch.from_numpy(points), torch.from_numpy(dirs))[0])
     for i in range(20):
@@ -83,7 +91,9 @@ def test_state_round_trip():
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("name", ["network.0.bias", "network.1.weight", "network.2.bias", "tensor_0.colour_basis"])
+@pytest.mark.parametrize(
+    "name", ["network.0.bias", "network.1.weight", "network.2.bias", "tensor_0.colour_basis"]
+)
 def test_an_array_that_does_not_fit_is_named(name):
     arrays, metadata = random_field(torch.float32).state()
     without = {key: a for key, a in arrays.items() if key != name}
@@ -133,7 +143,9 @@ def test_composite_of_packed_samples_equals_a_loop_and_its_gradient():
     weights, opacity = composite(depth.detach(), ray, 5)
     trans = torch.ones(5, dtype=torch.float64)
     for i, r in enumerate(ray):
-        assert float(weights[i]) == pytest.approx(float(trans[r] * (1 - torch.exp(-depth.detach()[i]))), abs=1e-14)
+        assert float(weights[i]) == pytest.approx(
+            float(trans[r] * (1 - torch.exp(-depth.detach()[i]))), abs=1e-14
+        )
         trans[r] *= torch.exp(-depth[i].detach())
     np.testing.assert_allclose(opacity, 1 - trans, atol=1e-14)
     assert torch.autograd.gradcheck(lambda x: composite(x, ray, 5), depth)
@@ -174,36 +186,64 @@ def test_the_whole_pass_s_gradient_against_finite_differences(seed, monkeypatch)
     PackedPass(field).gradient(field, batch, rows)
     generator = torch.Generator().manual_seed(seed)
     weights = list(field.network.parameters())
-    for values, gradient in [(field.params, torch.from_numpy(rows.sum(0)))] + [(w.data, w.grad.clone()) for w in weights]:
+    for values, gradient in [(field.params, torch.from_numpy(rows.sum(0)))] + [
+        (w.data, w.grad.clone()) for w in weights
+    ]:
         along = torch.randn(values.shape, generator=generator, dtype=torch.float64)
         step, losses = 1e-6, []
         for sign in (1, -2):
             values += sign * step * along
             losses.append(loss_of(field, batch))
         values += step * along
-        assert float((gradient * along).sum()) == pytest.approx((losses[0] - losses[1]) / (2 * step), rel=1e-4, abs=1e-7)
+        assert float((gradient * along).sum()) == pytest.approx(
+            (losses[0] - losses[1]) / (2 * step), rel=1e-4, abs=1e-7
+        )
 
 
 def test_a_pass_over_rays_that_hit_nothing():
     field = random_field(torch.float32)
     batch = batch_at(field)._replace(rays_d=-batch_at(field).rays_d)
-    batch = batch._replace(target=batch.target.astype(np.float32), background=batch.background.astype(np.float32))
+    batch = batch._replace(
+        target=batch.target.astype(np.float32), background=batch.background.astype(np.float32)
+    )
     rows = np.zeros((2, field.params.numel()), np.float32)
     sums = PackedPass(field).gradient(field, batch, rows)
     assert np.isfinite(sums).all() and sums[2] == 0 and not rows.any()
 
 
-def test_a_tiny_fit_learns_a_ball():
-    cameras = orbit(BOX, 10, 40, 40)
-    pictures = []
+def pictures_of_a_ball(count: int, size: int):
+    """Cameras around a ball and its pictures (count, size, size, 4) uint8, straight alpha."""
+    cameras, images = orbit(BOX, count, size, size), []
     for camera in cameras:
         shown = render_image(Ball(density=20.0), camera)
         alpha = shown.opacity[..., None]
         straight = np.where(alpha > 0, shown.rgb / np.maximum(alpha, 1e-6), 0)
-        pictures.append(np.round(np.concatenate([straight, alpha], -1) * 255).astype(np.uint8))
-    images = np.stack(pictures)
-    field = fit(cameras[1:], images[1:], BOX, FitSettings(THIRTY_TWO, longest=32, steps=150, samples=1 << 13, colour="mlp"))
+        images.append(np.round(np.concatenate([straight, alpha], -1) * 255).astype(np.uint8))
+    return cameras, np.stack(images)
+
+
+def test_a_tiny_fit_learns_a_ball():
+    cameras, images = pictures_of_a_ball(10, 40)
+    settings = FitSettings(THIRTY_TWO, longest=32, steps=150, samples=1 << 14, colour="mlp")
+    field = fit(cameras[1:], images[1:], BOX, settings)
     assert isinstance(field, VMMLPField)
     alpha = images[0, ..., 3:] / 255
     truth = images[0, ..., :3] / 255 * alpha + 1 - alpha
-    assert psnr(render_image(field, cameras[0]).over((1, 1, 1)), truth) > 24
+    shown = psnr(render_image(field, cameras[0]).over((1, 1, 1)), truth)
+    blank = psnr(np.ones_like(truth), truth)
+    assert shown > max(24, blank + 6)
+
+
+def test_a_fit_taken_up_from_a_checkpoint_goes_on_as_before():
+    cameras, images = pictures_of_a_ball(3, 24)
+    settings = FitSettings(THIRTY_TWO, longest=24, steps=40, samples=1 << 11, colour="mlp")
+    whole, again = (FitRun.start(cameras, images, BOX, settings, "") for _ in range(2))
+    for _ in range(3):
+        whole.step(0.0)
+    again.restore(*whole.checkpoint())
+    for run in (whole, again):
+        run.step(0.1)
+    expected, found = whole.checkpoint()[0], again.checkpoint()[0]
+    assert expected.keys() == found.keys() and "pass.0.exp_avg" in found
+    for name in expected.keys() - {"random", "random_of_order"}:
+        np.testing.assert_array_equal(found[name], expected[name], name)

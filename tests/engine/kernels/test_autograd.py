@@ -1,4 +1,4 @@
-"""Density and features as torch functions: against a slow reference, their gradients against finite differences."""
+"""Density and features as torch functions: against a slow loop, gradients against finite differences."""
 
 import numpy as np
 import pytest
@@ -83,9 +83,13 @@ def test_gradients_against_finite_differences(seed):
     generator = torch.Generator().manual_seed(seed)
     d_sigma = torch.randn(len(points), generator=generator, dtype=torch.float64)
     d_products = torch.randn(len(points), 48, generator=generator, dtype=torch.float64)
-    expected, found = directional(lambda p: autograd.density(field, p, points, dirs), field.params, d_sigma, seed)
+    expected, found = directional(
+        lambda p: autograd.density(field, p, points, dirs), field.params, d_sigma, seed
+    )
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-7) and expected != 0
-    expected, found = directional(lambda p: autograd.features(field, p, points), field.params, d_products, seed)
+    expected, found = directional(
+        lambda p: autograd.features(field, p, points), field.params, d_products, seed
+    )
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-7) and expected != 0
 
 
