@@ -1,6 +1,8 @@
-"""The one place where both the engine and the formats are known: read, make engine objects, work, write, report.
+"""The one place where both the engine and the formats are known: read, make engine objects, work, write,
+report.
 
-Every function takes paths and plain values, writes its output whole or not at all, and returns a JSON-able report.
+Every function takes paths and plain values, writes its output whole or not at all, and returns a JSON-able
+report.
 """
 
 from fusedrf_cli.bridge.edit import add, delete

@@ -21,14 +21,30 @@ from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput
 
-REGION_SETTINGS = DistillSettings(max_numbers=2_000_000, rays=120_000, points=1_500_000, steps=500, rgb_steps=500, view_size=160)
+REGION_SETTINGS = DistillSettings(
+    max_numbers=2_000_000, rays=120_000, points=1_500_000, steps=500, rgb_steps=500, view_size=160
+)
 
 
 def add(
-    fused: str, source: str, output: str, *, name: str, object_to_world: np.ndarray, time_budget: float | None, rgb: bool, precision: str,
-    overwrite: bool, seed: int, device: str, threads: int | None, progress,
-) -> dict:  # fmt: skip
-    """Put one more object into a fused field. Its blocks are appended; cells that it does not reach keep their owner and numbers."""
+    fused: str,
+    source: str,
+    output: str,
+    *,
+    name: str,
+    object_to_world: np.ndarray,
+    time_budget: float | None,
+    rgb: bool,
+    precision: str,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    progress,
+) -> dict:
+    """Put one more object into a fused field. Its blocks are appended; cells that it does not reach keep
+    their owner and numbers.
+    """
     with engine(device, threads, progress):
         started = time.monotonic()
         progress.phase("reading", None)
@@ -37,7 +53,9 @@ def add(
             raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
         new = load_scene(source)
         origin = node.object_to_world[:3, 3]
-        objects = [Placed(name, p.field, object_to_world @ p.object_to_world).moved(origin) for p in new.placed]
+        objects = [
+            Placed(name, p.field, object_to_world @ p.object_to_world).moved(origin) for p in new.placed
+        ]
         settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
         progress.phase("adding", 1.0)
         objects = [as_vm(p, settings, rgb, progress) for p in objects]
@@ -46,27 +64,62 @@ def add(
             result = blocks_of([base, *objects])
         except ValueError as error:
             raise InvalidInput(f"{fused}: {error}") from error
-        box = enclosing([transformed_aabb(p.field.occupancy.tight_aabb(0), p.object_to_world) for p in objects])
+        box = enclosing(
+            [transformed_aabb(p.field.occupancy.tight_aabb(0), p.object_to_world) for p in objects]
+        )
         progress.phase("measuring", None)
         truth = ComposedField([base, *objects])
-        reached = Judge(truth, settings.views, settings.view_size, seed)(moved_frame(stored(result, precision), truth.origin))
+        reached = Judge(truth, settings.views, settings.view_size, seed)(
+            moved_frame(stored(result, precision), truth.origin)
+        )
         entry = {
-            "event": "added", "nodes": [placed_note(n, object_to_world, name) for n in history_nodes(new, output, {})], "psnr": reached,
-        }  # fmt: skip
+            "event": "added",
+            "nodes": [placed_note(n, object_to_world, name) for n in history_nodes(new, output, {})],
+            "psnr": reached,
+        }
         history = (*bundle.scene.history, entry)
         size = write_field(
-            output, result, node.name, precision=precision, overwrite=overwrite, origin=origin, history=history, kept=others(bundle, node)
+            output,
+            result,
+            node.name,
+            precision=precision,
+            overwrite=overwrite,
+            origin=origin,
+            history=history,
+            kept=others(bundle, node),
         )
-    return edit_report(output, size, fused, name, box + np.tile(origin, 2), result, {"psnr": {"before_rgb": reached}}, started)
+    return edit_report(
+        output,
+        size,
+        fused,
+        name,
+        box + np.tile(origin, 2),
+        result,
+        {"psnr": {"before_rgb": reached}},
+        started,
+    )
 
 
 def delete(
-    fused: str, names: tuple[str, ...], output: str, *, time_budget: float | None, rgb: bool, precision: str, allow_outside: bool,
-    overwrite: bool, seed: int, device: str, threads: int | None, progress,
-) -> dict:  # fmt: skip
-    """Take objects out of a fused field: their blocks are dropped; out of a distilled tensor only the cells they reached are cut.
+    fused: str,
+    names: tuple[str, ...],
+    output: str,
+    *,
+    time_budget: float | None,
+    rgb: bool,
+    precision: str,
+    allow_outside: bool,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    progress,
+) -> dict:
+    """Take objects out of a fused field: their blocks are dropped; out of a distilled tensor only the cells
+    they reached are cut.
 
-    What an object hid inside the tensor is learned again from the remaining sources where these are known, else left empty.
+    What an object hid inside the tensor is learned again from the remaining sources where these are known,
+    else left empty.
     """
     with engine(device, threads, progress):
         started = time.monotonic()
@@ -75,15 +128,27 @@ def delete(
         known = names_in(bundle, field, node.name)
         for name in names:
             if name not in known:
-                raise InvalidInput(f"{fused}: there is no '{name}' to delete; it holds {', '.join(sorted(known)) or 'nothing that has a name'}")
+                raise InvalidInput(
+                    f"{fused}: there is no '{name}' to delete; it holds "
+                    f"{', '.join(sorted(known)) or 'nothing that has a name'}"
+                )
         if set(names) == known:
-            raise InvalidInput(f"{fused}: deleting {', '.join(sorted(names))} would leave nothing; keep one object, or delete the file")
+            raise InvalidInput(
+                f"{fused}: deleting {', '.join(sorted(names))} would leave nothing; keep one object, or "
+                "delete the file"
+            )
         origin = node.object_to_world[:3, 3]
         own = {b.name for b in field.blocks}
-        boxes = [transformed_aabb(field.tensors[b.tensor].occupancy.tight_aabb(0), b.object_to_field) for b in field.blocks if b.name in names]
+        boxes = [
+            transformed_aabb(field.tensors[b.tensor].occupancy.tight_aabb(0), b.object_to_field)
+            for b in field.blocks
+            if b.name in names
+        ]
         result = without(field, set(names) & own) if own & set(names) else field
         figures = {"restored": True, "seconds": {}}
-        inside = [entry for entry in graph_nodes(bundle) if entry["name"] in names and entry["name"] not in own]
+        inside = [
+            entry for entry in graph_nodes(bundle) if entry["name"] in names and entry["name"] not in own
+        ]
         for entry in inside:
             progress.phase(f"deleting {entry['name']}", 1.0)
             box = np.asarray(entry["aabb"], np.float64) - np.tile(origin, 2)
@@ -93,11 +158,23 @@ def delete(
             result, learned = cut(result, box, rest, settings, rgb, progress)
             figures["restored"] &= rest is not None
             figures |= learned
-        history = (*bundle.scene.history, {"event": "deleted", "names": list(names), "restored": figures["restored"]})
-        size = write_field(
-            output, result, node.name, precision=precision, overwrite=overwrite, origin=origin, history=history, kept=others(bundle, node)
+        history = (
+            *bundle.scene.history,
+            {"event": "deleted", "names": list(names), "restored": figures["restored"]},
         )
-    return edit_report(output, size, fused, ", ".join(names), enclosing(boxes) + np.tile(origin, 2), result, figures, started)
+        size = write_field(
+            output,
+            result,
+            node.name,
+            precision=precision,
+            overwrite=overwrite,
+            origin=origin,
+            history=history,
+            kept=others(bundle, node),
+        )
+    return edit_report(
+        output, size, fused, ", ".join(names), enclosing(boxes) + np.tile(origin, 2), result, figures, started
+    )
 
 
 def read_fused(path: str) -> tuple[Bundle, object, VMField]:
@@ -107,7 +184,9 @@ def read_fused(path: str) -> tuple[Bundle, object, VMField]:
     bundle = read_bundle(path)
     leaves = [leaf for leaf in bundle.scene.leaves() if leaf.field is not None]
     if len(leaves) != 1:
-        raise InvalidInput(f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first")
+        raise InvalidInput(
+            f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
+        )
     field = make_field(bundle.fields[leaves[0].field], path)
     if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
@@ -136,12 +215,21 @@ def others(bundle: Bundle, node) -> dict[str, FieldRecord]:
 
 
 def as_vm(placed: Placed, settings: DistillSettings, rgb: bool, progress) -> Placed:
-    """A placed VM field with the same content: itself, or what distilling another kind gives, in the object's own frame."""
+    """A placed VM field with the same content: itself, or what distilling another kind gives, in the
+    object's own frame.
+    """
     if type(placed.field) is VMField:
         return placed
     teacher = ComposedField([Placed(placed.name, placed.field, np.eye(4))])
     student = empty_student(teacher, settings, torch.Generator().manual_seed(settings.seed), placed.name)
-    student, _ = distill(teacher, student, [teacher.occupancy.tight_aabb(0)], settings, rgb, advance=lambda s, f: progress.advance(s, **f))
+    student, _ = distill(
+        teacher,
+        student,
+        [teacher.occupancy.tight_aabb(0)],
+        settings,
+        rgb,
+        advance=lambda s, f: progress.advance(s, **f),
+    )
     back = placed.object_to_world.copy()
     back[:3, 3] += back[:3, :3] @ teacher.origin
     return Placed(placed.name, student, back)
@@ -164,8 +252,11 @@ def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
     }
 
 
-def remaining(bundle: Bundle, path: Path, gone: tuple[str, ...], origin: np.ndarray, allow_outside: bool, progress) -> list[Placed] | None:
-    """The other objects of the graph as placed fields, from inside the bundle or from their files; None, with a warning, where one is not
+def remaining(
+    bundle: Bundle, path: Path, gone: tuple[str, ...], origin: np.ndarray, allow_outside: bool, progress
+) -> list[Placed] | None:
+    """The other objects of the graph as placed fields, from inside the bundle or from their files; None,
+    with a warning, where one is not
     to be had."""
     found = []
     for node in graph_nodes(bundle):
@@ -173,10 +264,15 @@ def remaining(bundle: Bundle, path: Path, gone: tuple[str, ...], origin: np.ndar
             continue
         record = bundle.fields.get(node["field"]) or record_from_file(node, path, allow_outside)
         if record is None:
-            progress.warn(f"the source of '{node['name']}' is not to be had, so what the deleted objects hid stays empty")
+            progress.warn(
+                f"the source of '{node['name']}' is not to be had, so what the deleted objects hid stays "
+                "empty"
+            )
             return None
         field = make_field(record, node["name"])
-        found.append(Placed(node["name"], field, np.asarray(node["object_to_world"], np.float64)).moved(origin))
+        found.append(
+            Placed(node["name"], field, np.asarray(node["object_to_world"], np.float64)).moved(origin)
+        )
     return found
 
 
@@ -184,7 +280,12 @@ def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord
     """A source's field from the file the history names, if it is still there, unchanged, and may be read."""
     source = (path.resolve().parent / node.get("source", "")).resolve()
     inside = source.is_relative_to(path.resolve().parent)
-    if "source" not in node or not source.is_file() or not (inside or allow_outside) or sha256_of(source) != node["sha256"]:
+    if (
+        "source" not in node
+        or not source.is_file()
+        or not (inside or allow_outside)
+        or sha256_of(source) != node["sha256"]
+    ):
         return None
     return read_bundle(source).fields.get(node["field"])
 
@@ -192,7 +293,9 @@ def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord
 def cut(
     field: VMField, box: np.ndarray, rest: list[Placed] | None, settings: DistillSettings, rgb: bool, progress
 ) -> tuple[VMField, dict]:
-    """Empty the cells of a box in the distilled tensor, and fill them with a tensor of their own that holds what the rest shows there."""
+    """Empty the cells of a box in the distilled tensor, and fill them with a tensor of their own that holds
+    what the rest shows there.
+    """
     region = region_of(field, box)
     emptied = cleared(field, region)
     rest = [p for p in rest or [] if overlaps(p.aabb, region)]
@@ -204,12 +307,20 @@ def cut(
         return emptied, {}
     student = empty_student(local, settings, torch.Generator().manual_seed(settings.seed), "restored")
     student, did = distill(
-        local, student, [local.occupancy.tight_aabb(0)], settings, rgb, advance=lambda s, f: progress.advance(s, **f)
+        local,
+        student,
+        [local.occupancy.tight_aabb(0)],
+        settings,
+        rgb,
+        advance=lambda s, f: progress.advance(s, **f),
     )
     back = np.eye(4)
     back[:3, 3] = teacher.origin
     whole = blocks_of([Placed("fused", emptied, np.eye(4)), Placed("restored", student, back)])
-    return whole, {"psnr": {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb}, "seconds": did.seconds}
+    return whole, {
+        "psnr": {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb},
+        "seconds": did.seconds,
+    }
 
 
 def overlaps(a: np.ndarray, b: np.ndarray) -> bool:
@@ -222,12 +333,29 @@ def enclosing(boxes: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.min([b[:3] for b in boxes], 0), np.max([b[3:] for b in boxes], 0)])
 
 
-def edit_report(output: str, size: int, before: str, names: str, box: np.ndarray, field: VMField, figures: dict, started: float) -> dict:
+def edit_report(
+    output: str,
+    size: int,
+    before: str,
+    names: str,
+    box: np.ndarray,
+    field: VMField,
+    figures: dict,
+    started: float,
+) -> dict:
     """The report of an edit."""
     extent = box[3:] - box[:3]
     whole = field.occupancy.aabb[3:] - field.occupancy.aabb[:3]
     return {
-        "output": output, "bytes": size, "source_bytes": Path(before).stat().st_size,
-        "touched": {"names": names, "aabb": box.tolist(), "blocks": len(field.blocks), "share_of_box": float(min(1.0, np.prod(extent / whole)))},
-        **figures, "total_seconds": time.monotonic() - started,
-    }  # fmt: skip
+        "output": output,
+        "bytes": size,
+        "source_bytes": Path(before).stat().st_size,
+        "touched": {
+            "names": names,
+            "aabb": box.tolist(),
+            "blocks": len(field.blocks),
+            "share_of_box": float(min(1.0, np.prod(extent / whole))),
+        },
+        **figures,
+        "total_seconds": time.monotonic() - started,
+    }

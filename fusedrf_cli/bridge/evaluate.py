@@ -21,14 +21,27 @@ SCENE_SEED = 1_000
 
 
 def evaluate(
-    bundle: str, against: str, *, split: str, size: tuple[int, int] | None, allow_outside: bool, device: str, threads: int | None,
+    bundle: str,
+    against: str,
+    *,
+    split: str,
+    size: tuple[int, int] | None,
+    allow_outside: bool,
+    device: str,
+    threads: int | None,
     progress,
-) -> dict:  # fmt: skip
-    """Compare a bundle, over white, with a capture's views or with another scene on seeded views that fusing never uses."""
+) -> dict:
+    """Compare a bundle, over white, with a capture's views or with another scene on seeded views that fusing
+    never uses.
+    """
     with engine(device, threads, progress):
         progress.phase("reading", None)
         field, origin = renderable(load_scene(bundle, allow_outside))
-        pairs = capture_pairs(against, split, size) if is_capture(against) else scene_pairs(against, size, allow_outside)
+        pairs = (
+            capture_pairs(against, split, size)
+            if is_capture(against)
+            else scene_pairs(against, size, allow_outside)
+        )
         views = []
         for i, (camera, truth, total) in enumerate(pairs):
             if i == 0:
@@ -37,23 +50,33 @@ def evaluate(
             views.append({"name": camera.name, "psnr": psnr(shot, truth), "ssim": ssim(shot, truth)})
             progress.advance(i + 1, psnr=views[-1]["psnr"])
     return {
-        "bundle": bundle, "against": against, "mean": {k: float(np.mean([v[k] for v in views])) for k in ("psnr", "ssim")}, "views": views,
-    }  # fmt: skip
+        "bundle": bundle,
+        "against": against,
+        "mean": {k: float(np.mean([v[k] for v in views])) for k in ("psnr", "ssim")},
+        "views": views,
+    }
 
 
-def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Iterator[tuple[Camera, np.ndarray, int]]:
+def capture_pairs(
+    against: str, split: str, size: tuple[int, int] | None
+) -> Iterator[tuple[Camera, np.ndarray, int]]:
     """(camera, (H, W, 3) truth over white, how many) of a capture's photos."""
     capture = read_capture(against)
     views = {"test": capture.test, "train": capture.train, "all": (*capture.train, *capture.test)}[split]
     if not views:
         raise InvalidInput(f"{against}: the capture has no {split} views; choose another --split")
     if size is not None and size != (views[0].width, views[0].height):
-        raise InvalidInput(f"{against}: the photos are {views[0].width}x{views[0].height}; leave --size out to compare with them")
+        raise InvalidInput(
+            f"{against}: the photos are {views[0].width}x{views[0].height}; leave --size out to compare "
+            "with them"
+        )
     for view in views:
         yield camera_of(view), over_white(load_images([view]))[0], len(views)
 
 
-def scene_pairs(against: str, size: tuple[int, int] | None, allow_outside: bool) -> Iterator[tuple[Camera, np.ndarray, int]]:
+def scene_pairs(
+    against: str, size: tuple[int, int] | None, allow_outside: bool
+) -> Iterator[tuple[Camera, np.ndarray, int]]:
     """(camera, truth, how many) of another scene, seen from views around it."""
     field, origin = renderable(load_scene(against, allow_outside))
     box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)

@@ -11,7 +11,13 @@ from fusedrf_cli.bridge.train import BYTES_PER_NUMBER
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student, student_from
+from fusedrf_cli.engine.distillation.distill import (
+    DistillSettings,
+    Judge,
+    distill,
+    empty_student,
+    student_from,
+)
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
@@ -20,10 +26,25 @@ CONDITION_NOTED = 1.02  # a stretch beyond this shows in a translucent medium (b
 
 
 def fuse(
-    scene: str, output: str, *, kind: str, max_size: int | None, target_psnr: float | None, time_budget: float | None, rgb: bool,
-    from_scratch: bool, keep_sources: bool, precision: str, resume: bool, allow_outside: bool, overwrite: bool, seed: int, device: str,
-    threads: int | None, progress,
-) -> dict:  # fmt: skip
+    scene: str,
+    output: str,
+    *,
+    kind: str,
+    max_size: int | None,
+    target_psnr: float | None,
+    time_budget: float | None,
+    rgb: bool,
+    from_scratch: bool,
+    keep_sources: bool,
+    precision: str,
+    resume: bool,
+    allow_outside: bool,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    progress,
+) -> dict:
     """Turn a composed scene into one field and write it with the scene's history."""
     with engine(device, threads, progress):
         progress.phase("reading", None)
@@ -35,21 +56,40 @@ def fuse(
         if chosen == "blocks":
             field, figures = fuse_blocks(loaded, composed, limit, precision, seed, progress)
         else:
-            settings = DistillSettings(seed=seed, time_budget=time_budget, max_numbers=limit // BYTES_PER_NUMBER[precision] * 97 // 100)
+            settings = DistillSettings(
+                seed=seed,
+                time_budget=time_budget,
+                max_numbers=limit // BYTES_PER_NUMBER[precision] * 97 // 100,
+            )
             field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
         kept = {f.member: f.record for f in loaded.fields} if keep_sources else {}
         entry = {
-            "event": "fused", "kind": chosen, "composition": loaded.composition, "nodes": history_nodes(loaded, output, kept),
-            "settings": {"seed": seed, "max_size": limit, "rgb": rgb, "from_scratch": from_scratch}, "psnr": figures["psnr"],
-        }  # fmt: skip
+            "event": "fused",
+            "kind": chosen,
+            "composition": loaded.composition,
+            "nodes": history_nodes(loaded, output, kept),
+            "settings": {"seed": seed, "max_size": limit, "rgb": rgb, "from_scratch": from_scratch},
+            "psnr": figures["psnr"],
+        }
         size = write_field(
-            output, field, "fused", precision=precision, overwrite=overwrite, origin=composed.origin, history=(entry,), kept=kept
+            output,
+            field,
+            "fused",
+            precision=precision,
+            overwrite=overwrite,
+            origin=composed.origin,
+            history=(entry,),
+            kept=kept,
         )
         checkpoint_path(output).unlink(missing_ok=True)
     report = {
-        "output": output, "bytes": size, "source_bytes": source_bytes(loaded), "kind": chosen, **figures,
+        "output": output,
+        "bytes": size,
+        "source_bytes": source_bytes(loaded),
+        "kind": chosen,
+        **figures,
         "total_seconds": time.monotonic() - started,
-    }  # fmt: skip
+    }
     check_target(report, target_psnr, output)
     return report
 
@@ -59,13 +99,16 @@ def check_target(report: dict, target_psnr: float | None, output: str) -> None:
     reached = report["psnr"].get("after_rgb") or report["psnr"]["before_rgb"]
     if target_psnr is not None and reached < target_psnr:
         raise QualityNotReached(
-            f"{output}: reached {reached:.2f} dB where --target-psnr asked for {target_psnr:g}; give more --max-size or --time-budget",
+            f"{output}: reached {reached:.2f} dB where --target-psnr asked for {target_psnr:g}; give more "
+            "--max-size or --time-budget",
             report=report,
         )
 
 
 def choose_kind(kind: str, loaded: LoadedScene) -> str:
-    """Blocks where they can stand for the scene (VM sources, max composition): they measured better at every size; else vm."""
+    """Blocks where they can stand for the scene (VM sources, max composition): they measured better at every
+    size; else vm.
+    """
     possible = loaded.composition == "max" and all(type(p.field) is VMField for p in loaded.placed)
     if kind == "blocks" and not possible:
         raise InvalidInput(f"{loaded.path}: blocks need vm sources and 'max' composition; use --kind vm")
@@ -74,14 +117,22 @@ def choose_kind(kind: str, loaded: LoadedScene) -> str:
 
 def source_bytes(loaded: LoadedScene) -> int:
     """Bytes of the distinct source files."""
-    return sum(path.stat().st_size for path in {f.path for f in loaded.fields} if path is not None and path.is_file())
+    return sum(
+        path.stat().st_size for path in {f.path for f in loaded.fields} if path is not None and path.is_file()
+    )
 
 
-def fuse_blocks(loaded: LoadedScene, composed: ComposedField, limit: int, precision: str, seed: int, progress) -> tuple[VMField, dict]:
-    """Compile the scene to blocks, resampled where it would be larger than the limit, and measure what that cost."""
+def fuse_blocks(
+    loaded: LoadedScene, composed: ComposedField, limit: int, precision: str, seed: int, progress
+) -> tuple[VMField, dict]:
+    """Compile the scene to blocks, resampled where it would be larger than the limit, and measure what that
+    cost.
+    """
     progress.phase("blocks", None)
     started = time.monotonic()
-    occupancies = {id(p.field): sum(t.occupancy.occupied.size for t in p.field.tensors) // 8 for p in composed.placed}
+    occupancies = {
+        id(p.field): sum(t.occupancy.occupied.size for t in p.field.tensors) // 8 for p in composed.placed
+    }
     field = blocks_of(composed.placed, int(0.99 * limit) - sum(occupancies.values()) - 65536, precision)
     seconds = {"blocks": time.monotonic() - started}
     progress.phase("measuring", None)
@@ -90,27 +141,47 @@ def fuse_blocks(loaded: LoadedScene, composed: ComposedField, limit: int, precis
     seconds["measuring"] = time.monotonic() - started - seconds["blocks"]
     whole = len({id(p.field) for p in composed.placed})
     resolution = [list(t.resolution) for t in field.tensors]
-    why = f"{len(field.blocks)} blocks over {whole} tensors, each in its object's own axes, under {limit} bytes"
+    why = (
+        f"{len(field.blocks)} blocks over {whole} tensors, each in its object's own axes, under {limit} bytes"
+    )
     return field, {
-        "psnr": {"before_rgb": reached, "after_rgb": None, "views": views}, "seconds": seconds,
-        "chosen": {"resolution": resolution, "ranks": [field.shape.density_rank, field.shape.colour_rank], "why": why},
-    }  # fmt: skip
+        "psnr": {"before_rgb": reached, "after_rgb": None, "views": views},
+        "seconds": seconds,
+        "chosen": {
+            "resolution": resolution,
+            "ranks": [field.shape.density_rank, field.shape.colour_rank],
+            "why": why,
+        },
+    }
 
 
 def stored(field: VMField, precision: str) -> VMField:
     """The field as it will come back from a bundle of that precision."""
     if precision == "float32":
         return field
-    return VMField(field.shape, field.tensors, field.blocks, field.params.half().float(), field.occupancy, field.owners)
+    return VMField(
+        field.shape, field.tensors, field.blocks, field.params.half().float(), field.occupancy, field.owners
+    )
 
 
 def fuse_vm(
-    loaded: LoadedScene, composed: ComposedField, settings: DistillSettings, rgb: bool, from_scratch: bool, output: str, resume: bool, progress
+    loaded: LoadedScene,
+    composed: ComposedField,
+    settings: DistillSettings,
+    rgb: bool,
+    from_scratch: bool,
+    output: str,
+    resume: bool,
+    progress,
 ) -> tuple[VMField, dict]:
     """Distil the scene into one VM tensor, from the background's weights where they can be taken over."""
     generator = torch.Generator().manual_seed(settings.seed)
     background = background_of(loaded).placed
-    moved = Placed(background.name, background.field, composed.placed[[p.name for p in loaded.placed].index(background.name)].object_to_world)
+    moved = Placed(
+        background.name,
+        background.field,
+        composed.placed[[p.name for p in loaded.placed].index(background.name)].object_to_world,
+    )
     warn_of_stretch(composed, progress)
     student = None if from_scratch else student_from(moved, composed, settings, generator)
     start = f"the weights of '{background.name}'" if student is not None else "nothing"
@@ -121,33 +192,54 @@ def fuse_vm(
     if resume:
         arrays, state = load_checkpoint(output, "fuse")
         if state["numbers"] != student.params.numel():
-            raise InvalidInput(f"{checkpoint_path(output)}: made with other settings; repeat them, or run without --resume")
+            raise InvalidInput(
+                f"{checkpoint_path(output)}: made with other settings; repeat them, or run without --resume"
+            )
         student.params.copy_(torch.from_numpy(arrays["params"]))
     boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
     try:
         student, did = distill(
-            composed, student, boxes, settings, rgb, lambda name: progress.phase(name, 1.0), lambda s, f: progress.advance(s, **f)
+            composed,
+            student,
+            boxes,
+            settings,
+            rgb,
+            lambda name: progress.phase(name, 1.0),
+            lambda s, f: progress.advance(s, **f),
         )
     except KeyboardInterrupt as interrupt:
-        path = save_checkpoint(output, {"params": student.params.numpy()}, {"command": "fuse", "numbers": student.params.numel()})
+        path = save_checkpoint(
+            output, {"params": student.params.numpy()}, {"command": "fuse", "numbers": student.params.numel()}
+        )
         interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
         raise
     return student, {
-        "psnr": {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb, "rgb_kept": did.rgb_kept, "views": settings.views},
+        "psnr": {
+            "before_rgb": did.psnr_before_rgb,
+            "after_rgb": did.psnr_after_rgb,
+            "rgb_kept": did.rgb_kept,
+            "views": settings.views,
+        },
         "seconds": did.seconds,
         "chosen": {
-            "resolution": list(student.tensors[0].resolution), "ranks": [student.shape.density_rank, student.shape.colour_rank],
-            "start": start, "voxel": float(student.voxel_size), "finest_teacher_voxel": float(composed.voxel_size),
+            "resolution": list(student.tensors[0].resolution),
+            "ranks": [student.shape.density_rank, student.shape.colour_rank],
+            "start": start,
+            "voxel": float(student.voxel_size),
+            "finest_teacher_voxel": float(composed.voxel_size),
         },
-    }  # fmt: skip
+    }
 
 
 def warn_of_stretch(composed: ComposedField, progress) -> None:
-    """One isotropic density cannot hold a stretched one exactly; say by how much opacity may be off (FAILURES: A2)."""
+    """One isotropic density cannot hold a stretched one exactly; say by how much opacity may be off
+    (FAILURES: A2).
+    """
     for placed in composed.placed:
         if placed.condition > CONDITION_NOTED:
             c = np.sqrt(placed.condition)
             worst = c ** (-1 / (c - 1)) - c ** (-c / (c - 1))
             progress.warn(
-                f"'{placed.name}' is stretched by {placed.condition:.2f}: where it is translucent its opacity may be off by up to {worst:.3f}"
+                f"'{placed.name}' is stretched by {placed.condition:.2f}: where it is translucent its "
+                f"opacity may be off by up to {worst:.3f}"
             )

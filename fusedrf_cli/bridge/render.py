@@ -20,11 +20,26 @@ FILMS = (".gif", ".mp4")
 
 
 def render(
-    scene: str, output: str, *, cameras: str | None, path: str | None, orbit: int | None, size: tuple[int, int] | None,
-    background: tuple[float, float, float] | None, depth: bool, fps: float, allow_outside: bool, overwrite: bool, seed: int, device: str,
-    threads: int | None, progress,
-) -> dict:  # fmt: skip
-    """Render views of a bundle or scene to a picture, a folder of pictures or a film, by the output's name."""
+    scene: str,
+    output: str,
+    *,
+    cameras: str | None,
+    path: str | None,
+    orbit: int | None,
+    size: tuple[int, int] | None,
+    background: tuple[float, float, float] | None,
+    depth: bool,
+    fps: float,
+    allow_outside: bool,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    progress,
+) -> dict:
+    """Render views of a bundle or scene to a picture, a folder of pictures or a film, by the output's
+    name.
+    """
     suffix = Path(output).suffix.lower()
     if suffix in FILMS:
         check_film(output)
@@ -36,7 +51,9 @@ def render(
         field, origin = renderable(loaded)
         views = choose_views(field, origin, cameras or path, orbit, size)
         if suffix == ".png" and len(views) > 1:
-            raise UsageProblem(f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4")
+            raise UsageProblem(
+                f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
+            )
         progress.phase("rendering", len(views))
         shots = _shots(field, origin, views, progress)
         if suffix in FILMS:
@@ -50,7 +67,9 @@ def render(
 
 
 def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
-    """The field to march and the world position of its frame's origin: a lone field that is only moved is taken as it is."""
+    """The field to march and the world position of its frame's origin: a lone field that is only moved is
+    taken as it is.
+    """
     if len(loaded.fields) == 1:
         placed = loaded.fields[0].placed
         if np.array_equal(placed.object_to_world[:3, :3], np.eye(3)):
@@ -59,7 +78,9 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
     return composed, composed.origin
 
 
-def choose_views(field, origin: np.ndarray, cameras: str | None, count: int | None, size: tuple[int, int] | None) -> list[Camera]:
+def choose_views(
+    field, origin: np.ndarray, cameras: str | None, count: int | None, size: tuple[int, int] | None
+) -> list[Camera]:
     """The views a user asked for; with no choice, one that frames everything."""
     if cameras:
         return [camera_of(v) for v in read_cameras(cameras, size)]
@@ -95,5 +116,8 @@ def _write(path: Path, shot: RenderedImage, background, depth: bool) -> dict | s
 
 def _write_folder(folder: Path, views: list[Camera], shots, background, depth: bool, overwrite: bool) -> list:
     with atomic_folder(folder, overwrite=overwrite) as temporary:
-        files = [_write(temporary / f"{view.name}.png", shot, background, depth) for view, shot in zip(views, shots, strict=True)]
+        files = [
+            _write(temporary / f"{view.name}.png", shot, background, depth)
+            for view, shot in zip(views, shots, strict=True)
+        ]
     return [str(folder / Path(f if isinstance(f, str) else f["path"]).name) for f in files]

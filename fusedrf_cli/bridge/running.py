@@ -17,9 +17,13 @@ from fusedrf_cli.errors import InvalidInput, NumericFailure, ResourceProblem
 
 @contextlib.contextmanager
 def engine(device: str, threads: int | None, progress) -> Iterator[None]:
-    """Run engine work on the asked device and threads; numeric and memory failures become sentences with an exit code."""
+    """Run engine work on the asked device and threads; numeric and memory failures become sentences with an
+    exit code.
+    """
     if device == "cuda":
-        raise ResourceProblem("--device cuda: this version computes on the CPU only; use --device auto or cpu")
+        raise ResourceProblem(
+            "--device cuda: this version computes on the CPU only; use --device auto or cpu"
+        )
     count = threads or len(os.sched_getaffinity(0))
     from fusedrf_cli.engine import kernels
 
@@ -30,7 +34,9 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
     try:
         yield
     except FloatingPointError as error:
-        raise NumericFailure(f"the optimisation diverged: {error}; try another --seed or a lower resolution") from error
+        raise NumericFailure(
+            f"the optimisation diverged: {error}; try another --seed or a lower resolution"
+        ) from error
     except RuntimeError as error:
         if "alloc" in str(error):
             raise ResourceProblem("not enough memory; try a smaller --max-size or --size") from error
@@ -45,14 +51,19 @@ def checkpoint_path(output: str) -> Path:
 def save_checkpoint(output: str, arrays: dict[str, np.ndarray], state: dict) -> Path:
     """Write a run's state beside its output, whole or not at all."""
     path = checkpoint_path(output)
-    data = save({k: np.ascontiguousarray(v) for k, v in arrays.items()}, {"fusedrf": json.dumps(state, sort_keys=True)})
+    data = save(
+        {k: np.ascontiguousarray(v) for k, v in arrays.items()},
+        {"fusedrf": json.dumps(state, sort_keys=True)},
+    )
     with atomic_writer(path) as file:
         file.write(data)
     return path
 
 
 def load_checkpoint(output: str, command: str) -> tuple[dict[str, np.ndarray], dict]:
-    """The state that `save_checkpoint` left for an output; InvalidInput when there is none or it is another command's."""
+    """The state that `save_checkpoint` left for an output; InvalidInput when there is none or it is another
+    command's.
+    """
     path = checkpoint_path(output)
     if not path.exists():
         raise InvalidInput(f"{path}: no checkpoint to resume from; run without --resume")
@@ -61,7 +72,12 @@ def load_checkpoint(output: str, command: str) -> tuple[dict[str, np.ndarray], d
             state = json.loads((file.metadata() or {}).get("fusedrf", "{}"))
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (no mapping)
     except Exception as error:
-        raise InvalidInput(f"{path}: not a readable checkpoint ({error}); delete it and run without --resume") from error
+        raise InvalidInput(
+            f"{path}: not a readable checkpoint ({error}); delete it and run without --resume"
+        ) from error
     if state.get("command") != command:
-        raise InvalidInput(f"{path}: a checkpoint of '{state.get('command')}', not of '{command}'; delete it or choose another output")
+        raise InvalidInput(
+            f"{path}: a checkpoint of '{state.get('command')}', not of '{command}'; delete it or choose "
+            "another output"
+        )
     return arrays, state

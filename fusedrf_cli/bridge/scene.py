@@ -51,21 +51,31 @@ class LoadedScene:
 
 
 def make_field(record: FieldRecord, where: str):
-    """An engine field from a bundle's record; InvalidInput for an unknown kind or arrays that do not fit it."""
+    """An engine field from a bundle's record; InvalidInput for an unknown kind or arrays that do not fit
+    it.
+    """
     kinds = field_kinds()
     if record.kind not in kinds:
-        raise InvalidInput(f"{where}: field of unknown kind '{record.kind}'; this version knows {', '.join(sorted(kinds))}")
+        raise InvalidInput(
+            f"{where}: field of unknown kind '{record.kind}'; this version knows {', '.join(sorted(kinds))}"
+        )
     try:
         return kinds[record.kind].from_state(record.arrays, record.metadata)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise InvalidInput(f"{where}: the '{record.kind}' field is malformed ({error}); make the bundle again") from error
+        raise InvalidInput(
+            f"{where}: the '{record.kind}' field is malformed ({error}); make the bundle again"
+        ) from error
 
 
 def load_scene(path: str, allow_outside: bool = False) -> LoadedScene:
-    """Read a bundle, a scene.json or '-' with all fields it places; equal members become one field, read once."""
+    """Read a bundle, a scene.json or '-' with all fields it places; equal members become one field, read
+    once.
+    """
     if path == "-":
         where = Path.cwd() / "scene.json"
-        graph = inline_scenes(parse_scene(sys.stdin.buffer.read(STDIN_LIMIT + 1), "standard input"), where, allow_outside)
+        graph = inline_scenes(
+            parse_scene(sys.stdin.buffer.read(STDIN_LIMIT + 1), "standard input"), where, allow_outside
+        )
         return _load(graph, where, allow_outside)
     if is_bundle(path):
         bundle = read_bundle(path)
@@ -73,12 +83,24 @@ def load_scene(path: str, allow_outside: bool = False) -> LoadedScene:
     return _load(expand_scene(path, allow_outside), Path(path), allow_outside)
 
 
-def _load(graph: SceneGraph, path: Path, allow_outside: bool, members: dict[str, FieldRecord] | None = None) -> LoadedScene:
+def _load(
+    graph: SceneGraph, path: Path, allow_outside: bool, members: dict[str, FieldRecord] | None = None
+) -> LoadedScene:
     cache: dict = {}
     found = []
     for leaf in graph.leaves():
         if leaf.field is not None:
-            found.append(_source(leaf.name, leaf.object_to_world, leaf.background, path, leaf.field, (members or {})[leaf.field], cache))
+            found.append(
+                _source(
+                    leaf.name,
+                    leaf.object_to_world,
+                    leaf.background,
+                    path,
+                    leaf.field,
+                    (members or {})[leaf.field],
+                    cache,
+                )
+            )
         elif leaf.source is not None:
             found += _load_source(leaf, path, allow_outside, cache)
     if not found:
@@ -90,20 +112,42 @@ def _load_source(leaf, path: Path, allow_outside: bool, cache: dict) -> list[Sou
     source = resolve_source(path, leaf.source, allow_outside)
     if source not in cache:
         if not is_bundle(source):
-            raise InvalidInput(f"{path}: node '{leaf.name}': its source {leaf.source} is no bundle; train it to a .rfpack first")
+            raise InvalidInput(
+                f"{path}: node '{leaf.name}': its source {leaf.source} is no bundle; train it to a "
+                ".rfpack first"
+            )
         cache[source] = read_bundle(source)
     bundle = cache[source]
     inner = [node for node in bundle.scene.leaves() if node.field is not None]
     if not inner:
-        raise InvalidInput(f"{source}: the bundle holds no field, so node '{leaf.name}' would be empty; choose another source")
+        raise InvalidInput(
+            f"{source}: the bundle holds no field, so node '{leaf.name}' would be empty; choose another "
+            "source"
+        )
     named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
     return [
-        _source(name, leaf.object_to_world @ node.object_to_world, leaf.background, source, node.field, bundle.fields[node.field], cache)
+        _source(
+            name,
+            leaf.object_to_world @ node.object_to_world,
+            leaf.background,
+            source,
+            node.field,
+            bundle.fields[node.field],
+            cache,
+        )
         for name, node in zip(named, inner, strict=True)
     ]
 
 
-def _source(name: str, object_to_world: np.ndarray, background: bool, path: Path, member: str, record: FieldRecord, cache: dict) -> SourceField:
+def _source(
+    name: str,
+    object_to_world: np.ndarray,
+    background: bool,
+    path: Path,
+    member: str,
+    record: FieldRecord,
+    cache: dict,
+) -> SourceField:
     if member not in cache:
         cache[member] = make_field(record, f"{path}: node '{name}'")
     try:
@@ -116,11 +160,17 @@ def _source(name: str, object_to_world: np.ndarray, background: bool, path: Path
 def background_of(scene: LoadedScene) -> SourceField:
     """The node marked as background, else the one with the largest box."""
     marked = [f for f in scene.fields if f.background]
-    return marked[0] if marked else max(scene.fields, key=lambda f: float(np.prod(f.placed.aabb[3:] - f.placed.aabb[:3])))
+    return (
+        marked[0]
+        if marked
+        else max(scene.fields, key=lambda f: float(np.prod(f.placed.aabb[3:] - f.placed.aabb[:3])))
+    )
 
 
 def history_nodes(scene: LoadedScene, output: str, kept: dict[str, str]) -> list[dict]:
-    """What a history entry says of every source: name, placement, box, path from the output's folder, checksum, kept member."""
+    """What a history entry says of every source: name, placement, box, path from the output's folder,
+    checksum, kept member.
+    """
     folder, hashes, nodes = Path(output).resolve().parent, {}, []
     for f in scene.fields:
         if f.path is not None and f.path not in hashes and f.path.exists():
@@ -140,10 +190,19 @@ def history_nodes(scene: LoadedScene, output: str, kept: dict[str, str]) -> list
 
 
 def write_field(
-    output: str, field, name: str, *, precision: str, overwrite: bool, origin: np.ndarray | None = None, history: tuple[dict, ...] = (),
+    output: str,
+    field,
+    name: str,
+    *,
+    precision: str,
+    overwrite: bool,
+    origin: np.ndarray | None = None,
+    history: tuple[dict, ...] = (),
     kept: dict[str, FieldRecord] | None = None,
-) -> int:  # fmt: skip
-    """Write one field (and kept sources) as a bundle; its node is moved to origin (3,). Returns the bytes written."""
+) -> int:
+    """Write one field (and kept sources) as a bundle; its node is moved to origin (3,). Returns the bytes
+    written.
+    """
     writer = BundleWriter()
     for record in (kept or {}).values():
         writer.add_field(record, precision)

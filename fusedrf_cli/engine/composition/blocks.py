@@ -1,7 +1,9 @@
 """Blocks: a composed scene of VM fields as one VM field, each tensor in its object's own axes.
 
-Nothing is optimised here: tensors keep their numbers (or are resampled when the whole must be smaller), and the ownership grid of the
-field says per cell which block is asked. So a turned object costs no rank, copies of one object share a tensor, and appending or
+Nothing is optimised here: tensors keep their numbers (or are resampled when the whole must be smaller), and
+the ownership grid of the
+field says per cell which block is asked. So a turned object costs no rank, copies of one object share a
+tensor, and appending or
 dropping a block leaves all others bit for bit as they were.
 """
 
@@ -20,7 +22,8 @@ MAX_BLOCKS = 255
 def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str = "float16") -> VMField:
     """One VM field that answers as the max composition of placed VM fields does, in their common frame.
 
-    With `max_bytes` the tensors are resampled to the finest common voxel (in the common frame) whose numbers fit. Raises ValueError
+    With `max_bytes` the tensors are resampled to the finest common voxel (in the common frame) whose numbers
+    fit. Raises ValueError
     when a placed field is no VM field or there are more than MAX_BLOCKS blocks.
     """
     for p in placed:
@@ -35,7 +38,11 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
         tensors += wide.tensors
         params.append(wide.params)
     blocks = [
-        Block(first[id(p.field)] + b.tensor, p.object_to_world @ b.object_to_field, b.name if len(p.field.blocks) > 1 else p.name)
+        Block(
+            first[id(p.field)] + b.tensor,
+            p.object_to_world @ b.object_to_field,
+            b.name if len(p.field.blocks) > 1 else p.name,
+        )
         for p in placed
         for b in p.field.blocks
     ]
@@ -46,20 +53,26 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
 
 
 def without(field: VMField, names: set[str]) -> VMField | None:
-    """The field without the blocks of those names and the tensors that only they used; None when nothing is left."""
+    """The field without the blocks of those names and the tensors that only they used; None when nothing is
+    left.
+    """
     kept = [b for b in field.blocks if b.name not in names]
     if not kept:
         return None
     used = sorted({b.tensor for b in kept})
     sizes = [field.shape.size(field.tensors[t].resolution) for t in used]
-    params = torch.cat([field.params[field.layout[t, 0] : field.layout[t, 0] + n] for t, n in zip(used, sizes, strict=True)])
+    params = torch.cat(
+        [field.params[field.layout[t, 0] : field.layout[t, 0] + n] for t, n in zip(used, sizes, strict=True)]
+    )
     blocks = tuple(replace(b, tensor=used.index(b.tensor)) for b in kept)
     return VMField.assembled(field.shape, tuple(field.tensors[t] for t in used), blocks, params)
 
 
 def common_shape(shapes: list[VMShape]) -> VMShape:
     """The smallest shape that holds all of the given ones."""
-    return VMShape(*(max(getattr(s, name) for s in shapes) for name in ("density_rank", "colour_rank", "sh_degree")))
+    return VMShape(
+        *(max(getattr(s, name) for s in shapes) for name in ("density_rank", "colour_rank", "sh_degree"))
+    )
 
 
 def reshaped(field: VMField, shape: VMShape) -> VMField:
@@ -82,9 +95,15 @@ def reshaped(field: VMField, shape: VMShape) -> VMField:
 
 
 def shrunk(field: VMField, numbers: int) -> VMField:
-    """The field with its tensors resampled to the finest common voxel at which all numbers together are at most `numbers`."""
+    """The field with its tensors resampled to the finest common voxel at which all numbers together are at
+    most `numbers`.
+    """
     stretch = [
-        max(np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[0] for b in field.blocks if b.tensor == t)
+        max(
+            np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[0]
+            for b in field.blocks
+            if b.tensor == t
+        )
         for t in range(len(field.tensors))
     ]
 

@@ -16,10 +16,14 @@ RULES = ("max", "add")
 class ComposedField:
     """The naive composition that fusing is measured against: every field is asked at every sample.
 
-    Under `max` (FusedRF, eq. 2) the field with the highest σ gives σ and colour, ties going to the lower index; since all share
-    the step that is the highest alpha, without the ties that alpha has in float32. Under `add` (D2NeRF) σ = Σσ_i and
-    c = Σσ_i c_i / Σσ_i. The frame's origin is the scene's centre, `origin` in the world, so that a scene far from the world's
-    origin loses no digits: world points and ray origins have `origin` subtracted in float64 before they come here.
+    Under `max` (FusedRF, eq. 2) the field with the highest σ gives σ and colour, ties going to the lower
+    index; since all share
+    the step that is the highest alpha, without the ties that alpha has in float32. Under `add` (D2NeRF) σ =
+    Σσ_i and
+    c = Σσ_i c_i / Σσ_i. The frame's origin is the scene's centre, `origin` in the world, so that a scene far
+    from the world's
+    origin loses no digits: world points and ray origins have `origin` subtracted in float64 before they come
+    here.
     """
 
     kind = "composed"
@@ -69,7 +73,9 @@ class ComposedField:
         return sigma, rgb
 
     def sigmas(self, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(F, N) density of every placed field at points, and (N,) the index of the densest (lowest on a tie)."""
+        """(F, N) density of every placed field at points, and (N,) the index of the densest (lowest on a
+        tie).
+        """
         sigmas = torch.zeros(len(self.placed), len(points))
         for i, placed in enumerate(self.placed):
             inside = self._inside(placed, points)

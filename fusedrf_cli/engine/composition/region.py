@@ -38,7 +38,9 @@ class ClippedField:
         """The field's own."""
         return self.field.voxel_size
 
-    def query(self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) and rgb (N, 3); σ is 0 outside the box."""
         sigma, rgb = self.field.query(points, dirs, with_colour)
         box = torch.from_numpy(self.box)
@@ -46,7 +48,9 @@ class ClippedField:
 
 
 def region_of(field: VMField, aabb: np.ndarray) -> np.ndarray:
-    """(6,) the box grown to whole cells of the field's distilled tensor (block 0), so that cutting it out leaves no seam."""
+    """(6,) the box grown to whole cells of the field's distilled tensor (block 0), so that cutting it out
+    leaves no seam.
+    """
     tensor = field.tensors[field.blocks[0].tensor]
     at = field.blocks[0].object_to_field[:3, 3]
     cell, lo = tensor.occupancy.cell, tensor.aabb[:3] + at
@@ -57,7 +61,9 @@ def region_of(field: VMField, aabb: np.ndarray) -> np.ndarray:
 
 
 def cleared(field: VMField, region: np.ndarray) -> VMField:
-    """The field with the cells of a region (of `region_of`) empty in its distilled tensor; no number changes."""
+    """The field with the cells of a region (of `region_of`) empty in its distilled tensor; no number
+    changes.
+    """
     block = field.blocks[0]
     tensor = field.tensors[block.tensor]
     cell, lo = tensor.occupancy.cell, tensor.aabb[:3] + block.object_to_field[:3, 3]

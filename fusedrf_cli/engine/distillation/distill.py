@@ -1,7 +1,9 @@
 """Distil any radiance field into a VM student (FusedRF; PVD for one teacher).
 
-Three phases: ask the teacher on rays through it, fit the student's σ and colour at the points of those rays (3D losses), then a
-few passes over the rays themselves (RGB loss) at a tenth of the rate, kept only if the student got better on views of its own.
+Three phases: ask the teacher on rays through it, fit the student's σ and colour at the points of those rays
+(3D losses), then a
+few passes over the rays themselves (RGB loss) at a tenth of the rate, kept only if the student got better on
+views of its own.
 """
 
 import time
@@ -26,7 +28,7 @@ from fusedrf_cli.engine.rendering.volume import render_image
 
 RATE = 0.02
 RATE_DECAY = 0.1
-RGB_RATE = 0.004
+RGB_RATE = 0.1 * RATE
 OPAQUE = 5.0  # optical depth of a step beyond which more density cannot be seen
 DEPTH_GAIN = 10.0  # in log1p(gain τ): how much thin fog counts
 COLOUR_WEIGHT = 2.0
@@ -48,7 +50,9 @@ class DistillSettings:
     rgb_steps: int = 1500
     rgb_samples: int = 1 << 15
     time_budget: float | None = None
-    """Seconds for the 3D phase; the RGB phase gets as much again. None: the steps decide, and equal seeds give equal bytes."""
+    """Seconds for the 3D phase; the RGB phase gets as much again. None: the steps decide, and equal seeds
+    give equal bytes.
+    """
     seed: int = 0
     views: int = 4
     view_size: int = 160
@@ -74,7 +78,9 @@ class Judge:
 
     def __call__(self, student: RadianceField) -> float:
         """PSNR in dB of all pixels of all views together, over white."""
-        return psnr(np.stack([render_image(student, c).over(WHITE) for c in self.cameras]), np.stack(self.truth))
+        return psnr(
+            np.stack([render_image(student, c).over(WHITE) for c in self.cameras]), np.stack(self.truth)
+        )
 
 
 def resolution_for(aabb: np.ndarray, finest: float, shape: VMShape, max_numbers: int) -> tuple[int, int, int]:
@@ -85,7 +91,9 @@ def resolution_for(aabb: np.ndarray, finest: float, shape: VMShape, max_numbers:
     return texels(aabb, longest)
 
 
-def empty_student(teacher: RadianceField, settings: DistillSettings, generator: torch.Generator, name: str) -> VMField:
+def empty_student(
+    teacher: RadianceField, settings: DistillSettings, generator: torch.Generator, name: str
+) -> VMField:
     """An untrained student over the teacher's box, whose occupancy is the teacher's."""
     box = teacher.occupancy.aabb
     resolution = resolution_for(box, teacher.voxel_size, settings.shape, settings.max_numbers)
@@ -93,10 +101,14 @@ def empty_student(teacher: RadianceField, settings: DistillSettings, generator: 
     return student.with_occupancy(teacher.occupancy)
 
 
-def student_from(background: Placed, teacher: RadianceField, settings: DistillSettings, generator: torch.Generator) -> VMField | None:
-    """A student over the teacher's box that starts as the background (FusedRF §3), or None where that cannot be taken over.
+def student_from(
+    background: Placed, teacher: RadianceField, settings: DistillSettings, generator: torch.Generator
+) -> VMField | None:
+    """A student over the teacher's box that starts as the background (FusedRF §3), or None where that cannot
+    be taken over.
 
-    A VM decomposition follows its axes, so the background must be placed upright: moved and uniformly scaled only.
+    A VM decomposition follows its axes, so the background must be placed upright: moved and uniformly scaled
+    only.
     """
     linear = background.object_to_world[:3, :3]
     scale = linear[0, 0]
@@ -107,8 +119,16 @@ def student_from(background: Placed, teacher: RadianceField, settings: DistillSe
     source = background.field.tensors[0]
     placed_box = source.aabb * scale + np.tile(background.object_to_world[:3, 3], 2)
     tensor = VMTensor(source.resolution, placed_box, source.scale / scale, source.shift)
-    moved = VMField(background.field.shape, (tensor,), (Block(0, np.eye(4), "fused"),), background.field.params, OccupancyGrid.full(placed_box))
-    shape = VMShape(*(max(a, b) for a, b in zip(vars(moved.shape).values(), vars(settings.shape).values(), strict=True)))
+    moved = VMField(
+        background.field.shape,
+        (tensor,),
+        (Block(0, np.eye(4), "fused"),),
+        background.field.params,
+        OccupancyGrid.full(placed_box),
+    )
+    shape = VMShape(
+        *(max(a, b) for a, b in zip(vars(moved.shape).values(), vars(settings.shape).values(), strict=True))
+    )
     box = teacher.occupancy.aabb
     resolution = resolution_for(box, teacher.voxel_size, shape, settings.max_numbers)
     student = reshaped(moved, shape).resampled(box, resolution).with_occupancy(teacher.occupancy)
@@ -117,7 +137,9 @@ def student_from(background: Placed, teacher: RadianceField, settings: DistillSe
 
 
 def wake(student: VMField, generator: torch.Generator) -> None:
-    """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for ever."""
+    """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for
+    ever.
+    """
     for name, section in student.sections(0).items():
         if name != "colour_basis":
             section += 0.03 * torch.randn(section.shape, generator=generator)
@@ -132,7 +154,8 @@ def distill(
     phase: Callable[[str], None] = lambda name: None,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
 ) -> tuple[VMField, DistillReport]:
-    """Teach a one-block VM student in the teacher's frame; boxes are the scene's and the objects' (6,), for sampling.
+    """Teach a one-block VM student in the teacher's frame; boxes are the scene's and the objects' (6,), for
+    sampling.
 
     Raises FloatingPointError when the student's numbers are not finite any more.
     """
@@ -176,7 +199,9 @@ class _Clock:
 
 
 def shares(steps: int, budget: float | None):
-    """Yield the share of a phase that is done before each step: of its steps, or of its seconds where a budget is given."""
+    """Yield the share of a phase that is done before each step: of its steps, or of its seconds where a
+    budget is given.
+    """
     started, done = time.monotonic(), 0
     while (share := (time.monotonic() - started) / budget if budget is not None else done / steps) < 1:
         yield share
@@ -184,11 +209,18 @@ def shares(steps: int, budget: float | None):
 
 
 def fit_points(
-    student: VMField, pool: TeacherPool, step: float, settings: DistillSettings, generator: torch.Generator, advance: Callable
+    student: VMField,
+    pool: TeacherPool,
+    step: float,
+    settings: DistillSettings,
+    generator: torch.Generator,
+    advance: Callable,
 ) -> None:
-    """The 3D losses: (log1p(g τ_s) - log1p(g τ_t))^2 at the step's optical depth τ = σ δ, and colour weighted by alpha.
+    """The 3D losses: (log1p(g τ_s) - log1p(g τ_t))^2 at the step's optical depth τ = σ δ, and colour
+    weighted by alpha.
 
-    Depths beyond OPAQUE look the same and are not told apart; a saturated student still feels a gradient, which an alpha loss
+    Depths beyond OPAQUE look the same and are not told apart; a saturated student still feels a gradient,
+    which an alpha loss
     would not give it.
     """
     if not len(pool.points):
@@ -202,7 +234,9 @@ def fit_points(
             advance(share, {"loss": loss})
 
 
-def point_step(student: VMField, pool: TeacherPool, chosen: torch.Tensor, step: float, optimiser: Adam) -> float:
+def point_step(
+    student: VMField, pool: TeacherPool, chosen: torch.Tensor, step: float, optimiser: Adam
+) -> float:
     """Loss of the chosen points, its gradient added to the optimiser's."""
     points, dirs = pool.points[chosen], pool.dirs[chosen]
     sigma, rgb = student.query(points, dirs)
@@ -215,13 +249,25 @@ def point_step(student: VMField, pool: TeacherPool, chosen: torch.Tensor, step: 
     d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step
     d_rgb = 2 / n * COLOUR_WEIGHT * alpha[:, None] * off
     cpu.query_backward(
-        *student.kernel_shape, student.arrays, student.grid, points.numpy(), dirs.numpy(), d_sigma.numpy(), d_rgb.numpy(), optimiser.grads
+        *student.kernel_shape,
+        student.arrays,
+        student.grid,
+        points.numpy(),
+        dirs.numpy(),
+        d_sigma.numpy(),
+        d_rgb.numpy(),
+        optimiser.grads,
     )
     return float((error**2).mean() + COLOUR_WEIGHT * (alpha[:, None] * off**2).mean())
 
 
 def fit_rays(
-    student: VMField, pool: TeacherPool, step: float, settings: DistillSettings, generator: torch.Generator, advance: Callable
+    student: VMField,
+    pool: TeacherPool,
+    step: float,
+    settings: DistillSettings,
+    generator: torch.Generator,
+    advance: Callable,
 ) -> None:
     """The RGB loss over the teacher's own rays, colour over white and opacity."""
     optimiser = Adam(student, torch.get_num_threads())
@@ -237,11 +283,30 @@ def fit_rays(
         jitter = torch.rand(len(chosen), generator=generator, dtype=torch.float64).numpy()
         loss = np.zeros((optimiser.parts, 3))
         cpu.train_rays(
-            *student.kernel_shape, student.arrays, student.grid, pool.rays_o[chosen], pool.rays_d[chosen], 0.0, jitter, step, EARLY_STOP,
-            target[chosen].numpy(), np.ones((len(chosen), 3), np.float32), 0.1, slots, optimiser.grads, loss,
-        )  # fmt: skip
+            *student.kernel_shape,
+            student.arrays,
+            student.grid,
+            pool.rays_o[chosen],
+            pool.rays_d[chosen],
+            0.0,
+            jitter,
+            step,
+            EARLY_STOP,
+            target[chosen].numpy(),
+            np.ones((len(chosen), 3), np.float32),
+            0.1,
+            slots,
+            optimiser.grads,
+            loss,
+        )
         optimiser.step(RGB_RATE * RATE_DECAY**share)
-        count = int(np.clip(0.9 * count + 0.1 * settings.rgb_samples * len(chosen) / max(loss[:, 2].sum(), 1), 256, 1 << 14))
+        count = int(
+            np.clip(
+                0.9 * count + 0.1 * settings.rgb_samples * len(chosen) / max(loss[:, 2].sum(), 1),
+                256,
+                1 << 14,
+            )
+        )
         if i % 20 == 0:
             advance(share, {"psnr": float(-10 * np.log10(max(loss[:, 0].sum() / len(chosen), 1e-10)))})
 
@@ -252,7 +317,9 @@ def pruned(student: VMField) -> OccupancyGrid:
     cells = np.argwhere(grid.occupied)
 
     sigma = np.zeros(len(cells), np.float32)
-    cpu.density_at_cells(student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma)
+    cpu.density_at_cells(
+        student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma
+    )
     occupied = np.zeros_like(grid.occupied)
     occupied[tuple(cells[sigma * grid.cell.min() > EMPTY_BELOW].T)] = True
     kept = OccupancyGrid(grid.aabb, occupied).dilated().occupied & grid.occupied

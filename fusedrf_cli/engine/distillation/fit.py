@@ -59,9 +59,7 @@ class FitSettings:
 class RayPool:
     """Random pixels of posed pictures as rays with target colours."""
 
-    def __init__(
-        self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator
-    ):
+    def __init__(self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator):
         """images (n, H, W, 4) uint8 straight alpha."""
         self.images = torch.from_numpy(images).reshape(-1, 4)
         self.generator, self.pixels = generator, images.shape[1] * images.shape[2]
@@ -160,7 +158,9 @@ class FitRun:
             self.refresh(share)
             self.step(share)
             if self.steps == 1:
-                self.started = time.monotonic()  # a first run compiles in its first step; that is not the budget's
+                self.started = (
+                    time.monotonic()
+                )  # a first run compiles in its first step; that is not the budget's
             if self.steps % 20 == 0:
                 if not math.isfinite(self.mse):
                     raise FloatingPointError(f"the loss is {self.mse} after {self.steps} steps")
@@ -262,7 +262,14 @@ class FitRun:
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
         step = (1.0 if dense else STEP_PER_VOXEL) * field.voxel_size
         batch = Batch(
-            rays_o, rays_d, jitter, target.numpy(), background, settings.opacity_weight, settings.near, step,
+            rays_o,
+            rays_d,
+            jitter,
+            target.numpy(),
+            background,
+            settings.opacity_weight,
+            settings.near,
+            step,
             EARLY_STOP,
         )
         sums = self.rays_pass.gradient(field, batch, self.optimiser.grads)

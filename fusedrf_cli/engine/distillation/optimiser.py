@@ -32,10 +32,19 @@ class Adam:
         params = self.field.arrays.params
         for low, high, ratio in self.slices():
             cpu.adam(
-                params, self.grads, self.moment1, self.moment2, np.float32(rate * ratio), low, high,
-                np.float32(BETA1), np.float32(BETA2), np.float32(EPS), np.float32(correction1),
+                params,
+                self.grads,
+                self.moment1,
+                self.moment2,
+                np.float32(rate * ratio),
+                low,
+                high,
+                np.float32(BETA1),
+                np.float32(BETA2),
+                np.float32(EPS),
+                np.float32(correction1),
                 np.float32(correction2),
-            )  # fmt: skip
+            )
 
     def slices(self) -> list[tuple[int, int, float]]:
         """(low, high, rate ratio) of every group of parameters."""

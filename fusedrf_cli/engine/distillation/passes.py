@@ -67,10 +67,22 @@ class FusedPass:
         loss = np.zeros((len(grads), 3))
         diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
         cpu.train_rays(
-            *field.kernel_shape, field.arrays, field.grid, batch.rays_o, batch.rays_d, batch.near,
-            batch.jitter, batch.step, batch.early_stop, batch.target, batch.background, batch.opacity_weight,
-            int(diagonal / batch.step) + 2, grads, loss,
-        )  # fmt: skip
+            *field.kernel_shape,
+            field.arrays,
+            field.grid,
+            batch.rays_o,
+            batch.rays_d,
+            batch.near,
+            batch.jitter,
+            batch.step,
+            batch.early_stop,
+            batch.target,
+            batch.background,
+            batch.opacity_weight,
+            int(diagonal / batch.step) + 2,
+            grads,
+            loss,
+        )
         return loss.sum(0)
 
     def step(self, decay: float) -> None:
@@ -168,8 +180,8 @@ def shaded_samples(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Indices (M,) of samples whose colour is asked, and their chances of it, min(1, weight / THIN_BELOW).
 
-    Samples of weights under THIN_BELOW stand for their neighbours: along a ray one is taken each time the running
-    sum passes another multiple of it. In the untrained haze, where all have a little, it is one in twenty.
+    Samples of weights under THIN_BELOW stand for their neighbours: along a ray one is taken each time the
+    running sum passes another multiple of it. In the untrained haze that is one in twenty.
     """
     if not THIN_BELOW:
         seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]

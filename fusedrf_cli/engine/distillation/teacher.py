@@ -1,4 +1,6 @@
-"""What a teacher is asked before distilling: rays with their colours, and points with σ and colour on those rays."""
+"""What a teacher is asked before distilling: rays with their colours, and points with σ and colour on those
+rays.
+"""
 
 from dataclasses import dataclass
 
@@ -9,7 +11,9 @@ from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
-WHOLE_SCENE_SHARE = 0.5  # of the rays; the others are shared out over the objects, so that a small one is not missed
+WHOLE_SCENE_SHARE = (
+    0.5  # of the rays; the others are shared out over the objects, so that a small one is not missed
+)
 BELOW_SHARE = 0.1  # of the rays that look from under the horizon
 
 
@@ -30,11 +34,17 @@ class TeacherPool:
     """(N,), (N, 3) float32, what the teacher answered there."""
 
 
-def random_rays(boxes: list[np.ndarray], count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """rays_o, rays_d (count, 3) float64 from a shell around boxes[0] and the others in turn, each towards a random point of its box."""
+def random_rays(
+    boxes: list[np.ndarray], count: int, generator: torch.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """rays_o, rays_d (count, 3) float64 from a shell around boxes[0] and the others in turn, each towards a
+    random point of its box.
+    """
     others = boxes[1:] or boxes
     whole = int(count * WHOLE_SCENE_SHARE)
-    counts = [whole] + [(count - whole) // len(others) + (i < (count - whole) % len(others)) for i in range(len(others))]
+    counts = [whole] + [
+        (count - whole) // len(others) + (i < (count - whole) % len(others)) for i in range(len(others))
+    ]
     rays_o, rays_d = [], []
     for box, n in zip([boxes[0], *others], counts, strict=True):
         uniform = torch.rand(n, 7, generator=generator, dtype=torch.float64).numpy()
@@ -60,7 +70,9 @@ def ask(
     keep_points: float = 1.0,
     at_once: int = 1 << 16,
 ) -> TeacherPool:
-    """Render rays (R, 3) through a teacher and keep a share of the samples in front of what is opaque as points."""
+    """Render rays (R, 3) through a teacher and keep a share of the samples in front of what is opaque as
+    points.
+    """
     parts = []
     for start in range(0, len(rays_o), at_once):
         part = slice(start, start + at_once)
@@ -70,7 +82,12 @@ def ask(
 
 
 def _ask_part(
-    teacher: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray, step: float, generator: torch.Generator, keep: float
+    teacher: RadianceField,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    step: float,
+    generator: torch.Generator,
+    keep: float,
 ) -> tuple[torch.Tensor, ...]:
     n = len(rays_o)
     trans, pixels = np.ones(n, np.float32), np.zeros((n, 4), np.float32)

@@ -350,11 +350,14 @@ class VMField:
         shape = VMShape(**metadata["shape"])
         tensors = tuple(
             VMTensor(
-                tuple(t["resolution"]), np.asarray(t["aabb"], np.float64), t["scale"], t["shift"],
+                tuple(t["resolution"]),
+                np.asarray(t["aabb"], np.float64),
+                t["scale"],
+                t["shift"],
                 unpack_bits(arrays, f"tensor_{i}.occupancy", t["occupancy"]),
             )
             for i, t in enumerate(metadata["tensors"])
-        )  # fmt: skip
+        )
         blocks = tuple(
             Block(b["tensor"], np.asarray(b["object_to_field"], np.float64), b["name"])
             for b in metadata["blocks"]

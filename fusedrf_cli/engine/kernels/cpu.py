@@ -261,7 +261,8 @@ def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, st
 @task
 def train_task(
     ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-    background, opacity_weight, low, high, ts, pre, weights, carried, rgbs, blocks, slots, features, d_features,
+    background, opacity_weight, low, high, ts, pre, weights, carried, rgbs, blocks, slots, features,
+    d_features,
     basis, d_basis, sh, d_f, scratch, grad, loss,
 ):  # fmt: skip
     """`train_rays` for rays low..high, into one row of gradients and losses."""
@@ -278,7 +279,9 @@ def train_task(
         current = -1
         count = 0
         shaded = 0
-        waiting = 0.0  # weight of samples too light to be shaded alone; the next shaded one gives them its colour
+        waiting = (
+            0.0  # weight of samples too light to be shaded alone; the next shaded one gives them its colour
+        )
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
         while k >= 0 and trans > early_stop and count < ts.shape[0]:
             t = t0 + k * step
@@ -383,7 +386,8 @@ def train_rays(
         train_task(
             ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop,
             target, background, opacity_weight, p * n // parts, (p + 1) * n // parts, ts, pre, weights,
-            np.empty(max_samples), np.empty((max_samples, 3)), blocks, slots, np.empty(max_samples * width, kind),
+            np.empty(max_samples), np.empty((max_samples, 3)), blocks, slots, np.empty(max_samples * width,
+            kind),
             np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
             np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind), grads[p], loss[p],
         )  # fmt: skip

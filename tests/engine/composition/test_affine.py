@@ -1,4 +1,6 @@
-"""Placing a field by any invertible affine: optical depths against closed forms, and colours that turn along."""
+"""Placing a field by any invertible affine: optical depths against closed forms, and colours that turn
+along.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import CONDITION_LIMIT, Placed, mean_stretch
 from fusedrf_cli.engine.composition.composed import ComposedField
-from tests.engine.conftest import DIRECTIONS_26, BOX, AnalyticField, Gaussian, rays_at, unit
+from tests.engine.conftest import BOX, DIRECTIONS_26, AnalyticField, Gaussian, rays_at, unit
 
 
 def affine(linear, translation=(0.3, -0.2, 0.1)) -> np.ndarray:
@@ -84,10 +86,15 @@ def test_uniform_scale_divides_density():
 
 def test_points_and_directions_come_back():
     matrix = PLACEMENTS["all of it"]
-    points, dirs = np.random.default_rng(1).normal(size=(50, 3)), unit(np.random.default_rng(2).normal(size=(50, 3)))
+    points, dirs = (
+        np.random.default_rng(1).normal(size=(50, 3)),
+        unit(np.random.default_rng(2).normal(size=(50, 3))),
+    )
     world = points @ matrix[:3, :3].T + matrix[:3, 3]
     v = dirs @ matrix[:3, :3].T
-    x, d, stretch = Placed("one", Gaussian(), matrix).to_object(torch.from_numpy(world), torch.from_numpy(unit(v)))
+    x, d, stretch = Placed("one", Gaussian(), matrix).to_object(
+        torch.from_numpy(world), torch.from_numpy(unit(v))
+    )
     np.testing.assert_allclose(x, points, atol=1e-12)
     np.testing.assert_allclose(d, dirs, atol=1e-12)
     np.testing.assert_allclose(stretch, 1 / np.linalg.norm(v, axis=1), rtol=1e-12)
@@ -115,7 +122,9 @@ def test_a_flat_placement_is_refused_by_its_condition():
 
 def test_mean_stretch_of_a_stretched_sphere():
     """For M = diag(1, 1, k) the mean of |M^-1 d| has a closed form; k = 1/2 gives 1/2 (2 + asinh(√3)/√3)."""
-    assert mean_stretch(np.diag([1, 1, 0.5])) == pytest.approx(0.5 * (2 + np.arcsinh(3**0.5) / 3**0.5), rel=1e-4)
+    assert mean_stretch(np.diag([1, 1, 0.5])) == pytest.approx(
+        0.5 * (2 + np.arcsinh(3**0.5) / 3**0.5), rel=1e-4
+    )
 
 
 def test_moved_shifts_only_the_frame():

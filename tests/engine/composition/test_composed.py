@@ -15,6 +15,12 @@ from tests.engine.composition.test_affine import affine, turn
 from tests.engine.conftest import BOX, Ball, Gaussian, Slab, points_in, unit
 
 
+@pytest.fixture(autouse=True)
+def coarse_occupancy(monkeypatch):
+    """A grid that is made in no time: analytic fields have full occupancies anyway."""
+    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+
+
 class Painted(Slab):
     """A slab of one colour."""
 
@@ -23,7 +29,7 @@ class Painted(Slab):
         self.rgb = rgb
 
     def colour(self, points, dirs):
-        return np.broadcast_to(np.asarray(self.rgb, float), points.shape)
+        return np.broadcast_to(np.asarray(self.rgb, float), points.shape).copy()
 
 
 RED = Painted((1, 0, 0), density=3.0, low=-0.5, high=0.3)

@@ -1,0 +1,184 @@
+"""A folder of tiny solid fields, and the real bridge made small enough to run in seconds."""
+
+import importlib
+import json
+import shutil
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+from formats.captures import write_capture
+from formats.images import read_image
+from formats.scene import SceneGraph, make_node, write_scene
+from formats.views import View
+from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.engine.composition import composed
+from fusedrf_cli.engine.distillation import distill
+from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
+from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.fields import vm
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.rendering.cameras import orbit
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.main import cli
+
+SHAPE = VMShape(16, 8, 1)  # the one that the engine's tests compile
+
+
+@dataclass(frozen=True)
+class TinySettings(DistillSettings):
+    """A distillation of a second."""
+
+    shape: VMShape = SHAPE
+    rays: int = 3000
+    steps: int = 50
+    rgb_steps: int = 10
+    rgb_samples: int = 1 << 12
+    views: int = 2
+    view_size: int = 32
+
+
+PLACES = {"floor": (0, 0, -0.7), "red": (-0.5, 0, 0), "blue": (0.7, 0, 0)}
+
+
+def part(name: str):
+    """A module of the bridge: its package's attributes of that name are the functions."""
+    return importlib.import_module(f"fusedrf_cli.bridge.{name}")
+
+
+def solid(rgb, half=(0.3, 0.3, 0.3), density: float = 20.0) -> VMField:
+    """A box of one density and one colour around its origin, by rank-1 factors on 16 x 16 x 16 texels."""
+    half = np.asarray(half, float)
+    box = np.concatenate([-half, half])
+    field = VMField(
+        SHAPE,
+        (VMTensor((16, 16, 16), box, density, 0.0, np.ones((4, 4, 4), bool)),),
+        (Block(0, np.eye(4), ""),),
+        torch.zeros(SHAPE.size((16, 16, 16))),
+        OccupancyGrid.full(box, 4),
+    )
+    sections = field.sections(0)
+    for what, value in (("density", np.log(np.e - 1)), ("colour", 1.0)):  # softplus gives 1
+        sections[f"{what}_plane_0"][..., 0] = value
+        sections[f"{what}_line_0"][:, 0] = 1
+    logits = np.log(np.asarray(rgb) / (1 - np.asarray(rgb)))
+    sections["colour_basis"][:, 0, 0] = torch.from_numpy(logits / 0.28209479177387814).float()
+    return field.with_occupancy(OccupancyGrid(box, np.ones((4, 4, 4), bool)))
+
+
+FIELDS = {
+    "floor": solid((0.3, 0.6, 0.3), (1.4, 0.8, 0.2)),
+    "red": solid((0.9, 0.1, 0.1)),
+    "blue": solid((0.1, 0.2, 0.9)),
+}
+
+
+def write_scene_of(folder: Path, *names: str, file: str = "scene.json", **more) -> None:
+    """A scene of some of the solids at their PLACES; `more` are words of the scene graph."""
+    nodes = [
+        make_node(n, source=f"{n}.rfpack", translation=PLACES[n], background=n == "floor") for n in names
+    ]
+    write_scene(folder / file, SceneGraph(tuple(nodes), **more))
+
+
+def write_views(folder: Path, field=None) -> None:
+    """A capture of 8 train and 2 test views, 24 x 24, of a field (the red box)."""
+    field = field or FIELDS["red"]
+    box = np.array([-0.4, -0.4, -0.4, 0.4, 0.4, 0.4])
+    cameras = orbit(box, 5, 24, 24) + orbit(box, 5, 24, 24, elevation=-0.5)
+    views, pixels = [], []
+    for i, c in enumerate(cameras):
+        shot = render_image(field, c)
+        alpha = shot.opacity[..., None]
+        straight = shot.rgb / np.maximum(alpha, 1e-6)
+        pixels.append(np.rint(255 * np.clip(np.concatenate([straight, alpha], -1), 0, 1)).astype(np.uint8))
+        views.append(View(f"r_{i}", c.camera_to_world, c.fl_x, c.fl_y, c.cx, c.cy, 24, 24))
+    for split, chosen in (("train", [0, 1, 2, 3, 5, 6, 7, 8]), ("test", [4, 9])):
+        write_capture(folder, [views[i] for i in chosen], np.stack([pixels[i] for i in chosen]), split)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tiny():
+    """Coarse grids, few steps, small pictures: what is tested here is the way, not the quality."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(vm, "OWNERSHIP_CELLS", 48)
+        patch.setattr(composed, "OCCUPANCY_CELLS", 48)
+        patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
+        for name in ("fuse", "edit"):
+            patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
+        small = {
+            name: getattr(TINY, name)
+            for name in ("shape", "rays", "steps", "rgb_steps", "rgb_samples", "views", "view_size")
+        }
+        patch.setattr(part("fuse"), "DistillSettings", partial(DistillSettings, **small))
+        patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
+        patch.setattr(part("train"), "VMShape", partial(VMShape, SHAPE.density_rank, SHAPE.colour_rank))
+        draft = FitSettings(longest=24, steps=60, samples=1 << 13)
+        patch.setattr(part("train"), "QUALITY", dict.fromkeys(("draft", "normal", "high"), draft))
+        yield
+
+
+@pytest.fixture(scope="session")
+def shop(tmp_path_factory) -> Path:
+    """floor, red and blue as bundles, and scene.json of all three."""
+    folder = tmp_path_factory.mktemp("shop")
+    for name, field in FIELDS.items():
+        write_field(str(folder / f"{name}.rfpack"), field, name, precision="float16", overwrite=False)
+    write_scene_of(folder, "floor", "red", "blue")
+    write_scene_of(folder, "floor", "red", file="pair.json")
+    write_views(folder / "photos")
+    return folder
+
+
+def invoke(folder: Path, *words: str):
+    """click's Result of a command line in a folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        return CliRunner().invoke(cli, words)
+
+
+def done(folder: Path, *words: str) -> dict:
+    """The JSON report of a command line that has to succeed."""
+    result = invoke(folder, *words, "--json")
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def folder(tmp_path, shop) -> Path:
+    """A copy of the shop that a test may spoil."""
+    return Path(shutil.copytree(shop, tmp_path / "shop"))
+
+
+@pytest.fixture
+def run(folder):
+    """run("info", "red.rfpack") -> click's Result, in `folder`."""
+    return partial(invoke, folder)
+
+
+@pytest.fixture
+def report(folder):
+    """report("fuse", ...) -> the JSON of a command that succeeds, in `folder`."""
+    return partial(done, folder)
+
+
+@pytest.fixture
+def picture(folder, report):
+    """picture("fused.rfpack") -> (H, W, 3) in [0, 1] of a scene from one camera over white."""
+    transforms = folder / "eye.json"
+    c = orbit(np.array([-1.4, -0.8, -0.9, 1.4, 0.8, 0.4]), 1, 48, 48)[0]
+    content = {"fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "w": 48, "h": 48}
+    frame = {"file_path": "eye", "transform_matrix": c.camera_to_world.tolist()}
+    transforms.write_text(json.dumps({**content, "frames": [frame]}))
+
+    def picture(scene: str) -> np.ndarray:
+        report("render", scene, "--cameras", "eye.json", "-o", "eye.png", "-w")
+        return read_image(folder / "eye.png")[..., :3] / 255
+
+    return picture

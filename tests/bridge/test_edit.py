@@ -1,0 +1,150 @@
+"""`add` and `delete` for real: what was not touched stays, and what was is right."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from formats.bundle import read_bundle
+from fusedrf_cli.engine.rendering.cameras import orbit
+from fusedrf_cli.engine.rendering.metrics import psnr
+from tests.bridge.conftest import FIELDS, PLACES, done
+
+VM = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
+AT = ("--name", "blue", "-t", "0.7,0,0")
+
+
+@pytest.fixture(scope="module")
+def fused(shop, tmp_path_factory):
+    """The shop with blocks.rfpack (floor and red), vm.rfpack (floor, red and blue in one tensor), and
+    kept.rfpack (the same,
+    its sources inside)."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("fused") / "shop")
+    done(folder, "fuse", "pair.json", "-o", "blocks.rfpack")
+    done(folder, "fuse", "scene.json", "-o", "vm.rfpack", *VM)
+    done(folder, "fuse", "scene.json", "-o", "kept.rfpack", *VM, "--keep-sources")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path, fused):
+    return shutil.copytree(fused, tmp_path / "shop")
+
+
+def covered(name: str, grown: float = 0.15) -> np.ndarray:
+    """(48, 48) pixels of the `picture` camera that may see the object's box, a margin included."""
+    camera = orbit(np.array([-1.4, -0.8, -0.9, 1.4, 0.8, 0.4]), 1, 48, 48)[0]
+    box = FIELDS[name].aabb + np.tile(PLACES[name], 2) + grown * np.array([-1, -1, -1, 1, 1, 1])
+    rays_o, rays_d = camera.rays()
+    with np.errstate(divide="ignore"):
+        a, b = (box[:3] - rays_o) / rays_d, (box[3:] - rays_o) / rays_d
+    return (np.minimum(a, b).max(1) < np.maximum(a, b).min(1)).reshape(48, 48)
+
+
+def blues(image) -> int:
+    return int(((image[..., 2] > 0.6) & (image[..., 0] < 0.4) & (image[..., 1] < 0.45)).sum())
+
+
+def test_added_and_deleted_is_as_before(report, picture, folder):
+    """Blocks: outside of the new object's box the picture stays, with it it is the scene's, without it the
+    old bytes' one.
+    """
+    before = picture("blocks.rfpack")
+    said = report("add", "blocks.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
+    assert said["touched"]["blocks"] == 3 and said["psnr"]["before_rgb"] > 40
+    np.testing.assert_allclose(said["touched"]["aabb"], [0.4, -0.3, -0.3, 1.0, 0.3, 0.3], atol=1e-6)
+    more = picture("more.rfpack")
+    away = ~covered("blue")
+    assert psnr(more[away], before[away]) >= 45 and blues(more) > 20 and blues(before) == 0
+    assert psnr(more, picture("scene.json")) > 40
+    report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
+    assert psnr(picture("less.rfpack"), before) >= 50
+    one, other = (next(iter(read_bundle(folder / f"{n}.rfpack").fields)) for n in ("blocks", "less"))
+    assert one == other  # the field's bytes, by their hash
+
+
+def test_history_tells_of_every_edit(report, folder):
+    report("add", "blocks.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
+    report("delete", "more.rfpack", "red", "-o", "less.rfpack")
+    history = read_bundle(folder / "less.rfpack").scene.history
+    assert [entry["event"] for entry in history] == ["fused", "added", "deleted"]
+    assert history[1]["nodes"][0]["name"] == "blue" and history[2]["names"] == ["red"]
+    np.testing.assert_allclose(history[1]["nodes"][0]["aabb"], [0.4, -0.3, -0.3, 1.0, 0.3, 0.3], atol=1e-6)
+    report(
+        "add", "less.rfpack", "red.rfpack", "--name", "red", "-o", "again.rfpack"
+    )  # the name is free again
+
+
+def test_a_block_is_dropped_and_the_others_stay(report, picture):
+    report("delete", "blocks.rfpack", "red", "-o", "less.rfpack")
+    away = ~covered("red")
+    assert psnr(picture("less.rfpack")[away], picture("blocks.rfpack")[away]) >= 45
+    assert psnr(picture("less.rfpack")[~away], picture("blocks.rfpack")[~away]) < 25
+
+
+@pytest.mark.parametrize("bundle", ["vm.rfpack", "kept.rfpack"])
+def test_a_distilled_object_is_cut_out_and_the_rest_learnt_again(report, picture, folder, bundle):
+    """The sources lie beside the bundle, or inside it where they were kept."""
+    if bundle == "kept.rfpack":
+        for name in FIELDS:
+            (folder / f"{name}.rfpack").unlink()
+    before = picture(bundle)
+    said = report("delete", bundle, "blue", "-o", "less.rfpack", "--no-rgb")
+    assert (
+        said["warnings"] == [] and read_bundle(folder / "less.rfpack").scene.history[-1]["restored"] is True
+    )
+    after, away = picture("less.rfpack"), ~covered("blue", 0.3)
+    assert blues(before) > 10 and blues(after) == 0
+    assert psnr(after[away], before[away]) >= 40
+
+
+def test_without_its_sources_a_hole_stays_and_is_said(report, picture, folder):
+    (folder / "floor.rfpack").write_bytes(b"another file")
+    said = report("delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
+    assert any("the source of 'floor' is not to be had" in w for w in said["warnings"])
+    assert read_bundle(folder / "less.rfpack").scene.history[-1]["restored"] is False
+    assert blues(picture("less.rfpack")) == 0
+
+
+def test_sources_outside_are_read_only_where_allowed(report, folder):
+    (folder / "inner").mkdir()
+    report("fuse", "scene.json", "-o", "inner/vm.rfpack", *VM)
+    said = report("delete", "inner/vm.rfpack", "blue", "-o", "a.rfpack", "--no-rgb")
+    assert said["warnings"]
+    said = report("delete", "inner/vm.rfpack", "blue", "-o", "b.rfpack", "--no-rgb", "--allow-outside")
+    assert not said["warnings"]
+
+
+def test_an_object_added_to_a_distilled_field_can_go_again(report, picture):
+    before = picture("vm.rfpack")
+    report("add", "vm.rfpack", "red.rfpack", "--name", "second", "-t", "0,0,0.4", "-o", "more.rfpack")
+    assert psnr(picture("more.rfpack"), before) < 30
+    report("delete", "more.rfpack", "second", "-o", "less.rfpack")
+    assert psnr(picture("less.rfpack"), before) >= 50
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (("add", "blocks.rfpack", "blue.rfpack", "--name", "red"), "a 'red' already"),
+        (("add", "scene.json", "blue.rfpack", "--name", "new"), "not a bundle"),
+        (("delete", "blocks.rfpack", "ghost"), "no 'ghost' to delete; it holds floor, red"),
+        (("delete", "blocks.rfpack", "red", "floor"), "would leave nothing"),
+        (("delete", "vm.rfpack", "red", "floor", "blue"), "would leave nothing"),
+        (("delete", "scene.json", "red"), "not a bundle"),
+        (("add", "blocks.rfpack", "gone.rfpack", "--name", "new"), "no such file"),
+    ],
+)
+def test_what_cannot_be_edited_is_exit_3(run, folder, words, says):
+    result = run(*words, "-o", "out.rfpack")
+    assert result.exit_code == 3 and says in result.stderr and not (folder / "out.rfpack").exists()
+
+
+def test_no_cuda_and_no_silent_overwriting(run, folder):
+    assert (
+        run("add", "blocks.rfpack", "blue.rfpack", *AT, "-o", "x.rfpack", "--device", "cuda").exit_code == 5
+    )
+    assert run("delete", "blocks.rfpack", "red", "-o", "x.rfpack", "--device", "cuda").exit_code == 5
+    size = (folder / "vm.rfpack").stat().st_size
+    assert run("delete", "blocks.rfpack", "red", "-o", "vm.rfpack").exit_code != 0
+    assert (folder / "vm.rfpack").stat().st_size == size

@@ -1,0 +1,42 @@
+"""`eval` for real: against photos and against another scene."""
+
+import pytest
+
+
+def test_a_field_against_its_own_photos(report):
+    """The photos were taken of this very field: 8 bits and float16 are all that differs."""
+    for split, count in (("test", 2), ("train", 8), ("all", 10)):
+        said = report("eval", "red.rfpack", "--against", "photos", "--split", split)
+        assert len(said["views"]) == count and said["mean"]["psnr"] > 40 and said["mean"]["ssim"] > 0.99
+    mean = sum(v["psnr"] for v in said["views"]) / 10
+    assert said["mean"]["psnr"] == pytest.approx(mean)
+
+
+def test_another_field_is_worse(report):
+    assert report("eval", "blue.rfpack", "--against", "photos")["mean"]["psnr"] < 20
+
+
+def test_a_scene_against_itself_and_another(report):
+    same = report("eval", "scene.json", "--against", "scene.json", "--size", "24x24")
+    assert len(same["views"]) == 8 and same["mean"] == {"psnr": 100, "ssim": 1}
+    less = report("eval", "pair.json", "--against", "scene.json", "--size", "24x24")
+    assert less["mean"]["psnr"] < 30
+
+
+@pytest.mark.parametrize(
+    "words, code, says",
+    [
+        (("photos", "--size", "10x10"), 3, "24x24"),
+        (("photos", "--device", "cuda"), 5, "CPU only"),
+        (("gone",), 3, "no such file"),
+    ],
+)
+def test_what_cannot_be_compared(run, words, code, says):
+    result = run("eval", "red.rfpack", "--against", *words)
+    assert result.exit_code == code and says in result.stderr and result.stdout == ""
+
+
+def test_a_split_without_views_is_said(run, folder):
+    (folder / "photos" / "transforms_test.json").unlink()
+    result = run("eval", "red.rfpack", "--against", "photos")
+    assert result.exit_code == 3 and "no test views" in result.stderr

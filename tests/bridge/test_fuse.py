@@ -1,0 +1,116 @@
+"""`fuse` for real: blocks, a distilled tensor, limits, and what is refused."""
+
+import json
+
+import pytest
+
+from formats.bundle import read_bundle
+from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.engine.rendering.metrics import psnr
+from tests.bridge.conftest import part, write_scene_of
+
+VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
+
+
+def test_a_scene_becomes_blocks_that_look_the_same(report, folder, picture):
+    said = report("fuse", "scene.json", "-o", "fused.rfpack")
+    assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] > 45
+    assert said["bytes"] == (folder / "fused.rfpack").stat().st_size
+    assert psnr(picture("fused.rfpack"), picture("scene.json")) > 45
+    scene = read_bundle(folder / "fused.rfpack").scene
+    (entry,) = scene.history
+    assert entry["event"] == "fused" and [n["name"] for n in entry["nodes"]] == ["floor", "red", "blue"]
+    assert [n["source"] for n in entry["nodes"]] == ["floor.rfpack", "red.rfpack", "blue.rfpack"]
+    assert (
+        not any(n["kept"] for n in entry["nodes"]) and len(read_bundle(folder / "fused.rfpack").fields) == 1
+    )
+
+
+def test_the_same_scene_gives_the_same_bytes(report, folder):
+    for name in ("one", "two"):
+        report("fuse", "scene.json", "-o", f"{name}.rfpack")
+        report("fuse", "pair.json", "-o", f"{name}-vm.rfpack", *VM, "--seed", "3")
+    for kind in ("", "-vm"):
+        assert (folder / f"one{kind}.rfpack").read_bytes() == (folder / f"two{kind}.rfpack").read_bytes()
+
+
+def test_a_scene_becomes_one_tensor(report, folder, picture):
+    said = report(
+        "fuse", "scene.json", "-o", "fused.rfpack", "--kind", "vm", "--keep-sources", "--max-size", "300kB"
+    )
+    assert said["kind"] == "vm" and said["psnr"]["after_rgb"] is not None
+    assert max(said["psnr"]["before_rgb"], said["psnr"]["after_rgb"]) > 17
+    bundle = read_bundle(folder / "fused.rfpack")
+    assert len(bundle.fields) == 4 and all(n["kept"] for n in bundle.scene.history[0]["nodes"])
+    assert "floor" in said["chosen"]["start"]
+    assert psnr(picture("fused.rfpack"), picture("scene.json")) > 17
+
+
+@pytest.mark.parametrize("kind", ["blocks", "vm"])
+def test_the_file_is_no_larger_than_asked(report, folder, kind):
+    whole = report("fuse", "pair.json", "-o", "whole.rfpack")["bytes"]
+    limit = 70_000 + whole // 3
+    said = report(
+        "fuse", "pair.json", "-o", "less.rfpack", "--kind", kind, "--no-rgb", "--max-size", str(limit)
+    )
+    assert said["bytes"] <= limit and (kind == "vm" or said["bytes"] < whole)
+
+
+def test_add_composition_is_distilled(report, run, folder):
+    write_scene_of(folder, "floor", "red", file="fog.json", composition="add")
+    assert report("fuse", "fog.json", "-o", "fog.rfpack", "--no-rgb")["kind"] == "vm"
+    result = run("fuse", "fog.json", "-o", "blocks.rfpack", "--kind", "blocks")
+    assert result.exit_code == 3 and "--kind vm" in result.stderr
+
+
+def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
+    result = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--target-psnr", "90", "--json")
+    assert result.exit_code == 7 and "--target-psnr asked for 90" in result.stderr
+    assert json.loads(result.stdout)["bytes"] == (folder / "fused.rfpack").stat().st_size
+    assert run("fuse", "pair.json", "-o", "other.rfpack", "--target-psnr", "10").exit_code == 0
+
+
+def test_a_stretched_object_is_warned_of(report, folder):
+    nodes = (
+        make_node("floor", source="floor.rfpack"),
+        make_node("red", source="red.rfpack", scale=(1, 1, 2)),
+    )
+    write_scene(folder / "tall.json", SceneGraph(nodes))
+    said = report("fuse", "tall.json", "-o", "tall.rfpack", *VM)
+    assert any("'red' is stretched by 2.00" in w for w in said["warnings"])
+
+
+def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(part("fuse"), "distill", stop)
+        assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM).exit_code == 130
+    assert not (folder / "fused.rfpack").exists() and (folder / "fused.rfpack.checkpoint").exists()
+    wrong = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume", "--max-size", "80kB")
+    assert wrong.exit_code == 3 and "other settings" in wrong.stderr
+    assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume").exit_code == 0
+    assert not (folder / "fused.rfpack.checkpoint").exists()
+
+
+@pytest.mark.parametrize(
+    "words, code, says",
+    [
+        (("scene.json", "--resume", "--kind", "vm"), 3, "no checkpoint"),
+        (("nowhere.json",), 3, "no such file"),
+        (("scene.json", "--device", "cuda"), 5, "CPU only"),
+        (("scene.json", "--kind", "hash"), 2, "hash"),
+    ],
+)
+def test_what_cannot_be_fused(run, folder, words, code, says):
+    result = run("fuse", *words, "-o", "fused.rfpack")
+    assert result.exit_code == code and says in result.stderr and result.stdout == ""
+    assert not (folder / "fused.rfpack").exists()
+
+
+def test_an_output_in_the_way_is_left_alone(run, folder):
+    (folder / "fused.rfpack").write_text("mine")
+    assert run("fuse", "scene.json", "-o", "fused.rfpack").exit_code != 0
+    assert (folder / "fused.rfpack").read_text() == "mine"
+    assert run("fuse", "scene.json", "-o", "fused.rfpack", "-w").exit_code == 0

@@ -1,0 +1,90 @@
+"""`render` for real: one picture, a folder, a film, depth and transparency."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from formats.images import read_image
+
+SMALL = ("--size", "32x24")
+
+
+def test_one_picture_frames_the_scene(report, folder):
+    said = report("render", "red.rfpack", "-o", "red.png", *SMALL)
+    assert said["views"] == 1 and said["size"] == [32, 24] and said["files"] == ["red.png"]
+    pixels = read_image(folder / "red.png")
+    assert pixels.shape == (24, 32, 4)
+    assert (pixels[0, 0] == 255).all()  # white outside
+    middle = pixels[12, 16, :3] / 255
+    np.testing.assert_allclose(middle, (0.9, 0.1, 0.1), atol=0.02)
+
+
+def test_the_background_is_as_asked(report, folder):
+    report("render", "red.rfpack", "-o", "red.png", *SMALL, "--background", "#102030")
+    assert read_image(folder / "red.png")[0, 0].tolist() == [16, 32, 48, 255]
+
+
+def test_transparent_has_straight_alpha(report, folder):
+    report("render", "red.rfpack", "-o", "red.png", *SMALL, "--background", "transparent")
+    pixels = read_image(folder / "red.png")
+    assert pixels[0, 0, 3] == 0 and pixels[12, 16, 3] == 255
+    seen = pixels[pixels[..., 3] > 8]
+    assert (seen[:, 3] < 250).any()  # edges are part transparent, their colour is still the object's
+    assert np.abs(seen[:, :3].astype(int) - [230, 26, 26]).max() <= 16
+
+
+def test_a_folder_has_one_picture_per_view(report, folder):
+    said = report("render", "scene.json", "-o", "turn", "--orbit", "3", *SMALL)
+    assert [file.name for file in sorted((folder / "turn").iterdir())] == [
+        f"orbit_000{i}.png" for i in range(3)
+    ]
+    assert said["views"] == len(said["files"]) == 3
+    one, two = (read_image(folder / f) for f in said["files"][:2])
+    assert (one != two).any()
+
+
+def test_depth_lies_beside(report, folder):
+    said = report("render", "red.rfpack", "-o", "red.png", *SMALL, "--depth")
+    depth = np.asarray(Image.open(folder / "red_depth.png"), float) * said["files"][0]["depth"]["scale"]
+    assert depth.shape == (24, 32) and depth[0, 0] == 0
+    report("render", "red.rfpack", "-o", "turn", "--orbit", "2", *SMALL, "--depth")
+    assert len(list((folder / "turn").iterdir())) == 4
+    assert 1.0 < depth[12, 16] < 3.0  # 0.92 radii / sin(fov) away, about 1.6 less half a box
+
+
+def test_a_film_turns(report, folder):
+    report("render", "scene.json", "-o", "turn.gif", "--orbit", "3", *SMALL, "--fps", "10")
+    with Image.open(folder / "turn.gif") as film:
+        assert film.n_frames == 3 and film.size == (32, 24) and film.info["duration"] == 100
+
+
+def test_the_scene_is_the_sum_of_its_parts(picture):
+    """The composed scene shows floor, red and blue; without blue its pixels are no longer blue."""
+
+    def blues(image):
+        return ((image[..., 2] > 0.7) & (image[..., 0] < 0.3)).sum()
+
+    assert blues(picture("scene.json")) > 20 and blues(picture("pair.json")) == 0
+
+
+@pytest.mark.parametrize(
+    "words, code, says",
+    [
+        (("-o", "a.gif", "--background", "transparent"), 2, "transparency"),
+        (("-o", "a.gif", "--depth"), 2, "depth"),
+        (("-o", "a.png", "--orbit", "2"), 2, "one picture"),
+        (("-o", "a.png", "--device", "cuda"), 5, "CPU only"),
+        (("-o", "a.png", "--cameras", "none.json"), 3, "none.json"),
+    ],
+)
+def test_what_cannot_be_rendered(run, folder, words, code, says):
+    before = sorted(folder.iterdir())
+    result = run("render", "red.rfpack", *SMALL, *words)
+    assert result.exit_code == code and says in result.stderr and sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("output", ["red.png", "turn"])
+def test_an_output_in_the_way_needs_a_word(run, folder, output):
+    assert run("render", "red.rfpack", "-o", output, *SMALL).exit_code == 0
+    assert run("render", "red.rfpack", "-o", output, *SMALL).exit_code != 0
+    assert run("render", "red.rfpack", "-o", output, *SMALL, "-w").exit_code == 0

@@ -1,0 +1,114 @@
+"""`train` for real, on eight pictures of 24 x 24."""
+
+import json
+
+import pytest
+
+from formats.bundle import read_bundle
+from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.errors import Interrupted
+
+WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
+
+
+def train(report, output="out.rfpack", *more):
+    return report("train", "photos", "-o", output, *WORDS, *more)
+
+
+def test_photos_become_a_field(report, folder, picture):
+    said = train(report)
+    assert said["views"] == 8 and said["steps"] == 60 and said["kind"] == "vm" and said["holdout"] is None
+    assert said["training_psnr"] > 12 and said["bytes"] == (folder / "out.rfpack").stat().st_size
+    (record,) = read_bundle(folder / "out.rfpack").fields.values()
+    assert record.kind == "vm" and record.metadata["shape"]["sh_degree"] == 1
+    seen = report("eval", "out.rfpack", "--against", "photos")["mean"]["psnr"]
+    assert seen > 14
+
+
+def test_the_same_seed_gives_the_same_bytes(report, folder):
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        train(report, f"{name}.rfpack", "--seed", seed)
+    a, b, c = (next(iter(read_bundle(folder / f"{n}.rfpack").fields)) for n in "abc")
+    assert a == b != c
+
+
+@pytest.mark.parametrize("at", [1, 31])
+def test_an_interrupted_run_goes_on_to_the_same_bytes(report, run, folder, monkeypatch, at):
+    """Members are named by their content's hash: the same name is the same numbers."""
+    train(report, "straight.rfpack")
+    step = FitRun.step
+
+    def stopping(self, share):
+        if self.steps == at:
+            raise Interrupted(2)
+        step(self, share)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FitRun, "step", stopping)
+        result = run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert result.exit_code == 130 and "--resume" in result.stderr
+    assert not (folder / "out.rfpack").exists() and (folder / "out.rfpack.checkpoint").exists()
+    assert train(report, "out.rfpack", "--resume")["steps"] == 60
+    assert not (folder / "out.rfpack.checkpoint").exists()
+    straight, resumed = (read_bundle(folder / f"{n}.rfpack").fields for n in ("straight", "out"))
+    assert list(straight) == list(resumed)
+
+
+def test_a_plain_keyboard_interrupt_leaves_a_checkpoint_too(run, folder, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FitRun, "refresh_occupancy", stop)
+    assert run("train", "photos", "-o", "out.rfpack", *WORDS).exit_code == 130
+    assert (folder / "out.rfpack.checkpoint").exists()
+
+
+def test_holdout_measures_on_views_left_out(report):
+    said = train(report, "out.rfpack", "--holdout", "4")
+    assert said["views"] + said["holdout"]["views"] >= 8 and said["holdout"]["views"] >= 2
+    assert said["holdout"]["psnr"] > 10
+
+
+def test_max_size_makes_it_smaller(report):
+    whole = train(report, "whole.rfpack")["bytes"]
+    less = train(report, "less.rfpack", "--max-size", "60kB")
+    assert less["bytes"] < whole and max(less["resolution"]) < 24
+
+
+def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--target-psnr", "80", "--json")
+    assert result.exit_code == 7 and "--target-psnr asked for 80" in result.stderr
+    assert json.loads(result.stdout)["bytes"] == (folder / "out.rfpack").stat().st_size
+
+
+def test_divergence_is_exit_6(run, folder, monkeypatch):
+    step = FitRun.step
+
+    def spoiled(self, share):
+        step(self, share)
+        self.mse = float("nan")
+
+    monkeypatch.setattr(FitRun, "step", spoiled)
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert result.exit_code == 6 and "diverged" in result.stderr and not (folder / "out.rfpack").exists()
+
+
+def test_a_checkpoint_of_something_else_is_refused(run, folder):
+    for content, says in ((b"junk", "not a readable checkpoint"), (None, "no checkpoint")):
+        path = folder / "out.rfpack.checkpoint"
+        path.unlink(missing_ok=True)
+        if content:
+            path.write_bytes(content)
+        result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--resume")
+        assert result.exit_code == 3 and says in result.stderr
+
+
+@pytest.mark.parametrize("device, code", [("cuda", 5), ("cpu", 0)])
+def test_only_the_cpu_computes(run, device, code):
+    assert run("train", "photos", "-o", "out.rfpack", *WORDS, "--device", device).exit_code == code
+
+
+def test_an_output_in_the_way_is_left_alone(run, folder):
+    (folder / "out.rfpack").write_text("mine")
+    assert run("train", "photos", "-o", "out.rfpack", *WORDS).exit_code != 0
+    assert (folder / "out.rfpack").read_text() == "mine"
