@@ -22,6 +22,7 @@ from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000
+HEADER_BYTES = 16384  # scene graph, history and headers of a bundle, about
 CONDITION_NOTED = 1.02  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -56,10 +57,12 @@ def fuse(
         if chosen == "blocks":
             field, figures = fuse_blocks(loaded, composed, limit, precision, seed, progress)
         else:
+            overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
+            numbers = max(1, (limit - overhead) // BYTES_PER_NUMBER[precision])
             settings = DistillSettings(
                 seed=seed,
                 time_budget=time_budget,
-                max_numbers=limit // BYTES_PER_NUMBER[precision] * 97 // 100,
+                max_numbers=numbers,
             )
             field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
         kept = {f.member: f.record for f in loaded.fields} if keep_sources else {}

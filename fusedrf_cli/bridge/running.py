@@ -24,7 +24,7 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
         raise ResourceProblem(
             "--device cuda: this version computes on the CPU only; use --device auto or cpu"
         )
-    count = threads or len(os.sched_getaffinity(0))
+    count = threads or available_cores()
     from fusedrf_cli.engine import kernels
 
     torch.set_num_threads(count)
@@ -41,6 +41,13 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
         if "alloc" in str(error):
             raise ResourceProblem("not enough memory; try a smaller --max-size or --size") from error
         raise
+
+
+def available_cores() -> int:
+    """Cores this process may run on; the system's own count where it cannot be asked."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def checkpoint_path(output: str) -> Path:

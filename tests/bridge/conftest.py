@@ -112,11 +112,7 @@ def tiny():
         patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
         for name in ("fuse", "edit"):
             patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
-        small = {
-            name: getattr(TINY, name)
-            for name in ("shape", "rays", "steps", "rgb_steps", "rgb_samples", "views", "view_size")
-        }
-        patch.setattr(part("fuse"), "DistillSettings", partial(DistillSettings, **small))
+        patch.setattr(part("fuse"), "DistillSettings", TinySettings)
         patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
         patch.setattr(part("train"), "VMShape", partial(VMShape, SHAPE.density_rank, SHAPE.colour_rank))
         draft = FitSettings(longest=24, steps=60, samples=1 << 13)

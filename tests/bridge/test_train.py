@@ -5,8 +5,9 @@ import json
 import pytest
 
 from formats.bundle import read_bundle
-from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.errors import Interrupted
+from tests.bridge.conftest import part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
 
@@ -15,14 +16,16 @@ def train(report, output="out.rfpack", *more):
     return report("train", "photos", "-o", output, *WORDS, *more)
 
 
-def test_photos_become_a_field(report, folder, picture):
+def test_photos_become_a_field(report, folder, monkeypatch):
+    longer = {"normal": FitSettings(longest=24, steps=300, samples=1 << 13)}
+    monkeypatch.setattr(part("train"), "QUALITY", longer)
     said = train(report)
-    assert said["views"] == 8 and said["steps"] == 60 and said["kind"] == "vm" and said["holdout"] is None
-    assert said["training_psnr"] > 12 and said["bytes"] == (folder / "out.rfpack").stat().st_size
+    assert said["views"] == 8 and said["steps"] == 300 and said["kind"] == "vm" and said["holdout"] is None
+    assert said["bytes"] == (folder / "out.rfpack").stat().st_size
     (record,) = read_bundle(folder / "out.rfpack").fields.values()
     assert record.kind == "vm" and record.metadata["shape"]["sh_degree"] == 1
-    seen = report("eval", "out.rfpack", "--against", "photos")["mean"]["psnr"]
-    assert seen > 14
+    assert said["training_psnr"] > 18
+    assert report("eval", "out.rfpack", "--against", "photos")["mean"]["psnr"] > 18
 
 
 def test_the_same_seed_gives_the_same_bytes(report, folder):

@@ -22,6 +22,7 @@ OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
+MAX_TEXELS = 8192  # per axis, in a stored field
 SECTION_ALIGN = 16  # floats: a section starts on a cache line
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
@@ -346,35 +347,58 @@ class VMField:
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
-        """Inverse of `state`."""
+        """Inverse of `state`. Every number is checked before it can size an array or index one."""
         shape = VMShape(**metadata["shape"])
-        tensors = tuple(
-            VMTensor(
-                tuple(t["resolution"]),
-                np.asarray(t["aabb"], np.float64),
-                t["scale"],
-                t["shift"],
-                unpack_bits(arrays, f"tensor_{i}.occupancy", t["occupancy"]),
-            )
-            for i, t in enumerate(metadata["tensors"])
-        )
-        blocks = tuple(
-            Block(b["tensor"], np.asarray(b["object_to_field"], np.float64), b["name"])
-            for b in metadata["blocks"]
-        )
+        tensors = tuple(stored_tensor(i, t, arrays, shape) for i, t in enumerate(metadata["tensors"]))
+        blocks = tuple(stored_block(i, b, len(tensors)) for i, b in enumerate(metadata["blocks"]))
+        if not 1 <= len(blocks) <= NO_BLOCK:
+            raise ValueError(f"there should be 1 to {NO_BLOCK} blocks, found {len(blocks)}")
         params = torch.zeros(sum(shape.size(t.resolution) for t in tensors))
-        box = np.asarray(metadata["aabb"], np.float64)
-        field = cls(shape, tensors, blocks, params, OccupancyGrid.full(box), NO_OWNERS)
+        unplaced = cls(shape, tensors, blocks, params, tensors[0].occupancy, NO_OWNERS)
         for t in range(len(tensors)):
-            for name, view in field.sections(t).items():
-                found = arrays.get(f"tensor_{t}.{name}")
-                if found is None or found.shape != tuple(view.shape):
-                    have = "nothing" if found is None else list(found.shape)
-                    raise ValueError(
-                        f"array 'tensor_{t}.{name}' should have shape {list(view.shape)}, found {have}"
-                    )
-                view.copy_(torch.from_numpy(np.ascontiguousarray(found, np.float32)))
+            for name, view in unplaced.sections(t).items():
+                view.copy_(torch.from_numpy(np.ascontiguousarray(arrays[f"tensor_{t}.{name}"], np.float32)))
         return cls.assembled(shape, tensors, blocks, params)
+
+
+def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VMShape) -> VMTensor:
+    """The i-th tensor as metadata tell it. Raises ValueError naming what does not fit."""
+    resolution = whole_numbers(stored["resolution"], 2, f"tensor {i}: resolution")
+    for name, expected in shape.sections(resolution):
+        found = arrays.get(f"tensor_{i}.{name}")
+        if found is None or found.shape != expected:
+            have = "nothing" if found is None else list(found.shape)
+            raise ValueError(f"array 'tensor_{i}.{name}' should have shape {list(expected)}, found {have}")
+    aabb = np.asarray(stored["aabb"], np.float64)
+    if aabb.shape != (6,) or not np.isfinite(aabb).all() or (aabb[:3] >= aabb[3:]).any():
+        raise ValueError(f"tensor {i}: aabb should be three minima below three maxima, found {aabb.tolist()}")
+    scale, shift = float(stored["scale"]), float(stored["shift"])
+    if not (0 < scale < np.inf and np.isfinite(shift)):
+        raise ValueError(f"tensor {i}: scale should be positive and shift finite, found {scale} and {shift}")
+    cells = whole_numbers(stored["occupancy"], 1, f"tensor {i}: occupancy")
+    return VMTensor(
+        resolution, aabb, scale, shift, unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells))
+    )
+
+
+def stored_block(i: int, stored: dict, tensors: int) -> Block:
+    """The i-th block as metadata tell it. Raises ValueError naming what does not fit."""
+    if type(stored["tensor"]) is not int or not 0 <= stored["tensor"] < tensors:
+        raise ValueError(f"block {i}: tensor should be 0 to {tensors - 1}, found {stored['tensor']}")
+    matrix = np.asarray(stored["object_to_field"], np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not (matrix[3] == [0, 0, 0, 1]).all():
+        raise ValueError(f"block {i}: object_to_field should be a finite affine of four rows of four")
+    sizes = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if sizes[-1] <= 1e-6 * sizes[0]:
+        raise ValueError(f"block {i}: object_to_field is singular")
+    return Block(stored["tensor"], matrix, str(stored["name"]))
+
+
+def whole_numbers(values: list, least: int, what: str) -> tuple[int, int, int]:
+    """Three whole numbers from `least` to MAX_TEXELS."""
+    if len(values) != 3 or any(type(n) is not int or not least <= n <= MAX_TEXELS for n in values):
+        raise ValueError(f"{what} should be three whole numbers from {least} to {MAX_TEXELS}, found {values}")
+    return tuple(values)
 
 
 def unit_texels(aabb: np.ndarray, old_aabb: np.ndarray, axis: int, count: int) -> torch.Tensor:

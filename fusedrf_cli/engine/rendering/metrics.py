@@ -9,7 +9,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB of two arrays in [0, 1]: -10 log10 of the mean squared difference, at
     most PSNR_CAP."""
     mse = float(np.mean((np.asarray(a, np.float64) - b) ** 2))
-    return PSNR_CAP if mse == 0 else min(PSNR_CAP, -10 * np.log10(mse))
+    return PSNR_CAP if mse == 0 else min(PSNR_CAP, float(-10 * np.log10(mse)))
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:

@@ -99,7 +99,7 @@ def test_without_is_a_fresh_composition_of_the_rest():
     """Bit for bit in the numbers, and the same answers."""
     fields = [small(seed) for seed in (1, 2, 3)]
     all_of_them = [
-        Placed(n, f, affine(turn(30 * i), (1.5 * i, 0, 0))) for i, (n, f) in enumerate(zip("abc", fields))
+        Placed("abc"[i], f, affine(turn(30 * i), (1.5 * i, 0, 0))) for i, f in enumerate(fields)
     ]
     field = blocks_of(all_of_them)
     before = field.params.clone()
