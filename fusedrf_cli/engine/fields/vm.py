@@ -376,9 +376,7 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
     if not (0 < scale < np.inf and np.isfinite(shift)):
         raise ValueError(f"tensor {i}: scale should be positive and shift finite, found {scale} and {shift}")
     cells = whole_numbers(stored["occupancy"], 1, f"tensor {i}: occupancy")
-    return VMTensor(
-        resolution, aabb, scale, shift, unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells))
-    )
+    return VMTensor(resolution, aabb, scale, shift, unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells)))
 
 
 def stored_block(i: int, stored: dict, tensors: int) -> Block:

@@ -98,9 +98,7 @@ def test_blocks_of_blocks_keep_their_names():
 def test_without_is_a_fresh_composition_of_the_rest():
     """Bit for bit in the numbers, and the same answers."""
     fields = [small(seed) for seed in (1, 2, 3)]
-    all_of_them = [
-        Placed("abc"[i], f, affine(turn(30 * i), (1.5 * i, 0, 0))) for i, f in enumerate(fields)
-    ]
+    all_of_them = [Placed("abc"[i], f, affine(turn(30 * i), (1.5 * i, 0, 0))) for i, f in enumerate(fields)]
     field = blocks_of(all_of_them)
     before = field.params.clone()
     for gone in "abc":
