@@ -13,9 +13,9 @@ from fusedrf_cli.bridge.fuse import stored
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import history_nodes, load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of, without
+from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.region import ClippedField, cleared, region_of
+from fusedrf_cli.engine.composition.region import RESTORED, ClippedField, cleared, region_of
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.vm import VMField
@@ -59,7 +59,7 @@ def add(
         settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
         progress.phase("adding", 1.0)
         objects = [as_vm(p, settings, rgb, progress) for p in objects]
-        base = Placed(node.name, field, np.eye(4))
+        base = Placed("", field, np.eye(4))
         try:
             result = blocks_of([base, *objects])
         except ValueError as error:
@@ -138,16 +138,22 @@ def delete(
                 "delete the file"
             )
         origin = node.object_to_world[:3, 3]
-        own = {b.name for b in field.blocks}
+        dropped = [b for b in field.blocks if named(b, set(names))]
         boxes = [
             transformed_aabb(field.tensors[b.tensor].occupancy.tight_aabb(0), b.object_to_field)
-            for b in field.blocks
-            if b.name in names
+            for b in dropped
         ]
-        result = without(field, set(names) & own) if own & set(names) else field
+        result = without(field, set(names)) if dropped else field
+        if result is None:
+            raise InvalidInput(
+                f"{fused}: deleting {', '.join(names)} would leave nothing; keep one object, or "
+                "delete the file"
+            )
         figures = {"restored": True, "seconds": {}}
         inside = [
-            entry for entry in graph_nodes(bundle) if entry["name"] in names and entry["name"] not in own
+            entry
+            for entry in graph_nodes(bundle)
+            if entry["name"] in names and not any(named(b, {entry["name"]}) for b in dropped)
         ]
         for entry in inside:
             progress.phase(f"deleting {entry['name']}", 1.0)
@@ -206,7 +212,12 @@ def graph_nodes(bundle: Bundle) -> list[dict]:
 
 def names_in(bundle: Bundle, field: VMField, whole: str) -> set[str]:
     """Names that can be deleted: of the history and of the blocks."""
-    return {n["name"] for n in graph_nodes(bundle)} | {b.name for b in field.blocks} - {whole, "", "fused"}
+    return {n["name"] for n in graph_nodes(bundle)} | {b.name for b in field.blocks} - {
+        whole,
+        "",
+        "fused",
+        RESTORED,
+    }
 
 
 def others(bundle: Bundle, node) -> dict[str, FieldRecord]:
@@ -305,7 +316,7 @@ def cut(
     local = ClippedField(teacher, region - np.tile(teacher.origin, 2))
     if not local.occupancy.occupied.any():
         return emptied, {}
-    student = empty_student(local, settings, torch.Generator().manual_seed(settings.seed), "restored")
+    student = empty_student(local, settings, torch.Generator().manual_seed(settings.seed), RESTORED)
     student, did = distill(
         local,
         student,
@@ -316,7 +327,7 @@ def cut(
     )
     back = np.eye(4)
     back[:3, 3] = teacher.origin
-    whole = blocks_of([Placed("fused", emptied, np.eye(4)), Placed("restored", student, back)])
+    whole = blocks_of([Placed("", emptied, np.eye(4)), Placed(RESTORED, student, back)])
     return whole, {
         "psnr": {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb},
         "seconds": did.seconds,

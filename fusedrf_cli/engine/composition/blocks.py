@@ -41,7 +41,7 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
         Block(
             first[id(p.field)] + b.tensor,
             p.object_to_world @ b.object_to_field,
-            b.name if len(p.field.blocks) > 1 else p.name,
+            block_name(p, b),
         )
         for p in placed
         for b in p.field.blocks
@@ -52,11 +52,25 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
     return field if max_bytes is None else shrunk(field, max_bytes // BYTES_PER_NUMBER[precision])
 
 
+def block_name(placed: Placed, block: Block) -> str:
+    """The node's name; of a node that holds several blocks, the node's and the block's. A node without a name
+    (the field that is being edited) leaves its blocks theirs.
+    """
+    if not placed.name:
+        return block.name
+    return placed.name if len(placed.field.blocks) == 1 else f"{placed.name}/{block.name}"
+
+
+def named(block: Block, names: set[str]) -> bool:
+    """Whether a block goes by one of the names, or belongs to a node that does."""
+    return block.name in names or any(block.name.startswith(f"{name}/") for name in names)
+
+
 def without(field: VMField, names: set[str]) -> VMField | None:
     """The field without the blocks of those names and the tensors that only they used; None when nothing is
     left.
     """
-    kept = [b for b in field.blocks if b.name not in names]
+    kept = [b for b in field.blocks if not named(b, names)]
     if not kept:
         return None
     used = sorted({b.tensor for b in kept})

@@ -8,7 +8,9 @@ import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.fields.vm import VMField, VMTensor
+
+RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
 
 
 class ClippedField:
@@ -61,14 +63,23 @@ def region_of(field: VMField, aabb: np.ndarray) -> np.ndarray:
 
 
 def cleared(field: VMField, region: np.ndarray) -> VMField:
-    """The field with the cells of a region (of `region_of`) empty in its distilled tensor; no number
-    changes.
+    """The field with the cells of a region (of `region_of`) empty in its distilled tensor, and in the tensors
+    that earlier cuts filled in; no number changes.
     """
-    block = field.blocks[0]
-    tensor = field.tensors[block.tensor]
-    cell, lo = tensor.occupancy.cell, tensor.aabb[:3] + block.object_to_field[:3, 3]
-    low, high = np.rint((region[:3] - lo) / cell).astype(int), np.rint((region[3:] - lo) / cell).astype(int)
-    occupied = tensor.occupancy.occupied.copy()
-    occupied[low[0] : high[0], low[1] : high[1], low[2] : high[2]] = False
-    tensors = tuple(replace(t, occupied=occupied) if t is tensor else t for t in field.tensors)
+    blocks = [field.blocks[0], *(b for b in field.blocks[1:] if b.name == RESTORED)]
+    emptied = {
+        b.tensor: emptied_tensor(field.tensors[b.tensor], b.object_to_field[:3, 3], region) for b in blocks
+    }
+    tensors = tuple(emptied.get(t, tensor) for t, tensor in enumerate(field.tensors))
     return VMField.assembled(field.shape, tensors, field.blocks, field.params)
+
+
+def emptied_tensor(tensor: VMTensor, at: np.ndarray, region: np.ndarray) -> VMTensor:
+    """A tensor placed by a mere shift `at` (3,), without the cells whose centres lie in the region."""
+    grid = tensor.occupancy
+    cells = np.argwhere(grid.occupied)
+    centres = grid.aabb[:3] + at + (cells + 0.5) * grid.cell
+    inside = ((centres > region[:3]) & (centres < region[3:])).all(1)
+    occupied = grid.occupied.copy()
+    occupied[tuple(cells[inside].T)] = False
+    return replace(tensor, occupied=occupied)

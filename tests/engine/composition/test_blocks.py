@@ -85,14 +85,16 @@ def test_copies_share_one_tensor():
     assert_same(asked(field, composed.aabb, 20000), asked(composed, composed.aabb, 20000))
 
 
-def test_blocks_of_blocks_keep_their_names():
+def test_blocks_of_blocks_go_by_the_names_of_node_and_block():
     inner = blocks_of([Placed("a", small(1), affine(0.5)), Placed("b", small(2), affine(0.5, (2, 0, 0)))])
     composed = ComposedField(
         [Placed("pair", inner, affine(turn(15))), Placed("c", small(3), affine(1, (-4, 0, 0)))]
     )
     field = blocks_of(composed.placed)
-    assert [b.name for b in field.blocks] == ["a", "b", "c"]
+    assert [b.name for b in field.blocks] == ["pair/a", "pair/b", "c"]
     assert_same(asked(field, composed.aabb, 20000), asked(composed, composed.aabb, 20000))
+    assert [b.name for b in without(field, {"pair"}).blocks] == ["c"]
+    assert [b.name for b in blocks_of([Placed("", inner, affine(1))]).blocks] == ["a", "b"]
 
 
 def test_without_is_a_fresh_composition_of_the_rest():
