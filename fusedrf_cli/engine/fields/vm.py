@@ -22,6 +22,7 @@ OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
+MAX_STRIDE = 64
 MAX_TEXELS = 8192  # per axis, in a stored field
 SECTION_ALIGN = 16  # floats: a section starts on a cache line
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
@@ -216,11 +217,18 @@ class VMField:
     @property
     def voxel_size(self) -> float:
         """Finest texel spacing of any block, in the field's frame."""
-        sizes = []
-        for block in self.blocks:
-            stretch = np.linalg.svd(block.object_to_field[:3, :3], compute_uv=False)[-1]
-            sizes.append(float(self.tensors[block.tensor].voxel_size.min() * stretch))
-        return min(sizes)
+        return min(self._voxel_sizes())
+
+    def _voxel_sizes(self) -> list[float]:
+        """Finest texel spacing of every block, in the field's frame."""
+        squeezes = [np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[-1] for b in self.blocks]
+        finest = [self.tensors[b.tensor].voxel_size.min() for b in self.blocks]
+        return [float(size * squeeze) for size, squeeze in zip(finest, squeezes, strict=True)]
+
+    def _strides(self) -> np.ndarray:
+        """(B,) int64: a block's voxels over the finest block's, rounded down."""
+        sizes = np.asarray(self._voxel_sizes())
+        return np.clip(np.floor(sizes / sizes.min() + 1e-9), 1, MAX_STRIDE).astype(np.int64)
 
     def sections(self, tensor: int) -> dict[str, torch.Tensor]:
         """Views of the parameters of one tensor, by name."""
@@ -275,6 +283,7 @@ class VMField:
             np.asarray([[t.scale, t.shift] for t in self.tensors], real),
             first,
             second,
+            self._strides(),
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).astype(np.uint8),
             occupied_layout(self.tensors),
         )

@@ -39,6 +39,7 @@ class VMArrays(NamedTuple):
     density: object  # (T, 2) float, scale (1/length of the object frame) and shift of the softplus
     first: object  # (X, Y, Z) uint8, owning block of a cell; shape (0, 0, 0) when there is one block
     second: object  # (X, Y, Z) uint8, the other block that has matter in the cell, or NO_BLOCK
+    stride: object  # (B,) int64, steps of the finest block that one sample of this block may stand for
     occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
 
@@ -417,25 +418,31 @@ def matter_at(vm, t, u, v, w):
 
 @body
 def winning_block(ranks, vm, grid, x, y, z, dx, dy, dz):
-    """(block, σ, pre-activation) of the densest block at a point; ties go to the lower block (DESIGN §3)."""
+    """(block, σ, pre-activation, steps) of the densest block at a point; ties go to the lower block (DESIGN).
+
+    `steps` says for how many steps of the ray the answer stands: where only coarse blocks have matter, a
+    sample per step of the finest block would see nothing new.
+    """
     if vm.first.shape[0] == 0:
         stretch = object_direction(vm, 0, dx, dy, dz)[3]
         sigma, f = block_density(ranks, vm, 0, x, y, z, stretch)
-        return 0, sigma, f
+        return 0, sigma, f, 1
     nx, ny, nz = vm.first.shape
     i = cell_of(x, grid.lo[0], grid.cell[0], nx)
     j = cell_of(y, grid.lo[1], grid.cell[1], ny)
     m = cell_of(z, grid.lo[2], grid.cell[2], nz)
     b = int(vm.first[i, j, m])
     if b == NO_BLOCK:
-        return 0, 0.0, 0.0
+        return 0, 0.0, 0.0, 1
+    steps = vm.stride[b]
     sigma, f = block_density(ranks, vm, b, x, y, z, object_direction(vm, b, dx, dy, dz)[3])
     other = int(vm.second[i, j, m])
     if other != NO_BLOCK:
+        steps = min(steps, vm.stride[other])
         sigma2, f2 = block_density(ranks, vm, other, x, y, z, object_direction(vm, other, dx, dy, dz)[3])
         if sigma2 > sigma:
-            return other, sigma2, f2
-    return b, sigma, f
+            return other, sigma2, f2, steps
+    return b, sigma, f, steps
 
 
 @body

@@ -65,7 +65,7 @@ def query_task(
         rgb[i, 0], rgb[i, 1], rgb[i, 2] = 0, 0, 0
         if not occupied(grid, x, y, z):
             continue
-        b, s, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+        b, s, _, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
         sigma[i] = s
         if with_colour and s > 0:
             u, v, w, _ = unit_point(vm, b, x, y, z)
@@ -125,7 +125,7 @@ def query_backward_task(
         dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
         if not occupied(grid, x, y, z):
             continue
-        b, s, f = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+        b, s, f, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
         u, v, w, inside = unit_point(vm, b, x, y, z)
         if not inside or s == 0:
             continue
@@ -205,8 +205,8 @@ def render_task(
         while k >= 0 and trans > early_stop:
             t = t0 + k * step
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            b, s, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
-            alpha = 1.0 - math.exp(-s * step)
+            b, s, _, steps = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+            alpha = 1.0 - math.exp(-s * steps * step)
             weight = trans * alpha
             trans -= weight
             depth += weight * t
@@ -221,7 +221,7 @@ def render_task(
                 green += waiting * sigmoid(dot_row(colour_ranks, basis, 1, features, 0))
                 blue += waiting * sigmoid(dot_row(colour_ranks, basis, 2, features, 0))
                 waiting = 0.0
-            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
+            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + steps)
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
 
 
@@ -261,7 +261,7 @@ def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, st
 @task
 def train_task(
     ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-    background, opacity_weight, low, high, ts, pre, weights, carried, rgbs, blocks, slots, features,
+    background, opacity_weight, low, high, ts, pre, weights, carried, rgbs, blocks, slots, spans, features,
     d_features,
     basis, d_basis, sh, d_f, scratch, grad, loss,
 ):  # fmt: skip
@@ -286,10 +286,11 @@ def train_task(
         while k >= 0 and trans > early_stop and count < ts.shape[0]:
             t = t0 + k * step
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            b, s, f = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
-            weight = trans * (1.0 - math.exp(-s * step))
+            b, s, f, steps = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+            weight = trans * (1.0 - math.exp(-s * steps * step))
             trans -= weight
             ts[count], pre[count], weights[count], blocks[count], slots[count] = t, f, weight, b, -1
+            spans[count] = steps
             waiting += weight
             if waiting > COLOUR_FROM:
                 if b != current:
@@ -309,7 +310,7 @@ def train_task(
                 waiting = 0.0
                 shaded += 1
             count += 1
-            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
+            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + steps)
 
         e_r = red + trans * background[i, 0] - target[i, 0]
         e_g = green + trans * background[i, 1] - target[i, 1]
@@ -351,7 +352,7 @@ def train_task(
                     colour_ranks, basis, features, slots[q], g_r * wq, g_g * wq, g_b * wq, d_features, d_basis
                 )
                 scatter_colour(colour_ranks, vm, grad, vm.tensor[b], u, v, w, d_features, 0, scratch)
-            d_sigma = step * (after * own - behind)
+            d_sigma = spans[q] * step * (after * own - behind)
             behind += weights[q] * own
             after += weights[q]
             if inside and weights[q] > 0.0:  # where no block is asked, none learns
@@ -382,13 +383,13 @@ def train_rays(
     for p in prange(parts):
         kind = vm.params.dtype
         ts, pre, weights = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
-        blocks, slots = np.empty(max_samples, np.int64), np.empty(max_samples, np.int64)
+        whole = np.empty((3, max_samples), np.int64)
         train_task(
             ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop,
             target, background, opacity_weight, p * n // parts, (p + 1) * n // parts, ts, pre, weights,
-            np.empty(max_samples), np.empty((max_samples, 3)), blocks, slots, np.empty(max_samples * width,
-            kind),
-            np.empty(width, kind), np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind),
+            np.empty(max_samples), np.empty((max_samples, 3)), whole[0], whole[1], whole[2],
+            np.empty(max_samples * width, kind), np.empty(width, kind), np.empty(3 * width, kind),
+            np.empty(3 * width, kind), np.empty(16, kind),
             np.empty(1, kind), np.empty(2 * max(len(ranks), len(colour_ranks)), kind), grads[p], loss[p],
         )  # fmt: skip
 
