@@ -58,7 +58,7 @@ def add(
         ]
         settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
         progress.phase("adding", 1.0)
-        objects = [as_vm(p, settings, rgb, progress) for p in objects]
+        originals, objects = objects, [as_vm(p, settings, rgb, progress) for p in objects]
         base = Placed("", field, np.eye(4))
         try:
             result = blocks_of([base, *objects])
@@ -68,7 +68,7 @@ def add(
             [transformed_aabb(p.field.occupancy.tight_aabb(0), p.object_to_world) for p in objects]
         )
         progress.phase("measuring", None)
-        truth = ComposedField([base, *objects])
+        truth = ComposedField([base, *originals])
         reached = Judge(truth, settings.views, settings.view_size, seed)(
             moved_frame(stored(result, precision), truth.origin)
         )
