@@ -22,7 +22,7 @@ from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput
 
 REGION_SETTINGS = DistillSettings(
-    max_numbers=2_000_000, rays=120_000, points=1_500_000, steps=500, rgb_steps=500, view_size=160
+    max_numbers=2_000_000, rays=120_000, steps=500, rgb_steps=500, view_size=160
 )
 
 

@@ -20,7 +20,8 @@ from fusedrf_cli.placement import node_words
 def command(fused, source, output, name, translate, rotate, scale, matrix, **words):
     """Put one more object into a fused field.
 
-    OBJECT is scaled, then turned, then moved. Only the region of FUSED that it touches is learned again.
+    OBJECT is scaled, then turned, then moved. What is in FUSED
+    already keeps its numbers.
 
     \b
     Example:

@@ -18,7 +18,8 @@ from fusedrf_cli import options
 def command(fused, names, output, **words):
     """Take objects out of a fused field.
 
-    Only the region of FUSED that the objects NAME... covered is learned again.
+    The blocks of the objects NAME... are dropped; out of a distilled tensor only the cells of their boxes are
+    cut, and learned again where the other sources are known.
 
     \b
     Example:

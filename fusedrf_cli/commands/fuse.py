@@ -13,7 +13,7 @@ from fusedrf_cli import options
     type=click.Choice(["auto", "vm", "blocks"]),
     default="auto",
     show_default=True,
-    help="Kind of field; auto: the smallest that is good enough.",
+    help="blocks: tensors in their objects' own axes; vm: one distilled tensor; auto: blocks where it can.",
 )
 @options.max_size
 @options.target_psnr

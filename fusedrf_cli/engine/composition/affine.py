@@ -73,14 +73,3 @@ class Placed:
         matrix = self.object_to_world.copy()
         matrix[:3, 3] -= offset
         return Placed(self.name, self.field, matrix)
-
-
-def mean_stretch(linear: np.ndarray) -> float:
-    """Mean of |M^-1 d| over unit directions d, the isotropic stand-in for a stretched density (DESIGN §3);
-    linear is (3, 3) M.
-    """
-    i = np.arange(2048) + 0.5
-    z, angle = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i
-    ring = np.sqrt(1 - z * z)
-    directions = np.stack([np.cos(angle) * ring, np.sin(angle) * ring, z])
-    return float(np.linalg.norm(np.linalg.inv(linear) @ directions, axis=0).mean())

@@ -8,7 +8,7 @@ views of its own.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -45,13 +45,12 @@ class DistillSettings:
     max_numbers: int = 12_000_000
     """Numbers the student may have; its resolution follows."""
     rays: int = 400_000
-    points: int = 4_000_000
     steps: int = 1200
     rgb_steps: int = 1500
     rgb_samples: int = 1 << 15
     time_budget: float | None = None
-    """Seconds for the 3D phase; the RGB phase gets as much again. None: the steps decide, and equal seeds
-    give equal bytes.
+    """Seconds of learning, half for points and half for rays where there is an RGB phase. None: the steps
+    decide, and equal seeds give equal bytes.
     """
     seed: int = 0
     views: int = 4
@@ -162,6 +161,8 @@ def distill(
     generator = torch.Generator().manual_seed(settings.seed + 1)
     report = DistillReport()
     clock = _Clock(report.seconds)
+    if rgb and settings.time_budget is not None:
+        settings = replace(settings, time_budget=settings.time_budget / 2)
     step = 0.5 * student.voxel_size
     phase("asking the teachers")
     judge = Judge(teacher, settings.views, settings.view_size, settings.seed)

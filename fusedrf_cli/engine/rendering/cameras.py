@@ -25,21 +25,6 @@ class Camera:
     """k1, k2, k3, p1, p2."""
     name: str = ""
 
-    def resized(self, width: int, height: int) -> "Camera":
-        """The same view on another raster."""
-        sx, sy = width / self.width, height / self.height
-        return Camera(
-            self.camera_to_world,
-            self.fl_x * sx,
-            self.fl_y * sy,
-            self.cx * sx,
-            self.cy * sy,
-            width,
-            height,
-            self.distortion,
-            self.name,
-        )
-
     @property
     def intrinsics(self) -> tuple[float, ...]:
         """All that shapes the camera's own ray directions, as a key."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.composition.affine import CONDITION_LIMIT, Placed, mean_stretch
+from fusedrf_cli.engine.composition.affine import CONDITION_LIMIT, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from tests.engine.conftest import BOX, DIRECTIONS_26, AnalyticField, Gaussian, rays_at, unit
 
@@ -81,7 +81,6 @@ def test_uniform_scale_divides_density():
         _, _, stretch = placed.to_object(torch.zeros(26, 3), torch.from_numpy(DIRECTIONS_26))
         np.testing.assert_allclose(stretch.numpy(), 1 / k, rtol=1e-12)
         assert placed.voxel_size == pytest.approx(0.02 * k)
-        assert mean_stretch(k * np.eye(3)) == pytest.approx(1 / k)
 
 
 def test_points_and_directions_come_back():
@@ -118,13 +117,6 @@ def test_a_flat_placement_is_refused_by_its_condition():
         with pytest.raises(ValueError, match="'flat' is singular"):
             Placed("flat", Gaussian(), affine(scale))
     assert Placed("small", Gaussian(), affine(1e-5)).condition == pytest.approx(1)
-
-
-def test_mean_stretch_of_a_stretched_sphere():
-    """For M = diag(1, 1, k) the mean of |M^-1 d| has a closed form; k = 1/2 gives 1/2 (2 + asinh(√3)/√3)."""
-    assert mean_stretch(np.diag([1, 1, 0.5])) == pytest.approx(
-        0.5 * (2 + np.arcsinh(3**0.5) / 3**0.5), rel=1e-4
-    )
 
 
 def test_moved_shifts_only_the_frame():

@@ -67,17 +67,6 @@ def test_bands_of_rows_are_parts_of_the_whole():
         assert np.array_equal(whole[i], np.concatenate([band[i] for band in bands]))
 
 
-def test_resizing_keeps_the_view():
-    """A point lies at the same share of the picture's width and height."""
-    camera = camera_at()
-    other = camera.resized(46, 51)
-    points = points_in(BOX, 20)
-    np.testing.assert_allclose(
-        project(other, points) / [46, 51], project(camera, points) / [23, 17], rtol=1e-12
-    )
-    assert camera.resized(23, 17).intrinsics == camera.intrinsics
-
-
 @pytest.mark.parametrize("up", np.eye(3))
 def test_look_at_is_a_rotation_towards_the_target(up):
     for away in DIRECTIONS_26:
