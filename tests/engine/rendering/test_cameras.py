@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, look_at, orbit, scattered, undistort
-from tests.engine.conftest import BOX, DIRECTIONS_26, points_in
+from tests.engine.conftest import BOX, DIRECTIONS_26
 
 DISTORTION = (-0.12, 0.05, -0.01, 0.003, -0.002)
 
