@@ -4,6 +4,7 @@ touched."""
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.kernels import cpu
@@ -21,8 +22,9 @@ class Adam:
 
     def __post_init__(self):
         size = self.field.params.numel()
-        self.grads = np.zeros((self.parts, size), np.float32)
-        self.moment1, self.moment2 = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        # torch's memory starts on a cache line, so that a run of numbers touches no more lines than it must
+        self.grads = torch.zeros(self.parts, size).numpy()
+        self.moment1, self.moment2 = torch.zeros(size).numpy(), torch.zeros(size).numpy()
         self.steps = 0
 
     def step(self, rate: float) -> None:

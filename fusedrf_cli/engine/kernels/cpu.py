@@ -8,7 +8,9 @@ and a sum over rows has one order.
 import math
 
 import numpy as np
-from numba import njit, prange
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.extending import intrinsic
 
 from fusedrf_cli.engine.kernels.bodies import (
     COLOUR_FROM,
@@ -37,6 +39,57 @@ POINTS_PER_TASK = 2048
 RAYS_PER_TASK = 256
 ENTRIES_PER_TASK = 1 << 16
 LINE = 16  # floats in a cache line
+POINTS_AHEAD = 4  # a point's texels are asked for so many points before it
+SAMPLES_AHEAD = 2
+DENSITY, COLOUR = 0, 6  # first sections of both in a layout
+
+
+@intrinsic(prefer_literal=False)
+def prefetch(typing, array, index):
+    """Ask for the cache line of array[index], a flat array, before it is needed."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        line, whole = builder.gep(data, [arguments[1]]), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [line.type, whole, whole, whole])
+        known = builder.module.globals.get("llvm.prefetch.p0")
+        hint = known or ir.Function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(hint, [line, whole(0), whole(3), whole(1)])  # for reading, to the nearest cache, data
+        return context.get_dummy_value()
+
+    return types.void(array, index), generate
+
+
+@task
+def prefetch_plane(ranks, array, plane, na, nb, a, b):
+    """Ask for the four texels of a plane around unit coordinates (a, b), which may lie outside."""
+    rank = len(ranks)
+    real = array.dtype.type
+    ia = min(max(int(a * real(na - 1)), 0), na - 2)
+    ib = min(max(int(b * real(nb - 1)), 0), nb - 2)
+    lower = np.uint64(plane + (ia * nb + ib) * rank)
+    upper = lower + np.uint64(nb * rank)
+    for i in range(np.uint64(2 * rank // LINE)):
+        prefetch(array, lower + i * np.uint64(LINE))
+        prefetch(array, upper + i * np.uint64(LINE))
+    if rank % LINE != 0:
+        last = np.uint64(2 * rank - 1)
+        prefetch(array, lower + last)
+        prefetch(array, upper + last)
+
+
+@task
+def prefetch_planes(ranks, vm, array, first, b, x, y, z):
+    """Ask for what a query of block b at a field point reads, in params or gradients, of the planes from
+    section `first` on. A random point misses the cache a dozen times; asked for early, the misses overlap.
+    """
+    u, v, w, _ = unit_point(vm, b, x, y, z)
+    t = vm.tensor[b]
+    nx, ny, nz = vm.resolution[t, 0], vm.resolution[t, 1], vm.resolution[t, 2]
+    off = vm.layout[t]
+    prefetch_plane(ranks, array, off[first], nx, ny, u, v)
+    prefetch_plane(ranks, array, off[first + 1], nx, nz, u, w)
+    prefetch_plane(ranks, array, off[first + 2], ny, nz, v, w)
 
 
 @task
@@ -61,6 +114,12 @@ def query_task(
     for i in range(low, high):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
+        n = i + POINTS_AHEAD
+        if n < high:
+            px, py, pz = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+            prefetch_planes(ranks, vm, vm.params, DENSITY, 0, px, py, pz)
+            if with_colour:
+                prefetch_planes(colour_ranks, vm, vm.params, COLOUR, 0, px, py, pz)
         sigma[i] = 0
         rgb[i, 0], rgb[i, 1], rgb[i, 2] = 0, 0, 0
         if not occupied(grid, x, y, z):
@@ -123,6 +182,14 @@ def query_backward_task(
     for i in range(low, high):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
+        n = i + POINTS_AHEAD
+        if n < high:
+            px, py, pz = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+            prefetch_planes(ranks, vm, vm.params, DENSITY, 0, px, py, pz)
+            prefetch_planes(ranks, vm, grad, DENSITY, 0, px, py, pz)
+            if d_rgb[n, 0] != 0 or d_rgb[n, 1] != 0 or d_rgb[n, 2] != 0:
+                prefetch_planes(colour_ranks, vm, vm.params, COLOUR, 0, px, py, pz)
+                prefetch_planes(colour_ranks, vm, grad, COLOUR, 0, px, py, pz)
         if not occupied(grid, x, y, z):
             continue
         b, s, f, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
@@ -287,6 +354,9 @@ def train_task(
             t = t0 + k * step
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             b, s, f, steps = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
+            ahead = SAMPLES_AHEAD * steps * step
+            prefetch_planes(ranks, vm, vm.params, DENSITY, b, x + ahead * dx, y + ahead * dy, z + ahead * dz)
+            prefetch_planes(ranks, vm, grad, DENSITY, b, x, y, z)
             weight = trans * (1.0 - math.exp(-s * steps * step))
             trans -= weight
             ts[count], pre[count], weights[count], blocks[count], slots[count] = t, f, weight, b, -1
@@ -298,6 +368,7 @@ def train_task(
                     current = b
                 u, v, w, _ = unit_point(vm, b, x, y, z)
                 base = shaded * width
+                prefetch_planes(colour_ranks, vm, grad, COLOUR, b, x, y, z)
                 colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, base)
                 rgbs[count, 0] = sigmoid(dot_row(colour_ranks, basis, 0, features, base))
                 rgbs[count, 1] = sigmoid(dot_row(colour_ranks, basis, 1, features, base))
@@ -461,6 +532,30 @@ def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
     for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
         low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
         density_at_cells_task(ranks, vm, b, lo, cell, cells, low, high, offsets, out)
+
+
+@task
+def pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d):
+    """`pinhole_rays` for rays low..high."""
+    for i in range(low, high):
+        row, column = order[i] // width, order[i] % width
+        x, y = (column + 0.5 - cx) / fl_x, -(top + row + 0.5 - cy) / fl_y
+        dx = pose[0, 0] * x + pose[0, 1] * y - pose[0, 2]
+        dy = pose[1, 0] * x + pose[1, 1] * y - pose[1, 2]
+        dz = pose[2, 0] * x + pose[2, 1] * y - pose[2, 2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        rays_d[i, 0], rays_d[i, 1], rays_d[i, 2] = dx / length, dy / length, dz / length
+        rays_o[i, 0], rays_o[i, 1], rays_o[i, 2] = pose[0, 3], pose[1, 3], pose[2, 3]
+
+
+@loop
+def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
+    """Rays (N, 3) of an undistorted camera at pose (4, 4), camera to world, OpenGL axes: ray i is that of
+    pixel order[i] (N,), counted row by row of `width` pixels from row `top` on."""
+    n = order.shape[0]
+    for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
+        pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d)
 
 
 @loop

@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
 
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
@@ -134,15 +134,15 @@ def render_image(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> RenderedImage:
-    """Render one view in bands of rows; origin (3,) is the world position of the field's frame origin
+    """Render one view in bands of rows, each in tiles; origin (3,) is the world position of the field's frame origin
     (float64, so far scenes hold)."""
     shift = np.zeros(3) if origin is None else origin
     pixels = np.empty((camera.height * camera.width, 5), np.float32)
-    rows = max(1, ROWS_AT_ONCE_PIXELS // camera.width)
+    rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
     for top in range(0, camera.height, rows):
-        rays_o, rays_d = camera.rays(slice(top, top + rows))
-        start = top * camera.width
-        pixels[start : start + len(rays_o)] = render_rays(
+        order = tile_order(camera.width, min(rows, camera.height - top))
+        rays_o, rays_d = camera.rays(slice(top, top + rows), order)
+        pixels[top * camera.width + order] = render_rays(
             field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop
         )
     pixels = pixels.reshape(camera.height, camera.width, 5)
