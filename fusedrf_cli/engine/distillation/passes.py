@@ -12,7 +12,7 @@ import torch
 
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
-from fusedrf_cli.engine.kernels import autograd, cpu
+from fusedrf_cli.engine.kernels import autograd, bodies, cpu
 from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 NETWORK_RATE = 1e-3  # TensoRF's
@@ -184,11 +184,11 @@ def shaded_samples(
     running sum passes another multiple of it. In the untrained haze that is one in twenty.
     """
     if not THIN_BELOW:
-        seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]
+        seen = torch.nonzero(weights > bodies.COLOUR_FROM)[:, 0]
         return seen, torch.ones_like(weights[seen])
     total = weights.double().cumsum(0) / THIN_BELOW + (jitter * SCATTER % 1)[ray]
     crossed = total.floor() > (total - weights.double() / THIN_BELOW).floor()
-    seen = torch.nonzero(crossed & (weights > cpu.COLOUR_FROM))[:, 0]
+    seen = torch.nonzero(crossed & (weights > bodies.COLOUR_FROM))[:, 0]
     return seen, (weights[seen] / THIN_BELOW).clamp(max=1)
 
 

@@ -13,10 +13,10 @@ def kernel_cache() -> Path:
     """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
     written.
 
-    It is named for the text of bodies.py: numba only looks for changes in the file of the loop, not of what
-    the loop inlines.
+    It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
-    bodies = hashlib.sha256(Path(__file__).with_name("bodies.py").read_bytes()).hexdigest()[:12]
+    inlined = [Path(__file__).with_name(f"{name}.py") for name in ("bodies", "prefetch", "items")]
+    bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined)).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = Path(home) / "fusedrf" / "kernels" / bodies
     try:

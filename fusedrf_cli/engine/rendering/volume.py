@@ -134,7 +134,7 @@ def render_image(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> RenderedImage:
-    """Render one view in bands of rows, each in tiles; origin (3,) is the world position of the field's frame origin
+    """Render one view in bands of rows, tile by tile; origin (3,) is where the field's frame has its origin
     (float64, so far scenes hold)."""
     shift = np.zeros(3) if origin is None else origin
     pixels = np.empty((camera.height * camera.width, 5), np.float32)
