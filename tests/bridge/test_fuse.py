@@ -7,7 +7,7 @@ import pytest
 from formats.bundle import read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import part, write_scene_of
+from tests.bridge.conftest import write_scene_of
 
 VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
 
@@ -85,11 +85,12 @@ def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(part("fuse"), "distill", stop)
+        patch.setattr("fusedrf_cli.engine.distillation.distill.ask", stop)
         assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM).exit_code == 130
     assert not (folder / "fused.rfpack").exists() and (folder / "fused.rfpack.checkpoint").exists()
-    wrong = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume", "--max-size", "80kB")
-    assert wrong.exit_code == 3 and "other settings" in wrong.stderr
+    for other in (("--max-size", "80kB"), ("--seed", "5"), ("--rgb",), ("--from-scratch",)):
+        wrong = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume", *other)
+        assert wrong.exit_code == 3 and "other settings" in wrong.stderr, other
     assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume").exit_code == 0
     assert not (folder / "fused.rfpack.checkpoint").exists()
 

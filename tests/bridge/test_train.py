@@ -6,6 +6,7 @@ import pytest
 
 from formats.bundle import read_bundle
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.passes import FusedPass
 from fusedrf_cli.errors import Interrupted
 from tests.bridge.conftest import part
 
@@ -85,15 +86,11 @@ def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
 
 
 def test_divergence_is_exit_6(run, folder, monkeypatch):
-    step = FitRun.step
-
-    def spoiled(self, share):
-        step(self, share)
-        self.mse = float("nan")
-
-    monkeypatch.setattr(FitRun, "step", spoiled)
+    gradient = FusedPass.gradient
+    monkeypatch.setattr(FusedPass, "gradient", lambda *words: float("nan") * gradient(*words))
     result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 6 and "diverged" in result.stderr and not (folder / "out.rfpack").exists()
+    assert "44 steps" in result.stderr and "3 returns" in result.stderr
 
 
 def test_a_checkpoint_of_something_else_is_refused(run, folder):

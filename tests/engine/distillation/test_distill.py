@@ -16,7 +16,6 @@ from fusedrf_cli.engine.distillation.distill import (
     empty_student,
     pruned,
     resolution_for,
-    shares,
     student_from,
 )
 from fusedrf_cli.engine.distillation.fit import texels
@@ -89,16 +88,6 @@ def test_without_rgb_nothing_is_said_of_it():
     assert report.rgb_kept is None and report.psnr_after_rgb is None and "pictures" not in report.seconds
 
 
-def test_numbers_that_are_not_finite_are_an_error(monkeypatch):
-    def spoil(student, *_):
-        student.params[0] = float("nan")
-
-    monkeypatch.setattr(module, "fit_points", spoil)
-    monkeypatch.setattr(module, "Judge", lambda *_: lambda student: 0.0)
-    with pytest.raises(FloatingPointError, match="not finite"):
-        taught(replace(SETTINGS, rays=100), rgb=False)
-
-
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_a_student_starts_as_the_upright_background(scale):
     """Moved and scaled by `scale`, its tensor answers as the placed field does."""
@@ -134,12 +123,6 @@ def test_resolution_is_the_teachers_or_what_fits():
     tight = THIRTY_TWO.size(texels(BOX, 40))
     found = resolution_for(BOX, 1e-3, THIRTY_TWO, tight)
     assert 0.9 * tight < THIRTY_TWO.size(found) <= tight
-
-
-def test_shares_follow_the_steps_or_the_clock():
-    assert list(shares(4, None)) == [0, 0.25, 0.5, 0.75]
-    by_clock = list(shares(1, 0.05))
-    assert len(by_clock) > 1 and by_clock == sorted(by_clock) and by_clock[-1] < 1
 
 
 def test_pruned_drops_empty_cells_only():
