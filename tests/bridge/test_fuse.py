@@ -80,6 +80,20 @@ def test_a_stretched_object_is_warned_of(report, folder):
     assert any("'red' is stretched by 2.00" in w for w in said["warnings"])
 
 
+@pytest.mark.parametrize("at", [6, 30, 55])
+def test_an_interrupted_fuse_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step, at):
+    """In the midst of a step at 10, 50 (points) and 90 % (pictures) of 60 steps."""
+    words = ("fuse", "pair.json", "--kind", "vm", "--max-size", "300kB", "-o")
+    report(*words, "straight.rfpack")
+    with interrupted_in_step(at):
+        assert run(*words, "fused.rfpack").exit_code == 130
+    with interrupted_in_step(1):  # and once more
+        assert run(*words, "fused.rfpack", "--resume").exit_code == 130
+    said = report(*words, "fused.rfpack", "--resume")
+    assert said["psnr"]["after_rgb"] is not None and not (folder / "fused.rfpack.checkpoint").exists()
+    assert (folder / "fused.rfpack").read_bytes() == (folder / "straight.rfpack").read_bytes()
+
+
 def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt

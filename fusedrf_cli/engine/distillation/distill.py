@@ -34,6 +34,8 @@ RATE_DECAY = 0.1
 RGB_RATE = 0.1 * RATE
 OPAQUE = 5.0  # optical depth of a step beyond which more density cannot be seen
 DEPTH_GAIN = 10.0  # in log1p(gain τ): how much thin fog counts
+FAINT = 1e-8  # optical depth of a step under which a student that should be denser learns as if it had it
+MOST_LIFT = 1e30
 COLOUR_WEIGHT = 2.0
 POINTS_PER_STEP = 1 << 15
 RAYS_AT_FIRST = 1024
@@ -352,10 +354,12 @@ def point_step(
     tau, wanted = sigma * step, (pool.sigma[chosen] * step).clamp_max(OPAQUE)
     error = torch.log1p(DEPTH_GAIN * tau) - torch.log1p(DEPTH_GAIN * wanted)
     error[(tau >= OPAQUE) & (wanted >= OPAQUE)] = 0
+    # σ = softplus(f) and its slope vanish together: far below FAINT the gradient would be too small a number
+    lift = torch.where(error < 0, (FAINT / tau).clamp(1, MOST_LIFT), 1)
     alpha = 1 - torch.exp(-wanted)
     off = rgb - pool.rgb[chosen]
     n = len(chosen)
-    d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step
+    d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step * lift
     d_rgb = 2 / n * COLOUR_WEIGHT * alpha[:, None] * off
     cpu.query_backward(
         *student.kernel_shape,
