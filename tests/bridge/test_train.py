@@ -1,13 +1,15 @@
 """`train` for real, on eight pictures of 24 x 24."""
 
 import json
+import shutil
+from functools import partial
 
 import pytest
 
 from formats.bundle import read_bundle
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.engine.distillation.passes import FusedPass
-from tests.bridge.conftest import part
+from tests.bridge.conftest import done, part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
 
@@ -35,22 +37,28 @@ def test_the_same_seed_gives_the_same_bytes(report, folder):
     assert a == b != c
 
 
+@pytest.fixture(scope="module")
+def straight(shop, tmp_path_factory) -> list[str]:
+    """Members of the bundle of a run that nobody interrupted. They are named by their content's hash: the
+    same name is the same numbers."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("straight") / "shop")
+    train(partial(done, folder))
+    return list(read_bundle(folder / "out.rfpack").fields)
+
+
 @pytest.mark.parametrize("at", [1, 6, 30, 54])
-def test_an_interrupted_run_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step, at):
-    """Interrupted in the midst of a step, at 10, 50 and 90 % of a run. Members are named by their content's
-    hash: the same name is the same numbers."""
-    train(report, "straight.rfpack")
+def test_an_interrupted_run_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step, straight, at):
+    """Interrupted in the midst of a step, at the first, and at 10, 50 and 90 % of a run."""
     with interrupted_in_step(at):
         result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 130 and "--resume" in result.stderr
     assert not (folder / "out.rfpack").exists() and (folder / "out.rfpack.checkpoint").exists()
     assert train(report, "out.rfpack", "--resume")["steps"] == 60
     assert not (folder / "out.rfpack.checkpoint").exists()
-    straight, resumed = (read_bundle(folder / f"{n}.rfpack").fields for n in ("straight", "out"))
-    assert list(straight) == list(resumed)
+    assert list(read_bundle(folder / "out.rfpack").fields) == straight
 
 
-def test_an_interrupt_before_the_first_step_goes_on_to_the_same_bytes(report, run, folder, monkeypatch):
+def test_an_interrupt_before_all_goes_on_to_the_same_bytes(report, run, folder, straight, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
@@ -58,13 +66,11 @@ def test_an_interrupt_before_the_first_step_goes_on_to_the_same_bytes(report, ru
         patch.setattr(FitRun, "share", stop)
         assert run("train", "photos", "-o", "out.rfpack", *WORDS).exit_code == 130
     train(report, "out.rfpack", "--resume")
-    train(report, "straight.rfpack")
-    straight, resumed = (read_bundle(folder / f"{n}.rfpack").fields for n in ("straight", "out"))
-    assert list(straight) == list(resumed)
+    assert list(read_bundle(folder / "out.rfpack").fields) == straight
 
 
 def test_a_second_interrupt_does_not_wait(run, folder, interrupted_in_step):
-    """It tears a step, so nothing is left to go on from."""
+    """It tears a step, so that nothing is left to go on from."""
     with interrupted_in_step(6, times=2):
         result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 130 and "--resume" not in result.stderr

@@ -1,5 +1,7 @@
 """Distilling a coloured ball into a small student."""
 
+import contextlib
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -81,6 +83,83 @@ def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
     plain, _ = taught(brief, rgb=False)
     assert report.rgb_kept is kept and report.psnr_after_rgb == after and report.psnr_before_rgb == 20
     assert torch.equal(student.params, plain.params) is not kept
+
+
+def test_a_harmful_rgb_phase_is_not_kept(monkeypatch):
+    """At a rate of 3 the pictures spoil what the points taught; the student is the one of before."""
+    monkeypatch.setattr(module.RayPass, "rate", 3.0)
+    brief = replace(SETTINGS, rays=2000, rgb_steps=10)
+    student, report = taught(brief)
+    plain, before = taught(brief, rgb=False)
+    assert report.psnr_after_rgb < report.psnr_before_rgb - 3 and report.rgb_kept is False
+    assert report.psnr_before_rgb == before.psnr_before_rgb and torch.equal(student.params, plain.params)
+
+
+def test_bad_steps_are_skipped_and_told(monkeypatch):
+    """Every 15th answer of the loss is infinite: of the 90 steps of both phases four in the points are."""
+    point_step, calls = module.point_step, []
+
+    def infinite_at_times(*words):
+        calls.append(0)
+        return point_step(*words) * (float("inf") if len(calls) % 15 == 0 else 1)
+
+    monkeypatch.setattr(module, "point_step", infinite_at_times)
+    student, report = taught(SETTINGS)
+    assert report.numeric == {"skipped_steps": 4, "roll_backs": 0} and report.psnr_before_rgb > 19
+    assert torch.isfinite(student.params).all()
+
+
+def test_a_teacher_of_nan_is_an_error(monkeypatch):
+    def spoilt(teacher, *words, **more):
+        pool = ask(teacher, *words, **more)
+        pool.sigma[:] = float("nan")
+        return pool
+
+    ask = module.ask
+    monkeypatch.setattr(module, "ask", spoilt)
+    with pytest.raises(FloatingPointError, match="44 steps were not finite, after 3 returns"):
+        taught(replace(SETTINGS, rays=100), rgb=False)
+
+
+def test_a_student_that_holds_nothing_yet_keeps_its_cells():
+    """After one step nothing is dense: no cell may be given up, or nothing could be learnt any more."""
+    student, report = taught(replace(SETTINGS, rays=1000, steps=1), rgb=False)
+    assert report.found_nothing and np.array_equal(student.occupancy.occupied, TEACHER.occupancy.occupied)
+    assert not taught(replace(SETTINGS, rays=4000, steps=60), rgb=False)[1].found_nothing
+
+
+@pytest.mark.parametrize("at", [0, 7, 20, 25, 30])
+def test_a_restored_run_goes_on_to_the_same_bits(at):
+    """Stopped before the first step, in the points (20 steps) and in the pictures (10)."""
+    brief = replace(SETTINGS, rays=1000, steps=20, rgb_steps=10)
+    straight, told = taught(brief)
+
+    class Stop(Exception):
+        pass
+
+    @contextlib.contextmanager
+    def whole():
+        if left and not left.pop():
+            raise Stop
+        yield
+
+    left = [0] + [1] * at
+    run = a_run(brief)
+    with pytest.raises(Stop):
+        run.finish(whole=whole)
+    arrays, state = run.checkpoint()
+    arrays = {name: np.array(values) for name, values in arrays.items()}
+    again = a_run(brief)
+    again.restore(arrays, json.loads(json.dumps(state)))
+    student, report = again.finish()
+    assert torch.equal(student.params, straight.params)
+    assert np.array_equal(student.occupancy.occupied, straight.occupancy.occupied)
+    assert report.psnr_after_rgb == told.psnr_after_rgb and report.rgb_kept == told.rgb_kept
+
+
+def a_run(settings: DistillSettings) -> module.DistillRun:
+    student = empty_student(TEACHER, settings, torch.Generator().manual_seed(settings.seed), "ball")
+    return module.DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings)
 
 
 def test_without_rgb_nothing_is_said_of_it():
