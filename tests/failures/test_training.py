@@ -189,6 +189,7 @@ def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
     figure = clean - unseen_psnr(run.finish())
     assert run.guard.figures() == {"skipped_steps": 4, "roll_backs": 0} and run.steps == 80
+    assert np.isfinite(run.mse)
     row.check("T9", "PSNR lost to one bad step in twenty", figure, 0.5, at_most=True, unit="dB")
 
 

@@ -15,7 +15,9 @@ def seeded(seed: int = 0) -> torch.Generator:
 def test_every_number_comes_once_an_epoch(count, batch):
     """Also where the batches do not divide the epoch: the remainder is not lost."""
     epochs = Epochs(count, seeded())
-    drawn = torch.cat([epochs.draw(batch) for _ in range(5 * count)])
+    batches = [epochs.draw(batch) for _ in range(5 * count)]
+    assert {len(part) for part in batches} == {min(batch, count)}
+    drawn = torch.cat(batches)
     whole = drawn[: len(drawn) // count * count].view(-1, count)
     assert torch.equal(whole.sort(1).values, torch.arange(count).expand(len(whole), count))
 
