@@ -1,15 +1,16 @@
 """A folder of tiny solid fields, and the real bridge made small enough to run in seconds."""
 
+import contextlib
 import importlib
 import json
 import shutil
+import signal
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from click.testing import CliRunner
 
 from formats.captures import write_capture
@@ -21,14 +22,14 @@ from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields import vm
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.main import cli
-
-SHAPE = VMShape(16, 8, 1)  # the one that the engine's tests compile
+from fusedrf_cli.main import _interrupt, cli
+from tests.analytic.export import SHAPE, vm_field
+from tests.analytic.fields import Box, Tint
 
 
 @dataclass(frozen=True)
@@ -53,23 +54,8 @@ def part(name: str):
 
 
 def solid(rgb, half=(0.3, 0.3, 0.3), density: float = 20.0) -> VMField:
-    """A box of one density and one colour around its origin, by rank-1 factors on 16 x 16 x 16 texels."""
-    half = np.asarray(half, float)
-    box = np.concatenate([-half, half])
-    field = VMField(
-        SHAPE,
-        (VMTensor((16, 16, 16), box, density, 0.0, np.ones((4, 4, 4), bool)),),
-        (Block(0, np.eye(4), ""),),
-        torch.zeros(SHAPE.size((16, 16, 16))),
-        OccupancyGrid.full(box, 4),
-    )
-    sections = field.sections(0)
-    for what, value in (("density", np.log(np.e - 1)), ("colour", 1.0)):  # softplus gives 1
-        sections[f"{what}_plane_0"][..., 0] = value
-        sections[f"{what}_line_0"][:, 0] = 1
-    logits = np.log(np.asarray(rgb) / (1 - np.asarray(rgb)))
-    sections["colour_basis"][:, 0, 0] = torch.from_numpy(logits / 0.28209479177387814).float()
-    return field.with_occupancy(OccupancyGrid(box, np.ones((4, 4, 4), bool)))
+    """A box of one density and one colour around its origin, on 16 x 16 x 16 texels."""
+    return vm_field(Box(density, half, tint=Tint.of(*rgb)))
 
 
 FIELDS = {
@@ -178,3 +164,30 @@ def picture(folder, report):
         return read_image(folder / "eye.png")[..., :3] / 255
 
     return picture
+
+
+@pytest.fixture
+def interrupted_in_step(monkeypatch):
+    """with interrupted_in_step(6): SIGINT comes during the 6th step, before it moves the numbers."""
+
+    @contextlib.contextmanager
+    def interrupted_in_step(at: int, times: int = 1):
+        step, calls = Adam.step, []
+
+        def interrupted(self, rate):
+            calls.append(rate)
+            if len(calls) == at:
+                for _ in range(times):
+                    signal.raise_signal(signal.SIGINT)
+            step(self, rate)
+
+        previous = signal.signal(signal.SIGINT, _interrupt)  # as the process itself has it
+        try:
+            with monkeypatch.context() as patch:
+                patch.setattr(Adam, "step", interrupted)
+                yield
+        finally:
+            signal.signal(signal.SIGINT, previous)
+        assert len(calls) >= at
+
+    return interrupted_in_step

@@ -48,6 +48,20 @@ class Adam:
                 np.float32(correction2),
             )
 
+    def sound(self) -> bool:
+        """Whether the gradients are finite, judged by those of the colour bases (some thousand numbers).
+
+        Every shaded sample adds to its basis what it sends back, times its features: a gradient or a colour
+        factor that is not finite shows there. What only a density factor could hide, an infinite σ, is left
+        to the guard's look at all numbers.
+        """
+        bases = [row[low:high] for low, high, ratio in self.slices() if ratio != 1.0 for row in self.grads]
+        return all(np.isfinite(np.vdot(part, part)) for part in bases)
+
+    def clear(self) -> None:
+        """Forget the gradients without a step."""
+        self.grads[:] = 0
+
     def slices(self) -> list[tuple[int, int, float]]:
         """(low, high, rate ratio) of every group of parameters."""
         ends = [*self.field.layout[1:, 0], self.field.params.numel()]

@@ -47,6 +47,10 @@ class Pass(Protocol):
         """Move what is not in `field.params`, at `decay` times the first rate."""
         ...
 
+    def numbers(self) -> list[np.ndarray]:
+        """Views of what `step` changes."""
+        ...
+
     def state(self) -> dict[str, np.ndarray]:
         """What a checkpoint has to keep besides the field."""
         ...
@@ -88,6 +92,10 @@ class FusedPass:
     def step(self, decay: float) -> None:
         """Nothing: all is in `params`."""
 
+    def numbers(self) -> list[np.ndarray]:
+        """Nothing."""
+        return []
+
     def state(self) -> dict[str, np.ndarray]:
         """Nothing."""
         return {}
@@ -101,6 +109,9 @@ class PackedPass:
 
     def __init__(self, field: VMMLPField):
         self.optimiser = torch.optim.Adam(field.network.parameters(), NETWORK_RATE, BETAS)
+        for weight in field.network.parameters():  # moments that are there from the start can be copied
+            zero = {name: torch.zeros_like(weight) for name in ("exp_avg", "exp_avg_sq")}
+            self.optimiser.state[weight] = {"step": torch.tensor(0.0), **zero}
 
     def gradient(self, field: VMMLPField, batch: Batch, grads: np.ndarray) -> np.ndarray:
         """See Pass; the network's gradient stays with its weights until `step`."""
@@ -134,6 +145,11 @@ class PackedPass:
         for group in self.optimiser.param_groups:
             group["lr"] = NETWORK_RATE * decay
         self.optimiser.step()
+
+    def numbers(self) -> list[np.ndarray]:
+        """The network's weights, and Adam's moments and steps of them."""
+        held = self.optimiser.state
+        return [v.detach().numpy() for weight, own in held.items() for v in (weight, *own.values())]
 
     def state(self) -> dict[str, np.ndarray]:
         """Adam's moments and step of each of the network's weights, by `<weight>.<name>`."""
