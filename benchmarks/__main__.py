@@ -165,7 +165,7 @@ def train_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
     target, white = np.full((RAYS, 4), 0.5, np.float32), np.ones((RAYS, 3), np.float32)
     batch = Batch(rays_o, rays_d, np.full(RAYS, 0.5), target, white, 0.1, 0.0, STEP, EARLY_STOP)
     work = FusedPass(field)
-    mine = Adam(field, torch.get_num_threads())
+    mine = Adam.of(field)
 
     def ours():
         work.gradient(field, batch, mine.grads)
@@ -195,7 +195,7 @@ def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, ray
     dirs = torch.from_numpy(rays_d).repeat(POINTS // RAYS, 1)
     asked = torch.full((POINTS,), 20.0), torch.full((POINTS, 3), 0.5)
     pool = TeacherPool(rays_o, rays_d, torch.zeros(RAYS, 4), points, dirs, *asked)
-    mine, chosen = Adam(field, torch.get_num_threads()), torch.arange(1 << 15)
+    mine, chosen = Adam.of(field), torch.arange(1 << 15)
 
     def ours():
         point_step(field, pool, chosen, STEP, mine)

@@ -24,7 +24,6 @@ from fusedrf_cli.engine.distillation.teacher import TeacherPool, ask, random_ray
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -190,10 +189,8 @@ class DistillRun:
         self.settings, self.step = settings, 0.5 * student.voxel_size
         self.generator = torch.Generator()
         self.report = DistillReport()
-        self.optimiser = Adam(student, torch.get_num_threads())
-        self.guard = Guard(
-            lambda: [self.student.params.numpy(), self.optimiser.moment1, self.optimiser.moment2]
-        )
+        self.optimiser = Adam.of(student)
+        self.guard = Guard(lambda: self.optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
@@ -243,7 +240,7 @@ class DistillRun:
         self.guard.check()
         self.before = self.student.params.clone()
         self._prune()
-        self.optimiser = Adam(self.student, self.optimiser.parts)
+        self.optimiser = Adam.of(self.student)
         self.guard.renew()
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
 
@@ -278,13 +275,12 @@ class DistillRun:
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
         arrays, drawn = self.epochs.state()
-        arrays |= {"params": self.student.params.numpy()}
-        arrays |= {"moment1": self.optimiser.moment1, "moment2": self.optimiser.moment2}
+        arrays |= {"params": self.student.params.cpu().numpy()} | self.optimiser.state()
         random = self.generator.get_state() if self.asked else self.random
         if random is not None:
             arrays["random"] = random.numpy()
         if self.before is not None:
-            arrays["before"] = self.before.numpy()
+            arrays["before"] = self.before.cpu().numpy()
         state = {
             "command": "fuse",
             "phase": self.phase,
@@ -305,8 +301,8 @@ class DistillRun:
             self._begin_pictures()
             self.report.psnr_before_rgb = state["psnr_before_rgb"]
         self.student.params.copy_(torch.from_numpy(arrays["params"]))
-        self.optimiser.moment1[:], self.optimiser.moment2[:] = arrays["moment1"], arrays["moment2"]
-        self.optimiser.steps, self.count = state["adam_steps"], state["rays"]
+        self.optimiser.restore(arrays, state["adam_steps"])
+        self.count = state["rays"]
         self.phase, self.steps, self.elapsed = state["phase"], state["steps"], state["elapsed"]
         self.guard.restore(state["guard"])
         self.epochs.restore(arrays, state)
@@ -361,7 +357,7 @@ def point_step(
     n = len(chosen)
     d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step * lift
     d_rgb = 2 / n * COLOUR_WEIGHT * alpha[:, None] * off
-    cpu.query_backward(
+    student.loops.query_backward(
         *student.kernel_shape,
         student.arrays,
         student.grid,
@@ -392,7 +388,7 @@ class RayPass:
         chosen = run.epochs.draw(run.count).numpy()
         jitter = torch.rand(len(chosen), generator=run.generator, dtype=torch.float64).numpy()
         loss = np.zeros((run.optimiser.parts, 3))
-        cpu.train_rays(
+        run.student.loops.train_rays(
             *run.student.kernel_shape,
             run.student.arrays,
             run.student.grid,
@@ -421,7 +417,7 @@ def pruned(student: VMField) -> OccupancyGrid:
     cells = np.argwhere(grid.occupied)
 
     sigma = np.zeros(len(cells), np.float32)
-    cpu.density_at_cells(
+    student.loops.density_at_cells(
         student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma
     )
     occupied = np.zeros_like(grid.occupied)

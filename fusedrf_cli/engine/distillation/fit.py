@@ -16,7 +16,6 @@ from fusedrf_cli.engine.distillation.passes import PASSES, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.fields.vm import PROBES, VMField, VMShape
 from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
-from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import Camera
 
 RATE = 0.02
@@ -57,6 +56,8 @@ class FitSettings:
     seed: int = 0
     colour: str = "sh"
     """One of COLOURS: spherical harmonics, or a shallow network over features."""
+    device: str = "cpu"
+    """Where the field is trained, "cpu" or "cuda"; the latter with spherical harmonics only."""
 
 
 class RayPool:
@@ -115,21 +116,13 @@ class FitRun:
         generator: torch.Generator,
     ):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
-        self.parts = torch.get_num_threads()
-        self.optimiser = Adam(field, self.parts)
+        self.optimiser = Adam.of(field)
         self.rays_pass = PASSES[field.kind](field)
         self.started, self.steps = time.monotonic(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
         self.found_matter, self.found_nothing = False, 0
-        self.guard = Guard(
-            lambda: [
-                self.field.params.numpy(),
-                self.optimiser.moment1,
-                self.optimiser.moment2,
-                *self.rays_pass.numbers(),
-            ]
-        )
+        self.guard = Guard(lambda: [*self.optimiser.numbers(), *self.rays_pass.numbers()])
 
     @classmethod
     def start(
@@ -145,6 +138,7 @@ class FitRun:
         pool = RayPool(cameras, images, generator)
         coarse = texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1])))
         field = COLOURS[settings.colour].create(aabb, coarse, settings.shape, generator, name)
+        field = field.to(settings.device)
         return cls(field, pool, settings, generator)
 
     def finish(
@@ -181,7 +175,7 @@ class FitRun:
         arrays, metadata = self.field.state()
         arrays = {f"field.{name}": np.asarray(value) for name, value in arrays.items()}
         arrays |= {f"pass.{name}": value for name, value in self.rays_pass.state().items()}
-        arrays |= {"moment1": self.optimiser.moment1, "moment2": self.optimiser.moment2}
+        arrays |= self.optimiser.state()
         arrays |= {
             "random": self.generator.get_state().numpy(),
         }
@@ -206,11 +200,12 @@ class FitRun:
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
+        self.field = self.field.to(self.settings.device)
         self.rays_pass = PASSES[self.field.kind](self.field)
         self.rays_pass.restore(part_of(arrays, "pass."))
-        self.optimiser = Adam(self.field, self.parts)
-        self.optimiser.moment1[:], self.optimiser.moment2[:] = arrays["moment1"], arrays["moment2"]
-        self.optimiser.steps, self.steps = state["adam_steps"], state["steps"]
+        self.optimiser = Adam.of(self.field)
+        self.optimiser.restore(arrays, state["adam_steps"])
+        self.steps = state["steps"]
         self.stages = self.stages[len(self.stages) - state["stages"] :]
         self.refreshes = state["refreshes"]
         self.found_matter, self.found_nothing = state["found"]
@@ -262,7 +257,7 @@ class FitRun:
             occupancy = occupancy_of(self.field)
             if not occupancy.occupied.any():  # what there was lies between the new texels
                 self.field = before
-                self.optimiser = Adam(self.field, self.parts)
+                self.optimiser = Adam.of(self.field)
                 return
             self.field = self.field.with_occupancy(occupancy)
             self.optimiser.field = self.field
@@ -270,7 +265,7 @@ class FitRun:
     def resize(self, aabb: np.ndarray, longest: int) -> None:
         """Another box or resolution; the optimiser starts anew, since its moments belong to other texels."""
         self.field = self.field.resampled(aabb, texels(aabb, longest))
-        self.optimiser = Adam(self.field, self.parts)
+        self.optimiser = Adam.of(self.field)
         self.guard.renew()
 
     def step(self, share: float) -> None:
@@ -338,7 +333,8 @@ def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> Occ
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
     sigma = np.zeros(len(index), np.float32)
-    cpu.density_at_cells(field.kernel_shape[0], field.arrays, 0, box[:3].copy(), cell, index, PROBES, sigma)
+    cells = box[:3].copy(), cell, index
+    field.loops.density_at_cells(field.kernel_shape[0], field.arrays, 0, *cells, PROBES, sigma)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
     return OccupancyGrid(box, occupied).dilated()

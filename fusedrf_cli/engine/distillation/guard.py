@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
 
@@ -18,14 +19,14 @@ class Guard:
     """Skips steps whose loss or gradient is not finite, and goes back to a copy of the last good numbers, at
     a third of the rate, where they come too often."""
 
-    def __init__(self, numbers: Callable[[], list[np.ndarray]]):
-        """numbers() are the arrays that steps change: parameters and moments, as views to copy back into."""
+    def __init__(self, numbers: Callable[[], list[torch.Tensor]]):
+        """numbers() are what steps change: parameters and moments, to copy back into."""
         self.numbers = numbers
         self.rate = 1.0
         """What the learning rate is to be multiplied by."""
         self.skipped, self.roll_backs = 0, 0
         self.recent: deque[bool] = deque(maxlen=WINDOW)
-        self.kept: list[np.ndarray] = []
+        self.kept: list[torch.Tensor] = []
         self.age = 0
 
     def accepts(self, sums: np.ndarray, optimiser: Adam) -> bool:
@@ -44,15 +45,15 @@ class Guard:
         if not self.kept or self.age >= KEPT_EVERY:
             self.check()
             if len(self.kept) != len(now := self.numbers()):
-                self.kept = [np.empty_like(values) for values in now]
+                self.kept = [torch.empty_like(values) for values in now]
             for copy, values in zip(self.kept, now, strict=True):
-                np.copyto(copy, values)
+                copy.copy_(values)
             self.age = 0
         self.age += 1
 
     def check(self) -> None:
         """Go back where a number is not finite."""
-        if not all(np.isfinite(np.vdot(values, values)) for values in self.numbers()):
+        if not all(torch.dot(values.flatten(), values.flatten()).isfinite() for values in self.numbers()):
             self.roll_back()
 
     def renew(self) -> None:
@@ -68,7 +69,7 @@ class Guard:
                 "state at a third of the rate"
             )
         for copy, values in zip(self.kept, self.numbers(), strict=True):
-            np.copyto(values, copy)
+            values.copy_(copy)
         self.roll_backs += 1
         self.rate *= RATE_CUT
         self.recent.clear()

@@ -12,7 +12,7 @@ import torch
 
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
-from fusedrf_cli.engine.kernels import autograd, bodies, cpu
+from fusedrf_cli.engine.kernels import autograd, bodies
 from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 NETWORK_RATE = 1e-3  # TensoRF's
@@ -47,7 +47,7 @@ class Pass(Protocol):
         """Move what is not in `field.params`, at `decay` times the first rate."""
         ...
 
-    def numbers(self) -> list[np.ndarray]:
+    def numbers(self) -> list[torch.Tensor]:
         """Views of what `step` changes."""
         ...
 
@@ -68,9 +68,9 @@ class FusedPass:
 
     def gradient(self, field: VMField, batch: Batch, grads: np.ndarray) -> np.ndarray:
         """See Pass."""
-        loss = np.zeros((len(grads), 3))
+        loss = np.zeros((grads.shape[0], 3))
         diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
-        cpu.train_rays(
+        field.loops.train_rays(
             *field.kernel_shape,
             field.arrays,
             field.grid,
@@ -92,7 +92,7 @@ class FusedPass:
     def step(self, decay: float) -> None:
         """Nothing: all is in `params`."""
 
-    def numbers(self) -> list[np.ndarray]:
+    def numbers(self) -> list[torch.Tensor]:
         """Nothing."""
         return []
 
@@ -146,10 +146,10 @@ class PackedPass:
             group["lr"] = NETWORK_RATE * decay
         self.optimiser.step()
 
-    def numbers(self) -> list[np.ndarray]:
+    def numbers(self) -> list[torch.Tensor]:
         """The network's weights, and Adam's moments and steps of them."""
         held = self.optimiser.state
-        return [v.detach().numpy() for weight, own in held.items() for v in (weight, *own.values())]
+        return [v.detach() for weight, own in held.items() for v in (weight, *own.values())]
 
     def state(self) -> dict[str, np.ndarray]:
         """Adam's moments and step of each of the network's weights, by `<weight>.<name>`."""

@@ -5,6 +5,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
+from types import ModuleType
 
 import numba
 
@@ -40,6 +41,16 @@ from fusedrf_cli.engine.kernels import cpu  # noqa: E402  (compiles under the se
 from fusedrf_cli.engine.kernels.bodies import NO_BLOCK, GridArrays, VMArrays  # noqa: E402
 
 
+def loops(device: str) -> ModuleType:
+    """The module of compiled loops for arrays of a torch device type, "cpu" or "cuda". The first use of the
+    latter needs the `[gpu]` extra."""
+    if device == "cuda":
+        from fusedrf_cli.engine.kernels import cuda
+
+        return cuda
+    return cpu
+
+
 def set_threads(count: int) -> None:
     """Use that many cores, at most as many as numba started with."""
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
@@ -51,4 +62,4 @@ def is_cold() -> bool:
     return not folder.is_dir() or not any(folder.iterdir())
 
 
-__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "is_cold", "kernel_cache", "set_threads"]
+__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "is_cold", "kernel_cache", "loops", "set_threads"]

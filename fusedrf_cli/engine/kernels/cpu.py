@@ -33,6 +33,16 @@ ENTRIES_PER_TASK = 1 << 16
 POINTS_AHEAD = 4  # a point's texels are asked for so many points before it
 
 
+def shared(tensor):
+    """A torch tensor's numbers as the loops take them, not copied."""
+    return tensor.detach().numpy()
+
+
+def on_device(arrays):
+    """Arrays, or a tuple of them, where the loops read them fastest: here as they are."""
+    return arrays
+
+
 @task
 def query_task(
     ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, low, high, features, basis, sh,

@@ -190,10 +190,15 @@ def training_scratch(max_samples: int, rays: int, kind: np.dtype) -> tuple:
     return cuda.device_array((7, *shape), kind), cuda.device_array((3, *shape), np.int32)
 
 
+def shared(tensor):
+    """A torch tensor's numbers as the loops take them, not copied. The simulator's device is the host."""
+    return tensor.detach().numpy() if SIMULATED else cuda.as_cuda_array(tensor.detach())
+
+
 def on_device(value):
     """A host array's copy on the device, a tuple of arrays with all of them there; all else as it is."""
     if isinstance(value, np.ndarray):
-        return cuda.to_device(np.ascontiguousarray(value))
+        return value if SIMULATED else cuda.to_device(np.ascontiguousarray(value))
     return type(value)(*map(on_device, value)) if hasattr(value, "_fields") else value
 
 
@@ -202,9 +207,14 @@ def launch(kernel, items: int, inputs: tuple, outputs: tuple) -> None:
     if items:
         placed = [on_device(array) for array in outputs]
         kernel[(items + THREADS - 1) // THREADS, THREADS](*map(on_device, inputs), *placed)
-        for host, there in zip(outputs, placed, strict=True):
-            if isinstance(host, np.ndarray):
-                there.copy_to_host(host)
+        fetch(outputs, placed)
+
+
+def fetch(host: tuple, placed: list) -> None:
+    """Copy what lies on the device back to those arrays that lie on the host."""
+    for array, there in zip(host, placed, strict=True):
+        if there is not array:
+            there.copy_to_host(array)
 
 
 # -- the functions of cpu.py -------------------------------------------------------------------------------
@@ -272,9 +282,7 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     lines = -(-(high - low) // items.LINE)
     if lines > 0:
         plain_kernels().adam[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
-    for host, there in zip(inputs, placed, strict=True):
-        if isinstance(host, np.ndarray):
-            there.copy_to_host(host)
+    fetch(inputs, placed)
 
 
 def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):

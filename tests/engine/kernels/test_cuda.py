@@ -12,8 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.rendering.cameras import Camera, tile_order
+from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, tile_order
+from fusedrf_cli.engine.rendering.volume import render_image
 from tests.engine.conftest import BOX, SIXTY_FOUR, points_in, random_vm, rays_at, unit
 from tests.engine.kernels.test_cpu import two_blocks
 
@@ -155,6 +159,28 @@ def test_adam(rng):
         results.append(arrays)
     for wanted, found in zip(*results, strict=True):
         np.testing.assert_allclose(found, wanted, **EXACT)
+
+
+@on_a_device
+def test_a_field_there_learns_and_renders_as_here(monkeypatch):
+    """One step of training and one picture by the engine's own classes."""
+    rays_o, rays_d = rays_at(BOX, 2)
+    batch = Batch(rays_o, rays_d, np.full(2, 0.5), np.ones((2, 4)), np.zeros((2, 3)), 0.1, 0.0, 0.4, 1e-3)
+    camera = framing_camera(BOX, 0.9, 0.45, 2, 2)
+    found = []
+    for device in ("cpu", "cuda"):
+        if SIMULATED:
+            monkeypatch.setattr(kernels, "loops", lambda _, device=device: cuda if device == "cuda" else cpu)
+        field = random_vm(dtype=torch.float64).to("cpu" if SIMULATED else device)
+        optimiser = Adam(field, 1)
+        sums = FusedPass(field).gradient(field, batch, optimiser.grads)
+        assert optimiser.sound()
+        optimiser.step(0.01)
+        shot = render_image(field, camera, step=0.4)
+        found.append((sums, field.params.cpu().numpy(), shot.rgb, shot.opacity))
+    for wanted, other in zip(*found, strict=True):
+        np.testing.assert_allclose(other, wanted, rtol=1e-6, atol=1e-7)
+        assert wanted.any()
 
 
 @on_a_device
