@@ -24,6 +24,9 @@ class NullProgress:
         """One line that people should see; the JSON report carries it as well."""
         self.warnings.append(text)
 
+    def tell(self, text: str) -> None:
+        """One line that explains a wait."""
+
     def note(self, text: str) -> None:
         """One line for those who asked for more (-v)."""
 
@@ -60,6 +63,10 @@ class Progress(NullProgress):
     def warn(self, text: str) -> None:
         super().warn(text)
         self._say(f"Warning: {text}")
+
+    def tell(self, text: str) -> None:
+        if not self._quiet:
+            self._say(text)
 
     def note(self, text: str) -> None:
         if self._verbose:

@@ -16,6 +16,8 @@ from safetensors.numpy import save
 from formats.atomic import atomic_writer
 from fusedrf_cli.errors import InvalidInput, NumericFailure, ResourceProblem
 
+FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
+
 
 @contextlib.contextmanager
 def engine(device: str, threads: int | None, progress) -> Iterator[None]:
@@ -31,10 +33,9 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
 
     torch.set_num_threads(count)
     kernels.set_threads(count)
-    if kernels.is_cold():
-        progress.note("first use: compiling kernels takes up to two minutes and is kept for later runs")
     try:
-        yield
+        with kernels.telling_of_compilation(lambda: progress.tell(FIRST_USE)):
+            yield
     except FloatingPointError as error:
         raise NumericFailure(
             f"the optimisation diverged: {error}; try another --seed or a lower resolution"

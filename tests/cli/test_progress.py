@@ -38,6 +38,7 @@ def test_quiet_shows_warnings_alone(capsys, options):
     with Progress(**options) as progress:
         progress.phase("load")
         progress.note("a detail")
+        progress.tell("a wait")
         progress.warn("too few\nphotos")
     assert capsys.readouterr().err == "Warning: too few\\nphotos\n"
     assert progress.warnings == ["too few\nphotos"]
@@ -59,6 +60,11 @@ def test_a_failure_is_not_called_done(capsys):
 def test_notes_are_for_those_who_ask(capsys, verbose, shown):
     Progress(live=False, verbose=verbose).note("a detail")
     assert capsys.readouterr().err == shown
+
+
+def test_a_wait_is_explained(capsys):
+    Progress(live=False).tell("compiling")
+    assert capsys.readouterr().err == "compiling\n"
 
 
 def test_null_progress_shows_nothing_and_keeps_warnings(capsys):

@@ -4,10 +4,13 @@ numba."""
 import hashlib
 import os
 import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
 
 import numba
+from numba.core import event
 
 
 def kernel_cache() -> Path:
@@ -56,10 +59,33 @@ def set_threads(count: int) -> None:
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
 
 
-def is_cold() -> bool:
-    """Whether nothing has been compiled yet into the cache folder."""
-    folder = Path(numba.config.CACHE_DIR or os.environ["NUMBA_CACHE_DIR"])
-    return not folder.is_dir() or not any(folder.iterdir())
+class _First(event.Listener):
+    """Calls a function at the first compilation: what the cache holds is not compiled."""
+
+    def __init__(self, tell: Callable[[], None]):
+        self.tell, self.told = tell, False
+
+    def on_start(self, found: event.Event) -> None:
+        if not self.told:
+            self.told = True
+            self.tell()
+
+    def on_end(self, found: event.Event) -> None:
+        """Nothing."""
 
 
-__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "is_cold", "kernel_cache", "loops", "set_threads"]
+def telling_of_compilation(tell: Callable[[], None]) -> AbstractContextManager:
+    """Within it `tell` is called once, before the first kernel that has to be compiled."""
+    return event.install_listener("numba:compile", _First(tell))
+
+
+__all__ = [
+    "NO_BLOCK",
+    "GridArrays",
+    "VMArrays",
+    "cpu",
+    "kernel_cache",
+    "loops",
+    "set_threads",
+    "telling_of_compilation",
+]
