@@ -11,6 +11,8 @@ from typing import BinaryIO
 from formats.errors import BadJson, LimitExceeded, MissingFile, NotAFile, ResourceError
 
 MAX_INTEGER = 2**63 - 1
+# Commas and opening brackets of a document: what bounds the time and memory that parsing it takes.
+MAX_VALUES = 500_000
 
 
 def open_input(path: Path | str) -> BinaryIO:
@@ -48,10 +50,17 @@ def read_input(path: Path | str, limit: int) -> bytes:
 
 
 def parse_json(data: bytes, where: str):
-    """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise."""
+    """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise.
+
+    Raises LimitExceeded, before parsing, where there is more of it than a second's work.
+    """
+    data = bytes(data)
+    values = sum(map(data.count, (b",", b"[", b"{")))
+    if values > MAX_VALUES:
+        raise LimitExceeded(f"{where}: JSON of about {values:,} values, at most {MAX_VALUES:,} are read")
     try:
         return json.loads(
-            bytes(data).decode("utf-8"),
+            data.decode("utf-8"),
             object_pairs_hook=_unique,
             parse_float=_finite,
             parse_int=_bounded,
@@ -64,12 +73,13 @@ def parse_json(data: bytes, where: str):
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"key {next(k for k in keys if keys.count(k) > 1)!r} appears twice in one object")
-    for text in [*found, *found.values()]:
-        _encodable(text)
+    found = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"key {key[:40]!r} appears twice in one object")
+        _encodable(key)
+        _encodable(value)
+        found[key] = value
     return found
 
 
@@ -77,8 +87,11 @@ def _encodable(text: object) -> None:
     if isinstance(text, list):
         for item in text:
             _encodable(item)
-    elif isinstance(text, str) and any("\ud800" <= c <= "\udfff" for c in text):
-        raise ValueError(f"{text[:40]!r} holds half of a surrogate pair")
+    elif isinstance(text, str) and not text.isascii():
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            raise ValueError(f"{text[:40]!r} holds half of a surrogate pair") from None
 
 
 def _finite(digits: str) -> float:
