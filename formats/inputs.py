@@ -13,6 +13,8 @@ from formats.errors import BadJson, LimitExceeded, MissingFile, NotAFile, Resour
 MAX_INTEGER = 2**63 - 1
 # Commas and opening brackets of a document: what bounds the time and memory that parsing it takes.
 MAX_VALUES = 500_000
+# A scene of 64 levels has 130; what recurses over a document has room for this many.
+MAX_NESTING = 200
 
 
 def open_input(path: Path | str) -> BinaryIO:
@@ -59,7 +61,7 @@ def parse_json(data: bytes, where: str):
     if values > MAX_VALUES:
         raise LimitExceeded(f"{where}: JSON of about {values:,} values, at most {MAX_VALUES:,} are read")
     try:
-        return json.loads(
+        content = json.loads(
             data.decode("utf-8"),
             object_pairs_hook=_unique,
             parse_float=_finite,
@@ -70,6 +72,18 @@ def parse_json(data: bytes, where: str):
         raise BadJson(f"{where}: JSON is nested too deep to be read") from error
     except ValueError as error:
         raise BadJson(f"{where}: not strict JSON: {error}") from error
+    if _nesting(content) > MAX_NESTING:
+        raise BadJson(f"{where}: JSON is nested deeper than {MAX_NESTING} levels")
+    return content
+
+
+def _nesting(content: object) -> int:
+    """Levels of lists and objects, without recursion."""
+    level, depth = [content], 0
+    while level := [value for value in level if isinstance(value, dict | list)]:
+        depth += 1
+        level = [inner for value in level for inner in (value.values() if isinstance(value, dict) else value)]
+    return depth
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict:

@@ -8,6 +8,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -267,24 +268,20 @@ AS_NOBODY = (
 )
 
 
-def test_a_read_only_place_is_refused_before_work(tmp_path):
+def test_a_read_only_place_is_refused_before_work():
     """P6: a folder without write permission, as a user who is not root."""
-    (tmp_path / "locked").mkdir()
-    write_generation(tmp_path / "a.rfpack", 1)
     root = os.geteuid() == 0
-    for place in (tmp_path, *tmp_path.parents):
-        if root and not place.stat().st_mode & stat.S_IXOTH:
-            place.chmod(place.stat().st_mode | stat.S_IXOTH)
-        if place.name.startswith("pytest-of"):
-            break
-    (tmp_path / "locked").chmod(0o555)
-    # `train` of what is no capture at all: the place is judged before the input is looked at.
-    words = ["train", str(tmp_path / "a.rfpack"), "-o", str(tmp_path / "locked" / "out.rfpack")]
-    run = subprocess.run(
-        [sys.executable, "-c", AS_NOBODY if root else COMMAND, *words], cwd=ROOT, capture_output=True, text=True
-    )
-    assert run.returncode == 5 and "cannot write in" in run.stderr and run.stderr.count("\n") == 1
-    assert names(tmp_path / "locked") == []
+    with tempfile.TemporaryDirectory() as folder:  # pytest's own is closed to other users
+        locked = Path(folder) / "locked"
+        locked.mkdir()
+        write_generation(f"{folder}/a.rfpack", 1)
+        Path(folder).chmod(0o755)
+        locked.chmod(0o555)
+        # `train` of what is no capture at all: the place is judged before the input is looked at.
+        words = [AS_NOBODY if root else COMMAND, "train", f"{folder}/a.rfpack", "-o", f"{locked}/out.rfpack"]
+        run = subprocess.run([sys.executable, "-c", *words], cwd=ROOT, capture_output=True, text=True)
+        assert run.returncode == 5 and "cannot write in" in run.stderr and run.stderr.count("\n") == 1
+        assert names(locked) == []
 
 
 def test_a_read_only_mount_is_refused_before_work_even_for_root(small_disk):
