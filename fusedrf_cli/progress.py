@@ -91,14 +91,12 @@ class Progress(NullProgress):
         return f"done in {sum(seconds.values()):.1f} s ({parts})"
 
     def _draw(self, name: str, total: float | None) -> None:
-        from rich.markup import escape
-
         if self._bar is None:
             self._bar = _bar()
             self._bar.start()
         if self._task is not None:
             self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(escape(printable(name)), total=total, figures="")
+        self._task = self._bar.add_task(printable(name), total=total, figures="")
 
     def _stop(self) -> None:
         if self._bar is not None:

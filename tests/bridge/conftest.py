@@ -110,20 +110,20 @@ def tiny():
         yield
 
 
-def stock(folder: Path) -> None:
-    """floor, red and blue as bundles, scene.json of all three, pair.json of two, and photos of the red box."""
+def stock_fields(folder: Path) -> None:
+    """floor, red and blue as bundles, scene.json of all three, and pair.json of two."""
     for name, field in FIELDS.items():
         write_field(str(folder / f"{name}.rfpack"), field, name, precision="float16", overwrite=False)
     write_scene_of(folder, "floor", "red", "blue")
     write_scene_of(folder, "floor", "red", file="pair.json")
-    write_views(folder / "photos")
 
 
 @pytest.fixture(scope="session")
 def shop(tmp_path_factory) -> Path:
-    """A stocked folder."""
+    """A folder with the fields and scenes, and photos of the red box."""
     folder = tmp_path_factory.mktemp("shop")
-    stock(folder)
+    stock_fields(folder)
+    write_views(folder / "photos")
     return folder
 
 

@@ -1,7 +1,7 @@
 """Whole commands, killed: `python -m tests.promises.kills --kills 200 --seed 0 [COMMAND...]`.
 
 One process imports everything and forks a child for each run, so that a kill costs no start-up. A child is
-ended by SIGKILL after a random time, or (--calls) at its k-th system call of writing, for every k. Afterwards
+ended by SIGKILL after a random time, and with --calls at its k-th system call of writing, for every k. Then
 the output has to be the old one or the new one, byte for byte, and nothing else may have changed but hidden
 remains, which the next run has to remove.
 """
@@ -27,7 +27,7 @@ from formats import atomic, bundle, scene
 from formats.bundle import is_bundle, read_bundle
 from fusedrf_cli import bridge  # noqa: F401  (imported before the first fork)
 from fusedrf_cli.main import cli
-from tests.bridge.conftest import make_tiny, stock
+from tests.bridge.conftest import make_tiny, stock_fields, write_views
 from tests.promises.calls import At, watched
 
 HIDDEN = re.compile(r"\..*\.(tmp|old|fusedrf-lock)")
@@ -209,38 +209,43 @@ def in_place():
         yield
 
 
-def stocked(folder: Path) -> None:
-    """The shop, made in a child: kernels must not have run before a fork."""
+def stocked(folder: Path, names: list[str]) -> None:
+    """What the named victims need, made in a child: kernels must not have run before a fork."""
 
     def work():
-        stock(folder)
+        stock_fields(folder)
+        if "train" in names:
+            write_views(folder / "photos")
         os.chdir(folder)
         (folder / "old-views").mkdir()
         (folder / "old-views" / "old.png").write_bytes(b"old")
-        cli.main(["fuse", "pair.json", "-o", "fused.rfpack", "-q", "--threads", "1"])
+        if {"add", "delete"} & set(names):
+            cli.main(["fuse", "pair.json", "-o", "fused.rfpack", "-q", "--threads", "1"])
 
     assert forked(work) == 0
 
 
 def tried(names: list[str], kills: int, seed: int, calls: bool, defence=nullcontext) -> dict:
-    """Kill each named command; what became of it."""
+    """Kill each named command at random moments, at every call, or both; what became of it."""
     found = {}
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
         make_tiny(patch)
-        stocked(Path(folder))
+        stocked(Path(folder), names)
         for name in names:
             shop = Shop(Path(folder), VICTIMS[name], defence)
-            killed = kill_at_every_call(shop) if calls else kill_at_random(shop, kills, random.Random(f"{seed}{name}"))
-            found[name] = {"seconds": round(shop.seconds, 3), **killed}
+            if kills:
+                found[name] = kill_at_random(shop, kills, random.Random(f"{seed}{name}"))
+            if calls:
+                found[f"{name} at every call"] = kill_at_every_call(shop)
     return found
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("commands", nargs="*", metavar="COMMAND", help=", ".join(VICTIMS))
-    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--kills", type=int, default=200, help="at random moments; 0: none")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--calls", action="store_true", help="at every system call of writing instead")
+    parser.add_argument("--calls", action="store_true", help="at every system call of writing as well")
     parser.add_argument("--in-place", action="store_true", help="without the defence")
     options = parser.parse_args()
     defence = in_place if options.in_place else nullcontext
