@@ -22,7 +22,7 @@ def emit(report: dict, *, as_json: bool, quiet: bool = False) -> None:
 
 
 def _unmoving(text: str) -> str:
-    """JSON whose strings, some of them from hostile files, cannot move a terminal's cursor: the same values."""
+    """The same JSON, whose strings, some from hostile files, no longer move a terminal's cursor."""
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 

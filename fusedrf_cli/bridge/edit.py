@@ -230,9 +230,7 @@ def check_history(bundle: Bundle, path: str) -> None:
                 if not node.source.isprintable():
                     raise ValueError("a source that is no path")
         except (ValueError, FormatError) as error:
-            raise InvalidInput(
-                f"{path}: its history is malformed ({error}); fuse the scene again"
-            ) from error
+            raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
 
 
 def graph_nodes(bundle: Bundle) -> list[dict]:

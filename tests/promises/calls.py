@@ -1,4 +1,4 @@
-"""The system calls by which outputs are written, one after the other: to be told of, to fail, to be killed at."""
+"""The system calls by which outputs are written: to be told of, to fail, to be killed at."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -39,7 +39,7 @@ class File:
 
 @contextmanager
 def watched(before: Callable) -> Iterator[None]:
-    """In this block `before(name, *arguments)` runs ahead of each call that `formats.atomic` makes to write."""
+    """In this block `before(name, *arguments)` runs ahead of each call by which `formats.atomic` writes."""
     with pytest.MonkeyPatch.context() as patch:
         for name in OS_CALLS:
             patch.setattr(os, name, _told(name, getattr(os, name), before))

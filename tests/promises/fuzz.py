@@ -1,7 +1,8 @@
 """Mutated packs against every verb that reads one: `python -m tests.promises.fuzz --count 10000 --seed 0`.
 
 A pack is counted as *silent* if it was damaged and a verb took it, *crashed* if a verb ended in anything but
-its own error, *hung* if a verb computed for more than five seconds, or waited for a minute. Every pack follows from (seed, index).
+its own error, *hung* if a verb computed for more than five seconds, or waited for a minute. Every pack
+follows from (seed, index).
 """
 
 import argparse
@@ -46,7 +47,11 @@ def command(*words: str):
     def verb(path: str) -> bool:
         result = CliRunner().invoke(cli, [*words, path])
         said = result.stderr.replace("Warning: ", "")
-        if result.exit_code not in (0, 3, 4) or "internal error" in said or not said.replace("\n", "").isprintable():
+        if (
+            result.exit_code not in (0, 3, 4)
+            or "internal error" in said
+            or not said.replace("\n", "").isprintable()
+        ):
             raise Crashed(f"exit {result.exit_code}: {result.stderr}")
         return result.exit_code == 0
 
@@ -138,7 +143,13 @@ def fuzz(count: int, seed: int, folder: Path, first: int = 0) -> dict:
                 slowest = max(slowest, time.process_time() - began)
                 if problem is not None:
                     wrong.append({"index": index, "kind": kind, "verb": name, "problem": problem})
-    return {"packs": count, "seed": seed, "slowest": slowest, "wrong": wrong, "counts": dict(sorted(found.items()))}
+    return {
+        "packs": count,
+        "seed": seed,
+        "slowest": slowest,
+        "wrong": wrong,
+        "counts": dict(sorted(found.items())),
+    }
 
 
 def main() -> int:

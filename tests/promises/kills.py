@@ -61,7 +61,9 @@ VICTIMS = {
         "pair.json",
     ),
     "render": Victim(
-        ("render", "red.rfpack", "--orbit", "4", "--size", "24x24", "-o", "views", *QUICK), "views", "old-views"
+        ("render", "red.rfpack", "--orbit", "4", "--size", "24x24", "-o", "views", *QUICK),
+        "views",
+        "old-views",
     ),
 }
 

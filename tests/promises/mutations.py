@@ -13,13 +13,13 @@ from formats.archive import parse_archive, write_archive
 from formats.bundle import SCENE, member_name
 
 RAW = "\0raw\0"
-TOKENS = [
-    *("NaN", "Infinity", "-Infinity", "1e999", "-0", "-1", "0", "1", "1.5", "1e308", "1e-308", "-1e300"),
-    *("true", "null", "[]", "{}", "[0]", "[0,0,0]", "[1e300,1e300,1e300]", "[null]", "[[1,0],[0]]", '[{"a":1}]'),
-    *('""', '"../x"', '"/etc/passwd"', '"a\\u0000b"', '"\\ud800"', '"\\u001b[2J"', '"\\u202ex"', '"\uff0e\uff0e/x"'),
-    *(str(2**31), str(2**32), str(2**53 + 1), str(2**63), "9" * 5000, "0." + "1" * 5000, '"' + "x" * 5000 + '"'),
-    *("[" * 900 + "]" * 900, "[" * 9000 + "]" * 9000, '{"a":' * 300 + "1" + "}" * 300, "[" + "0," * 9000 + "0]"),
-]
+TOKENS = r"""
+NaN Infinity -Infinity 1e999 -0 -1 0 1 1.5 1e308 1e-308 -1e300 2147483648 4294967296 9007199254740993
+9223372036854775808 true null [] {} [0] [0,0,0] [1e300,1e300,1e300] [null] [[1,0],[0]] [{"a":1}] "" "../x"
+"/etc/passwd" "a\u0000b" "\ud800" "\u001b[2J" "\u202ex" "\uff0e\uff0e/x"
+""".split()
+TOKENS += ["9" * 5000, "0." + "1" * 5000, f'"{"x" * 5000}"', "[" * 900 + "]" * 900, "[" * 9000 + "]" * 9000]
+TOKENS += ['{"a":' * 300 + "1" + "}" * 300, "[" + "0," * 9000 + "0]"]
 EDGES = [0, 1, 2**7, 2**8 - 1, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1]
 
 
@@ -47,7 +47,9 @@ def _run(data: bytearray, rng: random.Random) -> tuple[int, int]:
 
 def _overwrite(data: bytearray, rng: random.Random) -> bytes:
     start, stop = _run(data, rng)
-    data[start:stop] = rng.choice((rng.randbytes(stop - start), bytes(stop - start), b"\xff" * (stop - start)))
+    data[start:stop] = rng.choice(
+        (rng.randbytes(stop - start), bytes(stop - start), b"\xff" * (stop - start))
+    )
     return bytes(data)
 
 
@@ -132,7 +134,9 @@ def spoilt_json(text: bytes, rng: random.Random) -> bytes:
     if how <= 2:
         parent[key] = RAW
     elif how == 3 and isinstance(parent, dict):
-        parent[rng.choice(("unknown", "name", "children", "field", "matrix", "nodes", "\0", "x" * 300))] = parent[key]
+        parent[rng.choice(("unknown", "name", "children", "field", "matrix", "nodes", "\0", "x" * 300))] = (
+            parent[key]
+        )
     elif how == 4 and isinstance(parent, list):
         parent.extend([parent[key]] * rng.choice((1, 20, 300)))
     else:

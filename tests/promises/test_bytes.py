@@ -51,6 +51,7 @@ def test_without_one_key_for_all_metadata_the_bytes_differ():
 def test_a_time_in_the_bytes_would_show(times):
     """P16 with its defence removed: a directory that tells when it was written."""
     code = WRITE.replace(
-        "from tests", "import time, formats.archive\nformats.archive.DATE = time.time_ns() % 65536\nfrom tests"
+        "from tests",
+        "import time, formats.archive\nformats.archive.DATE = time.time_ns() % 65536\nfrom tests",
     )
     assert len(digests(code)) > 1

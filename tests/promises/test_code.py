@@ -32,7 +32,7 @@ for golden in sys.argv[3:]:  # what Python itself loads for the first reading an
     read(golden)
 read("absent")
 CODE = ("exec", "compile", "import", "pickle", "marshal", "socket", "subprocess", "ctypes", "code.", "pty")
-SYSTEM = ("os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "os.startfile", "os.remove", "os.rename")
+SYSTEM = ("os.system", "os.exec", "os.fork", "os.posix_spawn", "os.spawn", "os.remove", "os.rename")
 events, opened, reading = set(), set(), False
 def hook(event, words):
     if not reading:

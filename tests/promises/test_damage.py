@@ -1,4 +1,4 @@
-"""No byte of a pack can change without notice, and no pack, damaged or hostile, gets past its reader's own words."""
+"""No byte of a pack can change without notice, and no pack, however hostile, makes a reader stumble."""
 
 import random
 import zlib
@@ -102,7 +102,9 @@ def test_content_is_under_two_sums_and_the_scene_under_one(monkeypatch):
     hold; what other changes it misses are 1 in 4 billion.
     """
     found = regions()
-    field, scene = (random.Random(1).sample(list(found[f"{n}: content"]), 60) for n in ("fields", "scene.json"))
+    field, scene = (
+        random.Random(1).sample(list(found[f"{n}: content"]), 60) for n in ("fields", "scene.json")
+    )
     for crc, sha, unseen in ((True, False, False), (False, True, False), (True, True, True)):
         with monkeypatch.context() as patch:
             no_sums(patch, crc=crc, sha=sha)
@@ -153,7 +155,9 @@ def test_mutated_packs_are_refused_or_read_as_they_are(tmp_path):
     result = fuzz(400, 0, tmp_path)
     counts = result["counts"]
     assert result["wrong"] == [] and counts["refused"] > 1000 and counts["taken"] > 50
-    assert {f"damaged: {kind}" for kind in DAMAGES} | {f"hostile: {kind}" for kind in HOSTILITIES} < counts.keys()
+    assert {f"damaged: {kind}" for kind in DAMAGES} | {
+        f"hostile: {kind}" for kind in HOSTILITIES
+    } < counts.keys()
 
 
 def test_a_reader_without_checks_is_found_out(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Commands killed at random moments, and at every system call of writing: the output is the old or the new one."""
+"""Commands killed at random, and at every system call of writing, leave the old output or the new one."""
 
 import json
 import random

@@ -106,7 +106,9 @@ def measured(path: Path, *words: str) -> dict:
     return json.loads(run.stdout)
 
 
-linux = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak of memory is read in /proc")
+linux = pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="the peak of memory is read in /proc"
+)
 
 
 @linux
@@ -240,7 +242,12 @@ def test_without_strict_numbers_they_get_in(monkeypatch, name, attribute, instea
 def test_limits_are_those_of_the_specification():
     """The format's limits are its readers' common ground: what one writes, all others read."""
     spec = (ROOT / "formats" / "SPEC.md").read_text()
-    for words in ("at most 10,001 members", "at most 1 MiB", "at most 4 MiB", "at most 10,000 nodes, 64 levels"):
+    for words in (
+        "at most 10,001 members",
+        "at most 1 MiB",
+        "at most 4 MiB",
+        "at most 10,000 nodes, 64 levels",
+    ):
         assert words in spec
     assert (MAX_MEMBERS, MAX_HEADER, scene.MAX_SCENE_BYTES) == (10_001, 1 << 20, 4 << 20)
     assert f"{inputs.MAX_VALUES:,}" in spec and f"{inputs.MAX_NESTING} levels" in spec

@@ -21,7 +21,8 @@ import fusedrf_cli.commands.validate, fusedrf_cli.commands.info, formats.bundle,
 opened = []
 def hook(event, words):
     if event == "open" and isinstance(words[0], (str, bytes)):
-        opened.append((os.fsdecode(os.path.realpath(words[0])), bool((words[2] or 0) & (os.O_WRONLY | os.O_RDWR))))
+        writing = bool((words[2] or 0) & (os.O_WRONLY | os.O_RDWR))
+        opened.append((os.fsdecode(os.path.realpath(words[0])), writing))
     elif event.split(".")[0] in ("os", "shutil") and event != "os.listdir" and event != "os.scandir":
         opened.append((event, True))
 sys.addaudithook(hook)
@@ -52,7 +53,11 @@ def folder(tmp_path):
 def run(*words) -> dict:
     """Exit code, opened paths and stderr of a command line."""
     done = subprocess.run(
-        [sys.executable, "-c", WATCHED, *map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", WATCHED, *map(str, words)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     *said, told = done.stderr.splitlines()
     return {**json.loads(told), "said": said}

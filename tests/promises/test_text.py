@@ -25,7 +25,19 @@ ESCAPES = {
     "line separator": "\u2028x",
     "null": "\0",
 }
-HARMLESS = ("é", "e\u0301", "日本語", "שלום", "👩\u200d🚀 chair", "a" * 255, "-rf", "$(id)", "; ls", "%s", "[red]")
+HARMLESS = (
+    "é",
+    "e\u0301",
+    "日本語",
+    "שלום",
+    "👩\u200d🚀 chair",
+    "a" * 255,
+    "-rf",
+    "$(id)",
+    "; ls",
+    "%s",
+    "[red]",
+)
 
 
 def said(*words: str) -> tuple[int, str, str]:

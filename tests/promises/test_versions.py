@@ -1,4 +1,4 @@
-"""Packs of every version that was ever written stay readable; packs of later ones are judged by their word."""
+"""Packs of every version ever written stay readable; packs of later ones are judged by their word."""
 
 import json
 import warnings
@@ -48,7 +48,9 @@ def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
 
     real = vm.stored_tensor
     monkeypatch.setattr(
-        vm, "stored_tensor", lambda i, stored, *rest: real(i, {**stored, "scale": 1.1 * stored["scale"]}, *rest)
+        vm,
+        "stored_tensor",
+        lambda i, stored, *rest: real(i, {**stored, "scale": 1.1 * stored["scale"]}, *rest),
     )
     assert decibels(rendered(GOLDEN / "pair.rfpack"), read_image(GOLDEN / "pair.png")[..., :3]) < 50
 

@@ -73,7 +73,9 @@ def each_failing(path: Path, write, number) -> tuple[int, list[str]]:
             if at.count < k:
                 return k - 1, wrong
             try:
-                if number(path) == 2:  # what failed then is the removal of the old, which the next writer does
+                if (
+                    number(path) == 2
+                ):  # what failed then is the removal of the old, which the next writer does
                     remove_leftovers(path)
                 elif number(path) != 1:
                     wrong.append(f"call {k}: it says {number(path)}")
@@ -186,7 +188,9 @@ def test_files_that_a_folder_was_given_unflushed_are_flushed(tmp_path):
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
 def test_the_kernel_sees_the_same_order(tmp_path):
     """P3, as the system calls of a process tell it."""
-    code = f"from tests.promises.packs import write_generation; write_generation({str(tmp_path / 'out')!r}, 1)"
+    code = (
+        f"from tests.promises.packs import write_generation; write_generation({str(tmp_path / 'out')!r}, 1)"
+    )
     words = ["strace", "-f", "-y", "-o", tmp_path / "trace", "-e", "trace=fsync,rename,renameat,renameat2"]
     run = subprocess.run([*words, sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     if run.returncode and "ptrace" in run.stderr:
@@ -206,7 +210,11 @@ def small_disk(tmp_path):
     place = tmp_path / "small"
     place.mkdir()
     words = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", place]
-    if not hasattr(os, "geteuid") or os.geteuid() != 0 or subprocess.run(words, capture_output=True).returncode:
+    if (
+        not hasattr(os, "geteuid")
+        or os.geteuid() != 0
+        or subprocess.run(words, capture_output=True).returncode
+    ):
         pytest.skip("mounting is not permitted here")
     yield place
     subprocess.run(["umount", place], check=True)
