@@ -11,8 +11,9 @@ from typing import BinaryIO
 from formats.errors import BadJson, LimitExceeded, MissingFile, NotAFile, ResourceError
 
 MAX_INTEGER = 2**63 - 1
-# Commas and opening brackets of a document: what bounds the time and memory that parsing it takes.
+# Commas and opening brackets of a document, and its colons: what bounds the time and memory of parsing it.
 MAX_VALUES = 500_000
+MAX_KEYS = 200_000
 # A scene of 64 levels has 130; what recurses over a document has room for this many.
 MAX_NESTING = 200
 
@@ -57,9 +58,12 @@ def parse_json(data: bytes, where: str):
     Raises LimitExceeded, before parsing, where there is more of it than a second's work.
     """
     data = bytes(data)
-    values = sum(map(data.count, (b",", b"[", b"{")))
-    if values > MAX_VALUES:
-        raise LimitExceeded(f"{where}: JSON of about {values:,} values, at most {MAX_VALUES:,} are read")
+    values, keys = sum(map(data.count, (b",", b"[", b"{"))), data.count(b":")
+    if values > MAX_VALUES or keys > MAX_KEYS:
+        raise LimitExceeded(
+            f"{where}: JSON of about {values:,} values and {keys:,} keys, at most {MAX_VALUES:,} and "
+            f"{MAX_KEYS:,} are read"
+        )
     try:
         content = json.loads(
             data.decode("utf-8"),

@@ -64,7 +64,8 @@ def test_a_temporary_cache_that_another_user_may_have_filled_is_not_used(tmp_pat
 
 def test_ours_is_what_we_own(tmp_path, monkeypatch):
     assert kernels.is_ours(tmp_path, others=0)
-    monkeypatch.setattr(os, "getuid", lambda uid=os.getuid(): uid + 1)
+    another = os.getuid() + 1
+    monkeypatch.setattr(os, "getuid", lambda: another)
     assert not kernels.is_ours(tmp_path, others=0)
 
 
