@@ -149,7 +149,9 @@ def _reserve(descriptor: int, size: int) -> None:
 
 def _keep_mode(target: Path, temporary: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
-        os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
+        mode = target.stat().st_mode
+        if stat.S_IFMT(mode) == stat.S_IFMT(temporary.stat().st_mode):  # not a file's for a folder
+            os.chmod(temporary, stat.S_IMODE(mode))
 
 
 def _is_empty_folder(path: Path) -> bool:

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from formats.bundle import Bundle, is_bundle, read_bundle, sha256_of
-from formats.errors import FormatError
 from formats.records import FieldRecord
-from formats.scene import Matrix4, make_node
+from formats.scene import Matrix4
 from fusedrf_cli.bridge.fuse import stored
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import history_nodes, load_scene, make_field, write_field
@@ -226,10 +225,10 @@ def check_history(bundle: Bundle, path: str) -> None:
         try:
             msgspec.convert(entry.get("names", []), list[str])
             for node in msgspec.convert(entry.get("nodes", []), list[HistoryNode]):
-                make_node(node.name, matrix=node.object_to_world)
+                Placed(node.name, None, np.array(node.object_to_world))
                 if not node.source.isprintable():
                     raise ValueError("a source that is no path")
-        except (ValueError, FormatError) as error:
+        except ValueError as error:
             raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
 
 

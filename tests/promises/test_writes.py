@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -262,7 +263,7 @@ def test_a_file_size_limit_keeps_the_old_pack(tmp_path):
 def test_space_is_looked_at_before_work(tmp_path, monkeypatch):
     """P5."""
     check_space(tmp_path / "out", 1000)
-    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 999))
+    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda _: SimpleNamespace(free=999))
     with pytest.raises(ResourceError, match="needs 1,000 bytes, but the disk has 999 left") as caught:
         check_space(tmp_path / "out", 1000)
     assert caught.value.exit_code == 5
@@ -366,6 +367,15 @@ def test_replaced_outputs_keep_their_mode(tmp_path, kind, mode):
     (tmp_path / "out").chmod(mode | 0o700)
     write(tmp_path / "out", 2)
     assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == mode | 0o700
+
+
+def test_a_folder_in_the_place_of_a_file_can_be_entered(tmp_path):
+    """P11: a file's mode is none for a folder."""
+    (tmp_path / "out").touch(0o600)
+    write_views(tmp_path / "out", 2)
+    assert (
+        stat.S_IMODE((tmp_path / "out").stat().st_mode) & 0o700 == 0o700 and views_of(tmp_path / "out") == 2
+    )
 
 
 @pytest.mark.parametrize("kind", OUTPUTS)
