@@ -26,7 +26,7 @@ test-slow: $(VENV)  ## every test
 
 fuzz: $(VENV)  ## 10,000 hostile packs and 200 kills of every command; PACKS=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
-	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls
+	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
 
 lint: $(VENV)  ## ruff
 	$(PYTHON) -m ruff check .

@@ -68,8 +68,8 @@ VICTIMS = {
 }
 
 
-def forked(work: Callable[[], int | None], kill_after: float | None = None) -> int:
-    """Do `work` in a child, killed after some seconds if it is not done; the status as a shell tells it."""
+def begun(work: Callable[[], int | None]) -> int:
+    """The number of a child that does `work` in silence."""
     child = os.fork()
     if child == 0:
         code = 70
@@ -82,6 +82,12 @@ def forked(work: Callable[[], int | None], kill_after: float | None = None) -> i
             code = done.code or 0
         finally:
             os._exit(code)
+    return child
+
+
+def forked(work: Callable[[], int | None], kill_after: float | None = None) -> int:
+    """Do `work` in a child, killed after some seconds if it is not done; the status as a shell tells it."""
+    child = begun(work)
     deadline = None if kill_after is None else time.monotonic() + kill_after
     while True:
         done, status = os.waitpid(child, os.WNOHANG if deadline is not None else 0)
@@ -196,6 +202,27 @@ def kill_at_every_call(shop: Shop) -> dict:
     return {"kills": k - 1, "wrong": wrong}
 
 
+def add_at_once(folder: Path, count: int) -> dict:
+    """As many `add` to one pack in place, all begun at once; which of them are in it in the end."""
+    shutil.copy(folder / "fused.rfpack", folder / "many.rfpack")
+    names = {f"new-{i}" for i in range(count)}
+
+    def adding(name: str) -> Callable:
+        def work():
+            os.chdir(folder)
+            words = ("add", "many.rfpack", "blue.rfpack", "--name", name, "-o", "many.rfpack", *QUICK)
+            cli.main(list(words))
+
+        return work
+
+    children = [begun(adding(name)) for name in sorted(names)]
+    codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    history = read_bundle(folder / "many.rfpack").scene.history
+    found = {node["name"] for entry in history for node in entry.get("nodes", ())} & names
+    wrong = [f"lost: {sorted(names - found)}"] if found != names else []
+    return {"adds": len(found), "wrong": wrong + [f"exit {code}" for code in codes if code]}
+
+
 @contextmanager
 def in_place():
     """The defence removed: outputs are written where they stand."""
@@ -227,7 +254,7 @@ def stocked(folder: Path, names: list[str]) -> None:
     assert forked(work) == 0
 
 
-def tried(names: list[str], kills: int, seed: int, calls: bool, defence=nullcontext) -> dict:
+def tried(names: list[str], kills: int, seed: int, calls: bool, adds: int, defence=nullcontext) -> dict:
     """Kill each named command at random moments, at every call, or both; what became of it."""
     found = {}
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
@@ -239,6 +266,8 @@ def tried(names: list[str], kills: int, seed: int, calls: bool, defence=nullcont
                 found[name] = kill_at_random(shop, kills, random.Random(f"{seed}{name}"))
             if calls:
                 found[f"{name} at every call"] = kill_at_every_call(shop)
+        if adds:
+            found["adds at once"] = add_at_once(Path(folder), adds)
     return found
 
 
@@ -247,11 +276,13 @@ def main() -> int:
     parser.add_argument("commands", nargs="*", metavar="COMMAND", help=", ".join(VICTIMS))
     parser.add_argument("--kills", type=int, default=200, help="at random moments; 0: none")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--adds", type=int, default=0, help="so many adds to one pack at once as well")
     parser.add_argument("--calls", action="store_true", help="at every system call of writing as well")
     parser.add_argument("--in-place", action="store_true", help="without the defence")
     options = parser.parse_args()
     defence = in_place if options.in_place else nullcontext
-    found = tried(options.commands or list(VICTIMS), options.kills, options.seed, options.calls, defence)
+    names = options.commands or list(VICTIMS)
+    found = tried(names, options.kills, options.seed, options.calls, options.adds, defence)
     print(json.dumps(found, indent=1))
     return 1 if any(result["wrong"] for result in found.values()) else 0
 

@@ -59,3 +59,9 @@ def test_every_command_killed_at_every_call_leaves_old_or_new():
     found = kills("--kills", "0", "--calls")
     assert {name: result["wrong"] for name, result in found.items()} == dict.fromkeys(found, [])
     assert all(result["kills"] >= 10 for result in found.values())
+
+
+@pytest.mark.slow
+def test_sixteen_adds_at_once_are_all_there():
+    """P8, with whole commands: `test_locks.py` has the same with a quick stand-in."""
+    assert kills("add", "--kills", "0", "--adds", "16") == {"adds at once": {"adds": 16, "wrong": []}}
