@@ -202,13 +202,14 @@ def test_a_graph_that_is_no_bounded_tree_is_refused_at_once(tmp_path, name):
 
 
 def test_without_a_count_a_graph_unfolds(tmp_path, monkeypatch):
-    """P13 with its defence removed: 13 small files make more than 10,000 nodes."""
-    path = doubling(tmp_path, 13)
+    """P13 with its defence removed: nine small files make 766 nodes."""
+    path = doubling(tmp_path, 8)
+    (tmp_path / "8.json").write_bytes(scene_json({"name": "leaf"}))
+    monkeypatch.setattr(scene, "MAX_NODES", 400)
     with pytest.raises(errors.LimitExceeded, match="unfold"):
         expand_scene(path)
     monkeypatch.setattr(scene, "MAX_NODES", 10**9)
-    (tmp_path / "13.json").write_bytes(scene_json({"name": "leaf"}))
-    assert sum(1 for _ in expand_scene(path).walk()) > 10_000
+    assert sum(1 for _ in expand_scene(path).walk()) == 2 * (2**8 - 1) + 2**8
 
 
 # --- numbers ------------------------------------------------------------------------------------------------
