@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import pytest
 
@@ -41,7 +42,7 @@ class File:
 def watched(before: Callable) -> Iterator[None]:
     """In this block `before(name, *arguments)` runs ahead of each call by which `formats.atomic` writes."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in OS_CALLS:
+        for name in filter(partial(hasattr, os), OS_CALLS):
             patch.setattr(os, name, _told(name, getattr(os, name), before))
         patch.setattr(atomic, "_exchange", _told("exchange", atomic._exchange, before))
         real = open
