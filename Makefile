@@ -4,7 +4,12 @@ PYTHON ?= .venv/bin/python
 PIP_FLAGS ?=
 VENV := $(filter .venv/bin/python,$(PYTHON))
 
-.PHONY: help demo test test-slow lint bench clean
+# What `make fuzz` does: mutated packs against every reader, and kills of every writer at random moments.
+PACKS ?= 10000
+KILLS ?= 200
+SEED ?= 0
+
+.PHONY: help demo test test-slow fuzz lint bench clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -18,6 +23,10 @@ test: $(VENV)  ## the quick tests
 
 test-slow: $(VENV)  ## every test
 	$(PYTHON) -m pytest -q
+
+fuzz: $(VENV)  ## 10,000 hostile packs and 200 kills of every command; PACKS=, KILLS=, SEED=
+	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
+	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
 
 lint: $(VENV)  ## ruff
 	$(PYTHON) -m ruff check .

@@ -2,7 +2,9 @@
 
 import contextlib
 import errno
+import hashlib
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -12,6 +14,10 @@ from typing import BinaryIO
 
 from formats.errors import FormatError, OutputExists, ResourceError
 
+MAX_STEM_BYTES = 200
+# Where a file system cannot reserve space, writing finds out whether there is enough.
+NO_RESERVING = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS, errno.ENODEV)
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # <fcntl.h>, <linux/fs.h>
 CAUSES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
     errno.EDQUOT: "the disk quota is used up; free some space or choose another folder",
@@ -25,10 +31,11 @@ CAUSES = {
 
 
 @contextlib.contextmanager
-def atomic_writer(path: Path | str, *, mode: str = "wb") -> Iterator[BinaryIO]:
+def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> Iterator[BinaryIO]:
     """A file object (with a real `.name`) whose content becomes `path` if the block ends without exception.
 
-    A link is written through. A new file gets mode 0666 less the umask, a replaced one keeps its mode. Any
+    `reserve` bytes, at most what will be written, are claimed first: a full disk is found before writing. A
+    link is written through. A new file gets mode 0666 less the umask, a replaced one keeps its mode. Any
     exception, KeyboardInterrupt too, leaves the old file and no temporary. Raises ResourceError: disk full,
     read-only, no permission.
     """
@@ -36,6 +43,8 @@ def atomic_writer(path: Path | str, *, mode: str = "wb") -> Iterator[BinaryIO]:
     temporary = _sibling(target)
     try:
         with open(temporary, mode.replace("w", "x"), encoding=None if "b" in mode else "utf-8") as file:
+            if reserve:
+                _reserve(file.fileno(), reserve)
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -54,13 +63,16 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
     """A temporary sibling folder that becomes `path` if the block ends without an exception, else is removed.
 
     An empty folder at `path` is replaced, anything else only with `overwrite` (OutputExists otherwise).
+    Flushed and with its mode kept as by `atomic_writer`. Raises ResourceError.
     """
-    check_writable(path, overwrite)
+    check_writable(path, overwrite, folders=True)
     target = Path(os.path.realpath(path))
     temporary = _sibling(target)
     try:
         temporary.mkdir()
         yield temporary
+        _sync_tree(temporary)
+        _keep_mode(target, temporary)
         _swap_in(temporary, target)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -69,24 +81,77 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
     _sync_folder(target.parent)
 
 
-def check_writable(path: Path | str, overwrite: bool) -> None:
-    """Before any work: `path` may be created here. Raises OutputExists or ResourceError."""
+def check_writable(path: Path | str, overwrite: bool, *, folders: bool = False) -> None:
+    """Before any work: a file (with `folders`, or a folder) may be created here.
+
+    Raises OutputExists or ResourceError.
+    """
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise ResourceError(f"{path}: its folder {target.parent} does not exist; create it first")
     if not os.access(target.parent, os.W_OK | os.X_OK):
         raise ResourceError(f"{path}: cannot write in {target.parent}; choose a folder that you may write to")
+    if target.exists() and not target.is_file() and not target.is_dir():
+        raise ResourceError(f"{path}: a pipe or device of that name is in the way; choose another name")
+    if target.is_dir() and not folders:
+        raise ResourceError(f"{path}: {CAUSES[errno.EISDIR]}")
     if not overwrite and target.exists() and not _is_empty_folder(target):
         raise OutputExists(f"{path}: exists already; give -w/--overwrite to replace it, or another name")
 
 
-def _sibling(target: Path) -> Path:
-    return target.with_name(f".{target.name[:80]}.{secrets.token_hex(6)}.tmp")
+def check_space(path: Path | str, needed: int) -> None:
+    """Before any work: the disk has room for `needed` bytes. Raises ResourceError."""
+    free = shutil.disk_usage(Path(os.path.realpath(path)).parent).free
+    if free < needed:
+        raise ResourceError(
+            f"{path}: needs {needed:,} bytes, but the disk has {free:,} left; free some space or choose "
+            "another folder"
+        )
+
+
+def hidden_sibling(target: Path, ending: str) -> Path:
+    """`.name.ending` beside `target`, for any name that a file can have."""
+    return target.with_name(f"{_hidden_stem(target)}.{ending}")
+
+
+def remove_leftovers(path: Path | str) -> None:
+    """Remove the temporaries that killed writers of `path` left; only for who holds its lock."""
+    target = Path(os.path.realpath(path))
+    # An old folder that had moved aside may be all there is: it goes only when its successor stands.
+    endings = "tmp|old" if target.exists() else "tmp"
+    leftover = re.compile(re.escape(_hidden_stem(target)) + rf"\.[0-9a-f]{{12}}\.({endings})")
+    for place in target.parent.iterdir():
+        if leftover.fullmatch(place.name):
+            with contextlib.suppress(OSError):
+                _remove(place)
+
+
+def _hidden_stem(target: Path) -> str:
+    name = target.name
+    if len(os.fsencode(name)) > MAX_STEM_BYTES:
+        name = name[:40] + hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    return f".{name}"
+
+
+def _sibling(target: Path, ending: str = "tmp") -> Path:
+    return hidden_sibling(target, f"{secrets.token_hex(6)}.{ending}")
+
+
+def _reserve(descriptor: int, size: int) -> None:
+    if not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        os.posix_fallocate(descriptor, 0, size)
+    except OSError as error:
+        if error.errno not in NO_RESERVING:
+            raise
 
 
 def _keep_mode(target: Path, temporary: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
-        os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
+        mode = target.stat().st_mode
+        if stat.S_IFMT(mode) == stat.S_IFMT(temporary.stat().st_mode):  # not a file's for a folder
+            os.chmod(temporary, stat.S_IMODE(mode))
 
 
 def _is_empty_folder(path: Path) -> bool:
@@ -94,21 +159,41 @@ def _is_empty_folder(path: Path) -> bool:
 
 
 def _swap_in(temporary: Path, target: Path) -> None:
-    """Rename onto `target`; what stood there moves aside first: a rename replaces only an empty folder."""
+    """Rename onto `target`. A rename replaces only an empty folder: anything else changes places with
+    `temporary`, and moves aside first where the system cannot do that.
+    """
     if not target.exists() or _is_empty_folder(target):
         os.replace(temporary, target)
         return
-    aside = _sibling(target)
+    if _exchange(temporary, target):
+        _remove(temporary)
+        return
+    aside = _sibling(target, "old")
     os.replace(target, aside)
     try:
         os.replace(temporary, target)
     except BaseException:
         os.replace(aside, target)
         raise
-    if aside.is_dir():
-        shutil.rmtree(aside, ignore_errors=True)
+    _remove(aside)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Whether two names changed places, in one step that nobody can see the middle of (Linux)."""
+    import ctypes
+
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    return renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
     else:
-        aside.unlink()
+        path.unlink()
 
 
 def _explain(error: BaseException, path: Path | str, temporary: Path, target: Path) -> None:
@@ -117,6 +202,18 @@ def _explain(error: BaseException, path: Path | str, temporary: Path, target: Pa
         return
     if error.filename is None or str(error.filename).startswith((str(temporary), str(target))):
         raise ResourceError(f"{path}: cannot be written: {CAUSES[error.errno]}") from error
+
+
+def _sync_tree(folder: Path) -> None:
+    """Flush every file in `folder`, and then the names."""
+    for place, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            descriptor = os.open(os.path.join(place, name), os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        _sync_folder(Path(place))
 
 
 def _sync_folder(folder: Path) -> None:

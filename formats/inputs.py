@@ -11,6 +11,11 @@ from typing import BinaryIO
 from formats.errors import BadJson, LimitExceeded, MissingFile, NotAFile, ResourceError
 
 MAX_INTEGER = 2**63 - 1
+# Commas and opening brackets of a document, and its colons: what bounds the time and memory of parsing it.
+MAX_VALUES = 500_000
+MAX_KEYS = 200_000
+# A scene of 64 levels has 130; what recurses over a document has room for this many.
+MAX_NESTING = 200
 
 
 def open_input(path: Path | str) -> BinaryIO:
@@ -48,10 +53,20 @@ def read_input(path: Path | str, limit: int) -> bytes:
 
 
 def parse_json(data: bytes, where: str):
-    """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise."""
+    """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise.
+
+    Raises LimitExceeded, before parsing, where there is more of it than a second's work.
+    """
+    data = bytes(data)
+    values, keys = sum(map(data.count, (b",", b"[", b"{"))), data.count(b":")
+    if values > MAX_VALUES or keys > MAX_KEYS:
+        raise LimitExceeded(
+            f"{where}: JSON of about {values:,} values and {keys:,} keys, at most {MAX_VALUES:,} and "
+            f"{MAX_KEYS:,} are read"
+        )
     try:
-        return json.loads(
-            bytes(data).decode("utf-8"),
+        content = json.loads(
+            data.decode("utf-8"),
             object_pairs_hook=_unique,
             parse_float=_finite,
             parse_int=_bounded,
@@ -61,15 +76,28 @@ def parse_json(data: bytes, where: str):
         raise BadJson(f"{where}: JSON is nested too deep to be read") from error
     except ValueError as error:
         raise BadJson(f"{where}: not strict JSON: {error}") from error
+    if _nesting(content) > MAX_NESTING:
+        raise BadJson(f"{where}: JSON is nested deeper than {MAX_NESTING} levels")
+    return content
+
+
+def _nesting(content: object) -> int:
+    """Levels of lists and objects, without recursion."""
+    level, depth = [content], 0
+    while level := [value for value in level if isinstance(value, dict | list)]:
+        depth += 1
+        level = [inner for value in level for inner in (value.values() if isinstance(value, dict) else value)]
+    return depth
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"key {next(k for k in keys if keys.count(k) > 1)!r} appears twice in one object")
-    for text in [*found, *found.values()]:
-        _encodable(text)
+    found = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"key {key[:40]!r} appears twice in one object")
+        _encodable(key)
+        _encodable(value)
+        found[key] = value
     return found
 
 
@@ -77,8 +105,11 @@ def _encodable(text: object) -> None:
     if isinstance(text, list):
         for item in text:
             _encodable(item)
-    elif isinstance(text, str) and any("\ud800" <= c <= "\udfff" for c in text):
-        raise ValueError(f"{text[:40]!r} holds half of a surrogate pair")
+    elif isinstance(text, str) and not text.isascii():
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            raise ValueError(f"{text[:40]!r} holds half of a surrogate pair") from None
 
 
 def _finite(digits: str) -> float:

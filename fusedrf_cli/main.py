@@ -58,7 +58,7 @@ def _tell(error: BaseException) -> int:
         click.echo(error.format_message(), err=True)
         return error.exit_code
     if isinstance(error, BrokenPipeError):  # the reader, `head` say, has had enough: nothing to tell
-        return 1
+        return 128 + signal.SIGPIPE  # what a shell sees of a tool that the signal ended
     sentence, code = _sentence(error)
     click.echo(f"Error: {printable(sentence)}", err=True)
     return code
@@ -104,6 +104,7 @@ def cli() -> None:
       6  numeric failure
       7  an asked quality was not reached
       130, 143  interrupted (SIGINT, SIGTERM)
+      141  the reader of stdout has left (SIGPIPE)
 
     \b
     Example:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 import click
 
-from formats.errors import FormatWarning, MissingFile
+from formats.errors import FormatWarning, MissingFile, printable
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.progress import Progress
 from fusedrf_cli.report import emit
@@ -258,21 +258,34 @@ running = _stack(_RUNNING)
 seeded = _stack((*_RUNNING, _seed))
 
 
-def writing(what: str) -> Callable:
-    """-o/--output (`what` it is) and -w; an output that is in the way or cannot be written is refused."""
+def writing(what: str, *, folders: bool = False, edits: str | None = None) -> Callable:
+    """-o/--output (`what` it is, a folder too with `folders`) and -w.
+
+    Before any work an output that is in the way, cannot be written, or is being written is refused. A command
+    whose argument `edits` is its output waits instead, and reads it only then: no edit is lost.
+    """
 
     def decorate(command: Callable) -> Callable:
         @functools.wraps(command)
         def checked(*, output: str, overwrite: bool, **words):
+            if output == STDIO:
+                return command(output=output, overwrite=overwrite, **words)
             from formats.atomic import check_writable
+            from formats.locks import output_lock
 
-            if output != STDIO:
-                check_writable(output, overwrite)
-            return command(output=output, overwrite=overwrite, **words)
+            check_writable(output, overwrite, folders=folders)
+            in_place = edits is not None and os.path.realpath(words[edits]) == os.path.realpath(output)
+            with output_lock(output, _tell if in_place else None):
+                check_writable(output, overwrite, folders=folders)  # it may have come while we waited
+                return command(output=output, overwrite=overwrite, **words)
 
         return click.option("-o", "--output", required=True, type=click.Path(), help=what)(overwrite(checked))
 
     return decorate
+
+
+def _tell(sentence: str) -> None:
+    click.echo(printable(sentence), err=True)
 
 
 def reporting(

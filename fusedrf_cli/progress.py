@@ -103,7 +103,7 @@ class Progress(NullProgress):
             self._bar.start()
         if self._task is not None:
             self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(name, total=total, figures="")
+        self._task = self._bar.add_task(printable(name), total=total, figures="")
 
     def _stop(self) -> None:
         if self._bar is not None:

@@ -15,10 +15,15 @@ _LONGEST_LIST = 12
 def emit(report: dict, *, as_json: bool, quiet: bool = False) -> None:
     """Print `report` on stdout. With `quiet`, people are not told what was written, only what they asked."""
     if as_json:
-        click.echo(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False))
+        click.echo(_unmoving(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False)))
     elif not (quiet and "output" in report):
         for line in lines(report):
             click.echo(printable(line))
+
+
+def _unmoving(text: str) -> str:
+    """The same JSON, whose strings, some from hostile files, no longer move a terminal's cursor."""
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 def lines(report: dict) -> Iterator[str]:

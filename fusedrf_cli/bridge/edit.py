@@ -1,14 +1,18 @@
 """`add` and `delete`: edits of a fused bundle that leave everything outside the touched region as it was."""
 
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 import torch
 
 from formats.bundle import Bundle, is_bundle, read_bundle, sha256_of
 from formats.records import FieldRecord
+from formats.scene import Matrix4
 from fusedrf_cli.bridge.fuse import stored
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import history_nodes, load_scene, make_field, write_field
@@ -24,6 +28,17 @@ from fusedrf_cli.errors import InvalidInput
 REGION_SETTINGS = DistillSettings(
     max_numbers=2_000_000, rays=120_000, steps=500, rgb_steps=500, view_size=160
 )
+
+
+class HistoryNode(msgspec.Struct):
+    """What an edit reads of a node in a bundle's history."""
+
+    name: str
+    object_to_world: Matrix4
+    aabb: Annotated[list[float], msgspec.Meta(min_length=6, max_length=6)]
+    field: str
+    source: str = ""
+    sha256: str = ""
 
 
 def add(
@@ -87,6 +102,7 @@ def add(
             origin=origin,
             history=history,
             kept=others(bundle, node),
+            extras=bundle.scene.extras,
         )
     return edit_report(
         output,
@@ -177,6 +193,7 @@ def delete(
             origin=origin,
             history=history,
             kept=others(bundle, node),
+            extras=bundle.scene.extras,
         )
     return edit_report(
         output, size, fused, ", ".join(names), enclosing(boxes) + np.tile(origin, 2), result, figures, started
@@ -188,6 +205,7 @@ def read_fused(path: str) -> tuple[Bundle, object, VMField]:
     if not is_bundle(path):
         raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
     bundle = read_bundle(path)
+    check_history(bundle, path)
     leaves = [leaf for leaf in bundle.scene.leaves() if leaf.field is not None]
     if len(leaves) != 1:
         raise InvalidInput(
@@ -197,6 +215,21 @@ def read_fused(path: str) -> tuple[Bundle, object, VMField]:
     if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
     return bundle, leaves[0], field
+
+
+def check_history(bundle: Bundle, path: str) -> None:
+    """InvalidInput where the history, which the format leaves free, does not tell of nodes as an edit needs
+    them.
+    """
+    for entry in bundle.scene.history:
+        try:
+            msgspec.convert(entry.get("names", []), list[str])
+            for node in msgspec.convert(entry.get("nodes", []), list[HistoryNode]):
+                Placed(node.name, None, np.array(node.object_to_world))
+                if not node.source.isprintable():
+                    raise ValueError("a source that is no path")
+        except ValueError as error:
+            raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
 
 
 def graph_nodes(bundle: Bundle) -> list[dict]:
@@ -293,7 +326,7 @@ def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord
     inside = source.is_relative_to(path.resolve().parent)
     if (
         "source" not in node
-        or not source.is_file()
+        or not os.path.isfile(source)
         or not (inside or allow_outside)
         or sha256_of(source) != node["sha256"]
     ):

@@ -199,9 +199,10 @@ def write_field(
     origin: np.ndarray | None = None,
     history: tuple[dict, ...] = (),
     kept: dict[str, FieldRecord] | None = None,
+    extras: dict | None = None,
 ) -> int:
     """Write one field (and kept sources) as a bundle; its node is moved to origin (3,). Returns the bytes
-    written.
+    written. `extras` are the scene's keys that this version does not know.
     """
     writer = BundleWriter()
     for record in (kept or {}).values():
@@ -210,6 +211,7 @@ def write_field(
     member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
     where = None if origin is None or not np.any(origin) else [float(v) for v in origin]
     node = make_node(name, field=member, translation=where)
-    graph = SceneGraph(nodes=(node,), history=history, generator=f"fusedrf {__version__}")
+    generator = f"fusedrf {__version__}"
+    graph = SceneGraph(nodes=(node,), history=history, generator=generator, extras=extras or {})
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size

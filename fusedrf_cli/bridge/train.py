@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_images, read_capture
 from formats.meshes import mesh_capture
 from formats.views import Capture, View
@@ -76,6 +77,8 @@ def train(
             near=0.0,
         )
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
+        numbers = settings.shape.size(texels(box, settings.longest))
+        check_space(output, numbers * BYTES_PER_NUMBER[precision])
         cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
         run = FitRun.start(cameras, images, box, settings, Path(source).resolve().stem)
         if saved:

@@ -9,7 +9,7 @@ from fusedrf_cli.placement import node_words
 @click.command("add")
 @click.argument("fused", type=options.INPUT)
 @click.argument("source", metavar="OBJECT", type=options.INPUT)
-@options.writing("The fused field to write, OUT.rfpack.")
+@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @click.option("--name", required=True, help="The object's name in the scene.")
 @options.placement
 @options.time_budget

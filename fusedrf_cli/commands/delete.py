@@ -8,7 +8,7 @@ from fusedrf_cli import options
 @click.command("delete")
 @click.argument("fused", type=options.INPUT)
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@options.writing("The fused field to write, OUT.rfpack.")
+@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @options.time_budget
 @options.rgb
 @options.precision

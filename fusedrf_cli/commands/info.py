@@ -1,4 +1,4 @@
-"""`fusedrf info`: what is in a bundle or scene, from its headers alone."""
+"""`fusedrf info`: what is in a bundle or scene, without decoding its arrays."""
 
 import click
 
@@ -34,7 +34,8 @@ def _scalars(event: dict) -> dict:
 def command(scene, progress):
     """Tell what a bundle or scene holds.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. Arrays are not read, so the answer is quick.
+    SCENE is a bundle, a scene.json, or - for a scene on stdin. Damage is found, but arrays are not decoded,
+    so the answer is quick.
 
     \b
     Example:

@@ -8,7 +8,7 @@ from fusedrf_cli.errors import UsageProblem
 
 @click.command("render")
 @click.argument("scene", type=options.SCENE)
-@options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).")
+@options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).", folders=True)
 @click.option("--cameras", type=options.INPUT, help="Views of a transforms.json.")
 @click.option("--path", type=options.INPUT, help="Views of a nerfstudio camera_path.json.")
 @click.option("--orbit", type=click.IntRange(1), metavar="N", help="N views around the scene.")

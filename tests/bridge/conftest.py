@@ -89,31 +89,40 @@ def write_views(folder: Path, field=None) -> None:
         write_capture(folder, [views[i] for i in chosen], np.stack([pixels[i] for i in chosen]), split)
 
 
+def make_tiny(patch: pytest.MonkeyPatch) -> None:
+    """Coarse grids, few steps, small pictures: what is tested here is the way, not the quality."""
+    patch.setattr(vm, "OWNERSHIP_CELLS", 48)
+    patch.setattr(composed, "OCCUPANCY_CELLS", 48)
+    patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
+    for name in ("fuse", "edit"):
+        patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
+    patch.setattr(part("fuse"), "DistillSettings", TinySettings)
+    patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
+    patch.setattr(part("train"), "VMShape", partial(VMShape, SHAPE.density_rank, SHAPE.colour_rank))
+    draft = FitSettings(longest=24, steps=60, samples=1 << 13)
+    patch.setattr(part("train"), "QUALITY", dict.fromkeys(("draft", "normal", "high"), draft))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def tiny():
-    """Coarse grids, few steps, small pictures: what is tested here is the way, not the quality."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vm, "OWNERSHIP_CELLS", 48)
-        patch.setattr(composed, "OCCUPANCY_CELLS", 48)
-        patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
-        for name in ("fuse", "edit"):
-            patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
-        patch.setattr(part("fuse"), "DistillSettings", TinySettings)
-        patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
-        patch.setattr(part("train"), "VMShape", partial(VMShape, SHAPE.density_rank, SHAPE.colour_rank))
-        draft = FitSettings(longest=24, steps=60, samples=1 << 13)
-        patch.setattr(part("train"), "QUALITY", dict.fromkeys(("draft", "normal", "high"), draft))
+        make_tiny(patch)
         yield
 
 
-@pytest.fixture(scope="session")
-def shop(tmp_path_factory) -> Path:
-    """floor, red and blue as bundles, and scene.json of all three."""
-    folder = tmp_path_factory.mktemp("shop")
+def stock_fields(folder: Path) -> None:
+    """floor, red and blue as bundles, scene.json of all three, and pair.json of two."""
     for name, field in FIELDS.items():
         write_field(str(folder / f"{name}.rfpack"), field, name, precision="float16", overwrite=False)
     write_scene_of(folder, "floor", "red", "blue")
     write_scene_of(folder, "floor", "red", file="pair.json")
+
+
+@pytest.fixture(scope="session")
+def shop(tmp_path_factory) -> Path:
+    """A folder with the fields and scenes, and photos of the red box."""
+    folder = tmp_path_factory.mktemp("shop")
+    stock_fields(folder)
     write_views(folder / "photos")
     return folder
 

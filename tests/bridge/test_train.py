@@ -3,9 +3,11 @@
 import json
 import shutil
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 
+from formats import atomic
 from formats.bundle import read_bundle
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.engine.distillation.passes import FusedPass
@@ -146,3 +148,12 @@ def test_an_output_in_the_way_is_left_alone(run, folder):
     (folder / "out.rfpack").write_text("mine")
     assert run("train", "photos", "-o", "out.rfpack", *WORDS).exit_code != 0
     assert (folder / "out.rfpack").read_text() == "mine"
+
+
+def test_a_disk_without_room_is_found_before_training(run, folder, monkeypatch):
+    """P5."""
+    monkeypatch.setattr(atomic.shutil, "disk_usage", lambda _: SimpleNamespace(free=5000))
+    monkeypatch.setattr(FitRun, "start", lambda *_: pytest.fail("it was trained"))
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert result.exit_code == 5 and "the disk has 5,000 left" in result.stderr
+    assert not (folder / "out.rfpack").exists()

@@ -95,6 +95,7 @@ def test_gap_that_the_end_record_knows_of():
 
 
 def test_sizes_are_judged_before_they_are_believed(tmp_path):
+    """P14."""
     with open(tmp_path / "sparse", "wb") as file:
         file.write(ONE[:4])
         file.truncate(1 << 40)

@@ -57,12 +57,14 @@ def assert_same(bundle: Bundle, scene: SceneGraph, records: dict[str, FieldRecor
 
 
 def test_the_writer_makes_the_golden_bytes(tmp_path):
+    """P16."""
     writer, scene = lamp_writer()
     writer.write(tmp_path / "a", scene)
     assert (tmp_path / "a").read_bytes() == GOLDEN.read_bytes()
 
 
 def test_the_golden_bundle_reads(tmp_path):
+    """P1."""
     writer, scene = lamp_writer()
     assert_same(read_bundle(GOLDEN), scene, {scene.nodes[0].field: LAMP})
 
@@ -74,6 +76,7 @@ def test_the_specification_prints_the_golden_bytes():
 
 
 def test_every_flipped_bit_is_refused():
+    """P4."""
     data = bytearray(GOLDEN.read_bytes())
     for at in range(len(data)):
         for mask in (1, 2, 4, 8, 16, 32, 64, 128, 255):
@@ -85,6 +88,7 @@ def test_every_flipped_bit_is_refused():
 
 
 def test_every_truncation_and_addition_is_refused(tmp_path):
+    """P4."""
     data, path = GOLDEN.read_bytes(), tmp_path / "a"
     for length in range(len(data)):
         path.write_bytes(data[:length])
@@ -98,7 +102,7 @@ def test_every_truncation_and_addition_is_refused(tmp_path):
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_hostile_content_under_good_checksums_is_read_or_refused(data):
-    """Bytes changed before sealing: outer checks pass, so the inner ones must hold by themselves."""
+    """P18: Bytes changed before sealing: outer checks pass, so the inner ones must hold by themselves."""
     views = parse_archive(memoryview(GOLDEN.read_bytes()), "here")
     members = {name: bytearray(view) for name, view in views.items()}
     target = members[data.draw(st.sampled_from(sorted(members)))]
@@ -202,6 +206,7 @@ def test_unverified_reading_still_checks_the_structure(tmp_path):
 
 
 def test_an_open_bundle_survives_its_replacement(tmp_path):
+    """P7, P10."""
     writer, scene = lamp_writer()
     writer.write(tmp_path / "a", scene)
     bundle = read_bundle(tmp_path / "a")
@@ -249,6 +254,7 @@ def test_content_tells_a_bundle(tmp_path):
 
 
 def test_opening_a_bundle_loads_no_engine_and_runs_no_code():
+    """P17."""
     heavy = {"torch", "click", "fusedrf_cli", "trimesh", "imageio", "scipy", "skimage", "numba", "PIL"}
     code = (
         # The schema's own annotations are compiled once, whatever the file.

@@ -58,6 +58,7 @@ def test_decoding_agrees_with_the_safetensors_library():
 
 
 def test_bytes_do_not_depend_on_order_or_layout():
+    """P16."""
     a, b = np.arange(6.0).reshape(2, 3), np.arange(4)
     first = encode_field(FieldRecord("vm", {"a": a, "b": b}, {"x": 1, "y": (2,)}))
     second = encode_field(
@@ -141,6 +142,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize(("data", "error"), HOSTILE.values(), ids=HOSTILE)
 def test_hostile_bytes(data, error):
+    """P12, P14."""
     with pytest.raises(error, match="^here: ") as caught:
         decode_field(data, "here")
     assert type(caught.value) is error and "\n" not in str(caught.value)

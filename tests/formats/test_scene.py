@@ -130,11 +130,13 @@ def test_json_is_for_people():
 
 
 def test_unknown_keys_of_the_scene_survive():
+    """P1."""
     scene = parse_scene(scene_json(author="me", a={"b": [1]}), "here")
     assert parse_scene(dump_scene(scene), "here").extras == {"author": "me", "a": {"b": [1]}}
 
 
 def test_a_newer_minor_version_warns_and_keeps_what_it_does_not_know():
+    """P1."""
     data = scene_json({"name": "a", "glow": 1, "children": [{"name": "b", "glow": 2}]}, version="1.7")
     with pytest.warns(errors.FormatWarning, match="1.7"):
         scene = parse_scene(data, "here")
@@ -217,6 +219,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("data", "error"), REFUSED.values(), ids=REFUSED)
 def test_refused(data, error):
+    """P12, P13, P15."""
     with pytest.raises(error, match="^here: ") as caught:
         parse_scene(data, "here")
     assert type(caught.value) is error and str(caught.value).isprintable()
@@ -275,6 +278,7 @@ def test_files(tmp_path):
 
 
 def test_inputs_that_are_no_files(tmp_path):
+    """P9."""
     with pytest.raises(errors.MissingFile):
         read_scene(tmp_path / "absent")
     os.mkfifo(tmp_path / "pipe")
@@ -313,6 +317,7 @@ OUTSIDE += ["link/a.rfpack", "link.rfpack", "\uff0e\uff0e/scene-evil/a.rfpack", 
 
 @pytest.mark.parametrize("source", OUTSIDE)
 def test_sources_outside_are_refused(folder, source):
+    """P9."""
     with pytest.raises(errors.OutsideFolder, match="--allow-outside"):
         resolve_source(folder / "scene.json", source)
 
@@ -358,6 +363,7 @@ def test_nested_scenes_become_groups(tmp_path):
 
 
 def test_a_scene_that_leads_back_to_itself(tmp_path):
+    """P13."""
     for here, there in (("a", "b"), ("b", "a")):
         write_scene(tmp_path / f"{here}.json", SceneGraph((make_node("n", source=f"{there}.json"),)))
     with pytest.raises(errors.CyclicScene, match="a.json -> b.json -> a.json"):
@@ -365,6 +371,7 @@ def test_a_scene_that_leads_back_to_itself(tmp_path):
 
 
 def test_scenes_that_double_at_every_level_are_stopped(tmp_path):
+    """P13."""
     (tmp_path / "40.json").touch()
     for i in range(40):
         twice = tuple(make_node(n, source=f"{i + 1}.json") for n in "ab")
@@ -383,7 +390,7 @@ def test_a_nested_scene_keeps_the_rule_of_composition(tmp_path):
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_any_change_of_a_value_is_read_or_refused(data):
-    """Whatever JSON stands in one place of a valid scene, the outcome is a scene or a FormatError."""
+    """P18: Whatever JSON stands in one place of a valid scene, the outcome is a scene or a FormatError."""
     junk = st.recursive(
         st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text()),
         lambda inner: st.one_of(st.lists(inner, max_size=5), st.dictionaries(st.text(), inner, max_size=3)),

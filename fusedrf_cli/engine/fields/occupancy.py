@@ -9,6 +9,7 @@ import numpy as np
 from fusedrf_cli.engine.kernels import GridArrays
 
 DEFAULT_CELLS = 128
+POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
 
 
 @dataclass(frozen=True)
@@ -117,10 +118,13 @@ def marked_cells(
     steps = np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in points], indexing="ij"), -1).reshape(-1, 3)
     corners = grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell
     found = np.zeros(counts, bool)
-    for step in steps:  # few steps, many cells
-        at = (corners + step * grid.cell) @ object_to_field[:3, :3].T + object_to_field[:3, 3]
-        index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
-        found[tuple(index.T)] = True
+    # Many cells and few steps, or, in a coarse grid, the other way round: loop over the fewer.
+    fewer, more = sorted((corners, steps * grid.cell), key=len)
+    for part in np.array_split(more, -(-len(more) // POINTS_AT_ONCE)) if len(more) else ():
+        for offset in fewer:
+            at = (part + offset) @ object_to_field[:3, :3].T + object_to_field[:3, 3]
+            index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
+            found[tuple(index.T)] = True
     return OccupancyGrid(aabb, found).dilated().occupied
 
 

@@ -1,8 +1,12 @@
 """Compiled kernels. Import `fusedrf_cli.engine.kernels` only when numbers are to be crunched: it loads
 numba."""
 
+import atexit
+import contextlib
 import hashlib
 import os
+import shutil
+import stat
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -15,7 +19,7 @@ from numba.core import event
 
 def kernel_cache() -> Path:
     """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
-    written.
+    written. Kernels are code, so a folder that another user could have filled is neither.
 
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
@@ -27,11 +31,29 @@ def kernel_cache() -> Path:
         wanted.mkdir(parents=True, exist_ok=True)
         probe = tempfile.TemporaryFile(dir=wanted)
         probe.close()
-        return wanted
     except OSError:
-        fallback = Path(tempfile.gettempdir()) / f"fusedrf-kernels-{os.getuid()}-{bodies}"
-        fallback.mkdir(exist_ok=True)
-        return fallback
+        return temporary_cache(bodies)
+    return wanted if is_ours(wanted, others=stat.S_IWGRP | stat.S_IWOTH) else temporary_cache(bodies)
+
+
+def temporary_cache(bodies: str) -> Path:
+    """A folder in the temporary one that is found again by its name, or a new one that lasts as long as the
+    process where that name is another user's or open to others.
+    """
+    shared = Path(tempfile.gettempdir()) / f"fusedrf-kernels-{os.getuid()}-{bodies}"
+    with contextlib.suppress(OSError):
+        shared.mkdir(mode=0o700, exist_ok=True)
+        if is_ours(shared, others=stat.S_IRWXG | stat.S_IRWXO):
+            return shared
+    private = tempfile.mkdtemp(prefix="fusedrf-kernels-")
+    atexit.register(shutil.rmtree, private, ignore_errors=True)
+    return Path(private)
+
+
+def is_ours(folder: Path, others: int) -> bool:
+    """Whether `folder` is one, no link, of this user's, and none of the rights `others` are given."""
+    status = folder.lstat()
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & others
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:

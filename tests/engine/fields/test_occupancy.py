@@ -1,10 +1,12 @@
 """Occupancy grids: the skip distance against a search of all cells, boxes, growth, and grids placed in
 another."""
 
+import time
+
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts, placed_occupancy
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts, marked_cells, placed_occupancy
 from tests.engine.conftest import BOX, points_in
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
@@ -90,3 +92,14 @@ def test_placed_grids_cover_their_matter(scale):
         points = points[own.contains(points)] @ placing[:3, :3].T + placing[:3, 3]
         assert len(points) > 100 and OccupancyGrid(grid.aabb, mark).contains(points).all()
     assert grid.occupied.mean() < 0.8
+
+
+def test_one_large_cell_reaches_what_many_small_ones_do():
+    """And in no more time than a pack may take to be read, though it is sampled two million times."""
+    box, matrix = np.array([0.0, 0, 0, 1, 1, 1]), np.eye(4)
+    matrix[:3, 3] = 0.25
+    wide = np.array([0.0, 0, 0, 1.5, 1.5, 1.5])
+    began = time.process_time()
+    one, many = (marked_cells(OccupancyGrid.full(box, cells), matrix, wide, 160) for cells in (1, 16))
+    assert time.process_time() - began < 20
+    np.testing.assert_array_equal(one, many)

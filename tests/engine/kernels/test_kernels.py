@@ -2,9 +2,12 @@
 
 import hashlib
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from fusedrf_cli.engine import kernels
 
@@ -43,4 +46,51 @@ def test_cache_that_cannot_be_written_is_made_elsewhere(tmp_path, monkeypatch):
     (tmp_path / "fusedrf").write_text("a file where the folder should be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert kernels.kernel_cache().parent == tmp_path
+
+
+def elsewhere(monkeypatch, tmp_path) -> Path:
+    """A temporary folder, and a user's cache that cannot be made."""
+    (tmp_path / "fusedrf").write_text("a file where the folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return tmp_path
+
+
+def test_a_temporary_cache_is_found_again_and_private(tmp_path, monkeypatch):
+    elsewhere(monkeypatch, tmp_path)
+    folder = kernels.kernel_cache()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700 and kernels.kernel_cache() == folder
+
+
+@pytest.mark.parametrize("trap", ["open to others", "a link", "another user's", "a file"])
+def test_a_temporary_cache_that_another_user_may_have_filled_is_not_used(tmp_path, monkeypatch, trap):
+    """Its name can be known, and what is in it is run."""
+    elsewhere(monkeypatch, tmp_path)
+    folder = kernels.temporary_cache("0123")
+    if trap == "open to others":
+        folder.chmod(0o777)
+    elif trap == "a link":
+        folder.rename(tmp_path / "theirs")
+        folder.symlink_to(tmp_path / "theirs")
+    elif trap == "another user's":
+        monkeypatch.setattr(kernels, "is_ours", lambda *_, **__: False)
+    else:
+        folder.rmdir()
+        folder.write_text("")
+    found = kernels.temporary_cache("0123")
+    assert found != folder and stat.S_IMODE(found.stat().st_mode) == 0o700 and not any(found.iterdir())
+
+
+def test_ours_is_what_we_own(tmp_path, monkeypatch):
+    assert kernels.is_ours(tmp_path, others=0)
+    another = os.getuid() + 1
+    monkeypatch.setattr(os, "getuid", lambda: another)
+    assert not kernels.is_ours(tmp_path, others=0)
+
+
+def test_a_users_cache_that_others_may_write_is_not_used(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    kernels.kernel_cache().chmod(0o777)
     assert kernels.kernel_cache().parent == tmp_path

@@ -1,0 +1,64 @@
+"""One writer per output: a lock beside it, held from reading to writing, which ends with its holder."""
+
+import contextlib
+import errno
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from formats.atomic import hidden_sibling, remove_leftovers
+from formats.errors import FormatWarning, ResourceError
+
+ENDING = "fusedrf-lock"
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
+
+
+@contextlib.contextmanager
+def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Be the only one, in this block, that writes `path`; what killed writers left of it is removed.
+
+    Another writer makes this one wait, after a call of `waiting` with a sentence, or without `waiting` raises
+    ResourceError. The lock is the kernel's (flock) on a hidden file beside `path`: a killed holder leaves the
+    file but not the lock. Where the file system has no locks, FormatWarning.
+    """
+    from filelock import FileLock, Timeout
+
+    target = Path(os.path.realpath(path))
+    beside = hidden_sibling(target, ENDING)
+    lock = FileLock(beside, fallback_to_soft=False)
+    try:
+        _acquire(lock, waiting, path)
+    except Timeout as error:
+        raise ResourceError(
+            f"{path}: another fusedrf is writing it; wait for its end, or choose another name"
+        ) from error
+    except PermissionError as error:
+        raise ResourceError(f"{path}: {beside} is another user's; wait until it is gone") from error
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        text = f"{path}: its file system has no locks; see that nobody else writes it meanwhile"
+        warnings.warn(text, FormatWarning, 3)
+        yield
+        return
+    try:
+        remove_leftovers(target)
+        yield
+    finally:
+        # Before the release: whoever waits on this file sees that its name is gone, and makes a new one.
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        lock.release()
+
+
+def _acquire(lock, waiting: Callable[[str], None] | None, path: Path | str) -> None:
+    from filelock import Timeout
+
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        if waiting is None:
+            raise
+        waiting(f"{path}: waiting for another fusedrf that is writing it")
+        lock.acquire()

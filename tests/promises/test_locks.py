@@ -1,0 +1,236 @@
+"""Readers and writers of one pack at the same time, and edits that wait for each other."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from formats.bundle import read_bundle
+from formats.errors import FormatWarning, ResourceError
+from formats.locks import ENDING, output_lock
+from tests.promises.packs import generation_of, write_generation
+
+ROOT = Path(__file__).parents[2]
+PACKS = (sys.executable, "-m", "tests.promises.packs")
+# A writer that has no rename: it writes where readers look.
+IN_PLACE = """
+import contextlib, sys
+import formats.bundle
+from tests.promises.packs import keep_writing
+@contextlib.contextmanager
+def in_place(path, **_):
+    with open(path, "wb") as file:
+        yield file
+formats.bundle.atomic_writer = in_place
+keep_writing(sys.argv[1])
+"""
+# `add` with a bridge that reads the pack, is at work for a moment, and writes it back with one node more.
+EDITING = """
+import dataclasses, sys, time, types
+from formats.bundle import BundleWriter, read_bundle
+from formats.scene import make_node
+def add(fused, source, output, *, name, **words):
+    bundle = read_bundle(fused)
+    time.sleep(0.02)
+    scene = dataclasses.replace(bundle.scene, nodes=(*bundle.scene.nodes, make_node(name)))
+    writer = BundleWriter()
+    for member in bundle.fields:
+        writer.copy_field(fused, member)
+    writer.write(output, scene, overwrite=True)
+    return {}
+import fusedrf_cli
+fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(add=add)
+"""
+UNLOCKED = """
+import contextlib, formats.locks
+formats.locks.output_lock = lambda *_: contextlib.nullcontext()
+"""
+# A command that holds its output, half written, until it is ended.
+HOLDING = """
+import sys, time, types
+from formats.atomic import atomic_writer
+def train(source, output, **words):
+    with atomic_writer(output) as file:
+        file.write(b"half")
+        print("ready", flush=True)
+        time.sleep(60)
+import fusedrf_cli
+fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
+"""
+MAIN = "from fusedrf_cli.main import main; main()"
+
+
+@contextlib.contextmanager
+def running(*words, **options):
+    process = subprocess.Popen(words, cwd=ROOT, text=True, stdout=subprocess.PIPE, **options)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+# --- readers ------------------------------------------------------------------------------------------------
+
+
+def readers_beside(path: Path, writer: tuple, count: int, opens: int) -> tuple[int, int]:
+    """(readers that failed, generations that the others saw) of `count` readers beside a writer."""
+    write_generation(path, 1)
+    words = (*PACKS, "read", str(path), str(opens))
+    with running(*writer, str(path)), contextlib.ExitStack() as stack:
+        readers = [stack.enter_context(running(*words, stderr=subprocess.DEVNULL)) for _ in range(count)]
+        told = [reader.communicate(timeout=600)[0] for reader in readers]
+    return sum(reader.returncode != 0 for reader in readers), sum(int(text or 0) for text in told)
+
+
+@pytest.mark.parametrize(
+    ("count", "opens"), [(4, 150), pytest.param(8, 1000, marks=pytest.mark.slow)], ids=["few", "many"]
+)
+def test_readers_beside_a_writer_each_see_one_whole_generation(tmp_path, count, opens):
+    """P7."""
+    failed, seen = readers_beside(tmp_path / "out", (*PACKS, "write"), count, opens)
+    assert failed == 0 and seen > 2 * count
+
+
+def test_readers_beside_a_writer_in_place_fail(tmp_path):
+    """P7 with its defence removed."""
+    failed, _ = readers_beside(tmp_path / "out", (sys.executable, "-c", IN_PLACE), 3, 2000)
+    assert failed > 0
+
+
+# --- edits --------------------------------------------------------------------------------------------------
+
+
+def edited(path: Path, code: str, count: int) -> tuple[set[str], list[str]]:
+    """(names of the nodes in the end, what was said on stderr) after `count` adds in place at once."""
+    write_generation(path, 1)
+    with contextlib.ExitStack() as stack:
+        edits = [
+            stack.enter_context(
+                running(
+                    *(sys.executable, "-c", code + MAIN, "add", path, path, "--name", f"new-{i}"),
+                    *("-w", "-q", "-o", path),
+                    stderr=subprocess.PIPE,
+                )
+            )
+            for i in range(count)
+        ]
+        told = [edit.communicate(timeout=300)[1] for edit in edits]
+    assert [edit.returncode for edit in edits] == [0] * count, told
+    return {node.name for node in read_bundle(path).scene.nodes if node.name.startswith("new-")}, told
+
+
+def test_sixteen_edits_at_once_are_all_there(tmp_path):
+    """P8."""
+    found, told = edited(tmp_path / "out", EDITING, 16)
+    assert len(found) == 16 and os.listdir(tmp_path) == ["out"]
+    assert all(text == "" or "waiting for another fusedrf" in text for text in told)
+
+
+def test_without_the_lock_edits_are_lost(tmp_path):
+    """P8 with its defence removed."""
+    found, _ = edited(tmp_path / "out", EDITING + UNLOCKED, 6)
+    assert len(found) < 6
+
+
+@pytest.fixture
+def held(tmp_path):
+    """A `train` that holds out.rfpack in `tmp_path`."""
+    write_generation(tmp_path / "photos", 1)
+    words = ("train", str(tmp_path / "photos"), "-o", str(tmp_path / "out.rfpack"))
+    with running(sys.executable, "-c", HOLDING + MAIN, *words) as process:
+        assert process.stdout.readline() == "ready\n"
+        yield process
+
+
+def second(folder: Path, code: str) -> tuple[int, str, float]:
+    """(exit code, stderr, seconds) of another `train` to the same output."""
+    words = ("train", str(folder / "photos"), "-w", "-o", str(folder / "out.rfpack"))
+    began = time.monotonic()
+    run = subprocess.run([sys.executable, "-c", code, *words], cwd=ROOT, capture_output=True, text=True)
+    return run.returncode, run.stderr, time.monotonic() - began
+
+
+QUICK = HOLDING.replace('print("ready", flush=True)', "return {}") + MAIN
+
+
+def test_a_second_writer_to_one_output_is_refused_at_once(tmp_path, held):
+    """P8: it would only be overwritten, so it does not wait."""
+    code, said, seconds = second(tmp_path, QUICK)
+    assert code == 5 and "another fusedrf is writing it" in said and seconds < 10
+    assert not (tmp_path / "out.rfpack").exists() and held.poll() is None
+
+
+def test_without_the_lock_a_second_writer_goes_ahead(tmp_path, held):
+    """P8 with its defence removed."""
+    assert second(tmp_path, UNLOCKED + QUICK)[0] == 0
+    assert (tmp_path / "out.rfpack").read_bytes() == b"half"
+
+
+def test_a_killed_holder_is_no_hindrance_and_its_remains_go(tmp_path, held):
+    """P8: the lock ends with its holder, and the next one removes the temporary."""
+    held.send_signal(signal.SIGKILL)
+    held.wait()
+    hidden = [name for name in os.listdir(tmp_path) if name.startswith(".")]
+    assert len(hidden) == 2 and f".out.rfpack.{ENDING}" in hidden
+    assert second(tmp_path, QUICK)[0] == 0
+    assert sorted(os.listdir(tmp_path)) == ["out.rfpack", "photos"]
+
+
+def test_remains_of_other_outputs_stay(tmp_path):
+    """P8: only what its own killed writers left is removed by a writer."""
+    others = [f".out2.{'0' * 12}.tmp", f".out.{'0' * 11}.tmp", ".out.tmp", "out.tmp", f".out.{'g' * 12}.tmp"]
+    for name in (*others, f".out.{'0' * 12}.tmp", f".out.{'0' * 12}.old"):
+        (tmp_path / name).touch()
+    with output_lock(tmp_path / "out"):
+        pass
+    assert sorted(os.listdir(tmp_path)) == sorted([*others, f".out.{'0' * 12}.old"])
+    (tmp_path / "out").touch()
+    with output_lock(tmp_path / "out"):
+        assert sorted(os.listdir(tmp_path)) == sorted([*others, "out", f".out.{ENDING}"])
+
+
+def test_a_file_system_without_locks_warns_and_goes_on(tmp_path, monkeypatch):
+    """P8, where it cannot be kept."""
+    import fcntl
+
+    def none(*_):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    with pytest.warns(FormatWarning, match="no locks"), output_lock(tmp_path / "out"):
+        pass
+
+
+def test_a_lock_of_another_user_is_a_sentence(tmp_path, monkeypatch):
+    import filelock
+
+    def denied(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", denied)
+    with pytest.raises(ResourceError, match="another user's"), output_lock(tmp_path / "out"):
+        pass
+
+
+def test_a_pack_that_was_edited_says_so_in_one_generation(tmp_path):
+    """P7: what `info` tells of size and content is of one file, even if the name moves on meanwhile."""
+    path = tmp_path / "out"
+    write_generation(path, 1)
+    code = (
+        "import json, sys\nimport formats.bundle as b\nfrom tests.promises.packs import write_generation\n"
+        "real = b._scene_summary\n"
+        "def late(*words):\n    write_generation(sys.argv[1], 2, numbers=9000)\n    return real(*words)\n"
+        "b._scene_summary = late\nprint(json.dumps(b.read_summary(sys.argv[1])))\n"
+    )
+    size = path.stat().st_size
+    run = subprocess.run(
+        [sys.executable, "-c", code, path], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert json.loads(run.stdout)["bytes"] == size and generation_of(path) == 2

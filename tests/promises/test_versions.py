@@ -1,0 +1,124 @@
+"""Packs of every version ever written stay readable; packs of later ones are judged by their word."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from formats import scene as scene_file
+from formats.bundle import BundleWriter, read_bundle, read_summary
+from formats.errors import FormatWarning, NewerVersion
+from formats.images import read_image
+from fusedrf_cli.bridge.render import renderable, to_pixels
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.engine.rendering.cameras import orbit
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.main import cli
+from tests.promises.mutations import sealed
+from tests.promises.packs import GOLDEN
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+def rendered(path) -> np.ndarray:
+    """(48, 48, 3) uint8 of a pack, as pair.png was made."""
+    field, origin = renderable(load_scene(str(path)))
+    camera = orbit(field.occupancy.tight_aabb(0) + np.tile(origin, 2), 1, 48, 48)[0]
+    return to_pixels(render_image(field, camera, origin=origin), WHITE)
+
+
+def decibels(one: np.ndarray, other: np.ndarray) -> float:
+    error = np.mean((one / 255.0 - other / 255.0) ** 2)
+    return float("inf") if error == 0 else float(-10 * np.log10(error))
+
+
+@pytest.mark.parametrize("name", ["pair.rfpack", "later.rfpack"])
+def test_kept_packs_render_as_they_did(name):
+    """P1: these files are kept for ever, and show what pair.png shows."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)
+        assert decibels(rendered(GOLDEN / name), read_image(GOLDEN / "pair.png")[..., :3]) >= 60
+
+
+def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
+    """P1 with its defence removed: a reader that changed its mind about a number misses the picture."""
+    from fusedrf_cli.engine.fields import vm
+
+    real = vm.stored_tensor
+    monkeypatch.setattr(
+        vm,
+        "stored_tensor",
+        lambda i, stored, *rest: real(i, {**stored, "scale": 1.1 * stored["scale"]}, *rest),
+    )
+    assert decibels(rendered(GOLDEN / "pair.rfpack"), read_image(GOLDEN / "pair.png")[..., :3]) < 50
+
+
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.rfpack")), ids=lambda path: path.stem)
+def test_every_kept_pack_is_valid(path):
+    """P1."""
+    result = CliRunner().invoke(cli, ["validate", str(path)])
+    assert result.exit_code == 0, result.stderr
+
+
+def versioned(tmp_path, old: bytes, new: bytes):
+    """The golden pair with a part of its scene.json changed, under right checksums."""
+    import random
+
+    data = sealed(
+        (GOLDEN / "pair.rfpack").read_bytes(),
+        lambda scene, field, _: (scene.replace(old, new, 1), field),
+        random.Random(0),
+    )
+    (tmp_path / "a.rfpack").write_bytes(data)
+    return str(tmp_path / "a.rfpack")
+
+
+@pytest.mark.parametrize("verb", ["info", "validate"])
+def test_another_major_version_is_refused_naming_both(tmp_path, verb):
+    """P1."""
+    result = CliRunner().invoke(cli, [verb, versioned(tmp_path, b'"1.0"', b'"2.3"')])
+    assert result.exit_code == 4 and "2.3" in result.stderr and "1.x" in result.stderr
+
+
+@pytest.mark.parametrize("verb", ["info", "validate"])
+def test_an_unknown_feature_that_is_required_is_refused(tmp_path, verb):
+    """P1."""
+    path = versioned(tmp_path, b'"composition"', b'"requires": ["time"],\n  "composition"')
+    result = CliRunner().invoke(cli, [verb, path])
+    assert result.exit_code == 4 and "time" in result.stderr
+
+
+def test_without_a_look_at_the_version_the_future_is_misread(tmp_path, monkeypatch):
+    """P1 with its defence removed."""
+    path = versioned(tmp_path, b'"1.0"', b'"2.3"')
+    with pytest.raises(NewerVersion):
+        read_summary(path)
+    monkeypatch.setattr(scene_file, "_check_version", lambda *_: False)
+    assert read_summary(path)["version"] == "2.3"
+
+
+def test_keys_that_this_version_does_not_know_survive_a_round_trip(tmp_path):
+    """P1: those of the scene, and those of its nodes."""
+    with pytest.warns(FormatWarning, match="1.7 is newer"):
+        bundle = read_bundle(GOLDEN / "later.rfpack")
+    writer = BundleWriter()
+    for member in bundle.fields:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FormatWarning)
+            writer.copy_field(GOLDEN / "later.rfpack", member)
+    writer.write(tmp_path / "a", bundle.scene)
+    assert (tmp_path / "a").read_bytes() == (GOLDEN / "later.rfpack").read_bytes()
+
+
+def test_an_edit_keeps_what_it_does_not_know_of_the_scene(tmp_path, monkeypatch):
+    """P1, through a whole `delete`."""
+    from fusedrf_cli.engine.fields import vm
+
+    monkeypatch.setattr(vm, "OWNERSHIP_CELLS", 32)
+    words = ["delete", str(GOLDEN / "later.rfpack"), "chair", "-o", str(tmp_path / "a.rfpack"), "--json"]
+    result = CliRunner().invoke(cli, words)
+    assert result.exit_code == 0, result.stderr
+    assert any("1.7 is newer" in text for text in json.loads(result.stdout)["warnings"])
+    assert read_bundle(tmp_path / "a.rfpack").scene.extras == {"licence": "CC0", "poses": {"a": [1, 2]}}
