@@ -74,7 +74,7 @@ def row_result(name: str, records: list[dict]) -> RowResult:
 
 def table(rows: dict[str, RowResult]) -> str:
     """The page: how many hold, then one table per group of rows."""
-    ran = [r for r in rows.values() if r.verdict in ("pass", "FAIL")]
+    ran = [r for r in rows.values() if r.name[0] in COUNTS and r.verdict in ("pass", "FAIL")]
     held = [r for r in ran if r.verdict == "pass"]
     lines = [
         "# Stability where methods fail",
@@ -127,7 +127,7 @@ def worst(row: RowResult) -> dict[str, tuple[float, float]]:
     """(worst PSNR, seconds) of a row by preset; "" where it depends on none."""
     found: dict[str, tuple[float, float]] = {}
     for check in row.measured:
-        if check["unit"] == "dB":
+        if check["unit"] == "dB" and not check["at_most"]:  # a PSNR, and no difference of two
             psnr, seconds = found.get(check["preset"], (inf, 0.0))
             found[check["preset"]] = (min(psnr, check["figure"]), max(seconds, check["seconds"]))
     return found
@@ -139,7 +139,7 @@ def chart(rows: dict[str, RowResult], path: Path) -> None:
 
     matplotlib.use("Agg")
     matplotlib.rcParams["svg.hashsalt"] = "stability"  # equal figures, equal bytes
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     shown = {name: found for name, row in rows.items() if (found := worst(row))}
     figure, (quality, speed) = pyplot.subplots(
@@ -154,13 +154,14 @@ def chart(rows: dict[str, RowResult], path: Path) -> None:
             quality.barh(y, max(psnr, SHOWN_FROM) - SHOWN_FROM, height, left=SHOWN_FROM, color=colour)
             speed.barh(y, seconds, height, color=colour)
     for at, name in enumerate(shown):
-        bars = {c["bar"] for c in rows[name].measured if c["unit"] == "dB"}
+        bars = {c["bar"] for c in rows[name].measured if c["unit"] == "dB" and not c["at_most"]}
         quality.vlines(sorted(bars), at - 0.45, at + 0.45, color="black", linewidth=1)
     quality.set_yticks(range(len(shown)), list(shown))
     quality.invert_yaxis()
     quality.set_xlim(SHOWN_FROM, 102)
     quality.set_xlabel("worst PSNR, dB (black: bars)")
     speed.set_xscale("log")
+    speed.xaxis.set_minor_formatter(ticker.NullFormatter())  # decades alone have room
     speed.set_xlabel("longest test, s")
     names = {"": "no preset", **{p: p for p in PRESETS}}
     used = {p for found in shown.values() for p in found}
