@@ -9,7 +9,7 @@ PACKS ?= 10000
 KILLS ?= 200
 SEED ?= 0
 
-.PHONY: help demo test test-slow fuzz lint bench clean
+.PHONY: help demo test test-slow fuzz lint bench stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -33,6 +33,12 @@ lint: $(VENV)  ## ruff
 
 bench: $(VENV)  ## the measurements that the claims rest on
 	$(PYTHON) -m benchmarks
+
+stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
+	mkdir -p build
+	rm -f build/stability.jsonl
+	-$(PYTHON) -m pytest -q tests/failures --stability-report build/stability.jsonl
+	$(PYTHON) -m benchmarks.stability build/stability.jsonl docs
 
 clean:  ## all that can be made again
 	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis *.egg-info

@@ -68,9 +68,7 @@ def add(
             raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
         new = load_scene(source)
         origin = node.object_to_world[:3, 3]
-        objects = [
-            Placed(name, p.field, object_to_world @ p.object_to_world).moved(origin) for p in new.placed
-        ]
+        objects = [placed_at(p, name, object_to_world, source).moved(origin) for p in new.placed]
         settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
         progress.phase("adding", 1.0)
         originals, objects = objects, [as_vm(p, settings, rgb, progress) for p in objects]
@@ -285,6 +283,15 @@ def moved_frame(field: VMField, origin: np.ndarray) -> VMField:
     shift[:3, 3] = -origin
     blocks = tuple(replace(b, object_to_field=shift @ b.object_to_field) for b in field.blocks)
     return VMField.assembled(field.shape, field.tensors, blocks, field.params)
+
+
+def placed_at(placed: Placed, name: str, object_to_world: np.ndarray, source: str) -> Placed:
+    """A placed field placed once more, under a name; InvalidInput where both placements together are
+    singular."""
+    try:
+        return Placed(name, placed.field, object_to_world @ placed.object_to_world)
+    except ValueError as error:
+        raise InvalidInput(f"{source}: {error}; give an invertible placement") from error
 
 
 def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:

@@ -1,8 +1,8 @@
 """`fuse`: a scene to one field."""
 
 import time
+from dataclasses import asdict, replace
 
-import numpy as np
 import torch
 
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
@@ -11,6 +11,13 @@ from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.detail import (
+    ENOUGH_VOXELS,
+    LOST_NOTED,
+    Detail,
+    block_details,
+    tensor_details,
+)
 from fusedrf_cli.engine.distillation.distill import (
     DistillRun,
     DistillSettings,
@@ -18,12 +25,13 @@ from fusedrf_cli.engine.distillation.distill import (
     empty_student,
     student_from,
 )
+from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000
 HEADER_BYTES = 16384  # scene graph, history and headers of a bundle, about
-CONDITION_NOTED = 1.02  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
+CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
 def fuse(
@@ -49,7 +57,7 @@ def fuse(
     """Turn a composed scene into one field and write it with the scene's history."""
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        loaded = load_scene(scene, allow_outside)
+        loaded = without_empty(load_scene(scene, allow_outside), scene, progress)
         composed = loaded.composed()
         chosen = choose_kind(kind, loaded)
         limit = max_size or DEFAULT_MAX_SIZE
@@ -138,6 +146,8 @@ def fuse_blocks(
         id(p.field): sum(t.occupancy.occupied.size for t in p.field.tensors) // 8 for p in composed.placed
     }
     field = blocks_of(composed.placed, int(0.99 * limit) - sum(occupancies.values()) - 65536, precision)
+    details = block_details(composed.placed, field)
+    warn_of_detail(details, "a larger --max-size", progress)
     seconds = {"blocks": time.monotonic() - started}
     progress.phase("measuring", None)
     views = DistillSettings.views
@@ -156,6 +166,7 @@ def fuse_blocks(
             "ranks": [field.shape.density_rank, field.shape.colour_rank],
             "why": why,
         },
+        "objects": [asdict(d) for d in details],
     }
 
 
@@ -186,14 +197,16 @@ def fuse_vm(
         background.field,
         composed.placed[[p.name for p in loaded.placed].index(background.name)].object_to_world,
     )
-    warn_of_stretch(composed, progress)
     student = None if from_scratch else student_from(moved, composed, settings, generator)
     start = f"the weights of '{background.name}'" if student is not None else "nothing"
     if student is None:
         if not from_scratch:
             progress.warn(f"'{background.name}' is turned or stretched, so the student starts from nothing")
         student = empty_student(composed, settings, generator, "fused")
-    boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
+    details = tensor_details(composed.placed, student.voxel_size)
+    warn_of_detail(details, "--kind blocks, or a larger --max-size", progress)
+    # in an order that does not depend on the nodes', so that equal scenes draw equal rays
+    boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
     run = DistillRun(composed, student, boxes, settings, rgb)
     # what the saved numbers depend on: with other words they would go on to something else
     made_with = {"numbers": student.params.numel(), "start": start, "rgb": rgb, "seed": settings.seed}
@@ -233,18 +246,44 @@ def fuse_vm(
             "finest_teacher_voxel": float(composed.voxel_size),
         },
         **did.numeric,
+        "objects": [asdict(d) for d in details],
     }
 
 
-def warn_of_stretch(composed: ComposedField, progress) -> None:
-    """One isotropic density cannot hold a stretched one exactly; say by how much opacity may be off
-    (FAILURES: A2).
-    """
-    for placed in composed.placed:
-        if placed.condition > CONDITION_NOTED:
-            c = np.sqrt(placed.condition)
-            worst = c ** (-1 / (c - 1)) - c ** (-c / (c - 1))
+def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
+    """The scene without the fields that show nothing, each named in a warning; InvalidInput where none is
+    left."""
+    full = {id(p.field): p.field for p in loaded.placed}
+    full = {key for key, field in full.items() if holds_matter(field)}
+    for f in loaded.fields:
+        if id(f.placed.field) not in full:
+            progress.warn(f"'{f.placed.name}' is empty and was left out")
+    kept = tuple(f for f in loaded.fields if id(f.placed.field) in full)
+    if not kept:
+        raise InvalidInput(f"{scene}: all its fields are empty; train them again")
+    return replace(loaded, fields=kept)
+
+
+def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
+    """Say which objects a fused field will not hold as they are: stretched translucent ones, those it has too
+    few voxels for, and those that share their cells with more than two."""
+    for d in details:
+        if d.opacity_off and d.stretch > CONDITION_NOTED:
             progress.warn(
-                f"'{placed.name}' is stretched by {placed.condition:.2f}: where it is translucent its "
-                f"opacity may be off by up to {worst:.3f}"
+                f"'{d.name}' is stretched by {d.stretch:.2f}: where it is translucent its "
+                f"opacity may be off by up to {d.opacity_off:.3f}"
             )
+        if d.voxels_across < ENOUGH_VOXELS:
+            progress.warn(f"'{d.name}' is only {d.voxels_across:.2g} voxels across; use {remedy}")
+        if d.lost > LOST_NOTED:
+            progress.warn(
+                f"{d.lost:.0%} of '{d.name}' is not shown, since more than two objects meet there in one "
+                "cell of a grid over the whole scene; render the scene as it is, or fuse its parts apart"
+            )
+    coarse = [d for d in details if d.held_voxel > d.own_voxel * (1 + 1e-6)]
+    if coarse:
+        worst = max(coarse, key=lambda d: d.held_voxel / d.own_voxel)
+        progress.warn(
+            f"{len(coarse)} of {len(details)} objects are held at coarser voxels than their own, "
+            f"'{worst.name}' at {worst.held_voxel / worst.own_voxel:.1f} times; use {remedy}"
+        )

@@ -216,8 +216,7 @@ class Slow:
 
 
 def even(density: float) -> Activation:
-    """The same density everywhere: the argument is 0. Nothing at all is the softplus' floor of a scale of
-    1e-30."""
+    """The same density everywhere: the argument is 0. Nothing is the softplus' floor of a scale of 1e-30."""
     one, up = np.ones_like, lambda x: np.full_like(x, -SHIFT)
     return Activation(density / np.log(2), ((up, one, one),)) if density > 0 else Activation(1e-30)
 

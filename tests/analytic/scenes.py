@@ -178,13 +178,15 @@ def s2_blobs(condition: float, count: int = 3, seed: int = 0, spread: float = 2.
     return scene_of(*parts)
 
 
-def s3_cube(degree: int = 1, density: float = 400.0) -> Scene:
+def s3_cube(degree: int = 1, density: float = 400.0, soft: bool = False) -> Scene:
     """An opaque cube whose six faces differ in colour (red grows with x, green with y, blue with z) and whose
-    colour turns with the view by SH of a degree, 0 to 2."""
+    colour turns with the view by SH of a degree, 0 to 2; soft is a blob in its stead, whose picture does not
+    depend on where a ray's samples lie."""
     facing = 0.9 * np.array([[-1.0, 0.3, 0], [0, -1, 0.3], [0.3, 0, -1]]) * (degree >= 1)
     bands = np.random.default_rng(3).normal(size=(3, 5)) if degree >= 2 else np.zeros((3, 0))
     tint = Tint(facing=facing, slope=4.0 * np.eye(3), bands=bands)
-    return scene_of(("cube", Box(density, 0.5, tint=tint), np.eye(4)))
+    blob = Gaussian(20.0, (0.0, 0.0, 0.0), 0.2, tint=tint)
+    return scene_of(("cube", blob if soft else Box(density, 0.5, tint=tint), np.eye(4)))
 
 
 def s4_twins(offset: float = 0.0, density: float = 1e3, noise: float = 0.0) -> Scene:

@@ -24,7 +24,7 @@ SCENES = {
 AROUND = np.array([-1.5, -1.5, -1.0, 1.5, 1.5, 1.0])
 
 
-def summed(scene, rays_o, rays_d, rule, reach=40.0, samples=20_000):
+def summed(scene, rays_o, rays_d, rule, reach=40.0, samples=8_000):
     """(N, 4) pixels by brute force."""
     t = (np.arange(samples) + 0.5) / samples * reach
     out = []
@@ -39,9 +39,9 @@ def summed(scene, rays_o, rays_d, rule, reach=40.0, samples=20_000):
 @pytest.mark.parametrize("rule", ["max", "add"])
 @pytest.mark.parametrize("name", ["S1", "S1 through", "S4", "S6", "S8"])
 def test_pixels_are_the_volume_integral(name, rule):
-    rays_o, rays_d = rays_at(AROUND, 4, seed=2, away=6.0)
+    rays_o, rays_d = rays_at(AROUND, 3, seed=2, away=6.0)
     np.testing.assert_allclose(
-        SCENES[name].pixels(rays_o, rays_d, rule), summed(SCENES[name], rays_o, rays_d, rule), atol=0.02
+        SCENES[name].pixels(rays_o, rays_d, rule), summed(SCENES[name], rays_o, rays_d, rule), atol=0.05
     )
 
 
@@ -57,12 +57,12 @@ def test_a_slab_dims_by_its_angle():
 def test_depths_are_the_integral_of_sigma(name):
     scene = SCENES[name]
     centre = scene.parts[0].object_to_world[:3, 3]
-    rays_o, rays_d = rays_at(AROUND + np.tile(centre, 2), 8, seed=4, away=5.0)
-    t = (np.arange(40_000) + 0.5) / 40_000 * 14.0
+    rays_o, rays_d = rays_at(AROUND + np.tile(centre, 2), 4, seed=4, away=5.0)
+    t = (np.arange(10_000) + 0.5) / 10_000 * 14.0
     for o, d, depth in zip(rays_o, rays_d, scene.depths(rays_o, rays_d).T, strict=True):
         sigmas = scene.sigmas(o + t[:, None] * d, np.tile(d, (len(t), 1)))
-        spread = sigmas.max(1) * 14.0 / 40_000  # a face lies somewhere in a sample
-        assert (np.abs(sigmas.sum(1) * 14.0 / 40_000 - depth) <= 2 * spread + 1e-6).all()
+        spread = sigmas.max(1) * 14.0 / 10_000  # a face lies somewhere in a sample
+        assert (np.abs(sigmas.sum(1) * 14.0 / 10_000 - depth) <= 2 * spread + 1e-6).all()
 
 
 FIELDS = {

@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from fusedrf_cli.engine.distillation.distill import Judge
 from fusedrf_cli.engine.fields.base import field_kinds
 from tests.analytic.export import NotExportable
+from tests.bridge.conftest import TinySettings, part
 
 ROW = re.compile(r"test_([a-z]+\d+)_")
 
@@ -65,6 +67,18 @@ def row(request) -> Row:
     """row.check("A1", "relative error of optical depth", figure, 1e-5, at_most=True)."""
     request.node.stability = Row(request.node.name)
     return request.node.stability
+
+
+@pytest.fixture
+def quick(monkeypatch) -> None:
+    """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
+    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 48)
+    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 48)
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.distill.POINTS_PER_STEP", 1 << 13)
+    monkeypatch.setattr(part("fuse"), "DistillSettings", TinySettings)
+    for name in ("fuse", "edit"):
+        judge = lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed)  # noqa: E731
+        monkeypatch.setattr(part(name), "Judge", judge)
 
 
 def pytest_generate_tests(metafunc):

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from benchmarks import stability
+
 SUITE = """
 import pytest
 
@@ -57,3 +59,24 @@ def test_every_outcome_is_written_down(tmp_path):
     assert found[1]["seconds"] == 2.5 and found[1]["preset"] == "draft" and found[0]["scene"] == "S2"
     assert found[4]["reason"] == "no such kind" and found[5]["reason"] == "nothing contracts yet"
     assert "'marble'" in found[6]["reason"]
+
+
+def test_the_table_has_every_row_and_hides_no_failure(tmp_path):
+    """What failed is shown as such, what is skipped tells why, what nobody ran is named."""
+    check = {"scene": "S2", "unit": "", "preset": "", "seconds": 1.0, "at_most": True, "test": "t"}
+    records = [
+        {**check, "row": "A1", "what": "error", "figure": 1e-7, "bar": 1e-5, "passed": True},
+        {**check, "row": "A2", "what": "error", "figure": 3e-5, "bar": 1e-5, "passed": False},
+        {"row": "B13", "passed": None, "reason": "nothing contracts yet", "test": "t"},
+    ]
+    for preset, figure in (("draft", 31.0), ("high", 36.0)):
+        decibel = {"unit": "dB", "at_most": False, "preset": preset, "figure": figure, "bar": 30.0}
+        records.append({**check, **decibel, "row": "A1", "what": "PSNR", "passed": True})
+    (tmp_path / "records").write_text("\n".join(json.dumps(r) for r in records))
+    stability.main(str(tmp_path / "records"), str(tmp_path / "docs"))
+    page = (tmp_path / "docs" / "stability.md").read_text()
+    assert "**1 of 2 rows" in page
+    assert "| A1 | S2 | PSNR (draft) | 31 dB | ≥ 30 dB | 3/3 | pass |" in page
+    assert "| A2 | S2 | error | 3e-05 | ≤ 1e-05 | 0/1 | FAIL |" in page
+    assert "skipped: nothing contracts yet" in page and page.count("not run") == 9 + 16 + 11 + 11 - 3
+    assert "<svg" in (tmp_path / "docs" / "stability.svg").read_text()

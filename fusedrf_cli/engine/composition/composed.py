@@ -59,18 +59,19 @@ class ComposedField:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
         sigmas, owner = self.sigmas(points, dirs)
-        rgb = torch.zeros(len(points), 3)
+        # Sums in double, rounded once: single ones would differ in the last bit with the order of the nodes.
+        rgb = torch.zeros(len(points), 3, dtype=torch.float64)
         if self.rule == "max":
             sigma = sigmas.amax(0)
             if with_colour:
                 for i in range(len(self.placed)):
                     self._shade(i, (owner == i) & (sigma > 0), points, dirs, None, rgb)
-            return sigma, rgb
-        sigma = sigmas.sum(0)
+            return sigma, rgb.float()
+        sigma = sigmas.double().sum(0)
         if with_colour:
             for i in range(len(self.placed)):
                 self._shade(i, sigmas[i] > 0, points, dirs, sigmas[i] / sigma.clamp_min(1e-30), rgb)
-        return sigma, rgb
+        return sigma.float(), rgb.float()
 
     def sigmas(self, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(F, N) density of every placed field at points, and (N,) the index of the densest (lowest on a
@@ -96,5 +97,5 @@ class ComposedField:
         """Add field i's colour at the masked points, times its share (N,) where one is given."""
         if mask.any():
             x, d, _ = self.placed[i].to_object(points[mask], dirs[mask])
-            colour = self.placed[i].field.query(x, d)[1].float()
+            colour = self.placed[i].field.query(x, d)[1].double()
             rgb[mask] += colour if share is None else colour * share[mask, None]

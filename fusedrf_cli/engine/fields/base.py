@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid
 
 
 @runtime_checkable
@@ -44,6 +44,25 @@ class StoredField(RadianceField, Protocol):
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "StoredField":
         """Inverse of `state`. Raises ValueError naming the array or key that does not fit."""
         ...
+
+
+NOTHING = 1e-4  # optical depth through a whole box under which a field shows nothing
+PROBED_AT_ONCE = 1 << 16
+
+
+def holds_matter(field: RadianceField) -> bool:
+    """Whether a field is dense enough anywhere to be seen, by asking it in the middle and at eight points of
+    every occupied cell."""
+    grid = field.occupancy
+    middles, through = grid.centres(), np.linalg.norm(grid.aabb[3:] - grid.aabb[:3])
+    offsets = np.concatenate([np.zeros((1, 3)), PROBES - 0.5]) * grid.cell
+    for start in range(0, len(middles), PROBED_AT_ONCE):
+        for offset in offsets:
+            points = torch.from_numpy(middles[start : start + PROBED_AT_ONCE] + offset)
+            sigma, _ = field.query(points, torch.eye(3, dtype=torch.float64)[[0] * len(points)], False)
+            if bool((sigma * through > NOTHING).any()):
+                return True
+    return False
 
 
 _KINDS: dict[str, type] = {}

@@ -10,6 +10,8 @@ from fusedrf_cli.engine.kernels import GridArrays
 
 DEFAULT_CELLS = 128
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
+# where in a cell its density is probed
+PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

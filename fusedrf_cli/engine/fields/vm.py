@@ -16,16 +16,16 @@ import torch
 
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.base import register
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_occupancy
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
 OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
-# where in a cell its density is probed
-PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
+TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 MAX_STRIDE = 64
 MAX_TEXELS = 8192  # per axis, in a stored field
+MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
 SECTION_ALIGN = 16  # floats: a section starts on a cache line
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
@@ -228,9 +228,9 @@ class VMField:
     @property
     def voxel_size(self) -> float:
         """Finest texel spacing of any block, in the field's frame."""
-        return min(self._voxel_sizes())
+        return min(self.voxel_sizes())
 
-    def _voxel_sizes(self) -> list[float]:
+    def voxel_sizes(self) -> list[float]:
         """Finest texel spacing of every block, in the field's frame."""
         squeezes = [np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[-1] for b in self.blocks]
         finest = [self.tensors[b.tensor].voxel_size.min() for b in self.blocks]
@@ -238,7 +238,7 @@ class VMField:
 
     def _strides(self) -> np.ndarray:
         """(B,) int64: a block's voxels over the finest block's, rounded down."""
-        sizes = np.asarray(self._voxel_sizes())
+        sizes = np.asarray(self.voxel_sizes())
         return np.clip(np.floor(sizes / sizes.min() + 1e-9), 1, MAX_STRIDE).astype(np.int64)
 
     def sections(self, tensor: int) -> dict[str, torch.Tensor]:
@@ -385,6 +385,7 @@ class VMField:
         for t in range(len(tensors)):
             for name, view in unplaced.sections(t).items():
                 view.copy_(torch.from_numpy(np.ascontiguousarray(arrays[f"tensor_{t}.{name}"], np.float32)))
+            check_answers(t, tensors[t], unplaced.sections(t))
         return cls.assembled(shape, tensors, blocks, params)
 
 
@@ -404,6 +405,24 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
         raise ValueError(f"tensor {i}: scale should be positive and shift finite, found {scale} and {shift}")
     cells = whole_numbers(stored["occupancy"], 1, f"tensor {i}: occupancy")
     return VMTensor(resolution, aabb, scale, shift, unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells)))
+
+
+def check_answers(i: int, tensor: VMTensor, sections: dict[str, torch.Tensor]) -> None:
+    """Raise ValueError where finite numbers could multiply to an infinite density or logit, and their
+    difference be NaN."""
+    peak = {name: view.abs().flatten(0, -2).amax(0).double() for name, view in sections.items()}
+    products = {
+        what: torch.stack([peak[f"{what}_plane_{m}"] * peak[f"{what}_line_{m}"] for m in range(3)])
+        for what in ("density", "colour")
+    }
+    density = tensor.scale * (float(products["density"].sum()) + abs(tensor.shift) + 1)
+    coefficients = sections["colour_basis"].shape[1]
+    logit = coefficients * float((products["colour"].flatten() * peak["colour_basis"]).sum())
+    for what, largest in (("density", density), ("colour", logit)):
+        if not largest <= MAX_ANSWER:
+            raise ValueError(
+                f"arrays 'tensor_{i}.{what}_*' multiply to {largest:.3g}, expected at most {MAX_ANSWER:g}"
+            )
 
 
 def stored_block(i: int, stored: dict, tensors: int) -> Block:
@@ -482,5 +501,7 @@ def settle_owners(field: VMField, marks: list[np.ndarray], first: np.ndarray, se
         cpu.density_at_cells(
             field.kernel_shape[0], field.arrays, b, grid.aabb[:3].copy(), grid.cell, crowded, PROBES, peak[b]
         )
+    # A probe misses matter that barely reaches into a cell: such blocks come last, by their peak elsewhere.
+    peak = np.where(peak > 0, peak, TOUCHING * peak.max(1, keepdims=True))
     densest = np.sort(np.argsort(-peak, axis=0, kind="stable")[:2], axis=0).astype(np.uint8)
     first[tuple(crowded.T)], second[tuple(crowded.T)] = densest

@@ -12,7 +12,7 @@ import torch
 
 from fusedrf_cli.engine.fields.base import register
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.vm import MAX_ANSWER, Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
@@ -225,7 +225,21 @@ class VMMLPField:
                     have = "nothing" if found is None else list(found.shape)
                     raise ValueError(f"array '{name}' should have shape {list(values.shape)}, found {have}")
                 values.copy_(torch.from_numpy(np.ascontiguousarray(found, np.float32)))
+        check_network(network)
         return cls(factors, network)
+
+
+def check_network(network: ColourNetwork) -> None:
+    """Raise ValueError where inputs of size 1 could grow past float32 on their way through the network: the
+    product of its layers' largest row sums bounds them."""
+    largest = 1.0
+    for layer in network.layers:
+        rows = layer.weight.detach().double().abs().sum(1) * largest + layer.bias.detach().double().abs()
+        largest = float(rows.max())
+    if not largest <= MAX_ANSWER:
+        raise ValueError(
+            f"arrays 'network.*' multiply to {largest:.3g}, which should be at most {MAX_ANSWER:g}"
+        )
 
 
 def named_weights(network: ColourNetwork) -> list[tuple[str, torch.nn.Parameter]]:

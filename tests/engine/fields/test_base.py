@@ -2,8 +2,10 @@
 
 import torch
 
-from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
+from fusedrf_cli.engine.fields.base import RadianceField, field_kinds, holds_matter
 from fusedrf_cli.engine.fields.vm import VMField
+from tests.analytic.export import vm_field
+from tests.analytic.fields import Box
 from tests.engine.conftest import BOX, Ball, points_in, random_vm
 
 
@@ -24,3 +26,10 @@ def test_fields_keep_the_protocol():
         assert (sigma >= 0).all() and (rgb >= 0).all() and (rgb <= 1).all()
         assert torch.equal(field.query(points, dirs, with_colour=False)[0], sigma)
         assert field.aabb.shape == (6,) and field.voxel_size > 0
+
+
+def test_matter_is_what_can_be_seen_through_the_whole_box():
+    """An optical depth of 1e-4 along the diagonal is nothing; a thousand times as much is thin fog."""
+    for field, found in ((Box(1e-5), False), (Box(1e-2), True), (Ball(), True), (Ball(radius=0.0), False)):
+        assert holds_matter(field) == found
+    assert holds_matter(vm_field(Box(1e-2))) and not holds_matter(vm_field(Box(0.0)))
