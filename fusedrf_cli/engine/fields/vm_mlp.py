@@ -17,6 +17,7 @@ from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
 POINTS_AT_ONCE = 1 << 15  # 20 MB of network inputs
+FEWEST_POINTS = 16  # matrix products of fewer rows may take another path, and round otherwise
 
 
 class ColourNetwork(torch.nn.Module):
@@ -180,6 +181,8 @@ class VMMLPField:
         if with_colour:
             with torch.no_grad():
                 for some in torch.nonzero(sigma > 0)[:, 0].split(POINTS_AT_ONCE):
+                    if len(some) < FEWEST_POINTS:  # so that a point's colour is the same in any company
+                        some = torch.cat([some, some[-1:].expand(FEWEST_POINTS - len(some))])
                     products = autograd.features(self, self.params, points[some])
                     rgb[some] = self.shade(products, dirs[some], self.basis)
         return sigma, rgb
