@@ -24,12 +24,18 @@ ROWS_AT_ONCE_BYTES = 1 << 22
 
 @contextmanager
 def png_writer(
-    path: Path | str, width: int, height: int, channels: int, *, bits: int = 8, text: dict[str, str] | None = None
+    path: Path | str,
+    width: int,
+    height: int,
+    channels: int,
+    *,
+    bits: int = 8,
+    text: dict[str, str] | None = None,
 ) -> Iterator[Callable[[np.ndarray], None]]:
     """A function that takes the picture's rows from the top, (n, width, channels) uint8 (uint16 with bits=16)
     each time; the file appears, whole, when the block ends after the last of `height` rows.
 
-    `text` becomes tEXt chunks, Latin-1. Raises ValueError (rows that are missing or do not fit), ResourceError.
+    `text` becomes tEXt chunks, Latin-1. Raises ValueError (rows missing, or that do not fit).
     """
     with atomic_writer(path) as file:
         file.write(SIGNATURE)

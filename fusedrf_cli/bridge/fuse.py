@@ -18,6 +18,7 @@ from fusedrf_cli.engine.distillation.distill import (
     empty_student,
     student_from,
 )
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
@@ -65,7 +66,7 @@ def fuse(
                 max_numbers=numbers,
             )
             field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
-        kept = {f.member: f.record for f in loaded.fields} if keep_sources else {}
+        kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
         entry = {
             "event": "fused",
             "kind": chosen,
@@ -113,7 +114,7 @@ def choose_kind(kind: str, loaded: LoadedScene) -> str:
     """What was asked for; for auto, blocks where they can stand for the scene (VM sources, max composition),
     which came far nearer to it in far less time (DESIGN), else vm.
     """
-    possible = loaded.composition == "max" and all(type(p.field) is VMField for p in loaded.placed)
+    possible = loaded.composition == "max" and all(p.field.kind == VMField.kind for p in loaded.placed)
     if kind == "blocks" and not possible:
         raise InvalidInput(f"{loaded.path}: blocks need vm sources and 'max' composition; use --kind vm")
     return kind if kind != "auto" else ("blocks" if possible else "vm")
@@ -135,7 +136,8 @@ def fuse_blocks(
     progress.phase("blocks", None)
     started = time.monotonic()
     occupancies = {
-        id(p.field): sum(t.occupancy.occupied.size for t in p.field.tensors) // 8 for p in composed.placed
+        id(p.field): sum(t.occupancy.occupied.size for t in opened(p.field).tensors) // 8
+        for p in composed.placed
     }
     field = blocks_of(composed.placed, int(0.99 * limit) - sum(occupancies.values()) - 65536, precision)
     seconds = {"blocks": time.monotonic() - started}
@@ -183,7 +185,7 @@ def fuse_vm(
     background = background_of(loaded).placed
     moved = Placed(
         background.name,
-        background.field,
+        opened(background.field),
         composed.placed[[p.name for p in loaded.placed].index(background.name)].object_to_world,
     )
     warn_of_stretch(composed, progress)

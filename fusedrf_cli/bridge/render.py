@@ -15,6 +15,7 @@ from formats.png import depth_png_writer, png_writer
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.train import camera_of
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
@@ -77,7 +78,7 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
     if len(loaded.fields) == 1:
         placed = loaded.fields[0].placed
         if np.array_equal(placed.object_to_world[:3, :3], np.eye(3)):
-            return placed.field, placed.object_to_world[:3, 3]
+            return opened(placed.field), placed.object_to_world[:3, 3]
     composed = loaded.composed()
     return composed, composed.origin
 

@@ -1,12 +1,12 @@
 """A composed scene: several placed fields that together are one radiance field."""
 
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_cells
 from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
 
 OCCUPANCY_CELLS = OWNERSHIP_CELLS  # so that a scene and what it is fused to are framed alike
@@ -41,8 +41,9 @@ class ComposedField:
     @cached_property
     def occupancy(self) -> OccupancyGrid:
         """Cells that any placed field's occupied cells reach."""
-        grids = [(p.field.occupancy, p.object_to_world) for p in self.placed]
-        return placed_occupancy(grids, OCCUPANCY_CELLS)[0]
+        grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
+        aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
+        return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
     @property
     def aabb(self) -> np.ndarray:

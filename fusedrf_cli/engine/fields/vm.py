@@ -7,6 +7,7 @@ asked (two where they meet; the denser wins), so that a query costs the same how
 edit appends or drops a block and leaves the rest as it is.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import register
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_cells, transformed_aabb
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
 OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
@@ -171,15 +172,14 @@ class VMField:
         densest there."""
         if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
-        occupancy, marks = placed_occupancy(
-            [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks], OWNERSHIP_CELLS
+        grids = [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks]
+        boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
+        aabb, marks = placed_cells(boxes, grids, OWNERSHIP_CELLS)
+        first, second, count = claimed_cells(marks)
+        unsettled = cls(
+            shape, tensors, blocks, params, OccupancyGrid(aabb, count > 0), owners=(first, second)
         )
-        first, second = (
-            np.full(occupancy.occupied.shape, NO_BLOCK, np.uint8),
-            np.full(occupancy.occupied.shape, NO_BLOCK, np.uint8),
-        )
-        unsettled = cls(shape, tensors, blocks, params, occupancy, (first, second))
-        settle_owners(unsettled, marks, first, second)
+        settle_crowded(unsettled, np.argwhere(count > 2), first, second)
         return unsettled
 
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
@@ -284,7 +284,7 @@ class VMField:
             first,
             second,
             self._strides(),
-            np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).astype(np.uint8),
+            np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
         )
 
@@ -448,19 +448,27 @@ def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
     return np.asarray([[o, *s] for o, s in zip(offsets, shapes, strict=True)], np.int64)
 
 
-def settle_owners(field: VMField, marks: list[np.ndarray], first: np.ndarray, second: np.ndarray) -> None:
-    """Write the ownership grids: lower block first where one or two have matter in a cell, the two densest
-    where more have."""
-    count = np.sum(marks, axis=0, dtype=np.uint8)
+def claimed_cells(marks: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Three (X, Y, Z) uint8 grids: the lowest and second lowest block with matter in a cell, and how many
+    have."""
+    first = second = count = None
     for b, mark in enumerate(marks):
+        if first is None:
+            first, second = (np.full(mark.shape, NO_BLOCK, np.uint8) for _ in range(2))
+            count = np.zeros(mark.shape, np.uint8)
         second[mark & (first != NO_BLOCK) & (second == NO_BLOCK)] = b
         first[mark & (first == NO_BLOCK)] = b
-    crowded = np.argwhere(count > 2)
+        count += mark
+    return first, second, count
+
+
+def settle_crowded(field: VMField, crowded: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
+    """Give the cells (N, 3) in which more than two blocks have matter to the two densest."""
     if not len(crowded):
         return
     grid = field.occupancy
-    peak = np.zeros((len(marks), len(crowded)), np.float32)
-    for b in range(len(marks)):
+    peak = np.zeros((len(field.blocks), len(crowded)), np.float32)
+    for b in range(len(field.blocks)):
         cpu.density_at_cells(
             field.kernel_shape[0], field.arrays, b, grid.aabb[:3].copy(), grid.cell, crowded, PROBES, peak[b]
         )
