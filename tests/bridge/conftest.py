@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from click.testing import CliRunner
 
 from formats.captures import write_capture
@@ -22,13 +21,12 @@ from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.fields import vm
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.main import cli
-
-SHAPE = VMShape(16, 8, 1)  # the one that the engine's tests compile
+from tests.analytic.export import SHAPE, vm_field
+from tests.analytic.fields import Box, Tint
 
 
 @dataclass(frozen=True)
@@ -53,23 +51,8 @@ def part(name: str):
 
 
 def solid(rgb, half=(0.3, 0.3, 0.3), density: float = 20.0) -> VMField:
-    """A box of one density and one colour around its origin, by rank-1 factors on 16 x 16 x 16 texels."""
-    half = np.asarray(half, float)
-    box = np.concatenate([-half, half])
-    field = VMField(
-        SHAPE,
-        (VMTensor((16, 16, 16), box, density, 0.0, np.ones((4, 4, 4), bool)),),
-        (Block(0, np.eye(4), ""),),
-        torch.zeros(SHAPE.size((16, 16, 16))),
-        OccupancyGrid.full(box, 4),
-    )
-    sections = field.sections(0)
-    for what, value in (("density", np.log(np.e - 1)), ("colour", 1.0)):  # softplus gives 1
-        sections[f"{what}_plane_0"][..., 0] = value
-        sections[f"{what}_line_0"][:, 0] = 1
-    logits = np.log(np.asarray(rgb) / (1 - np.asarray(rgb)))
-    sections["colour_basis"][:, 0, 0] = torch.from_numpy(logits / 0.28209479177387814).float()
-    return field.with_occupancy(OccupancyGrid(box, np.ones((4, 4, 4), bool)))
+    """A box of one density and one colour around its origin, on 16 x 16 x 16 texels."""
+    return vm_field(Box(density, half, tint=Tint.of(*rgb)))
 
 
 FIELDS = {

@@ -8,27 +8,9 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import CONDITION_LIMIT, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from tests.engine.conftest import BOX, DIRECTIONS_26, AnalyticField, Gaussian, rays_at, unit
+from tests.analytic.fields import BOX, AnalyticField, Gaussian
+from tests.analytic.rays import DIRECTIONS_26, SHEAR, affine, rays_at, turn, unit
 
-
-def affine(linear, translation=(0.3, -0.2, 0.1)) -> np.ndarray:
-    """(4, 4) of a linear part: a number, three of them, or (3, 3)."""
-    matrix = np.eye(4)
-    linear = np.asarray(linear, float)
-    matrix[:3, :3] = linear if linear.ndim == 2 else np.diag(np.broadcast_to(linear, 3))
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def turn(degrees: float, axis=(1.0, 2.0, -0.5)) -> np.ndarray:
-    """(3, 3) rotation by Rodrigues' formula."""
-    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.radians(degrees)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-SHEAR = [[1, 0.8, 0], [0, 1, 0], [0.3, 0, 1]]
 PLACEMENTS = {
     "as it is": np.eye(4),
     "tiny": affine(1e-3),

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.composition.blocks import (
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.vm import VMShape
 from fusedrf_cli.engine.kernels.reference import vm_query
-from tests.engine.composition.test_affine import SHEAR, affine, turn
+from tests.analytic.rays import SHEAR, affine, turn
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Gaussian, points_in, random_vm, unit
 
 SHIFT = np.array([2.0, -1.0, 0.5])

@@ -11,7 +11,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
-from tests.engine.composition.test_affine import affine, turn
+from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, Ball, Gaussian, Slab, points_in, unit
 
 

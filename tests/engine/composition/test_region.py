@@ -8,7 +8,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.region import ClippedField, cleared, region_of
 from fusedrf_cli.engine.rendering.volume import render_rays
-from tests.engine.composition.test_affine import affine
+from tests.analytic.rays import affine
 from tests.engine.conftest import BOX, THIRTY_TWO, Gaussian, chord_of_box, points_in, random_vm, rays_at, unit
 
 HOLE = np.array([-0.2, -0.35, 0.1, 0.5, 0.2, 0.6])

@@ -20,7 +20,7 @@ from fusedrf_cli.engine.distillation.distill import (
     student_from,
 )
 from fusedrf_cli.engine.distillation.fit import texels
-from tests.engine.composition.test_affine import affine, turn
+from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
 
 TEACHER = Ball(density=40.0, radius=0.7).occupy(16)

@@ -1,0 +1,141 @@
+"""Analytic fields as every stored field kind: the same truth in each.
+
+`exported` looks a kind up in EXPORTERS; a kind that is registered in the engine and missing here is reported
+by `NotExportable`, which tests turn into a skip with that reason.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.vm_mlp import FEATURE_DEGREE, ColourNetwork, VMMLPField
+from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
+
+SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's tests too
+BANDED = VMShape(16, 24, 2)  # the default one, for tints of degree 2
+Y0, Y1 = 0.28209479177387814, 0.4886025119029199  # constants of the first two SH bands
+CELLS = 4  # of the occupancy, per axis
+
+
+class NotExportable(ValueError):
+    """The field cannot be told in that kind, or nobody has written how."""
+
+
+def exported(
+    field: AnalyticField, kind: str, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3, **options
+):
+    """The analytic field as a stored one of a registered kind; "analytic" is the field itself.
+
+    `options` go to the kind's own exporter below.
+    """
+    if kind == "analytic":
+        return field
+    if kind not in EXPORTERS:
+        raise NotExportable(f"nothing exports analytic fields to '{kind}' yet (tests/analytic/export.py)")
+    return EXPORTERS[kind](field, resolution, **options)
+
+
+def vm_field(
+    field: AnalyticField,
+    resolution: tuple[int, int, int] = (NOISE_NODES,) * 3,
+    shape: VMShape | None = None,
+    dtype: torch.dtype = torch.float32,
+    cells: int = CELLS,
+) -> VMField:
+    """A one-block VM field over the box of the field's matter.
+
+    Exact at the texels, and between them wherever the functions of `activation` and the tint are linear; hard
+    faces are those of the tensor's box.
+    """
+    tint = field.tint or Tint()
+    shape = shape or (BANDED if tint.bands.shape[1] else SHAPE)
+    vm = bare_field(field, resolution, shape, dtype, cells)
+    write_colour_products(vm, texels(vm))
+    basis = vm.sections(0)["colour_basis"]
+    level = np.concatenate(
+        [
+            np.asarray(tint.level)[:, None] / Y0,
+            tint.facing[:, [1, 2, 0]] / (np.array([-1, 1, -1]) * Y1),  # bands of degree 1 are -y, z, -x
+            tint.bands,
+        ],
+        1,
+    )
+    if level[:, shape.coefficients :].any():
+        raise NotExportable(f"this tint needs more than SH degree {shape.sh_degree}")
+    basis[:, : level.shape[1], 0] = torch.from_numpy(level[:, : shape.coefficients]).to(dtype)
+    basis[:, 0, 1:4] = torch.from_numpy(tint.slope / Y0).to(dtype)
+    return vm
+
+
+def vm_mlp_field(
+    field: AnalyticField, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3, cells: int = CELLS
+) -> VMMLPField:
+    """A vm-mlp field whose network computes an affine tint exactly: ReLU(z) - ReLU(-z) = z, twice."""
+    tint = field.tint or Tint()
+    if tint.bands.any():
+        raise NotExportable("the small network of 'vm-mlp' holds no tint of degree 2 or more exactly")
+    shape = replace(SHAPE, sh_degree=FEATURE_DEGREE)
+    vm = bare_field(field, resolution, shape, torch.float32, cells)
+    write_colour_products(vm, texels(vm))
+    features = 3 * shape.coefficients
+    vm.sections(0)["colour_basis"].view(features, -1)[:4, :4] = torch.eye(4)
+    network = ColourNetwork(features, width=8)
+    first = np.concatenate([np.asarray(tint.level)[:, None], tint.slope], 1)
+    with torch.no_grad():
+        for weights in network.parameters():
+            weights.zero_()
+        into = network.layers[0].weight
+        into[:3, :4], into[:3, features : features + 3] = map(torch.from_numpy, (first, tint.facing))
+        into[3:6] = -into[:3]
+        network.layers[1].weight[:6, :6] = torch.eye(6)
+        network.layers[2].weight[:, :6] = torch.cat([torch.eye(3), -torch.eye(3)], 1)
+    return VMMLPField(vm, network)
+
+
+def bare_field(
+    field: AnalyticField, resolution: tuple[int, int, int], shape: VMShape, dtype: torch.dtype, cells: int
+) -> VMField:
+    """The density alone: every term in one component of mode 0, a(x) b(y) in its plane and c(z) in its
+    line."""
+    told = field.activation
+    if told is None:
+        raise NotExportable(f"the density of {type(field).__name__} is no sum of products of axes")
+    box = field.matter
+    grid = OccupancyGrid(box, np.ones((cells,) * 3, bool))
+    vm = VMField(
+        shape,
+        (VMTensor(tuple(resolution), box, told.scale, SHIFT, grid.occupied),),
+        (Block(0, np.eye(4), ""),),
+        torch.zeros(shape.size(resolution), dtype=dtype),
+        grid,
+    )
+    x, y, z = texels(vm)
+    sections = vm.sections(0)
+    for i, (a, b, c) in enumerate(told.terms):
+        sections["density_plane_0"][..., i] = torch.from_numpy(np.outer(a(x), b(y))).to(dtype)
+        sections["density_line_0"][:, i] = torch.from_numpy(c(z)).to(dtype)
+    return vm
+
+
+def texels(field: VMField) -> list[np.ndarray]:
+    """Coordinates of the texels on each axis."""
+    (tensor,) = field.tensors
+    return [np.linspace(tensor.aabb[a], tensor.aabb[a + 3], tensor.resolution[a]) for a in range(3)]
+
+
+def write_colour_products(field: VMField, axes: list[np.ndarray]) -> None:
+    """Make the first four colour products 1, x, y and z."""
+    x, y, z = axes
+    plane, line = field.sections(0)["colour_plane_0"], field.sections(0)["colour_line_0"]
+    for i, values in enumerate((np.outer(x**0, y**0), np.outer(x, y**0), np.outer(x**0, y))):
+        plane[..., i] = torch.from_numpy(values).to(plane.dtype)
+        line[:, i] = 1
+    plane[..., 3] = 1
+    line[:, 3] = torch.from_numpy(z).to(line.dtype)
+
+
+EXPORTERS: dict[str, Callable] = {"vm": vm_field, "vm-mlp": vm_mlp_field}
