@@ -11,8 +11,10 @@ from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.fuse import stored
+from fusedrf_cli.bridge.memory import FLOAT, Memory, ownership, picture, sources
+from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import history_nodes, load_scene, make_field, write_field
+from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -37,6 +39,7 @@ def add(
     object_to_world: np.ndarray,
     time_budget: float | None,
     rgb: bool,
+    memory: int | None,
     precision: str,
     overwrite: bool,
     seed: int,
@@ -50,10 +53,12 @@ def add(
     with engine(device, threads, progress):
         started = time.monotonic()
         progress.phase("reading", None)
-        scene, members, node, field = read_fused(fused)
+        budget = Memory(memory)
+        scene, members, node, field = read_fused(fused, budget)
         if name in names_in(scene, field, node.name):
             raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
-        new = load_scene(source)
+        new = load_scene(source, budget=budget)
+        budget.expect(addition_memory(field, new), "add a smaller object")
         origin = node.object_to_world[:3, 3]
         objects = [
             Placed(name, opened(p.field), object_to_world @ p.object_to_world).moved(origin)
@@ -98,7 +103,7 @@ def add(
         name,
         box + np.tile(origin, 2),
         result,
-        {"psnr": {"before_rgb": reached}},
+        {"psnr": {"before_rgb": reached}, "memory": budget.report()},
         started,
     )
 
@@ -186,7 +191,18 @@ def delete(
     )
 
 
-def read_fused(path: str) -> tuple[SceneGraph, list[str], Leaf, VMField]:
+def addition_memory(field: VMField, new: LoadedScene) -> dict[str, float]:
+    """What adding a scene's fields to a field needs."""
+    size, numbers = REGION_SETTINGS.view_size, field.params.numel() + sum(new.sizes) // FLOAT
+    return (
+        sources([field.params.numel() * FLOAT, *new.sizes])
+        | finished(numbers)
+        | ownership(field.aabb)
+        | picture(size, size, composed=True)
+    )
+
+
+def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, list[str], Leaf, VMField]:
     """The scene of a bundle of one field, its other members (kept sources), the field's leaf, and the field;
     InvalidInput when it is something else.
     """
@@ -198,6 +214,8 @@ def read_fused(path: str) -> tuple[SceneGraph, list[str], Leaf, VMField]:
         raise InvalidInput(
             f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
         )
+    if budget is not None:
+        budget.expect(sources([headers[leaves[0].field].decoded_size]), "edit a smaller field")
     field = make_field(read_field(path, leaves[0].field), path)
     if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from formats.captures import is_capture, load_images, read_capture
-from fusedrf_cli.bridge.render import renderable
+from fusedrf_cli.bridge.memory import Memory, measured, sources
+from fusedrf_cli.bridge.render import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.train import WHITE, camera_of, over_white
@@ -26,6 +27,7 @@ def evaluate(
     *,
     split: str,
     size: tuple[int, int] | None,
+    memory: int | None,
     allow_outside: bool,
     device: str,
     threads: int | None,
@@ -36,7 +38,9 @@ def evaluate(
     """
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        field, origin = renderable(load_scene(bundle, allow_outside))
+        budget = Memory(memory)
+        loaded = load_scene(bundle, allow_outside, budget)
+        field, origin = renderable(loaded)
         pairs = (
             capture_pairs(against, split, size)
             if is_capture(against)
@@ -45,6 +49,9 @@ def evaluate(
         views = []
         for i, (camera, truth, total) in enumerate(pairs):
             if i == 0:
+                side = camera.width, camera.height
+                needed = picture_memory(field, [camera], film=False) | measured(*side)
+                budget.expect(sources(loaded.sizes) | needed, "give a smaller --size")
                 progress.phase("rendering", total)
             shot = render_image(field, camera, origin=origin).over(WHITE)
             views.append({"name": camera.name, "psnr": psnr(shot, truth), "ssim": ssim(shot, truth)})
@@ -54,6 +61,7 @@ def evaluate(
         "against": against,
         "mean": {k: float(np.mean([v[k] for v in views])) for k in ("psnr", "ssim")},
         "views": views,
+        "memory": budget.report(),
     }
 
 

@@ -5,6 +5,17 @@ import time
 import numpy as np
 import torch
 
+from fusedrf_cli.bridge.memory import (
+    FLOAT,
+    READING,
+    Memory,
+    learning,
+    ownership,
+    picture,
+    result,
+    sources,
+    teaching,
+)
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, save_checkpoint
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, history_nodes, load_scene, write_field
 from fusedrf_cli.bridge.train import BYTES_PER_NUMBER
@@ -16,13 +27,17 @@ from fusedrf_cli.engine.distillation.distill import (
     Judge,
     distill,
     empty_student,
+    resolution_for,
     student_from,
 )
+from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000
+RECKONED_RAYS = 2000  # of which the number of points is reckoned
+KEPT_POINTS = 0.35  # of a distillation's samples
 HEADER_BYTES = 16384  # scene graph, history and headers of a bundle, about
 CONDITION_NOTED = 1.02  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
@@ -38,6 +53,7 @@ def fuse(
     rgb: bool,
     from_scratch: bool,
     keep_sources: bool,
+    memory: int | None,
     precision: str,
     resume: bool,
     allow_outside: bool,
@@ -50,12 +66,15 @@ def fuse(
     """Turn a composed scene into one field and write it with the scene's history."""
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        loaded = load_scene(scene, allow_outside)
+        budget = Memory(memory)
+        loaded = load_scene(scene, allow_outside, budget)
         composed = loaded.composed()
         chosen = choose_kind(kind, loaded)
         limit = max_size or DEFAULT_MAX_SIZE
         started = time.monotonic()
         if chosen == "blocks":
+            needed = blocks_memory(loaded, composed, limit // BYTES_PER_NUMBER[precision])
+            make_room(budget, loaded, needed)
             field, figures = fuse_blocks(loaded, composed, limit, precision, seed, progress)
         else:
             overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
@@ -65,6 +84,8 @@ def fuse(
                 time_budget=time_budget,
                 max_numbers=numbers,
             )
+            needed = vm_memory(loaded, composed, settings)
+            make_room(budget, loaded, needed)
             field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
         kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
         entry = {
@@ -93,9 +114,46 @@ def fuse(
         "kind": chosen,
         **figures,
         "total_seconds": time.monotonic() - started,
+        "memory": budget.report(),
     }
     check_target(report, target_psnr, output)
     return report
+
+
+def make_room(budget: Memory, loaded: LoadedScene, needed: dict[str, float]) -> None:
+    """Keep no more sources in memory than fit beside what else is needed; ResourceProblem where not even one
+    does.
+    """
+    loaded.shelf.resize(budget.room(needed) - READING * max(loaded.sizes))
+    budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, "give a smaller --max-size")
+
+
+def blocks_memory(loaded: LoadedScene, composed: ComposedField, numbers: int) -> dict[str, float]:
+    """What compiling a scene to blocks of at most so many numbers needs beside the sources."""
+    numbers = min(numbers, sum(loaded.sizes) // FLOAT)
+    size = DistillSettings.view_size
+    return result(numbers) | ownership(composed.aabb) | picture(size, size, composed=True)
+
+
+def vm_memory(loaded: LoadedScene, composed: ComposedField, settings: DistillSettings) -> dict[str, float]:
+    """What distilling a scene into one tensor needs beside the sources; the points that its rays will keep
+    are reckoned from a few of them.
+    """
+    box = composed.aabb
+    resolution = resolution_for(box, composed.voxel_size, settings.shape, settings.max_numbers)
+    numbers = settings.shape.size(resolution)
+    generator = torch.Generator().manual_seed(settings.seed)
+    boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
+    few = random_rays(boxes, RECKONED_RAYS, generator)
+    step = 0.5 * float(np.max((box[3:] - box[:3]) / (np.asarray(resolution) - 1)))
+    kept = len(ask(composed, *few, step, generator, KEPT_POINTS).points)
+    return (
+        result(numbers)
+        | learning(numbers, torch.get_num_threads())
+        | teaching(settings, kept * settings.rays // RECKONED_RAYS)
+        | ownership(box)
+        | picture(256, 256, composed=True)
+    )
 
 
 def check_target(report: dict, target_psnr: float | None, output: str) -> None:

@@ -12,6 +12,7 @@ from formats.atomic import atomic_folder
 from formats.captures import read_cameras
 from formats.images import check_film, write_film
 from formats.png import depth_png_writer, png_writer
+from fusedrf_cli.bridge.memory import Memory, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.train import camera_of
@@ -22,6 +23,7 @@ from fusedrf_cli.errors import UsageProblem
 
 DEFAULT_SIZE = (800, 800)
 FILMS = (".gif", ".mp4")
+FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
 def render(
@@ -35,6 +37,7 @@ def render(
     background: tuple[float, float, float] | None,
     depth: bool,
     fps: float,
+    memory: int | None,
     allow_outside: bool,
     overwrite: bool,
     seed: int,
@@ -52,13 +55,17 @@ def render(
             raise UsageProblem("a film has neither depth nor transparency; render to a folder instead")
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        loaded = load_scene(scene, allow_outside)
+        budget = Memory(memory)
+        loaded = load_scene(scene, allow_outside, budget)
         field, origin = renderable(loaded)
         views = choose_views(field, origin, cameras or path, orbit, size)
         if suffix == ".png" and len(views) > 1:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
             )
+        needed = picture_memory(field, views, suffix in FILMS)
+        loaded.shelf.resize(budget.room(needed))
+        budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, "give a smaller --size")
         progress.phase("rendering", len(views))
         shooting = _Shooting(field, origin, background, depth, progress)
         if suffix in FILMS:
@@ -68,7 +75,21 @@ def render(
             files = [shooting.picture(Path(output), views[0])]
         else:
             files = shooting.folder(Path(output), views, overwrite)
-    return {"output": output, "files": files, "views": len(views), "size": [views[0].width, views[0].height]}
+    return {
+        "output": output,
+        "files": files,
+        "views": len(views),
+        "size": [views[0].width, views[0].height],
+        "memory": budget.report(),
+    }
+
+
+def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
+    """What rendering needs beside the sources."""
+    largest = max(views, key=lambda view: view.width * view.height)
+    pixels = largest.width * largest.height
+    needed = picture(largest.width, largest.height, composed=not hasattr(field, "render_rays"))
+    return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
 
 
 def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:

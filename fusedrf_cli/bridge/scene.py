@@ -12,6 +12,7 @@ from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sh
 from formats.records import FieldHeader, FieldRecord
 from formats.scene import SceneGraph, expand_scene, inline_scenes, make_node, parse_scene, resolve_source
 from fusedrf_cli import __version__
+from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -77,29 +78,29 @@ def make_field(record: FieldRecord, where: str):
         ) from error
 
 
-def load_scene(path: str, allow_outside: bool = False, shelf: Shelf | None = None) -> LoadedScene:
+def load_scene(path: str, allow_outside: bool = False, budget: Memory | None = None) -> LoadedScene:
     """Read a bundle, a scene.json or '-' with all fields it places; equal members become one field.
 
-    Of the fields, as many stay in memory as `shelf` has room for; others are read again when asked.
+    Of the fields, as many stay in memory as the budget has room for; others are read again when asked. Raises
+    ResourceProblem where not even the largest fits, before it is read.
     """
-    shelf = shelf or Shelf()
     if path == "-":
         where = Path.cwd() / "scene.json"
         graph = inline_scenes(
             parse_scene(sys.stdin.buffer.read(STDIN_LIMIT + 1), "standard input"), where, allow_outside
         )
-        return _Loader(where, shelf).load(graph, allow_outside)
+        return _Loader(where, budget).load(graph, allow_outside)
     if is_bundle(path):
         scene, headers = read_headers(path)
-        return _Loader(Path(path), shelf).load(scene, allow_outside, headers)
-    return _Loader(Path(path), shelf).load(expand_scene(path, allow_outside), allow_outside)
+        return _Loader(Path(path), budget).load(scene, allow_outside, headers)
+    return _Loader(Path(path), budget).load(expand_scene(path, allow_outside), allow_outside)
 
 
 class _Loader:
     """Finds the fields of one scene; every bundle's headers are read once."""
 
-    def __init__(self, path: Path, shelf: Shelf):
-        self.path, self.shelf = path, shelf
+    def __init__(self, path: Path, budget: Memory | None):
+        self.path, self.budget, self.shelf = path, budget, Shelf()
         self.bundles: dict[Path, tuple[SceneGraph, dict[str, FieldHeader]]] = {}
         self.fields: dict[str, StreamedField] = {}
 
@@ -110,15 +111,20 @@ class _Loader:
         for leaf in graph.leaves():
             if leaf.field is not None:
                 where = leaf.name, leaf.object_to_world, leaf.background
-                found.append(self.source(*where, self.path, leaf.field, (headers or {})[leaf.field]))
+                found.append((*where, self.path, leaf.field, (headers or {})[leaf.field]))
             elif leaf.source is not None:
                 found += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
         if not found:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
-        return LoadedScene(tuple(found), graph.composition, graph, self.path, self.shelf)
+        if self.budget is not None:
+            sizes = list({member: header.decoded_size for *_, member, header in found}.values())
+            self.shelf.resize(self.budget.room({}))
+            self.budget.expect(sources(sizes, self.shelf.room), "use smaller sources")
+        fields = tuple(self.source(*where) for where in found)
+        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf)
 
-    def sources(self, leaf, path: Path) -> list[SourceField]:
-        """The fields of the bundle that a leaf names."""
+    def sources(self, leaf, path: Path) -> list[tuple]:
+        """The arguments of `source` for the fields of the bundle that a leaf names."""
         if path not in self.bundles:
             if not is_bundle(path):
                 raise InvalidInput(
@@ -135,7 +141,7 @@ class _Loader:
             )
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
         return [
-            self.source(
+            (
                 name,
                 leaf.object_to_world @ node.object_to_world,
                 leaf.background,
