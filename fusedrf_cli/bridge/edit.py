@@ -11,7 +11,7 @@ from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.fuse import stored
-from fusedrf_cli.bridge.memory import FLOAT, Memory, ownership, picture, sources
+from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, make_field, write_field
@@ -58,7 +58,7 @@ def add(
         if name in names_in(scene, field, node.name):
             raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
         new = load_scene(source, budget=budget)
-        budget.expect(addition_memory(field, new), "add a smaller object")
+        budget.expect(*addition_memory(field, new), advice="add a smaller object")
         origin = node.object_to_world[:3, 3]
         objects = [
             Placed(name, opened(p.field), object_to_world @ p.object_to_world).moved(origin)
@@ -191,15 +191,14 @@ def delete(
     )
 
 
-def addition_memory(field: VMField, new: LoadedScene) -> dict[str, float]:
-    """What adding a scene's fields to a field needs."""
-    size, numbers = REGION_SETTINGS.view_size, field.params.numel() + sum(new.sizes) // FLOAT
-    return (
-        sources([field.params.numel() * FLOAT, *new.sizes])
-        | finished(numbers)
-        | ownership(field.aabb)
-        | picture(size, size, composed=True)
-    )
+def addition_memory(field: VMField, new: LoadedScene) -> list[dict[str, float]]:
+    """The stages of adding a scene's fields to a field: putting together, measuring."""
+    view, old = REGION_SETTINGS.view_size, field.params.numel() * FLOAT
+    sizes, numbers = [old, *new.sizes], (old + sum(new.sizes)) // FLOAT
+    return [
+        sources(sizes, copies=RESAMPLING) | finished(numbers, measured=False) | ownership(field.aabb),
+        sources(sizes) | finished(numbers) | ownership(field.aabb) | picture(view, view // 2, composed=True),
+    ]
 
 
 def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, list[str], Leaf, VMField]:
@@ -215,7 +214,9 @@ def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, lis
             f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
         )
     if budget is not None:
-        budget.expect(sources([headers[leaves[0].field].decoded_size]), "edit a smaller field")
+        budget.expect(
+            sources([headers[leaves[0].field].decoded_size], copies=READING), advice="edit a smaller field"
+        )
     field = make_field(read_field(path, leaves[0].field), path)
     if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")

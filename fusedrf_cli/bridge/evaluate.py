@@ -12,7 +12,7 @@ from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.train import WHITE, camera_of, over_white
 from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
-from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import InvalidInput
 
@@ -51,8 +51,13 @@ def evaluate(
             if i == 0:
                 side = camera.width, camera.height
                 needed = picture_memory(field, [camera], film=False) | measured(*side)
-                budget.expect(sources(loaded.sizes) | needed, "give a smaller --size")
+                budget.expect(sources(loaded.sizes) | needed, advice="give a smaller --size")
                 progress.phase("rendering", total)
+                if min(side) < SSIM_WINDOW:
+                    progress.warn(
+                        f"SSIM compares windows of {SSIM_WINDOW} pixels a side, and the pictures are "
+                        f"{side[0]}x{side[1]}: it is left out"
+                    )
             shot = render_image(field, camera, origin=origin).over(WHITE)
             views.append({"name": camera.name, "psnr": psnr(shot, truth), "ssim": ssim(shot, truth)})
             progress.advance(i + 1, psnr=views[-1]["psnr"])

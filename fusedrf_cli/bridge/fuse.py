@@ -7,7 +7,7 @@ import torch
 
 from fusedrf_cli.bridge.memory import (
     FLOAT,
-    READING,
+    RESAMPLING,
     Memory,
     learning,
     ownership,
@@ -73,8 +73,8 @@ def fuse(
         limit = max_size or DEFAULT_MAX_SIZE
         started = time.monotonic()
         if chosen == "blocks":
-            needed = blocks_memory(loaded, composed, limit // BYTES_PER_NUMBER[precision])
-            make_room(budget, loaded, needed)
+            numbers = limit // BYTES_PER_NUMBER[precision]
+            make_room(budget, loaded, *blocks_memory(loaded, composed, numbers))
             field, figures = fuse_blocks(loaded, composed, limit, precision, seed, progress)
         else:
             overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
@@ -84,8 +84,7 @@ def fuse(
                 time_budget=time_budget,
                 max_numbers=numbers,
             )
-            needed = vm_memory(loaded, composed, settings)
-            make_room(budget, loaded, needed)
+            make_room(budget, loaded, *vm_memory(loaded, composed, settings))
             field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
         kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
         entry = {
@@ -120,23 +119,38 @@ def fuse(
     return report
 
 
-def make_room(budget: Memory, loaded: LoadedScene, needed: dict[str, float]) -> None:
-    """Keep no more sources in memory than fit beside what else is needed; ResourceProblem where not even one
-    does.
+def make_room(budget: Memory, loaded: LoadedScene, *stages: tuple[float, dict[str, float]]) -> None:
+    """Keep no more sources in memory than fit beside what every stage needs, which is so many copies of the
+    largest one and other things; ResourceProblem where not even one does.
     """
-    loaded.shelf.resize(budget.room(needed) - READING * max(loaded.sizes))
-    budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, "give a smaller --max-size")
+    sizes, shelf = loaded.sizes, loaded.shelf
+    shelf.resize(min(budget.room(needed) - copies * max(sizes) for copies, needed in stages))
+    budget.expect(
+        *(sources(sizes, shelf.room, copies) | needed for copies, needed in stages),
+        advice="give a smaller --max-size",
+    )
 
 
-def blocks_memory(loaded: LoadedScene, composed: ComposedField, numbers: int) -> dict[str, float]:
-    """What compiling a scene to blocks of at most so many numbers needs beside the sources."""
-    numbers = min(numbers, sum(loaded.sizes) // FLOAT)
-    size = DistillSettings.view_size
-    return result(numbers) | ownership(composed.aabb) | picture(size, size, composed=True)
+def blocks_memory(
+    loaded: LoadedScene, composed: ComposedField, numbers: int
+) -> list[tuple[float, dict[str, float]]]:
+    """The stages of compiling a scene to blocks of at most so many numbers: putting together, measuring."""
+    numbers, grids = min(numbers, sum(loaded.sizes) // FLOAT), ownership(composed.aabb)
+    return [
+        (RESAMPLING, result(numbers, measured=False) | grids),
+        (0.0, result(numbers) | grids | judged()),
+    ]
 
 
-def vm_memory(loaded: LoadedScene, composed: ComposedField, settings: DistillSettings) -> dict[str, float]:
-    """What distilling a scene into one tensor needs beside the sources; the points that its rays will keep
+def judged() -> dict[str, float]:
+    """Looking at a scene to measure; it covers about half of a picture that frames it."""
+    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)
+
+
+def vm_memory(
+    loaded: LoadedScene, composed: ComposedField, settings: DistillSettings
+) -> list[tuple[float, dict[str, float]]]:
+    """The stages of distilling a scene into one tensor: asking, learning. The points that its rays will keep
     are reckoned from a few of them.
     """
     box = composed.aabb
@@ -147,13 +161,11 @@ def vm_memory(loaded: LoadedScene, composed: ComposedField, settings: DistillSet
     few = random_rays(boxes, RECKONED_RAYS, generator)
     step = 0.5 * float(np.max((box[3:] - box[:3]) / (np.asarray(resolution) - 1)))
     kept = len(ask(composed, *few, step, generator, KEPT_POINTS).points)
-    return (
-        result(numbers)
-        | learning(numbers, torch.get_num_threads())
-        | teaching(settings, kept * settings.rays // RECKONED_RAYS)
-        | ownership(box)
-        | picture(256, 256, composed=True)
-    )
+    answers = teaching(settings, kept * settings.rays // RECKONED_RAYS) | ownership(box)
+    return [
+        (0.0, result(numbers, measured=False) | answers | picture(256, 256, composed=True)),
+        (0.0, learning(numbers, torch.get_num_threads()) | answers),
+    ]
 
 
 def check_target(report: dict, target_psnr: float | None, output: str) -> None:

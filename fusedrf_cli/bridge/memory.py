@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from fusedrf_cli.engine.distillation.distill import DistillSettings
-from fusedrf_cli.engine.distillation.fit import RESOLUTION_STAGES, FitSettings, texels
+from fusedrf_cli.engine.distillation.fit import FitSettings, texels
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
@@ -23,12 +23,13 @@ from fusedrf_cli.report import readable_size
 SHARE_OF_FREE = 0.8
 FLOAT = 4
 COMPILED = 130 << 20  # kernels, once they are loaded, and the libraries that come with them
-READING = 1.5  # of a field's numbers, on top of them, while it is read: decoded arrays, and the file's pages
+READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
+RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
 PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
-PER_SAMPLE = 150  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
+PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
-PER_TRIED_CELL = 240  # of the cells that a fit asks for their density: indices, centres and their copies
+PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
 PER_POINT = 128  # of a teacher's points, in pieces and joined
 PER_PIXEL_OF_PHOTOS = 4 + 16  # colours, and two orders of drawing
@@ -45,8 +46,11 @@ class Memory:
         self.limit = limit if self.asked else int(self.base + SHARE_OF_FREE * available())
         self.predicted = 0
 
-    def expect(self, parts: Mapping[str, float], advice: str) -> None:
-        """Hold the sum of parts, by what they are, against the limit. Raises ResourceProblem, with advice."""
+    def expect(self, *stages: Mapping[str, float], advice: str) -> None:
+        """Hold the largest of the stages, each a sum of parts by what they are, against the limit. Raises
+        ResourceProblem, with advice.
+        """
+        parts = max(stages, key=lambda stage: sum(stage.values()))
         needed = int(self.base + COMPILED + sum(parts.values()))
         self.predicted = max(self.predicted, needed)
         if needed > self.limit:
@@ -98,10 +102,11 @@ def available() -> int:
     return found
 
 
-def sources(sizes: list[int], room: float = float("inf")) -> dict[str, float]:
-    """Distinct fields of those sizes, as many as there is room for, and reading the largest."""
-    held = max(min(sum(sizes), room), max(sizes))
-    return {"the sources": held + READING * max(sizes)}
+def sources(sizes: list[int], room: float = float("inf"), copies: float = 0.0) -> dict[str, float]:
+    """Distinct fields of those sizes, as many as there is room for, and more of the largest while it is worked
+    on: READING copies, or RESAMPLING.
+    """
+    return {"the sources": max(min(sum(sizes), room), max(sizes)) + copies * max(sizes)}
 
 
 def picture(width: int, height: int, composed: bool) -> dict[str, float]:
@@ -121,9 +126,9 @@ def ownership(aabb: np.ndarray) -> dict[str, float]:
     return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, OWNERSHIP_CELLS)))}
 
 
-def result(numbers: int) -> dict[str, float]:
-    """A finished field of so many numbers: itself, and as it will be stored and come back."""
-    return {"the result": numbers * (FLOAT + 2 + FLOAT)}
+def result(numbers: int, measured: bool = True) -> dict[str, float]:
+    """A finished field of so many numbers: itself, and while it is measured also as it will be stored."""
+    return {"the result": numbers * (FLOAT + (2 + FLOAT) * measured)}
 
 
 def learning(numbers: int, threads: int) -> dict[str, float]:
@@ -138,15 +143,10 @@ def photos(count: int, width: int, height: int, cameras: int) -> dict[str, float
 
 
 def fitting(settings: FitSettings, aabb: np.ndarray, threads: int) -> dict[str, float]:
-    """The field of a fit over a box (6,) at its full resolution, beside what it grew out of."""
+    """The field of a fit over a box (6,) at its full resolution, while its occupancy is made anew."""
     numbers = settings.shape.size(texels(aabb, settings.longest))
-    before = settings.shape.size(texels(aabb, round(settings.longest * RESOLUTION_STAGES[-2][1])))
     grid = np.prod(cell_counts(aabb, min(DEFAULT_CELLS, settings.longest)))
-    return {
-        **learning(numbers, threads),
-        "the resolution before": before * FLOAT * (threads + 2),
-        "its occupancy": float(grid) * PER_TRIED_CELL,
-    }
+    return {**learning(numbers, threads), "its occupancy": float(grid) * PER_TRIED_CELL}
 
 
 def teaching(settings: DistillSettings, points: int) -> dict[str, float]:

@@ -65,7 +65,7 @@ def render(
             )
         needed = picture_memory(field, views, suffix in FILMS)
         loaded.shelf.resize(budget.room(needed))
-        budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, "give a smaller --size")
+        budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
         progress.phase("rendering", len(views))
         shooting = _Shooting(field, origin, background, depth, progress)
         if suffix in FILMS:

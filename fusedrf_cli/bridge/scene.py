@@ -12,7 +12,7 @@ from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sh
 from formats.records import FieldHeader, FieldRecord
 from formats.scene import SceneGraph, expand_scene, inline_scenes, make_node, parse_scene, resolve_source
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.memory import Memory, sources
+from fusedrf_cli.bridge.memory import READING, Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -119,7 +119,7 @@ class _Loader:
         if self.budget is not None:
             sizes = list({member: header.decoded_size for *_, member, header in found}.values())
             self.shelf.resize(self.budget.room({}))
-            self.budget.expect(sources(sizes, self.shelf.room), "use smaller sources")
+            self.budget.expect(sources(sizes, self.shelf.room, READING), advice="use smaller sources")
         fields = tuple(self.source(*where) for where in found)
         return LoadedScene(fields, graph.composition, graph, self.path, self.shelf)
 

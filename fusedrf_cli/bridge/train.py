@@ -80,7 +80,9 @@ def train(
             near=0.0,
         )
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
-        budget.expect(fit_memory(capture, box, settings), "use fewer or smaller photos, or a lower --quality")
+        budget.expect(
+            fit_memory(capture, box, settings), advice="use fewer or smaller photos, or a lower --quality"
+        )
         cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
         run = FitRun.start(cameras, images, box, settings, Path(source).resolve().stem)
         if saved:
