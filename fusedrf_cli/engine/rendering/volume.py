@@ -48,8 +48,12 @@ def render_rays(
     """Render rays (N, 3) float64 of the field's frame: (N, 5) float32 premultiplied rgb, opacity, Σ w t.
 
     A ray's numbers do not depend on which others it is rendered with. Where memory is short, fewer rays are
-    done at once; MemoryError (or torch's own) when even that does not help.
+    done at once; MemoryError (or torch's own) when even that does not help. Raises ValueError for a direction
+    of no length, along which there is no end, or one that is not finite.
     """
+    lengths = np.einsum("ni,ni->n", rays_d, rays_d)
+    if not ((lengths > 0) & (lengths < np.inf)).all():
+        raise ValueError(f"ray {np.argmax(~((lengths > 0) & (lengths < np.inf)))} has no direction")
     step = step or STEP_PER_VOXEL * field.voxel_size
     out = np.zeros((len(rays_o), 5), np.float32)
     fast = getattr(field, "render_rays", None)
