@@ -103,8 +103,8 @@ def available() -> int:
 
 
 def sources(sizes: list[int], room: float = float("inf"), copies: float = 0.0) -> dict[str, float]:
-    """Distinct fields of those sizes, as many as there is room for, and more of the largest while it is worked
-    on: READING copies, or RESAMPLING.
+    """Distinct fields of those sizes, as many as there is room for, and copies of the largest while it is
+    worked on: READING, RESAMPLING or none.
     """
     return {"the sources": max(min(sum(sizes), room), max(sizes)) + copies * max(sizes)}
 

@@ -87,8 +87,8 @@ def test_d1_twice_the_samples_show_the_same_of_smooth_matter(row, kind):
 
 @pytest.mark.parametrize("peak", [1.0, 10.0, 100.0])
 def test_d1_hard_surfaces_at_every_step(row, peak):
-    """Turned boxes 64 voxels wide with σh = 1, 10 and 100 inside hard faces: 40 dB at the default step of half
-    a voxel, 50 at an eighth."""
+    """Turned boxes 64 voxels wide with σh = 1, 10 and 100 inside hard faces: 40 dB by the default step of
+    half a voxel, 50 by an eighth."""
     parts = []
     for part in scenes.s8_boxes(4, 20).parts:
         half = part.field.aabb[3:]

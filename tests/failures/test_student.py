@@ -19,10 +19,10 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, without
 from fusedrf_cli.engine.distillation.distill import distill, empty_student
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.main import cli
 from tests.analytic import scenes
-from tests.analytic.export import SHAPE, vm_field
+from tests.analytic.export import SHAPE, exported, vm_field
 from tests.analytic.fields import Box, Gaussian, Tint
 from tests.analytic.rays import affine, turn
 from tests.bridge.conftest import TinySettings, tiny  # noqa: F401  (grids, steps and pictures made small)
@@ -58,7 +58,7 @@ def shop(tmp_path_factory, tiny):  # noqa: F811
     """Bundles of PARTS, scene.json of all and pair.json without blue, both fused; vm.rfpack is distilled."""
     folder = tmp_path_factory.mktemp("shop")
     for name, (box, _) in PARTS.items():
-        write_field(str(folder / f"{name}.rfpack"), vm_field(box), name, precision="float16", overwrite=False)
+        write_field(str(folder / f"{name}.rfpack"), vm_field(box, (40,) * 3), name, precision="float16", overwrite=False)
     for file, names in (("scene", PARTS), ("pair", ("floor", "red"))):
         nodes = [make_node(n, source=f"{n}.rfpack", matrix=PARTS[n][1].tolist()) for n in names]
         write_scene(folder / f"{file}.json", SceneGraph(tuple(nodes)))
@@ -118,8 +118,9 @@ def test_c1_an_object_beyond_the_bounds_leaves_the_rest(row, folder, growth):
     kept = tensors(folder / "far.rfpack")[:2] == tensors(folder / "pair.rfpack")
     row.check("C1", f"old tensors bit-equal at g = {growth:g}", kept, 1)
     away = ~reached(PARTS["blue"][0].aabb, affine(1.0, (-x, 0, 0)))
-    figure = psnr(picture(folder, "far.rfpack")[away], before[away])
-    row.check("C1", f"untouched pixels at g = {growth:g}", figure, 50.0, unit="dB")
+    wanted = truth("floor", "red")[away]  # samples begin at the larger box, so the two pictures differ a bit
+    lost = psnr(before[away], wanted) - psnr(picture(folder, "far.rfpack")[away], wanted)
+    row.check("C1", f"lost by untouched pixels at g = {growth:g}", lost, 0.5, at_most=True, unit="dB")
 
 
 def test_c1_what_does_not_fit_the_memory_is_refused_with_the_number(row, folder):
@@ -251,8 +252,6 @@ def test_c6_fog_keeps_its_opacity(row, folder, tau):
     scene = scenes.scene_of((fog, np.eye(4)), (CUBE, affine(1.0, (0, 2.0, 0))))
     rays = np.tile([[-3.0, 0.02, 0.01]], (7, 1)), np.array([[1.0, a / 40, a / 60] for a in range(-3, 4)])
     rays = rays[0], rays[1] / np.linalg.norm(rays[1], axis=1, keepdims=True)
-    from fusedrf_cli.engine.rendering.volume import render_rays
-
     wanted = scene.pixels(*rays)[:, 3]
     for name, field in (("composed", scene.composed("vm", resolution=(64,) * 3)), ("blocks", None)):
         field, origin = (field, field.origin) if field is not None else scene.blocks(resolution=(64,) * 3)
@@ -262,7 +261,7 @@ def test_c6_fog_keeps_its_opacity(row, folder, tau):
 
 
 def test_c7_a_white_edge_is_white(row, folder):
-    """A near-white box on black, resampled to a quarter of its voxels: what every pixel shows is its opacity's
+    """A near-white box on black, resampled to a quarter of its voxels: pixels show their opacity's
     worth of white."""
     white = Tint.of(0.98, 0.98, 0.98)
     field = blocks_of(
@@ -308,6 +307,7 @@ def test_c8_turned_boxes_are_as_good_as_upright_ones(row):
         found = np.stack([render_image(field, c, origin=origin).over(WHITE) for c in cameras])
         figures.append(psnr(found, np.stack([scene.image(c) for c in cameras])))
     row.check("C8", "worst PSNR over 0 to 45 degrees", min(figures), 40.0, unit="dB")
+    row.check("C8", "lost by turning", figures[0] - min(figures), 1.0, at_most=True, unit="dB")
 
 
 def distilled(scene, seed: int, **more):
@@ -339,11 +339,7 @@ def test_c8_c9_five_seeds_of_one_tensor(row):
 
 @pytest.mark.parametrize("density", [0.5, 60.0, 1e4])
 def test_c10_float16_looks_like_float32(row, tmp_path, kind, density):
-    from tests.analytic.export import exported
-
     for truth in (Box(density, 0.5, noise=0.3, tint=scenes.RED), Gaussian(density, tint=scenes.SAND)):
-        if kind != "vm" and truth.noise if isinstance(truth, Box) else False:
-            continue
         field, shots = exported(truth, kind, (16,) * 3), []
         for precision in ("float16", "float32"):
             path = str(tmp_path / f"{precision}.rfpack")
@@ -361,12 +357,9 @@ def test_c11_what_is_cut_out_does_not_show_through(row, folder):
     (record,) = read_bundle(folder / "less.rfpack").fields.values()
     leaf = read_bundle(folder / "less.rfpack").scene.leaves()[0]
     field = make_field(record, "less.rfpack")
-    from fusedrf_cli.engine.rendering.volume import render_rays
-
     y, z = np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0.0, 0.1, 5))
-    rays_o = np.stack([0.7 + 0 * y.ravel(), y.ravel(), z.ravel() + 3.0 * 0], 1)
-    rays_o = rays_o + [0, 0, 1.5] - leaf.object_to_world[:3, 3]
-    found = render_rays(field, rays_o, np.tile([[0.0, 0, -1.0]], (25, 1)), near=0.0)
+    rays_o = np.stack([np.full(25, 0.7), y.ravel(), z.ravel() + 1.5], 1) - leaf.object_to_world[:3, 3]
+    found = render_rays(field, rays_o, np.tile([[0.0, 0, -1.0]], (25, 1)))
     depth = found[:, 4] / np.maximum(found[:, 3], 1e-6)
     floor = 1.5 + z.ravel() + 0.5  # distance to the floor's upper face
     ghosts = ((depth < floor - 0.25) & (found[:, 3] > 0.02)).mean()
