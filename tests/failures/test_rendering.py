@@ -117,7 +117,7 @@ def trained():
         pixels = np.concatenate([straight, found[..., 3:]], -1)
         pictures.append(np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
     torch.set_num_threads(2)
-    settings = FitSettings(shape=SHAPE, longest=40, steps=250, samples=1 << 13)
+    settings = FitSettings(shape=SHAPE, longest=40, steps=200, samples=1 << 12)
     field = fit(cameras, np.stack(pictures), box, settings)
     unseen = scattered(box, 3, 40, 40, seed=9, lowest=-0.6)
     return field, unseen, np.stack([scene.image(camera) for camera in unseen])
@@ -178,7 +178,7 @@ def test_d4_stopping_early_costs_at_most_what_it_leaves(row, kind, early_stop):
     """Slabs of many depths, one behind the other: |ΔC| ≤ ε for every pixel."""
     scene = scenes.s1_slabs(2.0, 8.0)
     field = scene.composed(kind)
-    camera = scenes.camera_at((-6.0, 1.0, 0.5), size=24)
+    camera = scenes.camera_at((-6.0, 1.0, 0.5), size=16)
     whole, stopped = (
         render_image(field, camera, origin=field.origin, early_stop=e).over(BLACK) for e in (0.0, early_stop)
     )
@@ -288,13 +288,13 @@ def test_d6_from_inside_a_solid_its_first_colour_is_seen(row, kind):
 def test_d6_going_through_a_face_is_continuous(row, kind, what):
     """A camera that goes into the box in steps of a hundredth of a voxel."""
     truth = {"blob": Gaussian(tint=scenes.SAND), "solid": Box(1e3, 0.5, tint=scenes.RED)}[what]
-    field = exported(truth, kind, (40,) * 3 if what == "blob" else (16,) * 3)
+    field = exported(truth, kind, (24,) * 3 if what == "blob" else (16,) * 3)
     h, face = field.voxel_size, field.aabb[0]
     if what == "solid":  # the face itself is where a solid begins to fill the view: from inside, deeper
         face += 2 * h
     pictures = []
-    for i in range(-15, 16):
-        camera = scenes.camera_at((face + 0.01 * h * i, 0.03, 0.02), target=(3.0, 0.5, 0.3), size=12)
+    for i in range(-6, 7):
+        camera = scenes.camera_at((face + 0.01 * h * i, 0.03, 0.02), target=(3.0, 0.5, 0.3), size=8)
         pictures.append(render_image(field, camera).over(WHITE))
     change = abs(np.diff(pictures, axis=0)).max()
     row.check("D6", f"{kind}, {what}: largest change per h/100", change, 2 / 255, at_most=True)
@@ -379,9 +379,9 @@ def test_d9_rays_along_axes_and_diagonals(row, kind, spot):
     field = exported(truth, kind)
     for what, o, d in scenes.s12_rays(scenes.scene_of((truth, np.eye(4)))):
         if what == spot:
-            found = render_rays(field, o, d, step=1e-3, early_stop=0.0)[:, 3]
+            found = render_rays(field, o, d, step=2e-3, early_stop=0.0)[:, 3]
             error = abs(found - (1 - np.exp(-truth.depth(o, d)))).max()
-            row.check("D9", f"{kind}: opacity of 26 rays from {spot}", error, 2e-3, at_most=True)
+            row.check("D9", f"{kind}: opacity of 26 rays from {spot}", error, 3e-3, at_most=True)
 
 
 def test_d9_neighbours_never_both_miss(row, kind):
@@ -396,14 +396,14 @@ def test_d9_neighbours_never_both_miss(row, kind):
 
 @pytest.mark.parametrize("what", ["blob", "solid"])
 def test_d10_a_camera_that_turns_a_little_sees_little_change(row, kind, what):
-    """A millionth of a radian ten times, grazing a face and looking along an edge."""
+    """A millionth of a radian four times, grazing a face and looking along an edge."""
     truth = {"blob": Gaussian(tint=scenes.SAND), "solid": Box(1e3, 0.5, tint=scenes.RED)}[what]
-    field = exported(truth, kind, (40,) * 3 if what == "blob" else (16,) * 3)
+    field = exported(truth, kind, (24,) * 3 if what == "blob" else (16,) * 3)
     change = 0.0
     for eye in ((-2.5, 0.503, 0.21), (-2.5, 0.5021, 0.5017)):
-        first = scenes.camera_at(eye, target=(0.0, 0.48, 0.3), size=24)
+        first = scenes.camera_at(eye, target=(0.0, 0.48, 0.3), size=16)
         pictures = []
-        for i in range(10):
+        for i in range(5):
             turned = affine(turn(np.degrees(1e-6 * i), (0, 0, 1)), (0, 0, 0))
             pose = first.camera_to_world.copy()
             pose[:3, :3] = turned[:3, :3] @ pose[:3, :3]
