@@ -1,60 +1,125 @@
-"""Kernel speed against the torch reference in the same run: python -m benchmarks (or make bench).
+"""Kernel speed against the torch reference in the same run, and against what the machine can do: python -m
+benchmarks (or make bench).
 
-Prints medians of several repeats as ratios, since a bare time says little of a shared machine.
+Prints a Markdown table. Ratios are medians over runs that alternate with the reference's, since a bare time
+says little of a shared machine. Work is counted from the formulas: floating-point operations (a multiply-add
+is two) and bytes of texels asked for. Both are given as shares of the machine's peaks measured in the same
+run: multiply-adds in registers, bytes streamed from memory, and cache lines fetched at random from an array
+as large as the field.
 """
 
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from benchmarks.peaks import Peaks, measured_peaks
+from fusedrf_cli.engine.distillation.distill import point_step
+from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
+from fusedrf_cli.engine.distillation.teacher import TeacherPool
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.kernels import cpu, reference
-from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.rendering.cameras import framing_camera
+from fusedrf_cli.engine.rendering.volume import render_image
 
-POINTS, RAYS, REPEATS, TEXELS = 1 << 17, 1 << 13, 5, 224
+POINTS, RAYS, REPEATS, TEXELS, CELLS, FRAME = 1 << 17, 1 << 11, 5, 224, 96, 800
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
+STEP = 1.0 / TEXELS
+EARLY_STOP = 1e-3
+LINE = 64  # bytes
 
 
-def median_seconds(work: Callable[[], object]) -> float:
-    """Median of REPEATS runs after one that compiles."""
-    work()
-    seconds = []
+@dataclass(frozen=True)
+class Row:
+    """One piece of work, done by the kernels and by the reference."""
+
+    what: str
+    unit: str
+    count: float
+    """Units of work in a call of `ours`."""
+    ours: Callable[[], object]
+    theirs: Callable[[], object]
+    their_count: float
+    flops: float = 0.0
+    """Floating-point operations per unit; 0: not counted."""
+    bytes: float = 0.0
+    """Bytes of texels and gradients per unit."""
+
+
+def alternate(row: Row) -> tuple[float, float]:
+    """(median seconds of a unit by the kernels, median of the reference's over it), runs taking turns."""
+    row.ours(), row.theirs()  # compiles, and fills caches
+    seconds, ratios = [], []
     for _ in range(REPEATS):
-        started = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds)
+        took = []
+        for work, count in ((row.ours, row.count), (row.theirs, row.their_count)):
+            started = time.perf_counter()
+            work()
+            took.append((time.perf_counter() - started) / count)
+        seconds.append(took[0])
+        ratios.append(took[1] / took[0])
+    return statistics.median(seconds), statistics.median(ratios)
 
 
-def query_ratio(field: VMField, generator: torch.Generator, with_colour: bool) -> tuple[float, float]:
-    """(millions of points per second, times faster than the reference) of a query and its backward pass."""
+def shell_field(generator: torch.Generator) -> VMField:
+    """A VM tensor of random numbers that is dense in a shell of cells: like a surface, most of it is
+    empty."""
+    field = VMField.create(BOX, (TEXELS,) * 3, VMShape(), generator)
+    grid = OccupancyGrid.full(BOX, CELLS)
+    centres = BOX[:3] + (np.indices(grid.occupied.shape).reshape(3, -1).T + 0.5) * grid.cell
+    radius = np.linalg.norm(centres, axis=1).reshape(grid.occupied.shape)
+    tensor = field.with_occupancy(OccupancyGrid(BOX, abs(radius - 0.7) < 0.04)).tensors[0]
+    object.__setattr__(tensor, "shift", 0.0)
+    return VMField(field.shape, (tensor,), field.blocks, field.params, tensor.occupancy)
+
+
+def counts(shape: VMShape) -> dict[str, tuple[float, float]]:
+    """(floating-point operations, bytes) of a point's density and colour, forward and backward.
+
+    Per mode and component a bilinear plane (7 operations), a line (3) and their product (1); four texels of
+    the plane and two of the line are read, and backward read again, and their gradients read and written.
+    """
+    density, colour = 3 * shape.density_rank, 3 * shape.colour_rank
+    fold = 3 * 2 * shape.coefficients * colour  # SH into the colour basis
+    dot = 3 * 2 * colour
+    texels = 6 * 4
+    return {
+        "density": (12 * density, texels * density),
+        "density backward": (24 * density, 3 * texels * density),
+        "colour": (11 * colour + fold + dot, texels * colour),
+        "colour backward": (22 * colour + fold + 3 * dot + fold, 3 * texels * colour),
+    }
+
+
+def total(shape: VMShape, *names: str) -> tuple[float, float]:
+    """Summed operations and bytes of some of `counts`."""
+    found = counts(shape)
+    return tuple(float(sum(found[name][i] for name in names)) for i in range(2))
+
+
+def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> Row:
+    """A query of random points and its backward pass, all cells occupied."""
     points = torch.rand(POINTS, 3, generator=generator, dtype=torch.float64) * 2 - 1
     dirs = torch.nn.functional.normalize(
         torch.randn(POINTS, 3, generator=generator, dtype=torch.float64), dim=1
     )
-    grads = np.zeros((torch.get_num_threads(), field.params.numel()), np.float32)
+    grads = torch.zeros(torch.get_num_threads(), field.params.numel()).numpy()
     d_sigma, d_rgb = np.ones(POINTS, np.float32), np.full((POINTS, 3), float(with_colour), np.float32)
+    back = points.numpy(), dirs.numpy(), d_sigma, d_rgb, grads
 
-    def kernel():
+    def ours():
         field.query(points, dirs, with_colour)
-        cpu.query_backward(
-            *field.kernel_shape,
-            field.arrays,
-            field.grid,
-            points.numpy(),
-            dirs.numpy(),
-            d_sigma,
-            d_rgb,
-            grads,
-        )
+        cpu.query_backward(*field.kernel_shape, field.arrays, field.grid, *back)
 
     sections = {name: view.clone().requires_grad_() for name, view in field.sections(0).items()}
     unit, ways, tensor = ((points + 1) / 2).float(), dirs.float(), field.tensors[0]
 
-    def truth():
+    def theirs():
         if with_colour:
             sigma, rgb = reference.vm_query(sections, unit, ways, tensor.scale, tensor.shift)
             (sigma.sum() + rgb.sum()).backward()
@@ -62,63 +127,150 @@ def query_ratio(field: VMField, generator: torch.Generator, with_colour: bool) -
             feature = reference.vm_density_feature(sections, unit)
             reference.density(feature, tensor.scale, tensor.shift).sum().backward()
 
-    ours, theirs = median_seconds(kernel), median_seconds(truth)
-    return POINTS / ours / 1e6, theirs / ours
+    # the kernels evaluate again in the backward pass what they did not keep
+    names = ["density", "density", "density backward"] + with_colour * ["colour", "colour", "colour backward"]
+    what = "query forward and backward, density" + with_colour * " and colour"
+    return Row(what, "point", POINTS, ours, theirs, POINTS, *total(field.shape, *names))
 
 
-def ray_rates(field: VMField, generator: torch.Generator) -> tuple[float, float]:
-    """Millions of samples per second of rendering and of a training pass through a full grid."""
+def rays_through(generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from all sides to random points of the box."""
     origin = torch.nn.functional.normalize(
         torch.randn(RAYS, 3, generator=generator, dtype=torch.float64), dim=1
     )
     rays_o = (3 * origin).numpy()
-    target = torch.rand(RAYS, 3, generator=generator, dtype=torch.float64).numpy() - 0.5
-    rays_d = target - rays_o
-    rays_d /= np.linalg.norm(rays_d, axis=1, keepdims=True)
-    step, grads = 0.02, np.zeros((torch.get_num_threads(), field.params.numel()), np.float32)
-    wanted, white = np.zeros((RAYS, 4), np.float32), np.ones((RAYS, 3), np.float32)
-    loss = np.zeros((len(grads), 3))
+    rays_d = torch.rand(RAYS, 3, generator=generator, dtype=torch.float64).numpy() * 1.6 - 0.8 - rays_o
+    return rays_o, rays_d / np.linalg.norm(rays_d, axis=1, keepdims=True)
 
-    def train():
-        loss[:] = 0
-        cpu.train_rays(
-            *field.kernel_shape,
-            field.arrays,
-            field.grid,
-            rays_o,
-            rays_d,
-            0.0,
-            np.zeros(RAYS),
-            step,
-            1e-3,
-            wanted,
-            white,
-            0.1,
-            256,
-            grads,
-            loss,
-        )
 
-    trained = median_seconds(train)
-    samples = loss[:, 2].sum()
-    return samples / median_seconds(lambda: render_rays(field, rays_o, rays_d, step=step)) / 1e6, (
-        samples / trained / 1e6
+def march_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
+    """All samples of rays that lie in occupied cells."""
+    half, alive = np.full(RAYS, 0.5), np.ones(RAYS, bool)
+    ts, found = np.zeros((RAYS, int(4 / STEP))), np.zeros(RAYS, np.int64)
+
+    def ours():
+        start = np.zeros(RAYS, np.int64)
+        cpu.march(field.grid, rays_o, rays_d, 0.0, half, STEP, start, alive, ts, found)
+
+    tensors = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
+
+    def theirs():
+        reference.lattice(field, *tensors, 0.0, STEP, torch.tensor(0.5))
+
+    return Row("march to the samples of a ray", "ray", RAYS, ours, theirs, RAYS)
+
+
+def train_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
+    """A step of training: render, compare, backward, Adam."""
+    target, white = np.full((RAYS, 4), 0.5, np.float32), np.ones((RAYS, 3), np.float32)
+    batch = Batch(rays_o, rays_d, np.full(RAYS, 0.5), target, white, 0.1, 0.0, STEP, EARLY_STOP)
+    work = FusedPass(field)
+    mine = Adam.of(field)
+
+    def ours():
+        work.gradient(field, batch, mine.grads)
+        mine.step(0.0)
+
+    copy = VMField(
+        field.shape, field.tensors, field.blocks, field.params.clone().requires_grad_(), field.occupancy
     )
+    other = torch.optim.Adam([copy.params], 0.0)
+    few = RAYS // 8
+    tensors = torch.from_numpy(rays_o[:few]), torch.from_numpy(rays_d[:few])
+
+    def theirs():
+        other.zero_grad()
+        out = reference.render_rays(copy, *tensors, 0.0, STEP, EARLY_STOP)
+        colour = out[:, :3] + (1 - out[:, 3:4])
+        (((colour - 0.5) ** 2).mean() + 0.1 * ((out[:, 3] - 0.5) ** 2).mean()).backward()
+        other.step()
+
+    return Row("training step", "ray", RAYS, ours, theirs, few)
+
+
+def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
+    """A step of distilling: points of a teacher, 3D losses, Adam."""
+    centres = torch.from_numpy(field.occupancy.centres())
+    points = centres[torch.randint(len(centres), (POINTS,), generator=generator)]
+    dirs = torch.from_numpy(rays_d).repeat(POINTS // RAYS, 1)
+    asked = torch.full((POINTS,), 20.0), torch.full((POINTS, 3), 0.5)
+    pool = TeacherPool(rays_o, rays_d, torch.zeros(RAYS, 4), points, dirs, *asked)
+    mine, chosen = Adam.of(field), torch.arange(1 << 15)
+
+    def ours():
+        point_step(field, pool, chosen, STEP, mine)
+        mine.step(0.0)
+
+    sections = {name: view.clone().requires_grad_() for name, view in field.sections(0).items()}
+    other, tensor = torch.optim.Adam(sections.values(), 0.0), field.tensors[0]
+
+    def theirs():
+        other.zero_grad()
+        unit, ways = ((points[chosen] + 1) / 2).float(), dirs[chosen].float()
+        sigma, rgb = reference.vm_query(sections, unit, ways, tensor.scale, tensor.shift)
+        depth = torch.log1p(10 * STEP * sigma) - torch.log1p(10 * STEP * asked[0][chosen])
+        ((depth**2).mean() + 2 * ((rgb - 0.5) ** 2).mean()).backward()
+        other.step()
+
+    names = ["density"] * 2 + ["density backward"] + ["colour"] * 2 + ["colour backward"]
+    work = total(field.shape, *names)
+    return Row("fusing step, points", "point", len(chosen), ours, theirs, len(chosen), *work)
+
+
+def frame_row(field: VMField) -> Row:
+    """A frame; the reference renders one ray in 400."""
+    camera = framing_camera(field.occupancy.tight_aabb(0), 0.9, 0.45, FRAME, FRAME)
+    rays_o, rays_d = camera.rays()
+    some = torch.from_numpy(rays_o[::400].copy()), torch.from_numpy(rays_d[::400].copy())
+
+    def theirs():
+        with torch.no_grad():
+            reference.render_rays(field, *some, 0.0, STEP, EARLY_STOP)
+
+    what = f"frame of {FRAME} x {FRAME}"
+    return Row(what, "ray", FRAME**2, lambda: render_image(field, camera), theirs, len(some[0]))
+
+
+def line(row: Row, peaks: Peaks) -> str:
+    """The row of the table."""
+    seconds, ratio = alternate(row)
+    words = [row.what, f"{1e-6 / seconds:.2f} M {row.unit}s/s", f"{ratio:.1f}"]
+    if row.flops:
+        words += [
+            f"{row.flops:.0f}",
+            f"{row.flops / seconds / peaks.flops:.0%}",
+            f"{row.bytes:.0f}",
+            f"{row.bytes / seconds / peaks.stream:.0%}",
+            f"{row.bytes / LINE / seconds / peaks.lines:.0%}",
+        ]
+    else:
+        words += ["", "", "", "", ""]
+    return "| " + " | ".join(words) + " |"
 
 
 def main() -> None:
     """Measure and print the table."""
     generator = torch.Generator().manual_seed(0)
-    field = VMField.create(BOX, (TEXELS,) * 3, VMShape(), generator)
-    print(f"VM tensor of {TEXELS} texels per axis, ranks 16 and 24, {torch.get_num_threads()} threads")
-    for what, colour in (("density", False), ("density and colour", True)):
-        rate, ratio = query_ratio(field, generator, colour)
-        print(
-            f"query forward and backward, {what}: {rate:.2f} M points/s, "
-            f"{ratio:.1f} times the torch reference"
-        )
-    rendered, trained = ray_rates(field, generator)
-    print(f"fog (every sample shaded): render {rendered:.2f} M samples/s, train {trained:.2f} M samples/s")
+    full = VMField.create(BOX, (TEXELS,) * 3, VMShape(), generator)
+    shell = shell_field(generator)
+    rays = rays_through(generator)
+    peaks = measured_peaks(full.params.numel())
+    print(f"{TEXELS} texels per axis, ranks 16 and 24, SH degree 2; {torch.get_num_threads()} threads")
+    print(
+        f"peaks: {peaks.flops / 1e9:.0f} GFLOP/s, {peaks.stream / 1e9:.1f} GB/s streamed, "
+        f"{peaks.lines / 1e6:.0f} M random cache lines/s\n"
+    )
+    print("| work | rate | times faster than torch | FLOP | of peak | bytes | of stream | of random lines |")
+    print("|---|---|---|---|---|---|---|---|")
+    for row in (
+        query_row(full, generator, False),
+        query_row(full, generator, True),
+        march_row(shell, *rays),
+        train_row(shell, *rays),
+        fuse_row(shell, generator, *rays),
+        frame_row(shell),
+    ):
+        print(line(row, peaks), flush=True)
 
 
 if __name__ == "__main__":

@@ -16,16 +16,16 @@ from fusedrf_cli.bridge.memory import (
     sources,
     teaching,
 )
-from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, save_checkpoint
+from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, history_nodes, load_scene, write_field
-from fusedrf_cli.bridge.train import BYTES_PER_NUMBER
+from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import (
+    DistillRun,
     DistillSettings,
     Judge,
-    distill,
     empty_student,
     resolution_for,
     student_from,
@@ -265,30 +265,30 @@ def fuse_vm(
         if not from_scratch:
             progress.warn(f"'{background.name}' is turned or stretched, so the student starts from nothing")
         student = empty_student(composed, settings, generator, "fused")
+    boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
+    run = DistillRun(composed, student, boxes, settings, rgb)
+    # what the saved numbers depend on: with other words they would go on to something else
+    made_with = {"numbers": student.params.numel(), "start": start, "rgb": rgb, "seed": settings.seed}
+    made_with["boxes"] = [box.tolist() for box in boxes]
     if resume:
         arrays, state = load_checkpoint(output, "fuse")
-        if state["numbers"] != student.params.numel():
+        if any(state.get(word) != value for word, value in made_with.items()):
             raise InvalidInput(
                 f"{checkpoint_path(output)}: made with other settings; repeat them, or run without --resume"
             )
-        student.params.copy_(torch.from_numpy(arrays["params"]))
-    boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
-    try:
-        student, did = distill(
-            composed,
-            student,
-            boxes,
-            settings,
-            rgb,
-            lambda name: progress.phase(name, 1.0),
-            lambda s, f: progress.advance(s, **f),
+        run.restore(arrays, state)
+
+    def checkpoint() -> tuple[dict, dict]:
+        arrays, state = run.checkpoint()
+        return arrays, state | made_with
+
+    with resumable(output, checkpoint) as whole:
+        student, did = run.finish(
+            lambda name: progress.phase(name, 1.0), lambda s, f: progress.advance(s, **f), whole
         )
-    except KeyboardInterrupt as interrupt:
-        path = save_checkpoint(
-            output, {"params": student.params.numpy()}, {"command": "fuse", "numbers": student.params.numel()}
-        )
-        interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
-        raise
+    warn_of_numbers(did.numeric, progress)
+    if did.found_nothing:
+        progress.warn("the student holds no matter yet; no cell was given up. Give it more --time-budget")
     return student, {
         "psnr": {
             "before_rgb": did.psnr_before_rgb,
@@ -304,6 +304,7 @@ def fuse_vm(
             "voxel": float(student.voxel_size),
             "finest_teacher_voxel": float(composed.voxel_size),
         },
+        **did.numeric,
     }
 
 

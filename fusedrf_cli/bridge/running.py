@@ -3,6 +3,8 @@
 import contextlib
 import json
 import os
+import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,6 +48,52 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
                 f"not enough memory: {error}; {readable_size(peak())} were taken, "
                 f"{readable_size(available())} are free; try a smaller --max-size or --size"
             ) from error
+        raise
+
+
+class WholeSteps:
+    """A context to go through once per step, in which an interrupt waits for the step's end: what is saved
+    then is no half of one. A second interrupt does not wait, and `torn` tells that there is nothing to save.
+    """
+
+    def __init__(self):
+        self.torn, self.waiting, self.previous = False, None, {}
+
+    def __call__(self) -> "WholeSteps":
+        return self
+
+    def __enter__(self) -> "WholeSteps":
+        if threading.current_thread() is threading.main_thread():
+            found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+            self.previous = {number: handler for number, handler in found.items() if callable(handler)}
+        for number in self.previous:
+            signal.signal(number, self._arrived)
+        return self
+
+    def _arrived(self, number: int, frame: object) -> None:
+        self.torn = self.waiting is not None
+        self.waiting = number
+        if self.torn:
+            self.previous[number](number, frame)
+
+    def __exit__(self, kind, error, trace) -> None:
+        for number, handler in self.previous.items():
+            signal.signal(number, handler)
+        if self.waiting is not None and kind is None:
+            self.previous[self.waiting](self.waiting, None)
+
+
+@contextlib.contextmanager
+def resumable(output: str, checkpoint) -> Iterator[WholeSteps]:
+    """Run steps inside the `WholeSteps` that this gives; an interrupt leaves `checkpoint()` beside the output
+    and goes on its way, saying so."""
+    whole = WholeSteps()
+    try:
+        yield whole
+    except KeyboardInterrupt as interrupt:
+        if not whole.torn:
+            path = save_checkpoint(output, *checkpoint())
+            interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
         raise
 
 

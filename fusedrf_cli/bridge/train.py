@@ -11,7 +11,7 @@ from formats.captures import hold_out, is_mesh, load_images, read_capture
 from formats.meshes import mesh_capture
 from formats.views import Capture, View
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
-from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, save_checkpoint
+from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, texels
 from fusedrf_cli.engine.fields.vm import VMShape
@@ -104,6 +104,7 @@ def train(
         "training_psnr": run.psnr,
         "holdout": measured,
         "memory": budget.report(),
+        **run.guard.figures(),
     }
     if target_psnr is not None and reached < target_psnr:
         raise QualityNotReached(
@@ -128,13 +129,24 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     """Train to the end; an interrupt leaves a checkpoint and goes on its way."""
     progress.phase("training", 1.0)
     started = time.monotonic()
-    try:
-        field = run.finish(lambda share, figures: progress.advance(share, **figures))
-    except KeyboardInterrupt as interrupt:
-        path = save_checkpoint(output, *run.checkpoint())
-        interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
-        raise
+    with resumable(output, run.checkpoint) as whole:
+        field = run.finish(lambda share, figures: progress.advance(share, **figures), whole)
+    warn_of_numbers(run.guard.figures(), progress)
+    if not run.found_matter:
+        progress.warn(
+            f"{output}: no matter was found, so that all of the box was kept; look at the photos' alpha, "
+            "their poses, and --aabb"
+        )
     return field, time.monotonic() - started
+
+
+def warn_of_numbers(figures: dict[str, int], progress) -> None:
+    """Say that steps were not finite, where some were (`Guard.figures`)."""
+    if figures:
+        progress.warn(
+            f"{figures['skipped_steps']} steps were not finite and were skipped; returned "
+            f"{figures['roll_backs']} times to the last good state"
+        )
 
 
 def fitting_longest(aabb: np.ndarray, settings: FitSettings, max_size: int | None, precision: str) -> int:

@@ -1,8 +1,10 @@
 """A folder of tiny solid fields, and the real bridge made small enough to run in seconds."""
 
+import contextlib
 import importlib
 import json
 import shutil
+import signal
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,11 +22,12 @@ from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields import vm
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.main import cli
+from fusedrf_cli.main import _interrupt, cli
 from tests.analytic.export import SHAPE, vm_field
 from tests.analytic.fields import Box, Tint
 
@@ -161,3 +164,30 @@ def picture(folder, report):
         return read_image(folder / "eye.png")[..., :3] / 255
 
     return picture
+
+
+@pytest.fixture
+def interrupted_in_step(monkeypatch):
+    """with interrupted_in_step(6): SIGINT comes during the 6th step, before it moves the numbers."""
+
+    @contextlib.contextmanager
+    def interrupted_in_step(at: int, times: int = 1):
+        step, calls = Adam.step, []
+
+        def interrupted(self, rate):
+            calls.append(rate)
+            if len(calls) == at:
+                for _ in range(times):
+                    signal.raise_signal(signal.SIGINT)
+            step(self, rate)
+
+        previous = signal.signal(signal.SIGINT, _interrupt)  # as the process itself has it
+        try:
+            with monkeypatch.context() as patch:
+                patch.setattr(Adam, "step", interrupted)
+                yield
+        finally:
+            signal.signal(signal.SIGINT, previous)
+        assert len(calls) >= at
+
+    return interrupted_in_step

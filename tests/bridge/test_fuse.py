@@ -1,13 +1,14 @@
 """`fuse` for real: blocks, a distilled tensor, limits, and what is refused."""
 
 import json
+import shutil
 
 import pytest
 
 from formats.bundle import read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import part, write_scene_of
+from tests.bridge.conftest import done, write_scene_of
 
 VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
 
@@ -80,16 +81,40 @@ def test_a_stretched_object_is_warned_of(report, folder):
     assert any("'red' is stretched by 2.00" in w for w in said["warnings"])
 
 
+WITH_RGB = ("fuse", "pair.json", "--kind", "vm", "--max-size", "300kB", "-o")
+
+
+@pytest.fixture(scope="module")
+def straight(shop, tmp_path_factory) -> bytes:
+    """The bundle of a run that nobody interrupted."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("straight") / "shop")
+    done(folder, *WITH_RGB, "fused.rfpack")
+    return (folder / "fused.rfpack").read_bytes()
+
+
+@pytest.mark.parametrize("at", [6, 30, 55])
+def test_a_fuse_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step, straight, at):
+    """In the midst of a step at 10, 50 (points) and 90 % (pictures) of 60 steps, and once more after it."""
+    with interrupted_in_step(at):
+        assert run(*WITH_RGB, "fused.rfpack").exit_code == 130
+    with interrupted_in_step(1):
+        assert run(*WITH_RGB, "fused.rfpack", "--resume").exit_code == 130
+    said = report(*WITH_RGB, "fused.rfpack", "--resume")
+    assert said["psnr"]["after_rgb"] is not None and not (folder / "fused.rfpack.checkpoint").exists()
+    assert (folder / "fused.rfpack").read_bytes() == straight
+
+
 def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(part("fuse"), "distill", stop)
+        patch.setattr("fusedrf_cli.engine.distillation.distill.ask", stop)
         assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM).exit_code == 130
     assert not (folder / "fused.rfpack").exists() and (folder / "fused.rfpack.checkpoint").exists()
-    wrong = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume", "--max-size", "80kB")
-    assert wrong.exit_code == 3 and "other settings" in wrong.stderr
+    for other in (("--max-size", "80kB"), ("--seed", "5"), ("--rgb",), ("--from-scratch",)):
+        wrong = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume", *other)
+        assert wrong.exit_code == 3 and "other settings" in wrong.stderr, other
     assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume").exit_code == 0
     assert not (folder / "fused.rfpack.checkpoint").exists()
 

@@ -8,20 +8,22 @@ views of its own.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import reshaped
+from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.fit import EARLY_STOP, EMPTY_BELOW, texels
+from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import TeacherPool, ask, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -31,8 +33,11 @@ RATE_DECAY = 0.1
 RGB_RATE = 0.1 * RATE
 OPAQUE = 5.0  # optical depth of a step beyond which more density cannot be seen
 DEPTH_GAIN = 10.0  # in log1p(gain τ): how much thin fog counts
+FAINT = 1e-8  # optical depth of a step under which a student that should be denser learns as if it had it
+MOST_LIFT = 1e30
 COLOUR_WEIGHT = 2.0
 POINTS_PER_STEP = 1 << 15
+RAYS_AT_FIRST = 1024
 WHITE = np.ones(3)
 JUDGED_SEED = 7_000_001  # views the student is judged on are drawn from a stream of their own
 
@@ -65,6 +70,10 @@ class DistillReport:
     psnr_before_rgb: float = float("nan")
     psnr_after_rgb: float | None = None
     rgb_kept: bool | None = None
+    found_nothing: bool = False
+    """Whether the student held no matter after the points, so that the teacher's occupancy was kept."""
+    numeric: dict[str, int] = field(default_factory=dict)
+    """Steps skipped and returns to a good state, where there were any (guard.py)."""
 
 
 class Judge:
@@ -156,36 +165,148 @@ def distill(
     """Teach a one-block VM student in the teacher's frame; boxes are the scene's and the objects' (6,), for
     sampling.
 
-    Raises FloatingPointError when the student's numbers are not finite any more.
+    Raises FloatingPointError when the student's numbers do not stay finite.
     """
-    generator = torch.Generator().manual_seed(settings.seed + 1)
-    report = DistillReport()
-    clock = _Clock(report.seconds)
-    if rgb and settings.time_budget is not None:
-        settings = replace(settings, time_budget=settings.time_budget / 2)
-    step = 0.5 * student.voxel_size
-    phase("asking the teachers")
-    judge = Judge(teacher, settings.views, settings.view_size, settings.seed)
-    rays_o, rays_d = random_rays(boxes, settings.rays, generator)
-    pool = ask(teacher, rays_o, rays_d, step, generator, keep_points=0.35)
-    clock.lap("teachers")
-    phase("points")
-    fit_points(student, pool, step, settings, generator, advance)
-    student = student.with_occupancy(pruned(student))
-    report.psnr_before_rgb = judge(student)
-    clock.lap("points")
-    if rgb:
-        phase("pictures")
-        before = student.params.clone()
-        fit_rays(student, pool, step, settings, generator, advance)
-        report.psnr_after_rgb = judge(student)
-        report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
-        if not report.rgb_kept:
-            student.params.copy_(before)
-        clock.lap("pictures")
-    if not torch.isfinite(student.params).all():
-        raise FloatingPointError("the student's numbers are not finite")
-    return student, report
+    return DistillRun(teacher, student, boxes, settings, rgb).finish(phase, advance)
+
+
+class DistillRun:
+    """The moving parts of one distillation, which can be saved between two steps and taken up again.
+
+    What the teacher was asked is not saved: the same seed asks the same.
+    """
+
+    def __init__(
+        self,
+        teacher: RadianceField,
+        student: VMField,
+        boxes: list[np.ndarray],
+        settings: DistillSettings,
+        rgb: bool = True,
+    ):
+        """The arguments are those of `distill`."""
+        self.teacher, self.student, self.boxes, self.rgb = teacher, student, boxes, rgb
+        self.settings, self.step = settings, 0.5 * student.voxel_size
+        self.generator = torch.Generator()
+        self.report = DistillReport()
+        self.optimiser = Adam.of(student)
+        self.guard = Guard(lambda: self.optimiser.numbers())
+        self.phase, self.steps, self.elapsed = "points", 0, 0.0
+        self.before: torch.Tensor | None = None
+        """The student's numbers before the RGB phase."""
+        self.epochs, self.count = Epochs(settings.rays, self.generator), RAYS_AT_FIRST
+        self.asked, self.random = False, None
+        """Whether the teacher was asked, and the state the generator has to be in then; None: as it is."""
+
+    def finish(
+        self,
+        phase: Callable[[str], None] = lambda name: None,
+        advance: Callable[[float, dict], None] = lambda share, figures: None,
+        whole: Callable[[], AbstractContextManager] = nullcontext,
+    ) -> tuple[VMField, DistillReport]:
+        """Run to the end. Every step happens inside a `whole()`, which may hold an interrupt back."""
+        report, settings = self.report, self.settings
+        clock = _Clock(report.seconds)
+        phase("asking the teachers")
+        self.generator.manual_seed(settings.seed + 1)
+        judge = Judge(self.teacher, settings.views, settings.view_size, settings.seed)
+        rays_o, rays_d = random_rays(self.boxes, settings.rays, self.generator)
+        pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, keep_points=0.35)
+        if self.random is not None:
+            self.generator.set_state(self.random)
+        self.asked = True
+        clock.lap("teachers")
+        if self.phase == "points":
+            phase("points")
+            if len(pool.points):
+                self._learn(PointPass(pool, self), settings.steps, advance, whole)
+            with whole():
+                self._begin_pictures()
+                report.psnr_before_rgb = judge(self.student)
+            clock.lap("points")
+        if self.rgb:
+            phase("pictures")
+            self._learn(RayPass(pool, self), settings.rgb_steps, advance, whole)
+            report.psnr_after_rgb = judge(self.student)
+            report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
+            if not report.rgb_kept:
+                self.student.params.copy_(self.before)
+            clock.lap("pictures")
+        report.numeric = self.guard.figures()
+        return self.student, report
+
+    def _begin_pictures(self) -> None:
+        """What was learnt from points is the RGB phase's start, and what it has to surpass."""
+        self.guard.check()
+        self.before = self.student.params.clone()
+        self._prune()
+        self.optimiser = Adam.of(self.student)
+        self.guard.renew()
+        self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
+
+    def _prune(self) -> None:
+        """Leave out the cells that turned out empty, unless that would be all of them."""
+        occupancy = pruned(self.student)
+        self.report.found_nothing = bool(self.teacher.occupancy.occupied.any() > occupancy.occupied.any())
+        if not self.report.found_nothing:
+            self.student = self.student.with_occupancy(occupancy)
+
+    def _learn(self, gradient: "PointPass | RayPass", steps: int, advance: Callable, whole: Callable) -> None:
+        """The steps of one phase."""
+        started = time.monotonic() - self.elapsed
+        while (share := self._share(steps, time.monotonic() - started)) < 1:
+            with whole():
+                self.guard.keep()
+                sums, figures = gradient()
+                if self.guard.accepts(sums, self.optimiser):
+                    self.optimiser.step(gradient.rate * RATE_DECAY**share * self.guard.rate)
+                self.steps += 1
+                self.elapsed = time.monotonic() - started
+            if self.steps % 20 == 1:
+                advance(share, figures)
+        self.guard.check()
+
+    def _share(self, steps: int, seconds: float) -> float:
+        """The share of the phase that is done: of its steps, or of its seconds where a budget is given."""
+        if self.settings.time_budget is None:
+            return self.steps / steps
+        return seconds / (self.settings.time_budget / (2 if self.rgb else 1))
+
+    def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
+        """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
+        arrays, drawn = self.epochs.state()
+        arrays |= {"params": self.student.params.cpu().numpy()} | self.optimiser.state()
+        random = self.generator.get_state() if self.asked else self.random
+        if random is not None:
+            arrays["random"] = random.numpy()
+        if self.before is not None:
+            arrays["before"] = self.before.cpu().numpy()
+        state = {
+            "command": "fuse",
+            "phase": self.phase,
+            "steps": self.steps,
+            "elapsed": self.elapsed,
+            "adam_steps": self.optimiser.steps,
+            "psnr_before_rgb": self.report.psnr_before_rgb,
+            "rays": self.count,
+            "guard": self.guard.state(),
+            **drawn,
+        }
+        return arrays, state
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
+        """Take up a run that `checkpoint` saved, over the same teacher and settings."""
+        if "before" in arrays:
+            self.student.params.copy_(torch.from_numpy(arrays["before"]))
+            self._begin_pictures()
+            self.report.psnr_before_rgb = state["psnr_before_rgb"]
+        self.student.params.copy_(torch.from_numpy(arrays["params"]))
+        self.optimiser.restore(arrays, state["adam_steps"])
+        self.count = state["rays"]
+        self.phase, self.steps, self.elapsed = state["phase"], state["steps"], state["elapsed"]
+        self.guard.restore(state["guard"])
+        self.epochs.restore(arrays, state)
+        self.random = torch.from_numpy(arrays["random"]) if "random" in arrays else None
 
 
 class _Clock:
@@ -199,40 +320,25 @@ class _Clock:
         self.seconds[name], self.last = now - self.last, now
 
 
-def shares(steps: int, budget: float | None):
-    """Yield the share of a phase that is done before each step: of its steps, or of its seconds where a
-    budget is given.
-    """
-    started, done = time.monotonic(), 0
-    while (share := (time.monotonic() - started) / budget if budget is not None else done / steps) < 1:
-        yield share
-        done += 1
-
-
-def fit_points(
-    student: VMField,
-    pool: TeacherPool,
-    step: float,
-    settings: DistillSettings,
-    generator: torch.Generator,
-    advance: Callable,
-) -> None:
+class PointPass:
     """The 3D losses: (log1p(g τ_s) - log1p(g τ_t))^2 at the step's optical depth τ = σ δ, and colour
     weighted by alpha.
 
     Depths beyond OPAQUE look the same and are not told apart; a saturated student still feels a gradient,
-    which an alpha loss
-    would not give it.
+    which an alpha loss would not give it.
     """
-    if not len(pool.points):
-        return
-    optimiser = Adam(student, torch.get_num_threads())
-    for i, share in enumerate(shares(settings.steps, settings.time_budget)):
-        chosen = torch.randint(len(pool.points), (POINTS_PER_STEP,), generator=generator)
-        loss = point_step(student, pool, chosen, step, optimiser)
-        optimiser.step(RATE * RATE_DECAY**share)
-        if i % 20 == 0:
-            advance(share, {"loss": loss})
+
+    rate = RATE
+
+    def __init__(self, pool: TeacherPool, run: DistillRun):
+        self.pool, self.run = pool, run
+
+    def __call__(self) -> tuple[np.ndarray, dict]:
+        """Leave the gradient of random points with the optimiser; the losses, and figures to tell."""
+        run = self.run
+        chosen = torch.randint(len(self.pool.points), (POINTS_PER_STEP,), generator=run.generator)
+        loss = point_step(run.student, self.pool, chosen, run.step, run.optimiser)
+        return np.array([loss]), {"loss": loss}
 
 
 def point_step(
@@ -244,12 +350,14 @@ def point_step(
     tau, wanted = sigma * step, (pool.sigma[chosen] * step).clamp_max(OPAQUE)
     error = torch.log1p(DEPTH_GAIN * tau) - torch.log1p(DEPTH_GAIN * wanted)
     error[(tau >= OPAQUE) & (wanted >= OPAQUE)] = 0
+    # σ = softplus(f) and its slope vanish together: far below FAINT the gradient would be too small a number
+    lift = torch.where(error < 0, (FAINT / tau).clamp(1, MOST_LIFT), 1)
     alpha = 1 - torch.exp(-wanted)
     off = rgb - pool.rgb[chosen]
     n = len(chosen)
-    d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step
+    d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step * lift
     d_rgb = 2 / n * COLOUR_WEIGHT * alpha[:, None] * off
-    cpu.query_backward(
+    student.loops.query_backward(
         *student.kernel_shape,
         student.arrays,
         student.grid,
@@ -262,54 +370,45 @@ def point_step(
     return float((error**2).mean() + COLOUR_WEIGHT * (alpha[:, None] * off**2).mean())
 
 
-def fit_rays(
-    student: VMField,
-    pool: TeacherPool,
-    step: float,
-    settings: DistillSettings,
-    generator: torch.Generator,
-    advance: Callable,
-) -> None:
+class RayPass:
     """The RGB loss over the teacher's own rays, colour over white and opacity."""
-    optimiser = Adam(student, torch.get_num_threads())
-    target = pool.pixels.clone()
-    target[:, :3] += 1 - target[:, 3:]
-    slots = int(np.linalg.norm(student.aabb[3:] - student.aabb[:3]) / step) + 2
-    count, at, order = 1024, 0, torch.randperm(len(target), generator=generator)
-    for i, share in enumerate(shares(settings.rgb_steps, settings.time_budget)):
-        if at + count > len(order):
-            order, at = torch.randperm(len(target), generator=generator), 0
-        chosen = order[at : at + count].numpy()
-        at += count
-        jitter = torch.rand(len(chosen), generator=generator, dtype=torch.float64).numpy()
-        loss = np.zeros((optimiser.parts, 3))
-        cpu.train_rays(
-            *student.kernel_shape,
-            student.arrays,
-            student.grid,
+
+    rate = RGB_RATE
+
+    def __init__(self, pool: TeacherPool, run: DistillRun):
+        self.pool, self.run = pool, run
+        self.target = pool.pixels.clone()
+        self.target[:, :3] += 1 - self.target[:, 3:]
+        extent = run.student.aabb[3:] - run.student.aabb[:3]
+        self.slots = int(np.linalg.norm(extent) / run.step) + 2
+
+    def __call__(self) -> tuple[np.ndarray, dict]:
+        """Leave the gradient of the next rays with the optimiser; the losses, and figures to tell."""
+        run, pool = self.run, self.pool
+        chosen = run.epochs.draw(run.count).numpy()
+        jitter = torch.rand(len(chosen), generator=run.generator, dtype=torch.float64).numpy()
+        loss = np.zeros((run.optimiser.parts, 3))
+        run.student.loops.train_rays(
+            *run.student.kernel_shape,
+            run.student.arrays,
+            run.student.grid,
             pool.rays_o[chosen],
             pool.rays_d[chosen],
             0.0,
             jitter,
-            step,
+            run.step,
             EARLY_STOP,
-            target[chosen].numpy(),
+            self.target[chosen].numpy(),
             np.ones((len(chosen), 3), np.float32),
             0.1,
-            slots,
-            optimiser.grads,
+            self.slots,
+            run.optimiser.grads,
             loss,
         )
-        optimiser.step(RGB_RATE * RATE_DECAY**share)
-        count = int(
-            np.clip(
-                0.9 * count + 0.1 * settings.rgb_samples * len(chosen) / max(loss[:, 2].sum(), 1),
-                256,
-                1 << 14,
-            )
-        )
-        if i % 20 == 0:
-            advance(share, {"psnr": float(-10 * np.log10(max(loss[:, 0].sum() / len(chosen), 1e-10)))})
+        sums = loss.sum(0)
+        wanted = run.settings.rgb_samples * len(chosen) / max(sums[2], 1)
+        run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))
+        return sums, {"psnr": float(-10 * np.log10(max(sums[0] / len(chosen), 1e-10)))}
 
 
 def pruned(student: VMField) -> OccupancyGrid:
@@ -318,7 +417,7 @@ def pruned(student: VMField) -> OccupancyGrid:
     cells = np.argwhere(grid.occupied)
 
     sigma = np.zeros(len(cells), np.float32)
-    cpu.density_at_cells(
+    student.loops.density_at_cells(
         student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma
     )
     occupied = np.zeros_like(grid.occupied)

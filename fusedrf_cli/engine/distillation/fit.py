@@ -1,20 +1,21 @@
 """Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy
 grid is set."""
 
-import math
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.distillation.epochs import Epochs
+from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import PASSES, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.fields.vm import PROBES, VMField, VMShape
 from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
-from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import Camera
 
 RATE = 0.02
@@ -26,6 +27,7 @@ EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
 RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
+RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
 THINNEST = 12
 RAYS_PER_STEP = (512, 1 << 14)
@@ -54,6 +56,8 @@ class FitSettings:
     seed: int = 0
     colour: str = "sh"
     """One of COLOURS: spherical harmonics, or a shallow network over features."""
+    device: str = "cpu"
+    """Where the field is trained, "cpu" or "cuda"; the latter with spherical harmonics only."""
 
 
 class RayPool:
@@ -62,7 +66,7 @@ class RayPool:
     def __init__(self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator):
         """images (n, H, W, 4) uint8 straight alpha."""
         self.images = torch.from_numpy(images).reshape(-1, 4)
-        self.generator, self.pixels = generator, images.shape[1] * images.shape[2]
+        self.pixels = images.shape[1] * images.shape[2]
         keys = {camera.intrinsics: camera for camera in cameras}
         index = {key: i for i, key in enumerate(keys)}
         self.local = torch.stack(
@@ -72,26 +76,12 @@ class RayPool:
         poses = np.stack([c.camera_to_world for c in cameras])
         self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
         self.position = torch.from_numpy(poses[:, :3, 3].copy())
-        self.random_of_order = generator.get_state()
-        self.order, self.at = None, 0
-
-    def resume(self, random_of_order: torch.Tensor, at: int) -> None:
-        """Go on in the order that was drawn from a saved generator state, after its first `at` pixels."""
-        self.generator.set_state(random_of_order)
-        self._shuffle()
-        self.at = at
-
-    def _shuffle(self) -> None:
-        self.random_of_order = self.generator.get_state()
-        self.order, self.at = torch.randperm(len(self.images), generator=self.generator), 0
+        self.epochs = Epochs(len(self.images), generator)
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
         """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel once before
         any comes again."""
-        if self.order is None or self.at + count > len(self.order):
-            self._shuffle()
-        chosen = self.order[self.at : self.at + count]
-        self.at += count
+        chosen = self.epochs.draw(count)
         view, pixel = chosen // self.pixels, chosen % self.pixels
         local = self.local[self.map[view], pixel].double()
         d = torch.einsum("nij,nj->ni", self.rotation[view], local)
@@ -126,12 +116,13 @@ class FitRun:
         generator: torch.Generator,
     ):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
-        self.parts = torch.get_num_threads()
-        self.optimiser = Adam(field, self.parts)
+        self.optimiser = Adam.of(field)
         self.rays_pass = PASSES[field.kind](field)
         self.started, self.steps = time.monotonic(), 0
-        self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), list(OCCUPANCY_AT)
+        self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
+        self.found_matter, self.found_nothing = False, 0
+        self.guard = Guard(lambda: [*self.optimiser.numbers(), *self.rays_pass.numbers()])
 
     @classmethod
     def start(
@@ -147,25 +138,31 @@ class FitRun:
         pool = RayPool(cameras, images, generator)
         coarse = texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1])))
         field = COLOURS[settings.colour].create(aabb, coarse, settings.shape, generator, name)
+        field = field.to(settings.device)
         return cls(field, pool, settings, generator)
 
     def finish(
-        self, advance: Callable[[float, dict], None] = lambda share, figures: None
+        self,
+        advance: Callable[[float, dict], None] = lambda share, figures: None,
+        whole: Callable[[], AbstractContextManager] = nullcontext,
     ) -> VMField | VMMLPField:
-        """Run to the end, or to the target PSNR of the training rays where there is one. Raises
-        FloatingPointError on divergence."""
+        """Run to the end, or to the target PSNR of the training rays where there is one. Every step happens
+        inside a `whole()`, which may hold an interrupt back. Raises FloatingPointError on divergence."""
         while (share := self.share()) < 1.0 and not self.reached():
-            self.refresh(share)
-            self.step(share)
+            with whole():
+                self.refresh(share)
+                self.step(share)
             if self.steps == 1:
                 self.started = (
                     time.monotonic()
                 )  # a first run compiles in its first step; that is not the budget's
             if self.steps % 20 == 0:
-                if not math.isfinite(self.mse):
-                    raise FloatingPointError(f"the loss is {self.mse} after {self.steps} steps")
                 advance(share, {"psnr": self.psnr})
-        self.refresh_occupancy()
+        with whole():
+            if self.refreshes:  # not where the run was interrupted after it
+                self.refreshes.clear()
+                self.guard.check()
+                self.refresh_occupancy()
         return self.field
 
     def reached(self) -> bool:
@@ -178,11 +175,12 @@ class FitRun:
         arrays, metadata = self.field.state()
         arrays = {f"field.{name}": np.asarray(value) for name, value in arrays.items()}
         arrays |= {f"pass.{name}": value for name, value in self.rays_pass.state().items()}
-        arrays |= {"moment1": self.optimiser.moment1, "moment2": self.optimiser.moment2}
+        arrays |= self.optimiser.state()
         arrays |= {
             "random": self.generator.get_state().numpy(),
-            "random_of_order": self.pool.random_of_order.numpy(),
         }
+        order, drawn = self.pool.epochs.state()
+        arrays |= order
         state = {
             "command": "train",
             "field": metadata,
@@ -190,26 +188,31 @@ class FitRun:
             "elapsed": time.monotonic() - self.started,
             "adam_steps": self.optimiser.steps,
             "stages": len(self.stages),
-            "refreshes": len(self.refreshes),
+            "refreshes": self.refreshes,
+            "found": [self.found_matter, self.found_nothing],
             "mse": self.mse,
             "rays": self.rays,
-            "drawn": self.pool.at,
+            "guard": self.guard.state(),
+            **drawn,
         }
         return arrays, state
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
+        self.field = self.field.to(self.settings.device)
         self.rays_pass = PASSES[self.field.kind](self.field)
         self.rays_pass.restore(part_of(arrays, "pass."))
-        self.optimiser = Adam(self.field, self.parts)
-        self.optimiser.moment1[:], self.optimiser.moment2[:] = arrays["moment1"], arrays["moment2"]
-        self.optimiser.steps, self.steps = state["adam_steps"], state["steps"]
+        self.optimiser = Adam.of(self.field)
+        self.optimiser.restore(arrays, state["adam_steps"])
+        self.steps = state["steps"]
         self.stages = self.stages[len(self.stages) - state["stages"] :]
-        self.refreshes = self.refreshes[len(self.refreshes) - state["refreshes"] :]
+        self.refreshes = state["refreshes"]
+        self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
         self.started = time.monotonic() - state["elapsed"]
-        self.pool.resume(torch.from_numpy(arrays["random_of_order"]), state["drawn"])
+        self.guard.restore(state["guard"])
+        self.pool.epochs.restore(arrays, state)
         self.generator.set_state(torch.from_numpy(arrays["random"]))
 
     @property
@@ -227,40 +230,54 @@ class FitRun:
         """Occupancy, box and resolution changes that are due."""
         if self.refreshes and share >= self.refreshes[0]:
             self.refreshes.pop(0)
+            self.guard.check()
             self.refresh_occupancy()
         if self.stages and share >= self.stages[0][0]:
             _, part = self.stages.pop(0)
+            self.guard.check()
             self.resize(self.field.tensors[0].aabb, round(self.settings.longest * part))
 
     def refresh_occupancy(self) -> None:
-        """Mark the cells that hold matter, and cut the box down to them where that saves much."""
+        """Mark the cells that hold matter, and cut the box down to them where that saves much. Where none
+        does, nothing changes, and it is tried again later."""
         occupancy = occupancy_of(self.field)
         if not occupancy.occupied.any():
+            self.found_nothing += 1
+            retry = self.share() + RETRY_AFTER
+            if self.refreshes and self.refreshes[0] > retry:
+                self.refreshes.insert(0, retry)
             return
+        self.found_matter = True
         self.field = self.field.with_occupancy(occupancy)
         self.optimiser.field = self.field
         tight = occupancy.tight_aabb()
         if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
+            before = self.field
             self.resize(tight, max(self.field.tensors[0].resolution))
             occupancy = occupancy_of(self.field)
+            if not occupancy.occupied.any():  # what there was lies between the new texels
+                self.field = before
+                self.optimiser = Adam.of(self.field)
+                return
             self.field = self.field.with_occupancy(occupancy)
             self.optimiser.field = self.field
 
     def resize(self, aabb: np.ndarray, longest: int) -> None:
         """Another box or resolution; the optimiser starts anew, since its moments belong to other texels."""
         self.field = self.field.resampled(aabb, texels(aabb, longest))
-        self.optimiser = Adam(self.field, self.parts)
+        self.optimiser = Adam.of(self.field)
+        self.guard.renew()
 
     def step(self, share: float) -> None:
         """One batch of rays and one optimiser step."""
         settings, field = self.settings, self.field
-        dense = len(self.refreshes) == len(OCCUPANCY_AT)  # nothing is known to be empty yet: long steps
+        self.guard.keep()
         rays_o, rays_d, pixels = self.pool.draw(self.rays)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         background = np.ones((len(rays_o), 3), np.float32)
         target = pixels.clone()
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
-        step = (1.0 if dense else STEP_PER_VOXEL) * field.voxel_size
+        step = (STEP_PER_VOXEL if self.found_matter else 1.0) * field.voxel_size  # long while all is dense
         batch = Batch(
             rays_o,
             rays_d,
@@ -273,14 +290,19 @@ class FitRun:
             EARLY_STOP,
         )
         sums = self.rays_pass.gradient(field, batch, self.optimiser.grads)
-        decay = RATE_DECAY**share
+        if self.guard.accepts(sums, self.optimiser):
+            self.learn(sums, len(rays_o), RATE_DECAY**share * self.guard.rate)
+        self.steps += 1
+
+    def learn(self, sums: np.ndarray, rays: int, decay: float) -> None:
+        """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
+        of the next."""
         self.optimiser.step(RATE * decay)
         self.rays_pass.step(decay)
-        mse = sums[0] / len(rays_o)
+        mse = sums[0] / rays
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
-        per_ray = max(sums[2] / len(rays_o), 1.0)
-        self.rays = int(np.clip(0.9 * self.rays + 0.1 * settings.samples / per_ray, *RAYS_PER_STEP))
-        self.steps += 1
+        per_ray = max(sums[2] / rays, 1.0)
+        self.rays = int(np.clip(0.9 * self.rays + 0.1 * self.settings.samples / per_ray, *RAYS_PER_STEP))
 
 
 def part_of(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
@@ -311,7 +333,8 @@ def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> Occ
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
     sigma = np.zeros(len(index), np.float32)
-    cpu.density_at_cells(field.kernel_shape[0], field.arrays, 0, box[:3].copy(), cell, index, PROBES, sigma)
+    cells = box[:3].copy(), cell, index
+    field.loops.density_at_cells(field.kernel_shape[0], field.arrays, 0, *cells, PROBES, sigma)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
     return OccupancyGrid(box, occupied).dilated()

@@ -12,7 +12,7 @@ import torch
 
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
-from fusedrf_cli.engine.kernels import autograd, cpu
+from fusedrf_cli.engine.kernels import autograd, bodies
 from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 NETWORK_RATE = 1e-3  # TensoRF's
@@ -47,6 +47,10 @@ class Pass(Protocol):
         """Move what is not in `field.params`, at `decay` times the first rate."""
         ...
 
+    def numbers(self) -> list[torch.Tensor]:
+        """Views of what `step` changes."""
+        ...
+
     def state(self) -> dict[str, np.ndarray]:
         """What a checkpoint has to keep besides the field."""
         ...
@@ -64,9 +68,9 @@ class FusedPass:
 
     def gradient(self, field: VMField, batch: Batch, grads: np.ndarray) -> np.ndarray:
         """See Pass."""
-        loss = np.zeros((len(grads), 3))
+        loss = np.zeros((grads.shape[0], 3))
         diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
-        cpu.train_rays(
+        field.loops.train_rays(
             *field.kernel_shape,
             field.arrays,
             field.grid,
@@ -88,6 +92,10 @@ class FusedPass:
     def step(self, decay: float) -> None:
         """Nothing: all is in `params`."""
 
+    def numbers(self) -> list[torch.Tensor]:
+        """Nothing."""
+        return []
+
     def state(self) -> dict[str, np.ndarray]:
         """Nothing."""
         return {}
@@ -101,6 +109,9 @@ class PackedPass:
 
     def __init__(self, field: VMMLPField):
         self.optimiser = torch.optim.Adam(field.network.parameters(), NETWORK_RATE, BETAS)
+        for weight in field.network.parameters():  # moments that are there from the start can be copied
+            zero = {name: torch.zeros_like(weight) for name in ("exp_avg", "exp_avg_sq")}
+            self.optimiser.state[weight] = {"step": torch.tensor(0.0), **zero}
 
     def gradient(self, field: VMMLPField, batch: Batch, grads: np.ndarray) -> np.ndarray:
         """See Pass; the network's gradient stays with its weights until `step`."""
@@ -134,6 +145,11 @@ class PackedPass:
         for group in self.optimiser.param_groups:
             group["lr"] = NETWORK_RATE * decay
         self.optimiser.step()
+
+    def numbers(self) -> list[torch.Tensor]:
+        """The network's weights, and Adam's moments and steps of them."""
+        held = self.optimiser.state
+        return [v.detach() for weight, own in held.items() for v in (weight, *own.values())]
 
     def state(self) -> dict[str, np.ndarray]:
         """Adam's moments and step of each of the network's weights, by `<weight>.<name>`."""
@@ -184,11 +200,11 @@ def shaded_samples(
     running sum passes another multiple of it. In the untrained haze that is one in twenty.
     """
     if not THIN_BELOW:
-        seen = torch.nonzero(weights > cpu.COLOUR_FROM)[:, 0]
+        seen = torch.nonzero(weights > bodies.COLOUR_FROM)[:, 0]
         return seen, torch.ones_like(weights[seen])
     total = weights.double().cumsum(0) / THIN_BELOW + (jitter * SCATTER % 1)[ray]
     crossed = total.floor() > (total - weights.double() / THIN_BELOW).floor()
-    seen = torch.nonzero(crossed & (weights > cpu.COLOUR_FROM))[:, 0]
+    seen = torch.nonzero(crossed & (weights > bodies.COLOUR_FROM))[:, 0]
     return seen, (weights[seen] / THIN_BELOW).clamp(max=1)
 
 

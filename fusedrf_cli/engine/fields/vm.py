@@ -10,10 +10,12 @@ edit appends or drops a block and leaves the rest as it is.
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 import torch
 
+from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.base import register
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_cells, transformed_aabb
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
@@ -185,6 +187,8 @@ class VMField:
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
         """A one-block field on another box and resolution: planes and lines are interpolated, outside the old
         box they are 0."""
+        if self.params.device.type != "cpu":
+            return self.to("cpu").resampled(aabb, resolution).to(self.params.device)
         (tensor,), (block,) = self.tensors, self.blocks
         aabb = np.asarray(aabb, np.float64)
         params = torch.zeros(self.shape.size(resolution), dtype=self.params.dtype)
@@ -206,6 +210,13 @@ class VMField:
                 target[f"{what}_line_{m}"].copy_(interpolate_axis(old[f"{what}_line_{m}"], 0, at[c]))
         target["colour_basis"].copy_(old["colour_basis"])
         return new
+
+    def to(self, device: str | torch.device) -> "VMField":
+        """The same field with its numbers on a device: there it is asked, rendered and trained."""
+        if self.params.device == torch.device(device):
+            return self
+        params = self.params.to(device)
+        return VMField(self.shape, self.tensors, self.blocks, params, self.occupancy, self.owners)
 
     # -- reading ---------------------------------------------------------------------------------------------
 
@@ -259,7 +270,7 @@ class VMField:
     @cached_property
     def arrays(self) -> VMArrays:
         """What kernels read; `params` is shared, not copied."""
-        real = self.params.numpy().dtype
+        real = np.dtype(str(self.params.dtype).removeprefix("torch."))
         to_unit, to_object = [], []
         for block in self.blocks:
             box = self.tensors[block.tensor].aabb
@@ -273,8 +284,8 @@ class VMField:
                 )
             )
         first, second = self.owners if self.owners is not None else NO_OWNERS
-        return VMArrays(
-            self.params.detach().numpy(),
+        arrays = VMArrays(
+            self.loops.shared(self.params),
             self.layout,
             np.asarray([t.resolution for t in self.tensors], np.int64),
             np.ascontiguousarray(to_unit, np.float64),
@@ -287,11 +298,17 @@ class VMField:
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
         )
+        return self.loops.on_device(arrays)
 
     @property
+    def loops(self) -> ModuleType:
+        """The compiled loops of the device that the numbers lie on."""
+        return kernels.loops(self.params.device.type)
+
+    @cached_property
     def grid(self) -> GridArrays:
         """The occupancy's arrays."""
-        return self.occupancy.arrays
+        return self.loops.on_device(self.occupancy.arrays)
 
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
@@ -300,7 +317,7 @@ class VMField:
         differentiable (see autograd.py)."""
         sigma = np.empty(len(points), self.arrays.params.dtype)
         rgb = np.empty((len(points), 3), self.arrays.params.dtype)
-        cpu.query(
+        self.loops.query(
             *self.kernel_shape, self.arrays, self.grid, points.numpy(), dirs.numpy(), with_colour, sigma, rgb
         )
         return torch.from_numpy(sigma), torch.from_numpy(rgb)
@@ -316,7 +333,8 @@ class VMField:
     ) -> None:
         """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same
         columns in out (N, 5)."""
-        cpu.render(*self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, step, early_stop, out)
+        read = *self.kernel_shape, self.arrays, self.grid
+        self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
     # -- storing ---------------------------------------------------------------------------------------------
 
@@ -324,7 +342,7 @@ class VMField:
         """Arrays and metadata for a bundle; the tensors' occupancies are stored as packed bits, ownership
         follows from them."""
         arrays = {
-            f"tensor_{t}.{name}": view.detach().numpy()
+            f"tensor_{t}.{name}": view.detach().cpu().numpy()
             for t in range(len(self.tensors))
             for name, view in self.sections(t).items()
         }

@@ -5,6 +5,7 @@ basis (3, 9, 3 rank), read as the (27, 3 rank) matrix B, makes the features f = 
 """
 
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -173,6 +174,17 @@ class VMMLPField:
     def basis(self) -> torch.Tensor:
         """(27, 3 rank) view of the matrix that makes features of products."""
         return self.factors.sections(0)["colour_basis"].flatten(0, 1)
+
+    @property
+    def loops(self) -> ModuleType:
+        """The compiled loops of the factors' device."""
+        return self.factors.loops
+
+    def to(self, device: str | torch.device) -> "VMMLPField":
+        """The field itself on the CPU. Raises ValueError for any other device."""
+        if torch.device(device).type != "cpu":
+            raise ValueError(f"a vm-mlp field is computed on the CPU only, found device '{device}'")
+        return self
 
     # -- answering -------------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
+from types import ModuleType
 
 import numba
 
@@ -13,10 +14,10 @@ def kernel_cache() -> Path:
     """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
     written.
 
-    It is named for the text of bodies.py: numba only looks for changes in the file of the loop, not of what
-    the loop inlines.
+    It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
-    bodies = hashlib.sha256(Path(__file__).with_name("bodies.py").read_bytes()).hexdigest()[:12]
+    inlined = [Path(__file__).with_name(f"{name}.py") for name in ("bodies", "prefetch", "items")]
+    bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined)).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = Path(home) / "fusedrf" / "kernels" / bodies
     try:
@@ -40,6 +41,16 @@ from fusedrf_cli.engine.kernels import cpu  # noqa: E402  (compiles under the se
 from fusedrf_cli.engine.kernels.bodies import NO_BLOCK, GridArrays, VMArrays  # noqa: E402
 
 
+def loops(device: str) -> ModuleType:
+    """The module of compiled loops for arrays of a torch device type, "cpu" or "cuda". The first use of the
+    latter needs the `[gpu]` extra."""
+    if device == "cuda":
+        from fusedrf_cli.engine.kernels import cuda
+
+        return cuda
+    return cpu
+
+
 def set_threads(count: int) -> None:
     """Use that many cores, at most as many as numba started with."""
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
@@ -51,4 +62,4 @@ def is_cold() -> bool:
     return not folder.is_dir() or not any(folder.iterdir())
 
 
-__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "is_cold", "kernel_cache", "set_threads"]
+__all__ = ["NO_BLOCK", "GridArrays", "VMArrays", "cpu", "is_cold", "kernel_cache", "loops", "set_threads"]

@@ -204,6 +204,12 @@ def mode_products(ranks, params, plane, line, na, nb, nc, a, b, c, out, base):
 
 
 @body
+def accumulate(out, i, value):
+    """out[i] += value, where others may be adding too."""
+    out[i] += value
+
+
+@body
 def add_scaled_8(out, o, weight, values, v):
     """out[o : o + 8] += weight * values[v : v + 8].
 
@@ -240,6 +246,20 @@ def add_scaled(ranks, out, o, weight, values, v):
     for tile in range(np.uint64(len(ranks) // 8)):
         at = tile * np.uint64(8)
         add_scaled_8(out, o + at, weight, values, v + at)
+
+
+@body
+def scatter_8(out, o, weight, values, v):
+    """`add_scaled_8` to a place where others may be adding too; on the CPU each core has a row of its own."""
+    add_scaled_8(out, o, weight, values, v)
+
+
+@body
+def scatter(ranks, out, o, weight, values, v):
+    """`add_scaled` to a place where others may be adding too."""
+    for tile in range(np.uint64(len(ranks) // 8)):
+        at = tile * np.uint64(8)
+        scatter_8(out, o + at, weight, values, v + at)
 
 
 @body
@@ -299,12 +319,12 @@ def mode_scatter(ranks, params, grads, plane, line, na, nb, nc, a, b, c, d_out, 
         e7 = d7 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(7))
         store_8(scratch, half + r, e0, e1, e2, e3, e4, e5, e6, e7)
     zero = np.uint64(0)
-    add_scaled(ranks, grads, o00, w00, scratch, zero)
-    add_scaled(ranks, grads, o01, w01, scratch, zero)
-    add_scaled(ranks, grads, o10, w10, scratch, zero)
-    add_scaled(ranks, grads, o11, w11, scratch, zero)
-    add_scaled(ranks, grads, l0, params.dtype.type(1) - tc, scratch, half)
-    add_scaled(ranks, grads, l1, tc, scratch, half)
+    scatter(ranks, grads, o00, w00, scratch, zero)
+    scatter(ranks, grads, o01, w01, scratch, zero)
+    scatter(ranks, grads, o10, w10, scratch, zero)
+    scatter(ranks, grads, o11, w11, scratch, zero)
+    scatter(ranks, grads, l0, params.dtype.type(1) - tc, scratch, half)
+    scatter(ranks, grads, l1, tc, scratch, half)
 
 
 @body
@@ -478,7 +498,7 @@ def scatter_basis(colour_ranks, coefficients, vm, grads, b, sh, d_basis):
             target = start + np.uint64((c * count + k) * width)
             for mode in range(np.uint64(3)):
                 at = mode * np.uint64(len(colour_ranks))
-                add_scaled(colour_ranks, grads, target + at, sh[k], d_basis, row + at)
+                scatter(colour_ranks, grads, target + at, sh[k], d_basis, row + at)
 
 
 @body

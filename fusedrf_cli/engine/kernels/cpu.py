@@ -5,28 +5,22 @@ one: part p owns the p-th slice of the rays and row p of every scratch and gradi
 and a sum over rows has one order.
 """
 
-import math
-
 import numpy as np
 from numba import njit, prange
 
-from fusedrf_cli.engine.kernels.bodies import (
-    COLOUR_FROM,
-    add_scaled,
-    block_density,
-    colour_features,
-    directional_basis,
-    dot_row,
-    hit_box,
-    next_sample,
-    object_direction,
-    scatter_basis,
-    scatter_colour,
-    scatter_density,
-    sigmoid,
-    unit_point,
-    winning_block,
+from fusedrf_cli.engine.kernels.items import (
+    adam_line,
+    cell_density,
+    features_point,
+    features_point_backward,
+    march_ray,
+    pinhole_ray,
+    query_point,
+    query_point_backward,
+    render_ray,
+    train_ray,
 )
+from fusedrf_cli.engine.kernels.prefetch import COLOUR, DENSITY, LINE, prefetch_planes
 
 loop = njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
 # A task is the serial work of one core. Without the reference counting of array arguments (_nrt) it is up to
@@ -36,43 +30,36 @@ task = njit(fastmath=True, error_model="numpy", cache=True, _nrt=False)
 POINTS_PER_TASK = 2048
 RAYS_PER_TASK = 256
 ENTRIES_PER_TASK = 1 << 16
-LINE = 16  # floats in a cache line
+POINTS_AHEAD = 4  # a point's texels are asked for so many points before it
+
+
+def shared(tensor):
+    """A torch tensor's numbers as the loops take them, not copied."""
+    return tensor.detach().numpy()
+
+
+def on_device(arrays):
+    """Arrays, or a tuple of them, where the loops read them fastest: here as they are."""
+    return arrays
 
 
 @task
 def query_task(
-    ranks,
-    colour_ranks,
-    coefficients,
-    vm,
-    grid,
-    points,
-    dirs,
-    with_colour,
-    low,
-    high,
-    features,
-    basis,
-    sh,
-    sigma,
-    rgb,
-):
+    ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, low, high, features, basis, sh,
+    sigma, rgb,
+):  # fmt: skip
     """`query` for points low..high."""
     for i in range(low, high):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
-        sigma[i] = 0
-        rgb[i, 0], rgb[i, 1], rgb[i, 2] = 0, 0, 0
-        if not occupied(grid, x, y, z):
-            continue
-        b, s, _, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
-        sigma[i] = s
-        if with_colour and s > 0:
-            u, v, w, _ = unit_point(vm, b, x, y, z)
-            directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
-            colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, 0)
-            for c in range(3):
-                rgb[i, c] = sigmoid(dot_row(colour_ranks, basis, c, features, 0))
+        n = i + POINTS_AHEAD
+        if n < high:
+            x, y, z = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+            prefetch_planes(ranks, vm, vm.params, DENSITY, 0, x, y, z)
+            if with_colour:
+                prefetch_planes(colour_ranks, vm, vm.params, COLOUR, 0, x, y, z)
+        query_point(
+            ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, i, features, basis, sh,
+            sigma, rgb,
+        )  # fmt: skip
 
 
 @loop
@@ -105,50 +92,24 @@ def query(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour
 
 
 @task
-def occupied(grid, x, y, z):
-    """Whether a point lies in the grid's box, in a cell that is not empty."""
-    nx, ny, nz = grid.skip.shape
-    i = int(math.floor((x - grid.lo[0]) / grid.cell[0]))
-    j = int(math.floor((y - grid.lo[1]) / grid.cell[1]))
-    m = int(math.floor((z - grid.lo[2]) / grid.cell[2]))
-    return 0 <= i < nx and 0 <= j < ny and 0 <= m < nz and grid.skip[i, j, m] == 0
-
-
-@task
 def query_backward_task(
-    ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, low, high, grad, features,
-    d_features, basis, d_basis, sh, d_f, scratch,
+    ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, low, high, features,
+    d_features, basis, d_basis, sh, d_f, scratch, grad,
 ):  # fmt: skip
     """`query_backward` for points low..high, into one row of gradients."""
     for i in range(low, high):
-        x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        dx, dy, dz = float(dirs[i, 0]), float(dirs[i, 1]), float(dirs[i, 2])
-        if not occupied(grid, x, y, z):
-            continue
-        b, s, f, _ = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
-        u, v, w, inside = unit_point(vm, b, x, y, z)
-        if not inside or s == 0:
-            continue
-        t = vm.tensor[b]
-        stretch = object_direction(vm, b, dx, dy, dz)[3]
-        d_f[0] = d_sigma[i] * stretch * vm.density[t, 0] * sigmoid(f + vm.density[t, 1])
-        scatter_density(ranks, vm, grad, t, u, v, w, d_f, 0, scratch)
-        if s > 0 and (d_rgb[i, 0] != 0 or d_rgb[i, 1] != 0 or d_rgb[i, 2] != 0):
-            directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
-            colour_features(colour_ranks, vm, t, u, v, w, features, 0)
-            clear(d_basis)
-            shade_backward(
-                colour_ranks, basis, features, 0, d_rgb[i, 0], d_rgb[i, 1], d_rgb[i, 2], d_features, d_basis
-            )
-            scatter_colour(colour_ranks, vm, grad, t, u, v, w, d_features, 0, scratch)
-            scatter_basis(colour_ranks, coefficients, vm, grad, b, sh, d_basis)
-
-
-@task
-def clear(values):
-    """Set a vector to zero."""
-    for i in range(values.shape[0]):
-        values[i] = 0
+        n = i + POINTS_AHEAD
+        if n < high:
+            x, y, z = float(points[n, 0]), float(points[n, 1]), float(points[n, 2])
+            prefetch_planes(ranks, vm, vm.params, DENSITY, 0, x, y, z)
+            prefetch_planes(ranks, vm, grad, DENSITY, 0, x, y, z)
+            if d_rgb[n, 0] != 0 or d_rgb[n, 1] != 0 or d_rgb[n, 2] != 0:
+                prefetch_planes(colour_ranks, vm, vm.params, COLOUR, 0, x, y, z)
+                prefetch_planes(colour_ranks, vm, grad, COLOUR, 0, x, y, z)
+        query_point_backward(
+            ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, i, features,
+            d_features, basis, d_basis, sh, d_f, scratch, grad,
+        )  # fmt: skip
 
 
 @loop
@@ -162,28 +123,10 @@ def query_backward(ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_
         kind = vm.params.dtype
         query_backward_task(
             ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, p * n // parts,
-            (p + 1) * n // parts, grads[p], np.empty(width, kind), np.empty(width, kind),
-            np.empty(3 * width, kind), np.empty(3 * width, kind), np.empty(16, kind), np.empty(1, kind),
-            np.empty(2 * max(len(ranks), len(colour_ranks)), kind),
+            (p + 1) * n // parts, np.empty(width, kind), np.empty(width, kind), np.empty(3 * width, kind),
+            np.empty(3 * width, kind), np.empty(16, kind), np.empty(1, kind),
+            np.empty(2 * max(len(ranks), len(colour_ranks)), kind), grads[p],
         )  # fmt: skip
-
-
-@task
-def shade_backward(colour_ranks, basis, features, base, d_r, d_g, d_b, d_features, d_basis):
-    """Adjoint of rgb_c = sigmoid(<basis_c, features[base:]>): sets d_features, adds to d_basis."""
-    rank = len(colour_ranks)
-    real = basis.dtype.type
-    for r in range(np.uint64(3 * rank)):
-        d_features[r] = 0
-    for c in range(3):
-        rgb = sigmoid(dot_row(colour_ranks, basis, c, features, base))
-        d = d_r if c == 0 else (d_g if c == 1 else d_b)
-        d_logit = real(d * rgb * (1 - rgb))
-        for mode in range(3):
-            at = np.uint64(mode * rank)
-            row = np.uint64(3 * c * rank) + at
-            add_scaled(colour_ranks, d_features, at, d_logit, basis, row)
-            add_scaled(colour_ranks, d_basis, row, d_logit, features, np.uint64(base) + at)
 
 
 @task
@@ -193,36 +136,10 @@ def render_task(
 ):  # fmt: skip
     """`render` for rays low..high."""
     for i in range(low, high):
-        ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
-        dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
-        t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
-        t0 = max(t0, near) + 0.5 * step
-        red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
-        trans = 1.0
-        waiting = 0.0  # as in train_task
-        current = -1
-        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
-        while k >= 0 and trans > early_stop:
-            t = t0 + k * step
-            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            b, s, _, steps = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
-            alpha = 1.0 - math.exp(-s * steps * step)
-            weight = trans * alpha
-            trans -= weight
-            depth += weight * t
-            waiting += weight
-            if waiting > COLOUR_FROM:
-                if b != current:
-                    directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
-                    current = b
-                u, v, w, _ = unit_point(vm, b, x, y, z)
-                colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, 0)
-                red += waiting * sigmoid(dot_row(colour_ranks, basis, 0, features, 0))
-                green += waiting * sigmoid(dot_row(colour_ranks, basis, 1, features, 0))
-                blue += waiting * sigmoid(dot_row(colour_ranks, basis, 2, features, 0))
-                waiting = 0.0
-            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + steps)
-        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
+        render_ray(
+            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, i, features,
+            basis, sh, out,
+        )  # fmt: skip
 
 
 @loop
@@ -262,107 +179,15 @@ def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, st
 def train_task(
     ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
     background, opacity_weight, low, high, ts, pre, weights, carried, rgbs, blocks, slots, spans, features,
-    d_features,
-    basis, d_basis, sh, d_f, scratch, grad, loss,
+    d_features, basis, d_basis, sh, d_f, scratch, grad, loss,
 ):  # fmt: skip
     """`train_rays` for rays low..high, into one row of gradients and losses."""
-    n = rays_o.shape[0]
-    width = 3 * len(colour_ranks)
-    real = vm.params.dtype.type
     for i in range(low, high):
-        ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
-        dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
-        t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
-        t0 = max(t0, near) + jitter[i] * step
-        red, green, blue = 0.0, 0.0, 0.0
-        trans = 1.0
-        current = -1
-        count = 0
-        shaded = 0
-        waiting = (
-            0.0  # weight of samples too light to be shaded alone; the next shaded one gives them its colour
-        )
-        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
-        while k >= 0 and trans > early_stop and count < ts.shape[0]:
-            t = t0 + k * step
-            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            b, s, f, steps = winning_block(ranks, vm, grid, x, y, z, dx, dy, dz)
-            weight = trans * (1.0 - math.exp(-s * steps * step))
-            trans -= weight
-            ts[count], pre[count], weights[count], blocks[count], slots[count] = t, f, weight, b, -1
-            spans[count] = steps
-            waiting += weight
-            if waiting > COLOUR_FROM:
-                if b != current:
-                    directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
-                    current = b
-                u, v, w, _ = unit_point(vm, b, x, y, z)
-                base = shaded * width
-                colour_features(colour_ranks, vm, vm.tensor[b], u, v, w, features, base)
-                rgbs[count, 0] = sigmoid(dot_row(colour_ranks, basis, 0, features, base))
-                rgbs[count, 1] = sigmoid(dot_row(colour_ranks, basis, 1, features, base))
-                rgbs[count, 2] = sigmoid(dot_row(colour_ranks, basis, 2, features, base))
-                red += waiting * rgbs[count, 0]
-                green += waiting * rgbs[count, 1]
-                blue += waiting * rgbs[count, 2]
-                slots[count] = base
-                carried[count] = waiting
-                waiting = 0.0
-                shaded += 1
-            count += 1
-            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + steps)
-
-        e_r = red + trans * background[i, 0] - target[i, 0]
-        e_g = green + trans * background[i, 1] - target[i, 1]
-        e_b = blue + trans * background[i, 2] - target[i, 2]
-        e_a = (1.0 - trans) - target[i, 3]
-        loss[2] += count
-        loss[0] += (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0
-        loss[1] += e_a * e_a
-        if count == 0:
-            continue
-        scale = 2.0 / (3.0 * n)
-        g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
-        g_t = (
-            g_r * background[i, 0]
-            + g_g * background[i, 1]
-            + g_b * background[i, 2]
-            - 2.0 / n * opacity_weight * e_a
-        )
-
-        # Backwards along the ray: `behind` is the gradient's share of all that lies behind the sample, the
-        # background too.
-        behind = trans * g_t
-        after = trans
-        own = 0.0
-        clear(d_basis)
-        for q in range(count - 1, -1, -1):
-            b = blocks[q]
-            t = ts[q]
-            u, v, w, inside = unit_point(vm, b, ox + t * dx, oy + t * dy, oz + t * dz)
-            if slots[q] >= 0:
-                own = g_r * rgbs[q, 0] + g_g * rgbs[q, 1] + g_b * rgbs[q, 2]
-                if b != current:
-                    scatter_basis(colour_ranks, coefficients, vm, grad, current, sh, d_basis)
-                    directional_basis(colour_ranks, coefficients, vm, b, dx, dy, dz, basis, sh)
-                    clear(d_basis)
-                    current = b
-                wq = carried[q]
-                shade_backward(
-                    colour_ranks, basis, features, slots[q], g_r * wq, g_g * wq, g_b * wq, d_features, d_basis
-                )
-                scatter_colour(colour_ranks, vm, grad, vm.tensor[b], u, v, w, d_features, 0, scratch)
-            d_sigma = spans[q] * step * (after * own - behind)
-            behind += weights[q] * own
-            after += weights[q]
-            if inside and weights[q] > 0.0:  # where no block is asked, none learns
-                tensor = vm.tensor[b]
-                slope = object_direction(vm, b, dx, dy, dz)[3] * vm.density[tensor, 0]
-                d_f[0] = real(d_sigma * slope * sigmoid(pre[q] + vm.density[tensor, 1]))
-                if d_f[0] != 0:
-                    scatter_density(ranks, vm, grad, tensor, u, v, w, d_f, 0, scratch)
-        if shaded > 0:
-            scatter_basis(colour_ranks, coefficients, vm, grad, current, sh, d_basis)
+        train_ray(
+            ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop,
+            target, background, opacity_weight, i, ts, pre, weights, carried, rgbs, blocks, slots, spans,
+            features, d_features, basis, d_basis, sh, d_f, scratch, grad, loss,
+        )  # fmt: skip
 
 
 @loop
@@ -396,31 +221,12 @@ def train_rays(
 
 @task
 def adam_task(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
-    """`adam` for entries low..high, a cache line at a time; lines that no part touched cost one read."""
-    real = params.dtype.type
-    one, zero = real(1), real(0)
+    """`adam` for entries low..high."""
     for line in range(low, high, LINE):
-        start = np.uint64(line)
-        touched = zero
-        for p in range(grads.shape[0]):
-            for i in range(np.uint64(LINE)):
-                touched += abs(grads[p, start + i])
-        if touched == zero:
-            continue
-        for p in range(1, grads.shape[0]):
-            for i in range(np.uint64(LINE)):
-                grads[0, start + i] += grads[p, start + i]
-                grads[p, start + i] = zero
-        for i in range(np.uint64(LINE)):
-            g = grads[0, start + i]
-            m, v = moment1[start + i], moment2[start + i]
-            m_new = beta1 * m + (one - beta1) * g
-            v_new = beta2 * v + (one - beta2) * g * g
-            moment1[start + i] = m_new if g != zero else m
-            moment2[start + i] = v_new if g != zero else v
-            change = rate * (m_new * correction1) / (math.sqrt(v_new * correction2) + eps)
-            params[start + i] -= change if g != zero else zero
-            grads[0, start + i] = zero
+        adam_line(
+            params, grads, moment1, moment2, rate, np.uint64(line), beta1, beta2, eps, correction1,
+            correction2,
+        )  # fmt: skip
 
 
 @loop
@@ -444,13 +250,7 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
 def density_at_cells_task(ranks, vm, b, lo, cell, cells, low, high, offsets, out):
     """`density_at_cells` for cells low..high."""
     for i in range(low, high):
-        best = 0.0
-        for q in range(offsets.shape[0]):
-            x = lo[0] + (cells[i, 0] + offsets[q, 0]) * cell[0]
-            y = lo[1] + (cells[i, 1] + offsets[q, 1]) * cell[1]
-            z = lo[2] + (cells[i, 2] + offsets[q, 2]) * cell[2]
-            best = max(best, block_density(ranks, vm, b, x, y, z, 1.0)[0])
-        out[i] = best
+        cell_density(ranks, vm, b, lo, cell, cells, i, offsets, out)
 
 
 @loop
@@ -463,37 +263,36 @@ def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
         density_at_cells_task(ranks, vm, b, lo, cell, cells, low, high, offsets, out)
 
 
+@task
+def pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d):
+    """`pinhole_rays` for rays low..high."""
+    for i in range(low, high):
+        pinhole_ray(pose, fl_x, fl_y, cx, cy, width, top, order, i, rays_o, rays_d)
+
+
+@loop
+def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
+    """Rays (N, 3) of an undistorted camera at pose (4, 4), camera to world, OpenGL axes: ray i is that of
+    pixel order[i] (N,), counted row by row of `width` pixels from row `top` on."""
+    n = order.shape[0]
+    for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
+        pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d)
+
+
 @loop
 def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
     """The next samples of every living ray: ts (N, K) distances, counts (N,); start (N,) int64 is where to go
     on, -1 at the end."""
     for i in prange(rays_o.shape[0]):
-        counts[i] = 0
-        if not alive[i] or start[i] < 0:
-            continue
-        ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
-        dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
-        t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
-        t0 = max(t0, near) + jitter[i] * step
-        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, start[i])
-        while k >= 0 and counts[i] < ts.shape[1]:
-            ts[i, counts[i]] = t0 + k * step
-            counts[i] += 1
-            k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + 1)
-        start[i] = k
+        march_ray(grid, rays_o, rays_d, near, jitter, step, alive, i, start, ts, counts)
 
 
 @task
 def features_task(colour_ranks, vm, block, points, low, high, out):
     """`features` for points low..high."""
-    width = 3 * len(colour_ranks)
     for i in range(low, high):
-        u, v, w, inside = unit_point(vm, block, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
-        if inside:
-            colour_features(colour_ranks, vm, vm.tensor[block], u, v, w, out, i * width)
-        else:
-            for r in range(np.uint64(width)):
-                out[np.uint64(i * width) + r] = 0
+        features_point(colour_ranks, vm, block, points, i, out)
 
 
 @loop
@@ -506,13 +305,10 @@ def features(colour_ranks, vm, block, points, out):
 
 
 @task
-def features_backward_task(colour_ranks, vm, block, points, d_features, low, high, grad, scratch):
+def features_backward_task(colour_ranks, vm, block, points, d_features, low, high, scratch, grad):
     """`features_backward` for points low..high, into one row of gradients."""
-    width = 3 * len(colour_ranks)
     for i in range(low, high):
-        u, v, w, inside = unit_point(vm, block, float(points[i, 0]), float(points[i, 1]), float(points[i, 2]))
-        if inside:
-            scatter_colour(colour_ranks, vm, grad, vm.tensor[block], u, v, w, d_features, i * width, scratch)
+        features_point_backward(colour_ranks, vm, block, points, d_features, i, scratch, grad)
 
 
 @loop
@@ -524,4 +320,4 @@ def features_backward(colour_ranks, vm, block, points, d_features, grads):
     for p in prange(parts):
         scratch = np.empty(2 * len(colour_ranks), vm.params.dtype)
         low, high = p * n // parts, (p + 1) * n // parts
-        features_backward_task(colour_ranks, vm, block, points, d_features, low, high, grads[p], scratch)
+        features_backward_task(colour_ranks, vm, block, points, d_features, low, high, scratch, grads[p])

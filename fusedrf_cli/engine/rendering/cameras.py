@@ -5,8 +5,13 @@ at (i + 0.5, j + 0.5).
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+
+from fusedrf_cli.engine.kernels import cpu
+
+TILE = 16  # pixels along the side of a tile
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,35 @@ class Camera:
             x, y = undistort(x, y, self.distortion)
         return np.stack([x, -y, -np.ones_like(x)], -1)
 
-    def rays(self, rows: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """rays_o, rays_d, each (rows * width, 3) float64 in world space, rays_d of unit length, row by
-        row."""
-        d = self.local_directions(rows).reshape(-1, 3) @ self.camera_to_world[:3, :3].T
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
-        return np.broadcast_to(self.camera_to_world[:3, 3], d.shape).copy(), d
+    def rays(
+        self, rows: slice = slice(None), order: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """rays_o, rays_d, each (rows * width, 3) float64 in world space, rays_d of unit length, row by row,
+        or those of the rows' pixels in another order (N,) int64."""
+        top, bottom, _ = rows.indices(self.height)
+        if order is None:
+            order = np.arange((bottom - top) * self.width)
+        rays_o, rays_d = np.empty((len(order), 3)), np.empty((len(order), 3))
+        pose = np.ascontiguousarray(self.camera_to_world, np.float64)
+        if any(self.distortion):
+            rays_d[:] = self.local_directions(rows).reshape(-1, 3)[order] @ pose[:3, :3].T
+            rays_d /= np.linalg.norm(rays_d, axis=1, keepdims=True)
+            rays_o[:] = pose[:3, 3]
+        else:
+            inner = self.fl_x, self.fl_y, self.cx, self.cy
+            cpu.pinhole_rays(pose, *map(float, inner), self.width, top, order, rays_o, rays_d)
+        return rays_o, rays_d
+
+
+@lru_cache(maxsize=4)
+def tile_order(width: int, rows: int) -> np.ndarray:
+    """(rows * width,) int64 pixels, counted row by row, tile after tile: rays of a tile pass the same
+    texels."""
+    high, wide = -(-rows // TILE), -(-width // TILE)
+    padded = np.full((high * TILE, wide * TILE), -1)
+    padded[:rows, :width] = np.arange(rows * width).reshape(rows, width)
+    order = padded.reshape(high, TILE, wide, TILE).swapaxes(1, 2).ravel()
+    return order[order >= 0]
 
 
 def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
 
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
@@ -193,11 +193,14 @@ def render_bands(
     """The view of `render_image` as bands of whole rows from the top, for pictures that memory does not hold;
     put together they are that picture to the bit."""
     shift = np.zeros(3) if origin is None else origin
-    rows = max(1, ROWS_AT_ONCE_PIXELS // camera.width)
+    rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
     for top in range(0, camera.height, rows):
-        rays_o, rays_d = camera.rays(slice(top, top + rows))
+        order = tile_order(camera.width, min(rows, camera.height - top))
+        rays_o, rays_d = camera.rays(slice(top, top + rows), order)
         found = render_rays(field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop)
-        pixels = found.reshape(-1, camera.width, 5)
+        pixels = np.empty_like(found)
+        pixels[order] = found
+        pixels = pixels.reshape(-1, camera.width, 5)
         opacity = pixels[..., 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(opacity > 1e-3, pixels[..., 4] / opacity, np.inf).astype(np.float32)

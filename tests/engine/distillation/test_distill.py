@@ -1,5 +1,7 @@
 """Distilling a coloured ball into a small student."""
 
+import contextlib
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +18,6 @@ from fusedrf_cli.engine.distillation.distill import (
     empty_student,
     pruned,
     resolution_for,
-    shares,
     student_from,
 )
 from fusedrf_cli.engine.distillation.fit import texels
@@ -84,19 +85,86 @@ def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
     assert torch.equal(student.params, plain.params) is not kept
 
 
+def test_a_harmful_rgb_phase_is_not_kept(monkeypatch):
+    """At a rate of 3 the pictures spoil what the points taught; the student is the one of before."""
+    monkeypatch.setattr(module.RayPass, "rate", 3.0)
+    brief = replace(SETTINGS, rays=2000, rgb_steps=10)
+    student, report = taught(brief)
+    plain, before = taught(brief, rgb=False)
+    assert report.psnr_after_rgb < report.psnr_before_rgb - 3 and report.rgb_kept is False
+    assert report.psnr_before_rgb == before.psnr_before_rgb and torch.equal(student.params, plain.params)
+
+
+def test_bad_steps_are_skipped_and_told(monkeypatch):
+    """Every 15th answer of the loss is infinite: of the 90 steps of both phases four in the points are."""
+    point_step, calls = module.point_step, []
+
+    def infinite_at_times(*words):
+        calls.append(0)
+        return point_step(*words) * (float("inf") if len(calls) % 15 == 0 else 1)
+
+    monkeypatch.setattr(module, "point_step", infinite_at_times)
+    student, report = taught(SETTINGS)
+    assert report.numeric == {"skipped_steps": 4, "roll_backs": 0} and report.psnr_before_rgb > 19
+    assert torch.isfinite(student.params).all()
+
+
+def test_a_teacher_of_nan_is_an_error(monkeypatch):
+    def spoilt(teacher, *words, **more):
+        pool = ask(teacher, *words, **more)
+        pool.sigma[:] = float("nan")
+        return pool
+
+    ask = module.ask
+    monkeypatch.setattr(module, "ask", spoilt)
+    with pytest.raises(FloatingPointError, match="44 steps were not finite, after 3 returns"):
+        taught(replace(SETTINGS, rays=100), rgb=False)
+
+
+def test_a_student_that_holds_nothing_yet_keeps_its_cells():
+    """After one step nothing is dense: no cell may be given up, or nothing could be learnt any more."""
+    student, report = taught(replace(SETTINGS, rays=1000, steps=1), rgb=False)
+    assert report.found_nothing and np.array_equal(student.occupancy.occupied, TEACHER.occupancy.occupied)
+    assert not taught(replace(SETTINGS, rays=4000, steps=60), rgb=False)[1].found_nothing
+
+
+@pytest.mark.parametrize("at", [0, 7, 20, 25, 30])
+def test_a_restored_run_goes_on_to_the_same_bits(at):
+    """Stopped before the first step, in the points (20 steps) and in the pictures (10)."""
+    brief = replace(SETTINGS, rays=1000, steps=20, rgb_steps=10)
+    straight, told = taught(brief)
+
+    class Stop(Exception):
+        pass
+
+    @contextlib.contextmanager
+    def whole():
+        if left and not left.pop():
+            raise Stop
+        yield
+
+    left = [0] + [1] * at
+    run = a_run(brief)
+    with pytest.raises(Stop):
+        run.finish(whole=whole)
+    arrays, state = run.checkpoint()
+    arrays = {name: np.array(values) for name, values in arrays.items()}
+    again = a_run(brief)
+    again.restore(arrays, json.loads(json.dumps(state)))
+    student, report = again.finish()
+    assert torch.equal(student.params, straight.params)
+    assert np.array_equal(student.occupancy.occupied, straight.occupancy.occupied)
+    assert report.psnr_after_rgb == told.psnr_after_rgb and report.rgb_kept == told.rgb_kept
+
+
+def a_run(settings: DistillSettings) -> module.DistillRun:
+    student = empty_student(TEACHER, settings, torch.Generator().manual_seed(settings.seed), "ball")
+    return module.DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings)
+
+
 def test_without_rgb_nothing_is_said_of_it():
     report = taught(replace(SETTINGS, rays=500, steps=2), rgb=False)[1]
     assert report.rgb_kept is None and report.psnr_after_rgb is None and "pictures" not in report.seconds
-
-
-def test_numbers_that_are_not_finite_are_an_error(monkeypatch):
-    def spoil(student, *_):
-        student.params[0] = float("nan")
-
-    monkeypatch.setattr(module, "fit_points", spoil)
-    monkeypatch.setattr(module, "Judge", lambda *_: lambda student: 0.0)
-    with pytest.raises(FloatingPointError, match="not finite"):
-        taught(replace(SETTINGS, rays=100), rgb=False)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
@@ -134,12 +202,6 @@ def test_resolution_is_the_teachers_or_what_fits():
     tight = THIRTY_TWO.size(texels(BOX, 40))
     found = resolution_for(BOX, 1e-3, THIRTY_TWO, tight)
     assert 0.9 * tight < THIRTY_TWO.size(found) <= tight
-
-
-def test_shares_follow_the_steps_or_the_clock():
-    assert list(shares(4, None)) == [0, 0.25, 0.5, 0.75]
-    by_clock = list(shares(1, 0.05))
-    assert len(by_clock) > 1 and by_clock == sorted(by_clock) and by_clock[-1] < 1
 
 
 def test_pruned_drops_empty_cells_only():

@@ -10,7 +10,7 @@ from fusedrf_cli.engine.distillation.passes import Batch, PackedPass, composite
 from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm_mlp import ColourNetwork, Encoding, VMMLPField
-from fusedrf_cli.engine.kernels import autograd, cpu
+from fusedrf_cli.engine.kernels import autograd, bodies
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
@@ -133,7 +133,7 @@ def test_rendering_equals_a_slow_loop():
             sigma, colour = field.query(point, torch.from_numpy(d[None]))
             weight = trans * (1 - np.exp(-float(sigma[0]) * step))
             trans -= weight
-            rgb += weight * colour[0].numpy() * (weight > cpu.COLOUR_FROM)
+            rgb += weight * colour[0].numpy() * (weight > bodies.COLOUR_FROM)
         np.testing.assert_allclose(found[ray, :4], [*rgb, 1 - trans], atol=2e-5)
 
 
@@ -157,7 +157,7 @@ def test_thinned_samples_stand_for_all():
     ray, jitter = torch.arange(20_000) // 10, torch.rand(2000, generator=generator, dtype=torch.float64)
     seen, share = passes.shaded_samples(weights, ray, jitter)
     assert set(torch.nonzero(weights > 1.001 * passes.THIN_BELOW)[:, 0].tolist()) <= set(seen.tolist())
-    assert len(seen) < 0.5 * int((weights > cpu.COLOUR_FROM).sum())
+    assert len(seen) < 0.5 * int((weights > bodies.COLOUR_FROM).sum())
     values = torch.rand(20_000, generator=generator)
     found = ((weights[seen] / share) * values[seen]).sum() / (weights * values).sum()
     assert float(found) == pytest.approx(1, abs=0.03)
@@ -178,7 +178,7 @@ def loss_of(field, batch) -> float:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_whole_pass_s_gradient_against_finite_differences(seed, monkeypatch):
-    monkeypatch.setattr(cpu, "COLOUR_FROM", 0.0)  # the loss jumps where a sample crosses it
+    monkeypatch.setattr(bodies, "COLOUR_FROM", 0.0)  # the loss jumps where a sample crosses it
     monkeypatch.setattr(passes, "THIN_BELOW", 0.0)
     field = random_field(seed=seed, cells=4)
     batch = batch_at(field)

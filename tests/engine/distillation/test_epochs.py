@@ -1,0 +1,49 @@
+"""Every number once before any comes again, whatever the batches."""
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.engine.distillation.epochs import Epochs
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("count, batch", [(10, 3), (10, 10), (10, 25), (7, 1), (64, 48)])
+def test_every_number_comes_once_an_epoch(count, batch):
+    """Also where the batches do not divide the epoch: the remainder is not lost."""
+    epochs = Epochs(count, seeded())
+    batches = [epochs.draw(batch) for _ in range(5 * count)]
+    assert {len(part) for part in batches} == {min(batch, count)}
+    drawn = torch.cat(batches)
+    whole = drawn[: len(drawn) // count * count].view(-1, count)
+    assert torch.equal(whole.sort(1).values, torch.arange(count).expand(len(whole), count))
+
+
+def test_epochs_differ_and_follow_the_seed():
+    first, again, other = (Epochs(50, seeded(s)) for s in (1, 1, 2))
+    a, b, c = first.draw(50), again.draw(50), other.draw(50)
+    assert torch.equal(a, b) and not torch.equal(a, c) and not torch.equal(a, first.draw(50))
+
+
+@pytest.mark.parametrize("before", [0, 1, 4, 9])
+def test_a_restored_order_goes_on(before):
+    """Also from before the first draw, and with other random numbers drawn in between."""
+    generator = seeded()
+    epochs = Epochs(10, generator)
+    torch.rand(3, generator=generator)
+    for _ in range(before):
+        epochs.draw(3)
+        torch.rand(1, generator=generator)
+    arrays, state = epochs.state()
+    arrays = {name: np.array(value) for name, value in arrays.items()}
+    random = generator.get_state()
+
+    other = seeded(99)
+    restored = Epochs(10, other)
+    restored.restore(arrays, state)
+    other.set_state(random)
+    for _ in range(12):
+        assert torch.equal(epochs.draw(3), restored.draw(3))

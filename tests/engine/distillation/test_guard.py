@@ -1,0 +1,145 @@
+"""Bad steps change nothing; too many of them bring the last good numbers back."""
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.engine.distillation.guard import ALLOWED, KEPT_EVERY, MOST_ROLL_BACKS, WINDOW, Guard
+from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
+from tests.engine.conftest import THIRTY_TWO, random_vm
+
+FINE, BAD = np.array([1.0, 2.0, 3.0]), np.array([1.0, np.nan, 3.0])
+
+
+@pytest.fixture
+def parts():
+    """A field, its optimiser and their guard."""
+    field = random_vm(THIRTY_TWO, dtype=torch.float32)
+    optimiser = Adam(field, 2)
+    return field, optimiser, Guard(optimiser.numbers)
+
+
+@pytest.mark.parametrize("loss", [np.nan, np.inf, -np.inf])
+def test_a_bad_loss_is_no_step(parts, loss):
+    _, optimiser, guard = parts
+    guard.keep()
+    optimiser.grads[:] = 1
+    assert not guard.accepts(np.array([loss, 0, 0]), optimiser)
+    assert not optimiser.grads.any() and guard.figures() == {"skipped_steps": 1, "roll_backs": 0}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_a_bad_gradient_of_the_basis_is_no_step(parts, value):
+    """1e30 is finite, but its square in the second moment would not be."""
+    field, optimiser, guard = parts
+    guard.keep()
+    optimiser.grads[1, int(field.layout[0, 12]) + 5] = value
+    assert not guard.accepts(FINE, optimiser)
+
+
+def test_fine_steps_are_accepted_and_not_told(parts):
+    _, optimiser, guard = parts
+    for _ in range(3 * KEPT_EVERY):
+        guard.keep()
+        optimiser.grads[:, ::1000] = 1e-3
+        assert guard.accepts(FINE, optimiser)
+    assert guard.figures() == {} and guard.rate == 1
+
+
+def test_a_poisoned_factor_shows_in_the_basis():
+    """An infinite colour factor: the loss may stay finite, the next step is refused all the same."""
+    from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
+    from tests.engine.conftest import BOX, rays_at
+
+    field = random_vm(THIRTY_TWO, dtype=torch.float32)
+    field.sections(0)["colour_line_1"][:, 3] = float("inf")
+    optimiser = Adam(field, 2)
+    rays = rays_at(BOX, 64)
+    zeros = np.zeros((64, 4), np.float32)
+    batch = Batch(*rays, np.zeros(64), zeros, zeros[:, :3].copy(), 0.1, 0.0, 0.1, 1e-3)
+    sums = FusedPass(field).gradient(field, batch, optimiser.grads)
+    assert not np.isfinite(optimiser.grads).all()
+    assert not (np.isfinite(sums).all() and optimiser.sound())
+
+
+def test_more_than_ten_in_a_hundred_go_back(parts):
+    """To the copy of before, moments and all, at a third of the rate."""
+    field, optimiser, guard = parts
+    guard.keep()
+    good = field.params.clone()
+    field.params += 1
+    optimiser.moment1 += 1
+    for i in range(ALLOWED + 1):
+        assert guard.roll_backs == 0, i
+        guard.keep()
+        guard.accepts(BAD, optimiser)
+    assert guard.roll_backs == 1 and guard.rate == pytest.approx(1 / 3)
+    assert torch.equal(field.params, good) and not optimiser.moment1.any()
+
+
+def test_ten_in_a_hundred_are_borne_for_ever(parts):
+    _, optimiser, guard = parts
+    for i in range(5 * WINDOW):
+        guard.keep()
+        guard.accepts(BAD if i % WINDOW < ALLOWED else FINE, optimiser)
+    assert guard.roll_backs == 0 and guard.skipped == 5 * ALLOWED
+
+
+def test_the_fourth_time_is_the_last(parts):
+    _, optimiser, guard = parts
+    guard.keep()
+    for _ in range((MOST_ROLL_BACKS + 1) * (ALLOWED + 1) - 1):
+        guard.accepts(BAD, optimiser)
+    assert guard.roll_backs == MOST_ROLL_BACKS and guard.rate == pytest.approx(1 / 27)
+    with pytest.raises(FloatingPointError, match="44 steps were not finite"):
+        guard.accepts(BAD, optimiser)
+
+
+def test_poisoned_numbers_are_found_when_a_copy_is_due(parts):
+    """One NaN among all numbers is gone after KEPT_EVERY steps, though no loss told of it."""
+    field, optimiser, guard = parts
+    guard.keep()
+    good = field.params.clone()
+    field.params[7] = float("nan")
+    for _ in range(KEPT_EVERY):
+        guard.keep()
+        guard.accepts(FINE, optimiser)
+    assert guard.roll_backs == 1 and torch.equal(field.params, good)
+
+
+def test_nothing_good_to_go_back_to(parts):
+    field, _, guard = parts
+    field.params[7] = float("inf")
+    with pytest.raises(FloatingPointError):
+        guard.keep()
+
+
+def test_a_restored_guard_counts_on(parts):
+    _, optimiser, guard = parts
+    guard.keep()
+    for _ in range(ALLOWED):
+        guard.accepts(BAD, optimiser)
+    other = Guard(guard.numbers)
+    other.restore(guard.state())
+    other.keep()
+    other.accepts(BAD, optimiser)
+    assert other.figures() == {"skipped_steps": ALLOWED + 1, "roll_backs": 1}
+
+
+def test_a_networks_weights_and_moments_go_back_too():
+    from fusedrf_cli.engine.distillation.passes import PackedPass
+    from fusedrf_cli.engine.fields.vm import VMShape
+    from tests.engine.conftest import BOX
+
+    field = VMMLPField.create(BOX, (5, 6, 7), VMShape(16, 8, 2), torch.Generator().manual_seed(0))
+    rays_pass = PackedPass(field)
+    guard = Guard(rays_pass.numbers)
+    guard.keep()
+    before = [values.clone() for values in rays_pass.numbers()]
+    for weight in field.network.parameters():
+        weight.grad = torch.ones_like(weight)
+    rays_pass.step(1.0)
+    assert not any(torch.equal(a, b) for a, b in zip(before, rays_pass.numbers(), strict=True))
+    guard.roll_back()
+    assert all(torch.equal(a, b) for a, b in zip(before, rays_pass.numbers(), strict=True))
