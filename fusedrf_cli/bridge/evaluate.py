@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from formats.captures import is_capture, load_images, read_capture
-from fusedrf_cli.bridge.memory import Memory, measured, sources
+from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
 from fusedrf_cli.bridge.render import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
@@ -44,7 +44,7 @@ def evaluate(
         pairs = (
             capture_pairs(against, split, size)
             if is_capture(against)
-            else scene_pairs(against, size, allow_outside)
+            else scene_pairs(against, size, allow_outside, budget)
         )
         views = []
         for i, (camera, truth, total) in enumerate(pairs):
@@ -88,11 +88,15 @@ def capture_pairs(
 
 
 def scene_pairs(
-    against: str, size: tuple[int, int] | None, allow_outside: bool
+    against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory
 ) -> Iterator[tuple[Camera, np.ndarray, int]]:
     """(camera, truth, how many) of another scene, seen from views around it."""
-    field, origin = renderable(load_scene(against, allow_outside))
+    loaded = load_scene(against, allow_outside, budget)
+    field, origin = renderable(loaded)
     box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
     width, height = size or SCENE_SIZE
+    composed = not hasattr(field, "render_rays")
+    needed = sources(loaded.sizes) | picture(width, height, composed) | measured(width, height)
+    budget.expect(needed, advice="give a smaller --size")
     for camera in scattered(box, SCENE_VIEWS, width, height, seed=JUDGED_SEED + SCENE_SEED):
         yield camera, render_image(field, camera, origin=origin).over(WHITE), SCENE_VIEWS

@@ -7,6 +7,7 @@ import torch
 
 from fusedrf_cli.bridge.memory import (
     FLOAT,
+    READING,
     RESAMPLING,
     Memory,
     learning,
@@ -124,7 +125,11 @@ def make_room(budget: Memory, loaded: LoadedScene, *stages: tuple[float, dict[st
     largest one and other things; ResourceProblem where not even one does.
     """
     sizes, shelf = loaded.sizes, loaded.shelf
-    shelf.resize(min(budget.room(needed) - copies * max(sizes) for copies, needed in stages))
+    room = min(budget.room(needed) - copies * max(sizes) for copies, needed in stages)
+    if room < sum(sizes):  # then one is read now and then in every stage
+        stages = tuple((max(copies, READING), needed) for copies, needed in stages)
+        room = min(budget.room(needed) - copies * max(sizes) for copies, needed in stages)
+    shelf.resize(room)
     budget.expect(
         *(sources(sizes, shelf.room, copies) | needed for copies, needed in stages),
         advice="give a smaller --max-size",
