@@ -108,6 +108,21 @@ def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
     return _bundle(read_archive(path, verify=verify), str(path), verify)
 
 
+def read_headers(path: Path | str, *, verify: bool = True) -> tuple[SceneGraph, dict[str, FieldHeader]]:
+    """The scene of the bundle at `path` and what each of its fields says of itself, by member; no array is
+    decoded, but with `verify` every byte is checked. Raises as `read_bundle`.
+    """
+    return _headers(read_archive(path, verify=verify), str(path), verify)
+
+
+def read_field(path: Path | str, member: str) -> FieldRecord:
+    """One field of a bundle whose bytes were checked before. Raises MissingMember, and as `read_bundle`."""
+    views = read_archive(path, verify=False)
+    if member not in views:
+        raise MissingMember(f"{path}: holds no member {member!r} any more; was it replaced meanwhile?")
+    return decode_field(views[member], f"{path}: {member}")
+
+
 def parse_bundle(data: bytes | memoryview, where: str) -> Bundle:
     """As `read_bundle`, of bytes."""
     return _bundle(parse_archive(memoryview(data), where), where, verify=True)
@@ -122,11 +137,8 @@ def read_summary(path: Path | str) -> dict:
         summary = _scene_summary(read_scene(path), {})
         return {"path": str(path), "format": "scene", "bytes": _size(path), **summary, "fields": []}
     views = read_archive(path)
-    scene = _scene(views, str(path))
-    members = _checked_members(views, str(path), verify=False)
-    check_fields(scene, members, str(path))
-    headers = {name: decode_header(view, f"{path}: {name}") for name, view in members.items()}
-    fields = [_field_summary(name, headers[name], len(members[name])) for name in members]
+    scene, headers = _headers(views, str(path), verify=False)
+    fields = [_field_summary(name, header) for name, header in headers.items()]
     return {
         "path": str(path),
         "format": FORMAT,
@@ -165,6 +177,15 @@ def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
     members = _checked_members(views, where, verify)
     check_fields(scene, members, where)
     return Bundle(scene, {name: decode_field(view, f"{where}: {name}") for name, view in members.items()})
+
+
+def _headers(
+    views: dict[str, memoryview], where: str, verify: bool
+) -> tuple[SceneGraph, dict[str, FieldHeader]]:
+    scene = _scene(views, where)
+    members = _checked_members(views, where, verify)
+    check_fields(scene, members, where)
+    return scene, {name: decode_header(view, f"{where}: {name}") for name, view in members.items()}
 
 
 def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:
@@ -231,13 +252,13 @@ def world_aabb(aabb: list[float], object_to_world: np.ndarray) -> list[float]:
     return [*(centre - half).tolist(), *(centre + half).tolist()]
 
 
-def _field_summary(name: str, header: FieldHeader, size: int) -> dict:
+def _field_summary(name: str, header: FieldHeader) -> dict:
     arrays = {key: {"dtype": str(s.dtype), "shape": list(s.shape)} for key, s in sorted(header.specs.items())}
     count = sum(int(np.prod(spec.shape)) for spec in header.specs.values())
     return {
         "member": name,
         "kind": header.kind,
-        "bytes": size,
+        "bytes": header.size,
         "parameters": count,
         "arrays": arrays,
         "metadata": header.metadata,

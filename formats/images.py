@@ -1,4 +1,4 @@
-"""Pictures and films: 8-bit sRGB in, PNG, depth PNG, GIF and MP4 out, each whole or not at all."""
+"""Pictures and films: 8-bit sRGB in, PNG, GIF and MP4 out, each whole or not at all."""
 
 import itertools
 import os
@@ -13,6 +13,7 @@ import numpy as np
 from formats.atomic import atomic_writer
 from formats.errors import BadImage, LimitExceeded, MissingExtra, NoViews
 from formats.inputs import open_input
+from formats.png import png_writer
 
 MAX_SIDE = 16384
 DEEP_MODES = ("I", "F")
@@ -82,29 +83,9 @@ def _check_header(image, path: Path | str) -> None:
 
 def write_png(path: Path | str, pixels: np.ndarray) -> None:
     """(H, W, 3) or (H, W, 4) uint8, straight alpha. Raises ResourceError."""
-    from PIL import Image
-
-    with atomic_writer(path) as file:
-        Image.fromarray(pixels).save(file, "PNG")
-
-
-def write_depth_png(path: Path | str, depth: np.ndarray) -> dict:
-    """(H, W) distances in world units as 16-bit grey; 0, and whatever is not finite, stands for nothing
-    there.
-
-    Returns {"path", "scale"}: a distance is its grey level times `scale`; the PNG's text says so too.
-    """
-    from PIL import Image, PngImagePlugin
-
-    seen = np.isfinite(depth) & (depth > 0)
-    farthest = float(depth[seen].max()) if seen.any() else 1.0
-    scale = farthest / 65535
-    levels = np.where(seen, np.clip(np.where(seen, depth, 0) / scale, 1, 65535), 0)
-    text = PngImagePlugin.PngInfo()
-    text.add_text("depth", f"world units = grey level * {scale!r}; level 0 is nothing")
-    with atomic_writer(path) as file:
-        Image.fromarray(np.rint(levels).astype(np.uint16)).save(file, "PNG", pnginfo=text)
-    return {"path": str(path), "scale": scale}
+    height, width, channels = pixels.shape
+    with png_writer(path, width, height, channels) as write:
+        write(pixels)
 
 
 def check_film(path: Path | str) -> None:

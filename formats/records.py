@@ -58,6 +58,15 @@ class FieldHeader:
     kind: str
     metadata: dict
     specs: dict[str, ArraySpec]
+    size: int
+    """Bytes of the whole field in its file."""
+
+    @property
+    def decoded_size(self) -> int:
+        """Bytes of its arrays once decoded: floats as float32."""
+        return sum(
+            math.prod(s.shape) * (4 if s.dtype.kind == "f" else s.dtype.itemsize) for s in self.specs.values()
+        )
 
 
 def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
@@ -110,7 +119,7 @@ def decode_header(data: bytes | memoryview, where: str) -> FieldHeader:
         raise LimitExceeded(f"{where}: {len(header)} arrays, at most {MAX_ARRAYS} are read")
     specs = {name: _spec(name, entry, 8 + length, where) for name, entry in header.items()}
     _check_cover(specs, 8 + length, size, where)
-    return FieldHeader(kind, metadata, specs)
+    return FieldHeader(kind, metadata, specs, size)
 
 
 def _plain(value: object) -> object:

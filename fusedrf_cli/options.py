@@ -208,6 +208,9 @@ precision = click.option(
 )
 time_budget = click.option("--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds.")
 max_size = click.option("--max-size", type=BYTES, help="Largest output file, such as 25MB.")
+memory = click.option(
+    "--memory", type=BYTES, help="Most memory to take, such as 8GiB; default: 80 % of what is free."
+)
 target_psnr = click.option(
     "--target-psnr", type=POSITIVE, metavar="DB", help="Quality to reach, else exit code 7."
 )

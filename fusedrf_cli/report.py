@@ -30,7 +30,7 @@ def lines(report: dict) -> Iterator[str]:
     """The report for people, one fact per line. Warnings are left out: stderr has had them."""
     facts = {key: value for key, value in _plain(report, strict=False).items() if key != "warnings"}
     if "output" in facts:
-        size = f" ({_size(facts.pop('bytes'))})" if "bytes" in facts else ""
+        size = f" ({readable_size(facts.pop('bytes'))})" if "bytes" in facts else ""
         yield f"wrote {facts.pop('output')}{size}"
     yield from _lines(facts, "")
 
@@ -62,14 +62,15 @@ def _phrase(key: str, value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if key.split(" ")[0] == "bytes" or key.endswith("_bytes"):
-        return _size(value)
+        return readable_size(value)
     if isinstance(value, float):
         unit = " s" if "seconds" in key else " dB" if "psnr" in key and not key.endswith("views") else ""
         return f"{value + 0.0:.4g}{unit}"  # + 0.0: no "-0"
     return str(value)
 
 
-def _size(count: int) -> str:
+def readable_size(count: int) -> str:
+    """25 MB, say."""
     for scale, unit in _UNITS:
         if count >= scale:
             return f"{count / scale:.3g} {unit}"

@@ -10,18 +10,21 @@ import msgspec
 import numpy as np
 import torch
 
-from formats.bundle import Bundle, is_bundle, read_bundle, sha256_of
+from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
-from formats.scene import Matrix4
+from formats.scene import Leaf, Matrix4, SceneGraph
 from fusedrf_cli.bridge.fuse import stored
+from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
+from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import history_nodes, load_scene, make_field, write_field
+from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import RESTORED, ClippedField, cleared, region_of
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput
 
@@ -50,6 +53,7 @@ def add(
     object_to_world: np.ndarray,
     time_budget: float | None,
     rgb: bool,
+    memory: int | None,
     precision: str,
     overwrite: bool,
     seed: int,
@@ -63,12 +67,16 @@ def add(
     with engine(device, threads, progress):
         started = time.monotonic()
         progress.phase("reading", None)
-        bundle, node, field = read_fused(fused)
-        if name in names_in(bundle, field, node.name):
+        budget = Memory(memory)
+        scene, members, node, field = read_fused(fused, budget)
+        if name in names_in(scene, field, node.name):
             raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
-        new = load_scene(source)
+        new = load_scene(source, budget=budget)
+        budget.expect(*addition_memory(field, new), advice="add a smaller object")
         origin = node.object_to_world[:3, 3]
-        objects = [placed_at(p, name, object_to_world, source).moved(origin) for p in new.placed]
+        objects = [
+            placed_at(p, opened(p.field), name, object_to_world, source).moved(origin) for p in new.placed
+        ]
         settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
         progress.phase("adding", 1.0)
         originals, objects = objects, [as_vm(p, settings, rgb, progress) for p in objects]
@@ -90,7 +98,7 @@ def add(
             "nodes": [placed_note(n, object_to_world, name) for n in history_nodes(new, output, {})],
             "psnr": reached,
         }
-        history = (*bundle.scene.history, entry)
+        history = (*scene.history, entry)
         size = write_field(
             output,
             result,
@@ -99,8 +107,8 @@ def add(
             overwrite=overwrite,
             origin=origin,
             history=history,
-            kept=others(bundle, node),
-            extras=bundle.scene.extras,
+            kept=dict.fromkeys(members, fused),
+            extras=scene.extras,
         )
     return edit_report(
         output,
@@ -109,7 +117,7 @@ def add(
         name,
         box + np.tile(origin, 2),
         result,
-        {"psnr": {"before_rgb": reached}},
+        {"psnr": {"before_rgb": reached}, "memory": budget.report()},
         started,
     )
 
@@ -138,8 +146,8 @@ def delete(
     with engine(device, threads, progress):
         started = time.monotonic()
         progress.phase("reading", None)
-        bundle, node, field = read_fused(fused)
-        known = names_in(bundle, field, node.name)
+        scene, members, node, field = read_fused(fused)
+        known = names_in(scene, field, node.name)
         for name in names:
             if name not in known:
                 raise InvalidInput(
@@ -166,20 +174,20 @@ def delete(
         figures = {"restored": True, "seconds": {}}
         inside = [
             entry
-            for entry in graph_nodes(bundle)
+            for entry in graph_nodes(scene)
             if entry["name"] in names and not any(named(b, {entry["name"]}) for b in dropped)
         ]
         for entry in inside:
             progress.phase(f"deleting {entry['name']}", 1.0)
             box = np.asarray(entry["aabb"], np.float64) - np.tile(origin, 2)
             boxes.append(box)
-            rest = remaining(bundle, Path(fused), names, origin, allow_outside, progress)
+            rest = remaining(scene, members, Path(fused), names, origin, allow_outside, progress)
             settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
             result, learned = cut(result, box, rest, settings, rgb, progress)
             figures["restored"] &= rest is not None
             figures |= learned
         history = (
-            *bundle.scene.history,
+            *scene.history,
             {"event": "deleted", "names": list(names), "restored": figures["restored"]},
         )
         size = write_field(
@@ -190,36 +198,52 @@ def delete(
             overwrite=overwrite,
             origin=origin,
             history=history,
-            kept=others(bundle, node),
-            extras=bundle.scene.extras,
+            kept=dict.fromkeys(members, fused),
+            extras=scene.extras,
         )
     return edit_report(
         output, size, fused, ", ".join(names), enclosing(boxes) + np.tile(origin, 2), result, figures, started
     )
 
 
-def read_fused(path: str) -> tuple[Bundle, object, VMField]:
-    """A bundle of one field, its leaf, and the field; InvalidInput when it is something else."""
+def addition_memory(field: VMField, new: LoadedScene) -> list[dict[str, float]]:
+    """The stages of adding a scene's fields to a field: putting together, measuring."""
+    view, old = REGION_SETTINGS.view_size, field.params.numel() * FLOAT
+    sizes, numbers = [old, *new.sizes], (old + sum(new.sizes)) // FLOAT
+    return [
+        sources(sizes, copies=RESAMPLING) | finished(numbers, measured=False) | ownership(field.aabb),
+        sources(sizes) | finished(numbers) | ownership(field.aabb) | picture(view, view // 2, composed=True),
+    ]
+
+
+def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, list[str], Leaf, VMField]:
+    """The scene of a bundle of one field, its other members (kept sources), the field's leaf, and the field;
+    InvalidInput when it is something else.
+    """
     if not is_bundle(path):
         raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
-    bundle = read_bundle(path)
-    check_history(bundle, path)
-    leaves = [leaf for leaf in bundle.scene.leaves() if leaf.field is not None]
+    scene, headers = read_headers(path)
+    check_history(scene, path)
+    leaves = [leaf for leaf in scene.leaves() if leaf.field is not None]
     if len(leaves) != 1:
         raise InvalidInput(
             f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
         )
-    field = make_field(bundle.fields[leaves[0].field], path)
+    if budget is not None:
+        budget.expect(
+            sources([headers[leaves[0].field].decoded_size], copies=READING), advice="edit a smaller field"
+        )
+    field = make_field(read_field(path, leaves[0].field), path)
     if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
-    return bundle, leaves[0], field
+    return scene, [m for m in headers if m != leaves[0].field], leaves[0], field
 
 
-def check_history(bundle: Bundle, path: str) -> None:
+def check_history(scene: SceneGraph, path: str) -> None:
     """InvalidInput where the history, which the format leaves free, does not tell of nodes as an edit needs
     them.
     """
-    for entry in bundle.scene.history:
+    for entry in scene.history:
         try:
             msgspec.convert(entry.get("names", []), list[str])
             for node in msgspec.convert(entry.get("nodes", []), list[HistoryNode]):
@@ -230,10 +254,10 @@ def check_history(bundle: Bundle, path: str) -> None:
             raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
 
 
-def graph_nodes(bundle: Bundle) -> list[dict]:
+def graph_nodes(scene: SceneGraph) -> list[dict]:
     """The named objects that the history says are in the field now."""
     nodes: dict[str, dict] = {}
-    for entry in bundle.scene.history:
+    for entry in scene.history:
         for node in entry.get("nodes", ()):
             nodes[node["name"]] = node
         for name in entry.get("names", ()):
@@ -241,19 +265,14 @@ def graph_nodes(bundle: Bundle) -> list[dict]:
     return list(nodes.values())
 
 
-def names_in(bundle: Bundle, field: VMField, whole: str) -> set[str]:
+def names_in(scene: SceneGraph, field: VMField, whole: str) -> set[str]:
     """Names that can be deleted: of the history and of the blocks."""
-    return {n["name"] for n in graph_nodes(bundle)} | {b.name for b in field.blocks} - {
+    return {n["name"] for n in graph_nodes(scene)} | {b.name for b in field.blocks} - {
         whole,
         "",
         "fused",
         RESTORED,
     }
-
-
-def others(bundle: Bundle, node) -> dict[str, FieldRecord]:
-    """The kept sources of a bundle: every member but the fused field itself."""
-    return {name: record for name, record in bundle.fields.items() if name != node.field}
 
 
 def as_vm(placed: Placed, settings: DistillSettings, rgb: bool, progress) -> Placed:
@@ -285,11 +304,11 @@ def moved_frame(field: VMField, origin: np.ndarray) -> VMField:
     return VMField.assembled(field.shape, field.tensors, blocks, field.params)
 
 
-def placed_at(placed: Placed, name: str, object_to_world: np.ndarray, source: str) -> Placed:
-    """A placed field placed once more, under a name; InvalidInput where both placements together are
-    singular."""
+def placed_at(placed: Placed, field, name: str, object_to_world: np.ndarray, source: str) -> Placed:
+    """A field placed as another one and then once more, under a name; InvalidInput where both placements
+    together are singular."""
     try:
-        return Placed(name, placed.field, object_to_world @ placed.object_to_world)
+        return Placed(name, field, object_to_world @ placed.object_to_world)
     except ValueError as error:
         raise InvalidInput(f"{source}: {error}; give an invertible placement") from error
 
@@ -304,16 +323,26 @@ def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
 
 
 def remaining(
-    bundle: Bundle, path: Path, gone: tuple[str, ...], origin: np.ndarray, allow_outside: bool, progress
+    scene: SceneGraph,
+    members: list[str],
+    path: Path,
+    gone: tuple[str, ...],
+    origin: np.ndarray,
+    allow_outside: bool,
+    progress,
 ) -> list[Placed] | None:
     """The other objects of the graph as placed fields, from inside the bundle or from their files; None,
     with a warning, where one is not
     to be had."""
     found = []
-    for node in graph_nodes(bundle):
+    for node in graph_nodes(scene):
         if node["name"] in gone:
             continue
-        record = bundle.fields.get(node["field"]) or record_from_file(node, path, allow_outside)
+        record = (
+            read_field(path, node["field"])
+            if node["field"] in members
+            else record_from_file(node, path, allow_outside)
+        )
         if record is None:
             progress.warn(
                 f"the source of '{node['name']}' is not to be had, so what the deleted objects hid stays "
@@ -338,7 +367,7 @@ def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord
         or sha256_of(source) != node["sha256"]
     ):
         return None
-    return read_bundle(source).fields.get(node["field"])
+    return read_field(source, node["field"]) if node["field"] in read_headers(source)[1] else None
 
 
 def cut(

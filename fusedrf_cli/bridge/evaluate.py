@@ -5,13 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from formats.captures import is_capture, load_images, read_capture
-from fusedrf_cli.bridge.render import renderable
+from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
+from fusedrf_cli.bridge.render import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.train import WHITE, camera_of, over_white
 from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
-from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import InvalidInput
 
@@ -26,6 +27,7 @@ def evaluate(
     *,
     split: str,
     size: tuple[int, int] | None,
+    memory: int | None,
     allow_outside: bool,
     device: str,
     threads: int | None,
@@ -36,16 +38,26 @@ def evaluate(
     """
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        field, origin = renderable(load_scene(bundle, allow_outside))
+        budget = Memory(memory)
+        loaded = load_scene(bundle, allow_outside, budget)
+        field, origin = renderable(loaded)
         pairs = (
             capture_pairs(against, split, size)
             if is_capture(against)
-            else scene_pairs(against, size, allow_outside)
+            else scene_pairs(against, size, allow_outside, budget)
         )
         views = []
         for i, (camera, truth, total) in enumerate(pairs):
             if i == 0:
+                side = camera.width, camera.height
+                needed = picture_memory(field, [camera], film=False) | measured(*side)
+                budget.expect(sources(loaded.sizes) | needed, advice="give a smaller --size")
                 progress.phase("rendering", total)
+                if min(side) < SSIM_WINDOW:
+                    progress.warn(
+                        f"SSIM compares windows of {SSIM_WINDOW} pixels a side, and the pictures are "
+                        f"{side[0]}x{side[1]}: it is left out"
+                    )
             shot = render_image(field, camera, origin=origin).over(WHITE)
             views.append({"name": camera.name, "psnr": psnr(shot, truth), "ssim": ssim(shot, truth)})
             progress.advance(i + 1, psnr=views[-1]["psnr"])
@@ -54,6 +66,7 @@ def evaluate(
         "against": against,
         "mean": {k: float(np.mean([v[k] for v in views])) for k in ("psnr", "ssim")},
         "views": views,
+        "memory": budget.report(),
     }
 
 
@@ -75,11 +88,15 @@ def capture_pairs(
 
 
 def scene_pairs(
-    against: str, size: tuple[int, int] | None, allow_outside: bool
+    against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory
 ) -> Iterator[tuple[Camera, np.ndarray, int]]:
     """(camera, truth, how many) of another scene, seen from views around it."""
-    field, origin = renderable(load_scene(against, allow_outside))
+    loaded = load_scene(against, allow_outside, budget)
+    field, origin = renderable(loaded)
     box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
     width, height = size or SCENE_SIZE
+    composed = not hasattr(field, "render_rays")
+    needed = sources(loaded.sizes) | picture(width, height, composed) | measured(width, height)
+    budget.expect(needed, advice="give a smaller --size")
     for camera in scattered(box, SCENE_VIEWS, width, height, seed=JUDGED_SEED + SCENE_SEED):
         yield camera, render_image(field, camera, origin=origin).over(WHITE), SCENE_VIEWS

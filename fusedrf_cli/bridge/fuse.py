@@ -3,8 +3,21 @@
 import time
 from dataclasses import asdict, replace
 
+import numpy as np
 import torch
 
+from fusedrf_cli.bridge.memory import (
+    FLOAT,
+    READING,
+    RESAMPLING,
+    Memory,
+    learning,
+    ownership,
+    picture,
+    result,
+    sources,
+    teaching,
+)
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, history_nodes, load_scene, write_field
 from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, warn_of_numbers
@@ -23,13 +36,18 @@ from fusedrf_cli.engine.distillation.distill import (
     DistillSettings,
     Judge,
     empty_student,
+    resolution_for,
     student_from,
 )
+from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.base import holds_matter
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000
+RECKONED_RAYS = 2000  # of which the number of points is reckoned
+KEPT_POINTS = 0.35  # of a distillation's samples
 HEADER_BYTES = 16384  # scene graph, history and headers of a bundle, about
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
@@ -45,6 +63,7 @@ def fuse(
     rgb: bool,
     from_scratch: bool,
     keep_sources: bool,
+    memory: int | None,
     precision: str,
     resume: bool,
     allow_outside: bool,
@@ -57,12 +76,15 @@ def fuse(
     """Turn a composed scene into one field and write it with the scene's history."""
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        loaded = without_empty(load_scene(scene, allow_outside), scene, progress)
+        budget = Memory(memory)
+        loaded = without_empty(load_scene(scene, allow_outside, budget), scene, progress)
         composed = loaded.composed()
         chosen = choose_kind(kind, loaded)
         limit = max_size or DEFAULT_MAX_SIZE
         started = time.monotonic()
         if chosen == "blocks":
+            numbers = limit // BYTES_PER_NUMBER[precision]
+            make_room(budget, loaded, *blocks_memory(loaded, composed, numbers))
             field, figures = fuse_blocks(loaded, composed, limit, precision, seed, progress)
         else:
             overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
@@ -72,8 +94,9 @@ def fuse(
                 time_budget=time_budget,
                 max_numbers=numbers,
             )
+            make_room(budget, loaded, *vm_memory(loaded, composed, settings))
             field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
-        kept = {f.member: f.record for f in loaded.fields} if keep_sources else {}
+        kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
         entry = {
             "event": "fused",
             "kind": chosen,
@@ -100,9 +123,63 @@ def fuse(
         "kind": chosen,
         **figures,
         "total_seconds": time.monotonic() - started,
+        "memory": budget.report(),
     }
     check_target(report, target_psnr, output)
     return report
+
+
+def make_room(budget: Memory, loaded: LoadedScene, *stages: tuple[float, dict[str, float]]) -> None:
+    """Keep no more sources in memory than fit beside what every stage needs, which is so many copies of the
+    largest one and other things; ResourceProblem where not even one does.
+    """
+    sizes, shelf = loaded.sizes, loaded.shelf
+    room = min(budget.room(needed) - copies * max(sizes) for copies, needed in stages)
+    if room < sum(sizes):  # then one is read now and then in every stage
+        stages = tuple((max(copies, READING), needed) for copies, needed in stages)
+        room = min(budget.room(needed) - copies * max(sizes) for copies, needed in stages)
+    shelf.resize(room)
+    budget.expect(
+        *(sources(sizes, shelf.room, copies) | needed for copies, needed in stages),
+        advice="give a smaller --max-size",
+    )
+
+
+def blocks_memory(
+    loaded: LoadedScene, composed: ComposedField, numbers: int
+) -> list[tuple[float, dict[str, float]]]:
+    """The stages of compiling a scene to blocks of at most so many numbers: putting together, measuring."""
+    numbers, grids = min(numbers, sum(loaded.sizes) // FLOAT), ownership(composed.aabb)
+    return [
+        (RESAMPLING, result(numbers, measured=False) | grids),
+        (0.0, result(numbers) | grids | judged()),
+    ]
+
+
+def judged() -> dict[str, float]:
+    """Looking at a scene to measure; it covers about half of a picture that frames it."""
+    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)
+
+
+def vm_memory(
+    loaded: LoadedScene, composed: ComposedField, settings: DistillSettings
+) -> list[tuple[float, dict[str, float]]]:
+    """The stages of distilling a scene into one tensor: asking, learning. The points that its rays will keep
+    are reckoned from a few of them.
+    """
+    box = composed.aabb
+    resolution = resolution_for(box, composed.voxel_size, settings.shape, settings.max_numbers)
+    numbers = settings.shape.size(resolution)
+    generator = torch.Generator().manual_seed(settings.seed)
+    boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
+    few = random_rays(boxes, RECKONED_RAYS, generator)
+    step = 0.5 * float(np.max((box[3:] - box[:3]) / (np.asarray(resolution) - 1)))
+    kept = len(ask(composed, *few, step, generator, KEPT_POINTS).points)
+    answers = teaching(settings, kept * settings.rays // RECKONED_RAYS) | ownership(box)
+    return [
+        (0.0, result(numbers, measured=False) | answers | picture(256, 256, composed=True)),
+        (0.0, learning(numbers, torch.get_num_threads()) | answers),
+    ]
 
 
 def check_target(report: dict, target_psnr: float | None, output: str) -> None:
@@ -121,7 +198,7 @@ def choose_kind(kind: str, loaded: LoadedScene) -> str:
     """What was asked for; for auto, blocks where they can stand for the scene (VM sources, max composition),
     which came far nearer to it in far less time (DESIGN), else vm.
     """
-    possible = loaded.composition == "max" and all(type(p.field) is VMField for p in loaded.placed)
+    possible = loaded.composition == "max" and all(p.field.kind == VMField.kind for p in loaded.placed)
     if kind == "blocks" and not possible:
         raise InvalidInput(f"{loaded.path}: blocks need vm sources and 'max' composition; use --kind vm")
     return kind if kind != "auto" else ("blocks" if possible else "vm")
@@ -143,7 +220,8 @@ def fuse_blocks(
     progress.phase("blocks", None)
     started = time.monotonic()
     occupancies = {
-        id(p.field): sum(t.occupancy.occupied.size for t in p.field.tensors) // 8 for p in composed.placed
+        id(p.field): sum(t.occupancy.occupied.size for t in opened(p.field).tensors) // 8
+        for p in composed.placed
     }
     field = blocks_of(composed.placed, int(0.99 * limit) - sum(occupancies.values()) - 65536, precision)
     details = block_details(composed.placed, field)
@@ -194,7 +272,7 @@ def fuse_vm(
     background = background_of(loaded).placed
     moved = Placed(
         background.name,
-        background.field,
+        opened(background.field),
         composed.placed[[p.name for p in loaded.placed].index(background.name)].object_to_world,
     )
     student = None if from_scratch else student_from(moved, composed, settings, generator)

@@ -1,22 +1,29 @@
 """`render`: pictures of any scene."""
 
+import contextlib
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from formats.atomic import atomic_folder
 from formats.captures import read_cameras
-from formats.images import check_film, write_depth_png, write_film, write_png
+from formats.images import check_film, write_film
+from formats.png import depth_png_writer, png_writer
+from fusedrf_cli.bridge.memory import Memory, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.train import camera_of
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
-from fusedrf_cli.engine.rendering.volume import RenderedImage, render_image
+from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
 
 DEFAULT_SIZE = (800, 800)
 FILMS = (".gif", ".mp4")
+FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
 def render(
@@ -30,6 +37,7 @@ def render(
     background: tuple[float, float, float] | None,
     depth: bool,
     fps: float,
+    memory: int | None,
     allow_outside: bool,
     overwrite: bool,
     seed: int,
@@ -47,23 +55,41 @@ def render(
             raise UsageProblem("a film has neither depth nor transparency; render to a folder instead")
     with engine(device, threads, progress):
         progress.phase("reading", None)
-        loaded = load_scene(scene, allow_outside)
+        budget = Memory(memory)
+        loaded = load_scene(scene, allow_outside, budget)
         field, origin = renderable(loaded)
         views = choose_views(field, origin, cameras or path, orbit, size)
         if suffix == ".png" and len(views) > 1:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
             )
+        needed = picture_memory(field, views, suffix in FILMS)
+        loaded.shelf.resize(budget.room(needed))
+        budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
         progress.phase("rendering", len(views))
-        shots = _shots(field, origin, views, progress)
+        shooting = _Shooting(field, origin, background, depth, progress)
         if suffix in FILMS:
-            write_film(output, (to_pixels(shot, background) for shot in shots), fps)
+            write_film(output, shooting.frames(views), fps)
             files = [output]
         elif suffix == ".png":
-            files = [_write(Path(output), next(shots), background, depth)]
+            files = [shooting.picture(Path(output), views[0])]
         else:
-            files = _write_folder(Path(output), views, shots, background, depth, overwrite)
-    return {"output": output, "files": files, "views": len(views), "size": [views[0].width, views[0].height]}
+            files = shooting.folder(Path(output), views, overwrite)
+    return {
+        "output": output,
+        "files": files,
+        "views": len(views),
+        "size": [views[0].width, views[0].height],
+        "memory": budget.report(),
+    }
+
+
+def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
+    """What rendering needs beside the sources."""
+    largest = max(views, key=lambda view: view.width * view.height)
+    pixels = largest.width * largest.height
+    needed = picture(largest.width, largest.height, composed=not hasattr(field, "render_rays"))
+    return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
 
 
 def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
@@ -73,7 +99,7 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
     if len(loaded.fields) == 1:
         placed = loaded.fields[0].placed
         if np.array_equal(placed.object_to_world[:3, :3], np.eye(3)):
-            return placed.field, placed.object_to_world[:3, 3]
+            return opened(placed.field), placed.object_to_world[:3, 3]
     composed = loaded.composed()
     return composed, composed.origin
 
@@ -89,13 +115,6 @@ def choose_views(
     return orbit(box, count, width, height) if count else [framing_camera(box, 0.9, 0.45, width, height)]
 
 
-def _shots(field, origin: np.ndarray, views: list[Camera], progress):
-    for i, view in enumerate(views):
-        started = time.monotonic()
-        yield render_image(field, view, origin=origin)
-        progress.advance(i + 1, seconds_per_view=time.monotonic() - started)
-
-
 def to_pixels(shot: RenderedImage, background: tuple[float, float, float] | None) -> np.ndarray:
     """(H, W, 3) uint8 over a background, or (H, W, 4) with straight alpha where it is None."""
     if background is not None:
@@ -105,19 +124,50 @@ def to_pixels(shot: RenderedImage, background: tuple[float, float, float] | None
     return np.rint(255 * np.clip(np.concatenate([straight, alpha], -1), 0, 1)).astype(np.uint8)
 
 
-def _write(path: Path, shot: RenderedImage, background, depth: bool) -> dict | str:
-    """One picture, and its depth beside it; returns what the report says of it."""
-    write_png(path, to_pixels(shot, background))
-    if not depth:
-        return str(path)
-    beside = path.with_name(f"{path.stem}_depth.png")
-    return {"path": str(path), "depth": write_depth_png(beside, shot.depth)}
+@dataclass
+class _Shooting:
+    """What all pictures of one command share."""
 
+    field: object
+    origin: np.ndarray
+    background: tuple[float, float, float] | None
+    depth: bool
+    progress: object
+    done: int = 0
+    """Views, so far."""
 
-def _write_folder(folder: Path, views: list[Camera], shots, background, depth: bool, overwrite: bool) -> list:
-    with atomic_folder(folder, overwrite=overwrite) as temporary:
-        files = [
-            _write(temporary / f"{view.name}.png", shot, background, depth)
-            for view, shot in zip(views, shots, strict=True)
-        ]
-    return [str(folder / Path(f if isinstance(f, str) else f["path"]).name) for f in files]
+    def frames(self, views: list[Camera]) -> Iterator[np.ndarray]:
+        """(H, W, 3) uint8, one for each view, made when it is asked for."""
+        for view in views:
+            started = time.monotonic()
+            yield to_pixels(render_image(self.field, view, origin=self.origin), self.background)
+            self.count(started)
+
+    def picture(self, path: Path, view: Camera) -> dict | str:
+        """Write one picture, and its depth beside it, as it is rendered; returns what the report says."""
+        started, size, rows = time.monotonic(), (view.width, view.height), 0
+        channels = 4 if self.background is None else 3
+        with contextlib.ExitStack() as stack:
+            add = stack.enter_context(png_writer(path, *size, channels))
+            beside = path.with_name(f"{path.stem}_depth.png")
+            deep = stack.enter_context(depth_png_writer(beside, *size)) if self.depth else None
+            for band in render_bands(self.field, view, origin=self.origin):
+                add(to_pixels(band, self.background))
+                if deep:
+                    deep[0](band.depth)
+                rows += len(band.depth)
+                self.progress.advance(self.done + rows / view.height)
+        self.count(started)
+        return {"path": str(path), "depth": deep[1]} if deep else str(path)
+
+    def folder(self, folder: Path, views: list[Camera], overwrite: bool) -> list[str]:
+        """A folder of one picture per view, named after it."""
+        with atomic_folder(folder, overwrite=overwrite) as temporary:
+            for view in views:
+                self.picture(temporary / f"{view.name}.png", view)
+        return [str(folder / f"{view.name}.png") for view in views]
+
+    def count(self, started: float) -> None:
+        """One view more is done."""
+        self.done += 1
+        self.progress.advance(self.done, seconds_per_view=time.monotonic() - started)

@@ -14,7 +14,10 @@ from safetensors import safe_open
 from safetensors.numpy import save
 
 from formats.atomic import atomic_writer
+from fusedrf_cli.bridge.memory import available, peak
+from fusedrf_cli.engine.rendering.volume import is_out_of_memory
 from fusedrf_cli.errors import InvalidInput, NumericFailure, ResourceProblem
+from fusedrf_cli.report import readable_size
 
 FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
 
@@ -40,9 +43,12 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
         raise NumericFailure(
             f"the optimisation diverged: {error}; try another --seed or a lower resolution"
         ) from error
-    except RuntimeError as error:
-        if "alloc" in str(error):
-            raise ResourceProblem("not enough memory; try a smaller --max-size or --size") from error
+    except (MemoryError, RuntimeError) as error:
+        if is_out_of_memory(error):
+            raise ResourceProblem(
+                f"not enough memory: {error}; {readable_size(peak())} were taken, "
+                f"{readable_size(available())} are free; try a smaller --max-size or --size"
+            ) from error
         raise
 
 

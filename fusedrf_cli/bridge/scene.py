@@ -2,18 +2,22 @@
 
 import os
 import sys
+from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import BundleWriter, is_bundle, read_bundle, sha256_of
-from formats.records import FieldRecord
+from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
+from formats.records import FieldHeader, FieldRecord
 from formats.scene import SceneGraph, expand_scene, inline_scenes, make_node, parse_scene, resolve_source
 from fusedrf_cli import __version__
+from fusedrf_cli.bridge.memory import READING, Memory, sources
+from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import field_kinds
+from fusedrf_cli.engine.fields.streamed import StreamedField
 from fusedrf_cli.errors import InvalidInput
 
 STDIN_LIMIT = 4 << 20
@@ -28,7 +32,8 @@ class SourceField:
     path: Path | None
     """The bundle it was read from."""
     member: str
-    record: FieldRecord
+    size: int
+    """Bytes of its numbers in memory."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,12 @@ class LoadedScene:
     composition: str
     graph: SceneGraph
     path: Path | None
+    shelf: Shelf
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of the distinct fields' numbers."""
+        return list({f.member: f.size for f in self.fields}.values())
 
     @property
     def placed(self) -> list[Placed]:
@@ -67,94 +78,101 @@ def make_field(record: FieldRecord, where: str):
         ) from error
 
 
-def load_scene(path: str, allow_outside: bool = False) -> LoadedScene:
-    """Read a bundle, a scene.json or '-' with all fields it places; equal members become one field, read
-    once.
+def load_scene(path: str, allow_outside: bool = False, budget: Memory | None = None) -> LoadedScene:
+    """Read a bundle, a scene.json or '-' with all fields it places; equal members become one field.
+
+    Of the fields, as many stay in memory as the budget has room for; others are read again when asked. Raises
+    ResourceProblem where not even the largest fits, before it is read.
     """
     if path == "-":
         where = Path.cwd() / "scene.json"
         graph = inline_scenes(
             parse_scene(sys.stdin.buffer.read(STDIN_LIMIT + 1), "standard input"), where, allow_outside
         )
-        return _load(graph, where, allow_outside)
+        return _Loader(where, budget).load(graph, allow_outside)
     if is_bundle(path):
-        bundle = read_bundle(path)
-        return _load(bundle.scene, Path(path), allow_outside, bundle.fields)
-    return _load(expand_scene(path, allow_outside), Path(path), allow_outside)
+        scene, headers = read_headers(path)
+        return _Loader(Path(path), budget).load(scene, allow_outside, headers)
+    return _Loader(Path(path), budget).load(expand_scene(path, allow_outside), allow_outside)
 
 
-def _load(
-    graph: SceneGraph, path: Path, allow_outside: bool, members: dict[str, FieldRecord] | None = None
-) -> LoadedScene:
-    cache: dict = {}
-    found = []
-    for leaf in graph.leaves():
-        if leaf.field is not None:
-            found.append(
-                _source(
-                    leaf.name,
-                    leaf.object_to_world,
-                    leaf.background,
-                    path,
-                    leaf.field,
-                    (members or {})[leaf.field],
-                    cache,
+class _Loader:
+    """Finds the fields of one scene; every bundle's headers are read once."""
+
+    def __init__(self, path: Path, budget: Memory | None):
+        self.path, self.budget, self.shelf = path, budget, Shelf()
+        self.bundles: dict[Path, tuple[SceneGraph, dict[str, FieldHeader]]] = {}
+        self.fields: dict[str, StreamedField] = {}
+
+    def load(
+        self, graph: SceneGraph, allow_outside: bool, headers: dict[str, FieldHeader] | None = None
+    ) -> LoadedScene:
+        found = []
+        for leaf in graph.leaves():
+            if leaf.field is not None:
+                where = leaf.name, leaf.object_to_world, leaf.background
+                found.append((*where, self.path, leaf.field, (headers or {})[leaf.field]))
+            elif leaf.source is not None:
+                found += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
+        if not found:
+            raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
+        if self.budget is not None:
+            sizes = list({member: header.decoded_size for *_, member, header in found}.values())
+            self.shelf.resize(self.budget.room({}))
+            self.budget.expect(sources(sizes, self.shelf.room, READING), advice="use smaller sources")
+        fields = tuple(self.source(*where) for where in found)
+        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf)
+
+    def sources(self, leaf, path: Path) -> list[tuple]:
+        """The arguments of `source` for the fields of the bundle that a leaf names."""
+        if path not in self.bundles:
+            if not is_bundle(path):
+                raise InvalidInput(
+                    f"{self.path}: node '{leaf.name}': its source {leaf.source} is no bundle; train it to a "
+                    ".rfpack first"
+                )
+            self.bundles[path] = read_headers(path)
+        scene, headers = self.bundles[path]
+        inner = [node for node in scene.leaves() if node.field is not None]
+        if not inner:
+            raise InvalidInput(
+                f"{path}: the bundle holds no field, so node '{leaf.name}' would be empty; choose another "
+                "source"
+            )
+        named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
+        return [
+            (
+                name,
+                leaf.object_to_world @ node.object_to_world,
+                leaf.background,
+                path,
+                node.field,
+                headers[node.field],
+            )
+            for name, node in zip(named, inner, strict=True)
+        ]
+
+    def source(
+        self,
+        name: str,
+        object_to_world: np.ndarray,
+        background: bool,
+        path: Path,
+        member: str,
+        header: FieldHeader,
+    ) -> SourceField:
+        size = header.decoded_size
+        if member not in self.fields:
+            self.fields[member] = StreamedField(
+                lambda: self.shelf.take(
+                    member, size, lambda: make_field(read_field(path, member), f"{path}: node '{name}'")
                 )
             )
-        elif leaf.source is not None:
-            found += _load_source(leaf, path, allow_outside, cache)
-    if not found:
-        raise InvalidInput(f"{path}: the scene places no field; add a node with a 'source'")
-    return LoadedScene(tuple(found), graph.composition, graph, path)
-
-
-def _load_source(leaf, path: Path, allow_outside: bool, cache: dict) -> list[SourceField]:
-    source = resolve_source(path, leaf.source, allow_outside)
-    if source not in cache:
-        if not is_bundle(source):
-            raise InvalidInput(
-                f"{path}: node '{leaf.name}': its source {leaf.source} is no bundle; train it to a "
-                ".rfpack first"
-            )
-        cache[source] = read_bundle(source)
-    bundle = cache[source]
-    inner = [node for node in bundle.scene.leaves() if node.field is not None]
-    if not inner:
-        raise InvalidInput(
-            f"{source}: the bundle holds no field, so node '{leaf.name}' would be empty; choose another "
-            "source"
-        )
-    named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
-    return [
-        _source(
-            name,
-            leaf.object_to_world @ node.object_to_world,
-            leaf.background,
-            source,
-            node.field,
-            bundle.fields[node.field],
-            cache,
-        )
-        for name, node in zip(named, inner, strict=True)
-    ]
-
-
-def _source(
-    name: str,
-    object_to_world: np.ndarray,
-    background: bool,
-    path: Path,
-    member: str,
-    record: FieldRecord,
-    cache: dict,
-) -> SourceField:
-    if member not in cache:
-        cache[member] = make_field(record, f"{path}: node '{name}'")
-    try:
-        placed = Placed(name, cache[member], object_to_world)
-    except ValueError as error:
-        raise InvalidInput(f"{path}: {error}; give an invertible placement") from error
-    return SourceField(placed, background, path, member, record)
+        try:
+            placed = Placed(name, self.fields[member], object_to_world)
+        except ValueError as error:
+            raise InvalidInput(f"{path}: {error}; give an invertible placement") from error
+        return SourceField(placed, background, path, member, size)
 
 
 def background_of(scene: LoadedScene) -> SourceField:
@@ -167,7 +185,7 @@ def background_of(scene: LoadedScene) -> SourceField:
     )
 
 
-def history_nodes(scene: LoadedScene, output: str, kept: dict[str, str]) -> list[dict]:
+def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list[dict]:
     """What a history entry says of every source: name, placement, box, path from the output's folder,
     checksum, kept member.
     """
@@ -198,15 +216,16 @@ def write_field(
     overwrite: bool,
     origin: np.ndarray | None = None,
     history: tuple[dict, ...] = (),
-    kept: dict[str, FieldRecord] | None = None,
+    kept: dict[str, Path] | None = None,
     extras: dict | None = None,
 ) -> int:
-    """Write one field (and kept sources) as a bundle; its node is moved to origin (3,). Returns the bytes
-    written. `extras` are the scene's keys that this version does not know.
+    """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
+    node is moved to origin (3,). Returns the bytes written. `extras` are the scene's keys that this version
+    does not know.
     """
     writer = BundleWriter()
-    for record in (kept or {}).values():
-        writer.add_field(record, precision)
+    for member, path in (kept or {}).items():
+        writer.copy_field(path, member)
     arrays, metadata = field.state()
     member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
     where = None if origin is None or not np.any(origin) else [float(v) for v in origin]

@@ -5,11 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_images, read_capture
 from formats.meshes import mesh_capture
 from formats.views import Capture, View
+from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, texels
@@ -42,6 +44,7 @@ def train(
     holdout: int | None,
     views: int,
     size: int,
+    memory: int | None,
     precision: str,
     aabb: tuple[float, ...] | None,
     resume: bool,
@@ -53,6 +56,7 @@ def train(
 ) -> dict:
     """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
     with engine(device, threads, progress):
+        budget = Memory(memory)
         saved = load_checkpoint(output, "train") if resume else None
         progress.phase("reading", None)
         capture = (
@@ -79,6 +83,9 @@ def train(
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
         numbers = settings.shape.size(texels(box, settings.longest))
         check_space(output, numbers * BYTES_PER_NUMBER[precision])
+        budget.expect(
+            fit_memory(capture, box, settings), advice="use fewer or smaller photos, or a lower --quality"
+        )
         cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
         run = FitRun.start(cameras, images, box, settings, Path(source).resolve().stem)
         if saved:
@@ -99,6 +106,7 @@ def train(
         "seconds": {"training": seconds},
         "training_psnr": run.psnr,
         "holdout": measured,
+        "memory": budget.report(),
         **run.guard.figures(),
     }
     if target_psnr is not None and reached < target_psnr:
@@ -108,6 +116,16 @@ def train(
             report=report,
         )
     return report
+
+
+def fit_memory(capture: Capture, box: np.ndarray, settings: FitSettings) -> dict[str, float]:
+    """What a fit to a capture's photos over a box (6,) needs."""
+    width, height = capture.train[0].width, capture.train[0].height
+    cameras = len({camera_of(v).intrinsics for v in capture.train})
+    return {
+        **photos(len(capture.train), width, height, cameras),
+        **fitting(settings, box, torch.get_num_threads()),
+    }
 
 
 def _run(run: FitRun, output: str, progress) -> tuple[object, float]:

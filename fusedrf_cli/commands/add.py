@@ -14,6 +14,7 @@ from fusedrf_cli.placement import node_words
 @options.placement
 @options.time_budget
 @options.rgb
+@options.memory
 @options.precision
 @options.seeded
 @options.reporting

@@ -16,6 +16,7 @@ from fusedrf_cli import options
     help="Which photos of a capture.",
 )
 @options.size
+@options.memory
 @options.allow_outside
 @options.running
 @options.reporting

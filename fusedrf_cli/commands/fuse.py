@@ -23,6 +23,7 @@ from fusedrf_cli import options
 @click.option(
     "--keep-sources", is_flag=True, help="Keep the sources inside; delete then restores what was hidden."
 )
+@options.memory
 @options.precision
 @options.resume
 @options.allow_outside

@@ -22,6 +22,7 @@ from fusedrf_cli.errors import UsageProblem
 )
 @click.option("--depth", is_flag=True, help="Write 16-bit depth pictures as well.")
 @click.option("--fps", type=options.POSITIVE, default=24.0, show_default=True, help="Frames per second.")
+@options.memory
 @options.allow_outside
 @options.seeded
 @options.reporting

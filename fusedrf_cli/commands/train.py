@@ -46,6 +46,7 @@ from fusedrf_cli import options
 )
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
+@options.memory
 @options.precision
 @options.resume
 @options.seeded

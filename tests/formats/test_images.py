@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from formats.errors import BadImage, LimitExceeded, MissingExtra, MissingFile, NoViews
-from formats.images import check_film, read_image, read_image_header, write_depth_png, write_film, write_png
+from formats.images import check_film, read_image, read_image_header, write_film, write_png
 
 RANDOM = np.random.default_rng(0)
 
@@ -95,26 +95,6 @@ def test_deep_pictures_are_refused(tmp_path):
 def test_missing(tmp_path):
     with pytest.raises(MissingFile, match=r"no\.png"):
         read_image(tmp_path / "no.png")
-
-
-def test_depth_round_trip(tmp_path):
-    depth = RANDOM.uniform(0.01, 9, (5, 7))
-    depth[0, :4] = [0, np.inf, np.nan, 1e-9]
-    report = write_depth_png(tmp_path / "d.png", depth)
-    with Image.open(tmp_path / "d.png") as picture:
-        levels, text = np.array(picture), picture.text["depth"]
-    back = levels * report["scale"]
-    assert levels[0, :3].tolist() == [0, 0, 0]
-    assert levels[0, 3] == 1  # something is there, however near
-    assert np.abs(back[1:] - depth[1:]).max() <= report["scale"] * 0.51
-    assert repr(report["scale"]) in text
-
-
-def test_depth_of_nothing(tmp_path):
-    report = write_depth_png(tmp_path / "d.png", np.zeros((2, 2)))
-    assert report["scale"] > 0
-    with Image.open(tmp_path / "d.png") as picture:
-        assert not np.array(picture).any()
 
 
 def frames(n: int, size=(12, 9)):

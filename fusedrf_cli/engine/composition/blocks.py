@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
 
 BYTES_PER_NUMBER = {"float16": 2, "float32": 4}
@@ -27,38 +28,46 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
     when a placed field is no VM field or there are more than MAX_BLOCKS blocks.
     """
     for p in placed:
-        if type(p.field) is not VMField:
+        if p.field.kind != VMField.kind:
             raise ValueError(f"blocks are made of vm fields only, but '{p.name}' is of kind '{p.field.kind}'")
     fields = {id(p.field): p.field for p in placed}
-    shape = common_shape([f.shape for f in fields.values()])
-    first, tensors, params = {}, [], []
-    for key, field in fields.items():
-        first[key] = len(tensors)
-        wide = reshaped(field, shape)
-        tensors += wide.tensors
-        params.append(wide.params)
+    first, tensors, shapes, own, dtype = {}, [], [], {}, torch.float32
+    for key, streamed in fields.items():
+        field = opened(streamed)
+        first[key], own[key] = len(tensors), field.blocks
+        tensors += field.tensors
+        shapes.append(field.shape)
+        dtype = field.params.dtype
+    shape = common_shape(shapes)
     blocks = [
-        Block(
-            first[id(p.field)] + b.tensor,
-            p.object_to_world @ b.object_to_field,
-            block_name(p, b),
-        )
+        Block(first[id(p.field)] + b.tensor, p.object_to_world @ b.object_to_field, block_name(p, b, own))
         for p in placed
-        for b in p.field.blocks
+        for b in own[id(p.field)]
     ]
     if len(blocks) > MAX_BLOCKS:
         raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, this scene has {len(blocks)}")
-    field = VMField.assembled(shape, tuple(tensors), tuple(blocks), torch.cat(params))
-    return field if max_bytes is None else shrunk(field, max_bytes // BYTES_PER_NUMBER[precision])
+    if max_bytes is not None:
+        numbers = max_bytes // BYTES_PER_NUMBER[precision]
+        fitting = fitting_resolutions(shape, tensors, blocks, numbers)
+        tensors = [replace(t, resolution=r) for t, r in zip(tensors, fitting, strict=True)]
+    params = torch.empty(sum(shape.size(t.resolution) for t in tensors), dtype=dtype)
+    at = 0
+    for key, streamed in fields.items():  # one after the other: not all of them need to be in memory
+        field = reshaped(opened(streamed), shape)
+        for t in range(len(field.tensors)):
+            numbers = tensor_params(field, t, tensors[first[key] + t].resolution)
+            params[at : at + len(numbers)] = numbers
+            at += len(numbers)
+    return VMField.assembled(shape, tuple(tensors), tuple(blocks), params)
 
 
-def block_name(placed: Placed, block: Block) -> str:
+def block_name(placed: Placed, block: Block, own: dict[int, tuple[Block, ...]]) -> str:
     """The node's name; of a node that holds several blocks, the node's and the block's. A node without a name
     (the field that is being edited) leaves its blocks theirs.
     """
     if not placed.name:
         return block.name
-    return placed.name if len(placed.field.blocks) == 1 else f"{placed.name}/{block.name}"
+    return placed.name if len(own[id(placed.field)]) == 1 else f"{placed.name}/{block.name}"
 
 
 def named(block: Block, names: set[str]) -> bool:
@@ -108,46 +117,43 @@ def reshaped(field: VMField, shape: VMShape) -> VMField:
     return wide
 
 
-def shrunk(field: VMField, numbers: int) -> VMField:
-    """The field with its tensors resampled to the finest common voxel at which all numbers together are at
-    most `numbers`.
+def fitting_resolutions(
+    shape: VMShape, tensors: list[VMTensor], blocks: list[Block], numbers: int
+) -> list[tuple[int, int, int]]:
+    """Of every tensor its own resolution, or that of the finest common voxel (in the blocks' frame) at which
+    all numbers together are at most `numbers`, where that is less.
     """
+    sizes = [np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False) for b in blocks]
     stretch = [
-        max(
-            np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[0]
-            for b in field.blocks
-            if b.tensor == t
-        )
-        for t in range(len(field.tensors))
+        max(s[0] for b, s in zip(blocks, sizes, strict=True) if b.tensor == t) for t in range(len(tensors))
     ]
 
     def resolutions(voxel: float) -> list[tuple[int, int, int]]:
         found = []
-        for tensor, scale in zip(field.tensors, stretch, strict=True):
+        for tensor, scale in zip(tensors, stretch, strict=True):
             wanted = np.ceil((tensor.aabb[3:] - tensor.aabb[:3]) * scale / voxel).astype(int) + 1
             found.append(tuple(int(n) for n in np.clip(wanted, 2, tensor.resolution)))
         return found
 
     def count(voxel: float) -> int:
-        return sum(field.shape.size(r) for r in resolutions(voxel))
+        return sum(shape.size(r) for r in resolutions(voxel))
 
-    fine, coarse = field.voxel_size / 8, float((field.aabb[3:] - field.aabb[:3]).max())
-    if count(fine) <= numbers:
-        return field
+    if sum(shape.size(t.resolution) for t in tensors) <= numbers:
+        return [t.resolution for t in tensors]
+    fine = min(tensors[b.tensor].voxel_size.min() * s[-1] for b, s in zip(blocks, sizes, strict=True)) / 8
+    coarse = max(float((t.aabb[3:] - t.aabb[:3]).max() * s) for t, s in zip(tensors, stretch, strict=True))
     for _ in range(40):
         middle = (fine * coarse) ** 0.5
         fine, coarse = (fine, middle) if count(middle) <= numbers else (middle, coarse)
-    return resampled_tensors(field, resolutions(coarse))
+    return resolutions(coarse)
 
 
-def resampled_tensors(field: VMField, resolutions: list[tuple[int, int, int]]) -> VMField:
-    """The field with every tensor at another resolution of its own box."""
-    tensors, params = [], []
-    for t, resolution in enumerate(resolutions):
-        single = tensor_field(field, t).resampled(field.tensors[t].aabb, resolution)
-        tensors.append(replace(field.tensors[t], resolution=resolution))
-        params.append(single.params)
-    return VMField.assembled(field.shape, tuple(tensors), field.blocks, torch.cat(params))
+def tensor_params(field: VMField, t: int, resolution: tuple[int, int, int]) -> torch.Tensor:
+    """(P,) numbers of one tensor of a field, resampled where the resolution is another."""
+    single = tensor_field(field, t)
+    if resolution == single.tensors[0].resolution:
+        return single.params
+    return single.resampled(single.tensors[0].aabb, resolution).params
 
 
 def tensor_field(field: VMField, t: int) -> VMField:

@@ -1,12 +1,12 @@
 """A composed scene: several placed fields that together are one radiance field."""
 
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_occupancy
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_cells
 from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
 
 OCCUPANCY_CELLS = OWNERSHIP_CELLS  # so that a scene and what it is fused to are framed alike
@@ -41,8 +41,9 @@ class ComposedField:
     @cached_property
     def occupancy(self) -> OccupancyGrid:
         """Cells that any placed field's occupied cells reach."""
-        grids = [(p.field.occupancy, p.object_to_world) for p in self.placed]
-        return placed_occupancy(grids, OCCUPANCY_CELLS)[0]
+        grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
+        aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
+        return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
     @property
     def aabb(self) -> np.ndarray:
@@ -58,44 +59,43 @@ class ComposedField:
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
-        sigmas, owner = self.sigmas(points, dirs)
         # Sums in double, rounded once: single ones would differ in the last bit with the order of the nodes.
-        rgb = torch.zeros(len(points), 3, dtype=torch.float64)
-        if self.rule == "max":
-            sigma = sigmas.amax(0)
-            if with_colour:
-                for i in range(len(self.placed)):
-                    self._shade(i, (owner == i) & (sigma > 0), points, dirs, None, rgb)
-            return sigma, rgb.float()
-        sigma = sigmas.double().sum(0)
-        if with_colour:
-            for i in range(len(self.placed)):
-                self._shade(i, sigmas[i] > 0, points, dirs, sigmas[i] / sigma.clamp_min(1e-30), rgb)
+        sigma, rgb = points.new_zeros(len(points)).double(), points.new_zeros(len(points), 3).double()
+        ask = self._densest if self.rule == "max" else self._sum
+        for placed in self.placed:  # one after the other: not all of them need to be in memory
+            box = torch.from_numpy(placed.aabb)
+            inside = torch.nonzero(((points >= box[:3]) & (points <= box[3:])).all(1))[:, 0]
+            if len(inside):
+                ask(placed, inside, points, dirs, with_colour, sigma, rgb)
+        if self.rule == "add" and with_colour:
+            rgb /= sigma.clamp_min(1e-30)[:, None]
         return sigma.float(), rgb.float()
 
-    def sigmas(self, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(F, N) density of every placed field at points, and (N,) the index of the densest (lowest on a
-        tie).
-        """
-        sigmas = torch.zeros(len(self.placed), len(points))
-        for i, placed in enumerate(self.placed):
-            inside = self._inside(placed, points)
-            if inside.any():
-                x, d, stretch = placed.to_object(points[inside], dirs[inside])
-                sigmas[i, inside] = (
-                    placed.field.query(x, d, with_colour=False)[0].double() * stretch
-                ).float()
-        return sigmas, sigmas.argmax(0)
+    def _densest(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
+        """Where a field is denser than those before it (at points of indices `inside`), it has the say."""
+        found = _sigma(placed, points[inside], dirs[inside])
+        denser = found > sigma[inside]
+        won = inside[denser]
+        sigma[won] = found[denser]
+        if with_colour and len(won):
+            rgb[won] = _colour(placed, points[won], dirs[won])
 
-    def _inside(self, placed: Placed, points: torch.Tensor) -> torch.Tensor:
-        box = torch.from_numpy(placed.aabb)
-        return ((points >= box[:3]) & (points <= box[3:])).all(1)
+    def _sum(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
+        """A field's density at points of indices `inside`, and its colour by that weight, added."""
+        found = _sigma(placed, points[inside], dirs[inside])
+        sigma[inside] += found
+        seen = inside[found > 0]
+        if with_colour and len(seen):
+            rgb[seen] += found[found > 0, None] * _colour(placed, points[seen], dirs[seen])
 
-    def _shade(
-        self, i: int, mask: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor, share, rgb: torch.Tensor
-    ) -> None:
-        """Add field i's colour at the masked points, times its share (N,) where one is given."""
-        if mask.any():
-            x, d, _ = self.placed[i].to_object(points[mask], dirs[mask])
-            colour = self.placed[i].field.query(x, d)[1].double()
-            rgb[mask] += colour if share is None else colour * share[mask, None]
+
+def _sigma(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
+    """(N,) density of a placed field per unit of the frame it is placed in: float32's values, in double."""
+    x, d, stretch = placed.to_object(points, dirs)
+    return (placed.field.query(x, d, with_colour=False)[0].double() * stretch).float().double()
+
+
+def _colour(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
+    """(N, 3) colour of a placed field, in double."""
+    x, d, _ = placed.to_object(points, dirs)
+    return placed.field.query(x, d)[1].double()

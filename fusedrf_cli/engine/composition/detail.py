@@ -8,6 +8,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import tensor_field
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import NO_BLOCK, VMField
 
 ENOUGH_VOXELS = 8  # across an object, under which there is no shape left
@@ -46,7 +47,7 @@ def block_details(placed: list[Placed], field: VMField) -> list[Detail]:
     """What a field of `blocks_of` these placed fields holds; blocks keep the stretch of density."""
     voxels, lost, found, at = field.voxel_sizes(), lost_shares(field), [], 0
     for p in placed:
-        own = slice(at, at + len(p.field.blocks))
+        own = slice(at, at + len(opened(p.field).blocks))
         at = own.stop
         held = min(voxels[own])
         found.append(

@@ -1,6 +1,7 @@
 """The occupancy grid of a field: which cells of its box hold matter, and how far away the next such cell
 is."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -88,21 +89,19 @@ def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     return tuple(int(n) for n in np.maximum(np.ceil(extent / extent.max() * longest - 1e-9), 1))
 
 
-def placed_occupancy(
-    placed: list[tuple[OccupancyGrid, np.ndarray]], longest: int
-) -> tuple[OccupancyGrid, list[np.ndarray]]:
-    """One grid over several placed ones, and which of its cells each of them may reach (conservative by up to
-    a cell).
+def placed_cells(
+    boxes: np.ndarray, placed: Iterable[tuple[OccupancyGrid, np.ndarray]], longest: int
+) -> tuple[np.ndarray, Iterator[np.ndarray]]:
+    """The box (6,) of one grid over several placed ones, and which of its cells each of them may reach
+    (conservative by up to a cell), one after the other.
 
-    placed are (grid, (4, 4) object_to_field); the new grid has near-cubic cells, `longest` on its longest
-    axis. Where nothing is occupied at all, the boxes themselves give the extent.
+    placed are (grid, (4, 4) object_to_field), taken one at a time, and boxes (N, 6) the boxes around their
+    occupied cells after placing; the new grid has near-cubic cells, `longest` on its longest axis.
     """
-    boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in placed])
     lo, hi = boxes[:, :3].min(0), boxes[:, 3:].max(0)
     margin = (hi - lo).max() / longest
     aabb = np.concatenate([lo - margin, hi + margin])
-    marks = [marked_cells(grid, matrix, aabb, longest) for grid, matrix in placed]
-    return OccupancyGrid(aabb, np.any(marks, axis=0)), marks
+    return aabb, (marked_cells(grid, matrix, aabb, longest) for grid, matrix in placed)
 
 
 def marked_cells(

@@ -7,6 +7,7 @@ asked (two where they meet; the denser wins), so that a query costs the same how
 edit appends or drops a block and leaves the rest as it is.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -16,7 +17,7 @@ import torch
 
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.base import register
-from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_occupancy
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_cells, transformed_aabb
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
 OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
@@ -173,15 +174,14 @@ class VMField:
         densest there."""
         if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
-        occupancy, marks = placed_occupancy(
-            [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks], OWNERSHIP_CELLS
+        grids = [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks]
+        boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
+        aabb, marks = placed_cells(boxes, grids, OWNERSHIP_CELLS)
+        first, second, count = claimed_cells(marks)
+        unsettled = cls(
+            shape, tensors, blocks, params, OccupancyGrid(aabb, count > 0), owners=(first, second)
         )
-        first, second = (
-            np.full(occupancy.occupied.shape, NO_BLOCK, np.uint8),
-            np.full(occupancy.occupied.shape, NO_BLOCK, np.uint8),
-        )
-        unsettled = cls(shape, tensors, blocks, params, occupancy, (first, second))
-        settle_owners(unsettled, marks, first, second)
+        settle_crowded(unsettled, np.argwhere(count > 2), first, second)
         return unsettled
 
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
@@ -295,7 +295,7 @@ class VMField:
             first,
             second,
             self._strides(),
-            np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).astype(np.uint8),
+            np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
         )
         return self.loops.on_device(arrays)
@@ -485,23 +485,39 @@ def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
     return np.asarray([[o, *s] for o, s in zip(offsets, shapes, strict=True)], np.int64)
 
 
-def settle_owners(field: VMField, marks: list[np.ndarray], first: np.ndarray, second: np.ndarray) -> None:
-    """Write the ownership grids: lower block first where one or two have matter in a cell, the two densest
-    where more have."""
-    count = np.sum(marks, axis=0, dtype=np.uint8)
+def claimed_cells(marks: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Three (X, Y, Z) uint8 grids: the lowest and second lowest block with matter in a cell, and how many
+    have."""
+    first = second = count = None
     for b, mark in enumerate(marks):
+        if first is None:
+            first, second = (np.full(mark.shape, NO_BLOCK, np.uint8) for _ in range(2))
+            count = np.zeros(mark.shape, np.uint8)
         second[mark & (first != NO_BLOCK) & (second == NO_BLOCK)] = b
         first[mark & (first == NO_BLOCK)] = b
-    crowded = np.argwhere(count > 2)
+        count += mark
+    return first, second, count
+
+
+def settle_crowded(field: VMField, crowded: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
+    """Give the cells (N, 3) in which more than two blocks have matter to the two densest."""
     if not len(crowded):
         return
     grid = field.occupancy
-    peak = np.zeros((len(marks), len(crowded)), np.float32)
-    for b in range(len(marks)):
+    best = np.full((2, len(crowded)), -1.0, np.float32)
+    densest = np.full((2, len(crowded)), NO_BLOCK, np.uint8)
+    for b in range(len(field.blocks)):
+        peak = np.zeros(len(crowded), np.float32)
         cpu.density_at_cells(
-            field.kernel_shape[0], field.arrays, b, grid.aabb[:3].copy(), grid.cell, crowded, PROBES, peak[b]
+            field.kernel_shape[0], field.arrays, b, grid.aabb[:3].copy(), grid.cell, crowded, PROBES, peak
         )
-    # A probe misses matter that barely reaches into a cell: such blocks come last, by their peak elsewhere.
-    peak = np.where(peak > 0, peak, TOUCHING * peak.max(1, keepdims=True))
-    densest = np.sort(np.argsort(-peak, axis=0, kind="stable")[:2], axis=0).astype(np.uint8)
-    first[tuple(crowded.T)], second[tuple(crowded.T)] = densest
+        # A probe misses matter that barely reaches into a cell: such blocks come last, by their peak
+        # elsewhere.
+        peak = np.where(peak > 0, peak, TOUCHING * peak.max())
+        leads, follows = peak > best[0], peak > best[1]
+        best[1], densest[1] = (
+            np.where(leads, held[0], np.where(follows, new, held[1]))
+            for held, new in ((best, peak), (densest, np.uint8(b)))
+        )
+        best[0], densest[0] = np.where(leads, peak, best[0]), np.where(leads, np.uint8(b), densest[0])
+    first[tuple(crowded.T)], second[tuple(crowded.T)] = np.sort(densest, axis=0)

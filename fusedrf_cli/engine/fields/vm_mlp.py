@@ -17,7 +17,11 @@ from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
-POINTS_AT_ONCE = 1 << 15  # 20 MB of network inputs
+# Shaded in whole runs of 512 rows, at most 12 of them, a point has the same colour in any company: products
+# of a few rows round otherwise, and so do sines and sigmoids where a piece that torch hands to a thread (one
+# per 32,768 numbers, here six at most) does not end on a whole vector.
+ROWS_PADDED = 512
+POINTS_AT_ONCE = 12 * ROWS_PADDED
 
 
 class ColourNetwork(torch.nn.Module):
@@ -192,6 +196,7 @@ class VMMLPField:
         if with_colour:
             with torch.no_grad():
                 for some in torch.nonzero(sigma > 0)[:, 0].split(POINTS_AT_ONCE):
+                    some = torch.cat([some, some[-1:].expand(-len(some) % ROWS_PADDED)])
                     products = autograd.features(self, self.params, points[some])
                     rgb[some] = self.shade(products, dirs[some], self.basis)
         return sigma, rgb

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+SSIM_WINDOW = 11  # pixels a side
 PSNR_CAP = 100.0  # dB, what two equal pictures are given
 
 
@@ -17,7 +18,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     when under 11 pixels."""
     from skimage.metrics import structural_similarity
 
-    if min(a.shape[:2]) < 11:
+    if min(a.shape[:2]) < SSIM_WINDOW:
         return float("nan")
     return float(
         structural_similarity(

@@ -15,6 +15,7 @@ STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
 SEEN_WEIGHT = 1e-6  # samples lighter than this stay black
 RAYS_AT_ONCE = 1 << 16
+HALVINGS = 6  # of the rays done at once, where memory is short
 SAMPLES_PER_WAVE = 32
 ROWS_AT_ONCE_PIXELS = 1 << 18
 
@@ -44,17 +45,49 @@ def render_rays(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> np.ndarray:
-    """Render rays (N, 3) float64 of the field's frame: (N, 5) float32 premultiplied rgb, opacity, Σ w t."""
+    """Render rays (N, 3) float64 of the field's frame: (N, 5) float32 premultiplied rgb, opacity, Σ w t.
+
+    A ray's numbers do not depend on which others it is rendered with. Where memory is short, fewer rays are
+    done at once; MemoryError (or torch's own) when even that does not help. Raises ValueError for a direction
+    of no length, along which there is no end, or one that is not finite.
+    """
+    lengths = np.einsum("ni,ni->n", rays_d, rays_d)
+    if not ((lengths > 0) & (lengths < np.inf)).all():
+        raise ValueError(f"ray {np.argmax(~((lengths > 0) & (lengths < np.inf)))} has no direction")
     step = step or STEP_PER_VOXEL * field.voxel_size
     out = np.zeros((len(rays_o), 5), np.float32)
     fast = getattr(field, "render_rays", None)
-    if fast is not None:
-        fast(rays_o, rays_d, near, step, early_stop, out)
-        return out
-    for start in range(0, len(rays_o), RAYS_AT_ONCE):
-        part = slice(start, start + RAYS_AT_ONCE)
-        march_rays(field, rays_o[part], rays_d[part], near, step, early_stop, out[part])
+
+    def render(part: slice) -> None:
+        if fast is not None:
+            fast(rays_o[part], rays_d[part], near, step, early_stop, out[part])
+        else:
+            march_rays(field, rays_o[part], rays_d[part], near, step, early_stop, out[part])
+
+    at_once = RAYS_AT_ONCE if fast is None else max(1, len(rays_o))
+    for start in range(0, len(rays_o), at_once):
+        in_halves(render, start, min(start + at_once, len(rays_o)))
     return out
+
+
+def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: int = HALVINGS) -> None:
+    """render(slice(start, stop)), or its halves one after the other where memory does not suffice."""
+    try:
+        return render(slice(start, stop))
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error) or not halvings or stop - start < 2:
+            raise
+    # Only here is the exception gone, and with it the arrays of the attempt that its traceback held.
+    middle = (start + stop) // 2
+    in_halves(render, start, middle, halvings - 1)
+    in_halves(render, middle, stop, halvings - 1)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory could not be had; torch says so by a RuntimeError."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and ("alloc" in str(error) or "out of memory" in str(error))
+    )
 
 
 def march_rays(
@@ -89,7 +122,8 @@ def march_rays(
             _, found = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
             colour[seen] = found.numpy()
         total[ray, :3] += (weights[..., None] * colour).sum(1)
-        total[ray, 4] += (weights * ts).sum(1)
+        # Along columns, so that every ray is summed in one order however long its wave's longest ray is.
+        total[ray, 4] += np.add.reduce(np.asfortranarray(weights * ts), axis=1)
     total[:, 3] = 1 - trans
     out[:] = total
 
@@ -134,19 +168,40 @@ def render_image(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> RenderedImage:
-    """Render one view in bands of rows, tile by tile; origin (3,) is where the field's frame has its origin
-    (float64, so far scenes hold)."""
+    """Render one view; origin (3,) is the world position of the field's frame origin (float64, so far scenes
+    hold)."""
+    shape = camera.height, camera.width
+    picture = RenderedImage(
+        np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
+    )
+    top = 0
+    for band in render_bands(field, camera, origin=origin, near=near, step=step, early_stop=early_stop):
+        rows = slice(top, top := top + len(band.rgb))
+        picture.rgb[rows], picture.opacity[rows], picture.depth[rows] = band.rgb, band.opacity, band.depth
+    return picture
+
+
+def render_bands(
+    field: RadianceField,
+    camera: Camera,
+    *,
+    origin: np.ndarray | None = None,
+    near: float = 0.0,
+    step: float | None = None,
+    early_stop: float = EARLY_STOP,
+) -> Iterator[RenderedImage]:
+    """The view of `render_image` as bands of whole rows from the top, for pictures that memory does not hold;
+    put together they are that picture to the bit."""
     shift = np.zeros(3) if origin is None else origin
-    pixels = np.empty((camera.height * camera.width, 5), np.float32)
     rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
     for top in range(0, camera.height, rows):
         order = tile_order(camera.width, min(rows, camera.height - top))
         rays_o, rays_d = camera.rays(slice(top, top + rows), order)
-        pixels[top * camera.width + order] = render_rays(
-            field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop
-        )
-    pixels = pixels.reshape(camera.height, camera.width, 5)
-    opacity = pixels[..., 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(opacity > 1e-3, pixels[..., 4] / opacity, np.inf).astype(np.float32)
-    return RenderedImage(pixels[..., :3], opacity, depth)
+        found = render_rays(field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop)
+        pixels = np.empty_like(found)
+        pixels[order] = found
+        pixels = pixels.reshape(-1, camera.width, 5)
+        opacity = pixels[..., 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.where(opacity > 1e-3, pixels[..., 4] / opacity, np.inf).astype(np.float32)
+        yield RenderedImage(pixels[..., :3], opacity, depth)

@@ -9,9 +9,7 @@ from fusedrf_cli.engine.composition.blocks import (
     MAX_BLOCKS,
     blocks_of,
     common_shape,
-    resampled_tensors,
     reshaped,
-    shrunk,
     tensor_field,
     without,
 )
@@ -123,15 +121,16 @@ def test_a_tensor_stays_while_one_copy_does():
 
 def test_shrunk_fits_and_resembles():
     smooth = random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32).resampled(BOX, (30, 33, 33))
-    field = blocks_of([Placed("a", smooth, affine(turn(20))), Placed("b", small(2), affine(0.5, (3, 0, 0)))])
+    placed = [Placed("a", smooth, affine(turn(20))), Placed("b", small(2), affine(0.5, (3, 0, 0)))]
+    field = blocks_of(placed)
     whole = field.params.numel()
     for numbers in (whole // 2, whole // 4):
-        less = shrunk(field, numbers)
+        less = blocks_of(placed, max_bytes=4 * numbers, precision="float32")
         assert 0.5 * numbers < less.params.numel() <= numbers
         assert all(min(t.resolution) >= 2 for t in less.tensors)
         wanted, found = asked(field, field.aabb)[0], asked(less, field.aabb)[0]
         assert (found - wanted).abs().mean() < 0.1 * wanted.mean()
-    assert shrunk(field, whole) is field
+    assert torch.equal(blocks_of(placed, max_bytes=4 * whole, precision="float32").params, field.params)
     limit = blocks_of([Placed("a", smooth, np.eye(4))], max_bytes=whole, precision="float32")
     assert 4 * limit.params.numel() <= whole
 
@@ -140,10 +139,10 @@ def test_resampling_to_the_same_resolution_changes_nothing():
     field = blocks_of(
         [Placed("a", small(1), affine(turn(20))), Placed("b", small(2), affine(0.5, (3, 0, 0)))]
     )
-    same = resampled_tensors(field, [t.resolution for t in field.tensors])
-    for t in range(2):
+    for t, tensor in enumerate(field.tensors):
+        same = tensor_field(field, t).resampled(tensor.aabb, tensor.resolution)
         for name, section in field.sections(t).items():
-            torch.testing.assert_close(same.sections(t)[name], section, rtol=0, atol=1e-6)
+            torch.testing.assert_close(same.sections(0)[name], section, rtol=0, atol=1e-6)
 
 
 def test_reshaped_changes_no_answer():

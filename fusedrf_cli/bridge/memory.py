@@ -1,0 +1,154 @@
+"""What a command will need of memory, added up from the arrays it is known to make, before it makes them.
+
+All figures are bytes. The formulas follow the code that allocates: where that keeps another array, the number
+here has to grow with it (tests/bridge/test_memory.py holds each against the peak of a real process).
+"""
+
+import os
+import resource
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fusedrf_cli.engine.distillation.distill import DistillSettings
+from fusedrf_cli.engine.distillation.fit import FitSettings, texels
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
+from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
+from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
+from fusedrf_cli.errors import ResourceProblem
+from fusedrf_cli.report import readable_size
+
+SHARE_OF_FREE = 0.8
+FLOAT = 4
+COMPILED = 130 << 20  # kernels, once they are loaded, and the libraries that come with them
+READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
+RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
+PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
+PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
+PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
+PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
+PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
+PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
+PER_POINT = 128  # of a teacher's points, in pieces and joined
+PER_PIXEL_OF_PHOTOS = 4 + 16  # colours, and two orders of drawing
+PER_OWN_RAY = 100  # of a camera's pixel: directions in float64 while they are made, float32 afterwards
+
+
+class Memory:
+    """How much a command may take, and what it said it would."""
+
+    def __init__(self, limit: int | None = None):
+        """limit for the whole process; None: what it holds now and SHARE_OF_FREE of what is free."""
+        self.base = resident()
+        self.asked = limit is not None
+        self.limit = limit if self.asked else int(self.base + SHARE_OF_FREE * available())
+        self.predicted = 0
+
+    def expect(self, *stages: Mapping[str, float], advice: str) -> None:
+        """Hold the largest of the stages, each a sum of parts by what they are, against the limit. Raises
+        ResourceProblem, with advice.
+        """
+        parts = max(stages, key=lambda stage: sum(stage.values()))
+        needed = int(self.base + COMPILED + sum(parts.values()))
+        self.predicted = max(self.predicted, needed)
+        if needed > self.limit:
+            most = max(parts, key=parts.get)
+            have = "--memory allows" if self.asked else "are to be had"
+            raise ResourceProblem(
+                f"this needs about {readable_size(needed)} of memory, {readable_size(int(parts[most]))} of "
+                f"it for {most}, and {readable_size(self.limit)} {have}; {advice}"
+            )
+
+    def room(self, parts: Mapping[str, float]) -> float:
+        """What the limit leaves beside parts."""
+        return self.limit - self.base - COMPILED - sum(parts.values())
+
+    def report(self) -> dict[str, int]:
+        """For a command's report: what was expected, and the most that this process ever held."""
+        return {"predicted_bytes": self.predicted, "peak_bytes": peak()}
+
+
+def resident() -> int:
+    """What this process holds now; where the system does not say, the most it ever held."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return peak()
+
+
+def peak() -> int:
+    """The most this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def available() -> int:
+    """What can be had without swapping, by the system's own estimate, within a control group's limit."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        found = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    for folder, most, used in (
+        ("/sys/fs/cgroup", "memory.max", "memory.current"),
+        ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
+    ):
+        try:
+            limit, taken = (Path(folder, name).read_text().strip() for name in (most, used))
+            found = min(found, max(0, int(limit) - int(taken)))
+        except (OSError, ValueError):  # no such group, or "max": no limit
+            continue
+    return found
+
+
+def sources(sizes: list[int], room: float = float("inf"), copies: float = 0.0) -> dict[str, float]:
+    """Distinct fields of those sizes, as many as there is room for, and copies of the largest while it is
+    worked on: READING, RESAMPLING or none.
+    """
+    return {"the sources": max(min(sum(sizes), room), max(sizes)) + copies * max(sizes)}
+
+
+def picture(width: int, height: int, composed: bool) -> dict[str, float]:
+    """Rendering one picture by bands; `composed`: by the general renderer."""
+    band = min(width * max(1, ROWS_AT_ONCE_PIXELS // width), width * height)
+    waves = min(band, RAYS_AT_ONCE) * SAMPLES_PER_WAVE * PER_SAMPLE if composed else 0
+    return {"a band of the picture": band * PER_PIXEL + waves}
+
+
+def measured(width: int, height: int) -> dict[str, float]:
+    """Holding a whole picture against another."""
+    return {"two pictures and their comparison": width * height * PER_MEASURED}
+
+
+def ownership(aabb: np.ndarray) -> dict[str, float]:
+    """Grids over a scene's box (6,)."""
+    return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, OWNERSHIP_CELLS)))}
+
+
+def result(numbers: int, measured: bool = True) -> dict[str, float]:
+    """A finished field of so many numbers: itself, and while it is measured also as it will be stored."""
+    return {"the result": numbers * (FLOAT + (2 + FLOAT) * measured)}
+
+
+def learning(numbers: int, threads: int) -> dict[str, float]:
+    """A field while it learns: numbers, a row of gradients per thread, and Adam's two moments."""
+    return {"the field that learns": numbers * FLOAT * (1 + threads + 2)}
+
+
+def photos(count: int, width: int, height: int, cameras: int) -> dict[str, float]:
+    """Photos as they are drawn from, and the rays of so many different cameras."""
+    pixels = width * height
+    return {"the photos": count * pixels * PER_PIXEL_OF_PHOTOS + cameras * pixels * PER_OWN_RAY}
+
+
+def fitting(settings: FitSettings, aabb: np.ndarray, threads: int) -> dict[str, float]:
+    """The field of a fit over a box (6,) at its full resolution, while its occupancy is made anew."""
+    numbers = settings.shape.size(texels(aabb, settings.longest))
+    grid = np.prod(cell_counts(aabb, min(DEFAULT_CELLS, settings.longest)))
+    return {**learning(numbers, threads), "its occupancy": float(grid) * PER_TRIED_CELL}
+
+
+def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
+    """What is asked of the teachers."""
+    return {"the teachers' answers": settings.rays * PER_RAY + points * PER_POINT}
