@@ -36,15 +36,15 @@ def evaluate(
     """Compare a bundle, over white, with a capture's views or with another scene on seeded views that fusing
     never uses.
     """
-    with engine(device, threads, progress):
+    with engine(device, threads, progress) as place:
         progress.phase("reading", None)
         budget = Memory(memory)
-        loaded = load_scene(bundle, allow_outside, budget)
+        loaded = load_scene(bundle, allow_outside, budget, place)
         field, origin = renderable(loaded)
         pairs = (
             capture_pairs(against, split, size)
             if is_capture(against)
-            else scene_pairs(against, size, allow_outside, budget)
+            else scene_pairs(against, size, allow_outside, budget, place)
         )
         views = []
         for i, (camera, truth, total) in enumerate(pairs):
@@ -88,10 +88,10 @@ def capture_pairs(
 
 
 def scene_pairs(
-    against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory
+    against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory, place: str
 ) -> Iterator[tuple[Camera, np.ndarray, int]]:
     """(camera, truth, how many) of another scene, seen from views around it."""
-    loaded = load_scene(against, allow_outside, budget)
+    loaded = load_scene(against, allow_outside, budget, place)
     field, origin = renderable(loaded)
     box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
     width, height = size or SCENE_SIZE

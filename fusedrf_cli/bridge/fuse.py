@@ -19,7 +19,14 @@ from fusedrf_cli.bridge.memory import (
     teaching,
 )
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
-from fusedrf_cli.bridge.scene import LoadedScene, background_of, history_nodes, load_scene, write_field
+from fusedrf_cli.bridge.scene import (
+    LoadedScene,
+    background_of,
+    history_nodes,
+    load_scene,
+    placed_on,
+    write_field,
+)
 from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
@@ -74,10 +81,10 @@ def fuse(
     progress,
 ) -> dict:
     """Turn a composed scene into one field and write it with the scene's history."""
-    with engine(device, threads, progress):
+    with engine(device, threads, progress) as place:
         progress.phase("reading", None)
         budget = Memory(memory)
-        loaded = without_empty(load_scene(scene, allow_outside, budget), scene, progress)
+        loaded = without_empty(load_scene(scene, allow_outside, budget, place), scene, progress)
         composed = loaded.composed()
         chosen = choose_kind(kind, loaded)
         limit = max_size or DEFAULT_MAX_SIZE
@@ -85,7 +92,7 @@ def fuse(
         if chosen == "blocks":
             numbers = limit // BYTES_PER_NUMBER[precision]
             make_room(budget, loaded, *blocks_memory(loaded, composed, numbers))
-            field, figures = fuse_blocks(loaded, composed, limit, precision, seed, progress)
+            field, figures = fuse_blocks(loaded, composed, limit, precision, seed, place, progress)
         else:
             overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
             numbers = max(1, (limit - overhead) // BYTES_PER_NUMBER[precision])
@@ -95,7 +102,8 @@ def fuse(
                 max_numbers=numbers,
             )
             make_room(budget, loaded, *vm_memory(loaded, composed, settings))
-            field, figures = fuse_vm(loaded, composed, settings, rgb, from_scratch, output, resume, progress)
+            asked = settings, rgb, from_scratch, output, resume
+            field, figures = fuse_vm(loaded, composed, *asked, place, progress)
         kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
         entry = {
             "event": "fused",
@@ -212,7 +220,7 @@ def source_bytes(loaded: LoadedScene) -> int:
 
 
 def fuse_blocks(
-    loaded: LoadedScene, composed: ComposedField, limit: int, precision: str, seed: int, progress
+    loaded: LoadedScene, composed: ComposedField, limit: int, precision: str, seed: int, place: str, progress
 ) -> tuple[VMField, dict]:
     """Compile the scene to blocks, resampled where it would be larger than the limit, and measure what that
     cost.
@@ -229,7 +237,7 @@ def fuse_blocks(
     seconds = {"blocks": time.monotonic() - started}
     progress.phase("measuring", None)
     views = DistillSettings.views
-    reached = Judge(composed, views, DistillSettings.view_size, seed)(stored(field, precision))
+    reached = Judge(composed, views, DistillSettings.view_size, seed)(stored(field, precision).to(place))
     seconds["measuring"] = time.monotonic() - started - seconds["blocks"]
     whole = len({id(p.field) for p in composed.placed})
     resolution = [list(t.resolution) for t in field.tensors]
@@ -265,6 +273,7 @@ def fuse_vm(
     from_scratch: bool,
     output: str,
     resume: bool,
+    place: str,
     progress,
 ) -> tuple[VMField, dict]:
     """Distil the scene into one VM tensor, from the background's weights where they can be taken over."""
@@ -272,7 +281,7 @@ def fuse_vm(
     background = background_of(loaded).placed
     moved = Placed(
         background.name,
-        opened(background.field),
+        placed_on(opened(background.field), "cpu"),
         composed.placed[[p.name for p in loaded.placed].index(background.name)].object_to_world,
     )
     student = None if from_scratch else student_from(moved, composed, settings, generator)
@@ -281,6 +290,7 @@ def fuse_vm(
         if not from_scratch:
             progress.warn(f"'{background.name}' is turned or stretched, so the student starts from nothing")
         student = empty_student(composed, settings, generator, "fused")
+    student = student.to(place)
     details = tensor_details(composed.placed, student.voxel_size)
     warn_of_detail(details, "--kind blocks, or a larger --max-size", progress)
     # in an order that does not depend on the nodes', so that equal scenes draw equal rays

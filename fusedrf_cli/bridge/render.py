@@ -53,10 +53,10 @@ def render(
         check_film(output)
         if depth or background is None:
             raise UsageProblem("a film has neither depth nor transparency; render to a folder instead")
-    with engine(device, threads, progress):
+    with engine(device, threads, progress) as place:
         progress.phase("reading", None)
         budget = Memory(memory)
-        loaded = load_scene(scene, allow_outside, budget)
+        loaded = load_scene(scene, allow_outside, budget, place)
         field, origin = renderable(loaded)
         views = choose_views(field, origin, cameras or path, orbit, size)
         if suffix == ".png" and len(views) > 1:

@@ -1,6 +1,7 @@
 """What every engine command does around its work: device, threads, and failures turned into sentences."""
 
 import contextlib
+import importlib.util
 import json
 import os
 import signal
@@ -22,15 +23,28 @@ from fusedrf_cli.report import readable_size
 FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
 
 
-@contextlib.contextmanager
-def engine(device: str, threads: int | None, progress) -> Iterator[None]:
-    """Run engine work on the asked device and threads; numeric and memory failures become sentences with an
-    exit code.
-    """
+def place_for(device: str) -> str:
+    """Where to compute, "cpu" or "cuda", when "auto", "cpu" or "cuda" was asked for; ResourceProblem where
+    there is no such place."""
+    if device == "cpu":
+        return "cpu"
+    if not torch.cuda.is_available():
+        missing = "torch finds no GPU"
+    elif importlib.util.find_spec("numba_cuda") is None:
+        missing = "the compiler for GPUs is not installed (pip install 'fusedrf[gpu]')"
+    else:
+        return "cuda"
     if device == "cuda":
-        raise ResourceProblem(
-            "--device cuda: this version computes on the CPU only; use --device auto or cpu"
-        )
+        raise ResourceProblem(f"--device cuda: {missing}; use --device cpu")
+    return "cpu"
+
+
+@contextlib.contextmanager
+def engine(device: str, threads: int | None, progress) -> Iterator[str]:
+    """Run engine work on the asked device and threads, and yield where that is, "cpu" or "cuda"; numeric and
+    memory failures become sentences with an exit code.
+    """
+    place = place_for(device)
     count = threads or available_cores()
     from fusedrf_cli.engine import kernels
 
@@ -38,7 +52,7 @@ def engine(device: str, threads: int | None, progress) -> Iterator[None]:
     kernels.set_threads(count)
     try:
         with kernels.telling_of_compilation(lambda: progress.tell(FIRST_USE)):
-            yield
+            yield place
     except FloatingPointError as error:
         raise NumericFailure(
             f"the optimisation diverged: {error}; try another --seed or a lower resolution"

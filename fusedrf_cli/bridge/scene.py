@@ -18,6 +18,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import field_kinds
 from fusedrf_cli.engine.fields.streamed import StreamedField
+from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput
 
 STDIN_LIMIT = 4 << 20
@@ -78,8 +79,16 @@ def make_field(record: FieldRecord, where: str):
         ) from error
 
 
-def load_scene(path: str, allow_outside: bool = False, budget: Memory | None = None) -> LoadedScene:
-    """Read a bundle, a scene.json or '-' with all fields it places; equal members become one field.
+def placed_on(field, place: str):
+    """A field on the device where it is to be asked; what is no vm field stays on the CPU."""
+    return field.to(place) if type(field) is VMField else field
+
+
+def load_scene(
+    path: str, allow_outside: bool = False, budget: Memory | None = None, place: str = "cpu"
+) -> LoadedScene:
+    """Read a bundle, a scene.json or '-' with all fields it places, on the device `place`; equal members
+    become one field.
 
     Of the fields, as many stay in memory as the budget has room for; others are read again when asked. Raises
     ResourceProblem where not even the largest fits, before it is read.
@@ -89,18 +98,18 @@ def load_scene(path: str, allow_outside: bool = False, budget: Memory | None = N
         graph = inline_scenes(
             parse_scene(sys.stdin.buffer.read(STDIN_LIMIT + 1), "standard input"), where, allow_outside
         )
-        return _Loader(where, budget).load(graph, allow_outside)
+        return _Loader(where, budget, place).load(graph, allow_outside)
     if is_bundle(path):
         scene, headers = read_headers(path)
-        return _Loader(Path(path), budget).load(scene, allow_outside, headers)
-    return _Loader(Path(path), budget).load(expand_scene(path, allow_outside), allow_outside)
+        return _Loader(Path(path), budget, place).load(scene, allow_outside, headers)
+    return _Loader(Path(path), budget, place).load(expand_scene(path, allow_outside), allow_outside)
 
 
 class _Loader:
     """Finds the fields of one scene; every bundle's headers are read once."""
 
-    def __init__(self, path: Path, budget: Memory | None):
-        self.path, self.budget, self.shelf = path, budget, Shelf()
+    def __init__(self, path: Path, budget: Memory | None, place: str):
+        self.path, self.budget, self.shelf, self.place = path, budget, Shelf(), place
         self.bundles: dict[Path, tuple[SceneGraph, dict[str, FieldHeader]]] = {}
         self.fields: dict[str, StreamedField] = {}
 
@@ -162,12 +171,12 @@ class _Loader:
         header: FieldHeader,
     ) -> SourceField:
         size = header.decoded_size
+
+        def read():
+            return placed_on(make_field(read_field(path, member), f"{path}: node '{name}'"), self.place)
+
         if member not in self.fields:
-            self.fields[member] = StreamedField(
-                lambda: self.shelf.take(
-                    member, size, lambda: make_field(read_field(path, member), f"{path}: node '{name}'")
-                )
-            )
+            self.fields[member] = StreamedField(lambda: self.shelf.take(member, size, read))
         try:
             placed = Placed(name, self.fields[member], object_to_world)
         except ValueError as error:

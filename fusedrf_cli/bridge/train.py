@@ -19,7 +19,7 @@ from fusedrf_cli.engine.fields.vm import VMShape
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.errors import QualityNotReached
+from fusedrf_cli.errors import QualityNotReached, UsageProblem
 
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
@@ -55,7 +55,9 @@ def train(
     progress,
 ) -> dict:
     """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
-    with engine(device, threads, progress):
+    if colour == "mlp" and device == "cuda":
+        raise UsageProblem("--colour mlp is computed on the CPU only; use --device cpu, or --colour sh")
+    with engine("cpu" if colour == "mlp" else device, threads, progress) as place:
         budget = Memory(memory)
         saved = load_checkpoint(output, "train") if resume else None
         progress.phase("reading", None)
@@ -79,6 +81,7 @@ def train(
             target_psnr=target_psnr,
             opacity_weight=0.0 if capture.opaque else 0.1,
             near=0.0,
+            device=place,
         )
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
         numbers = settings.shape.size(texels(box, settings.longest))

@@ -27,7 +27,7 @@ def test_a_scene_against_itself_and_another(report):
     "words, code, says",
     [
         (("photos", "--size", "10x10"), 3, "24x24"),
-        (("photos", "--device", "cuda"), 5, "CPU only"),
+        (("photos", "--device", "cuda"), 5, "no GPU"),
         (("gone",), 3, "no such file"),
     ],
 )

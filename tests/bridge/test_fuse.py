@@ -124,7 +124,7 @@ def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
     [
         (("scene.json", "--resume", "--kind", "vm"), 3, "no checkpoint"),
         (("nowhere.json",), 3, "no such file"),
-        (("scene.json", "--device", "cuda"), 5, "CPU only"),
+        (("scene.json", "--device", "cuda"), 5, "no GPU"),
         (("scene.json", "--kind", "hash"), 2, "hash"),
     ],
 )

@@ -73,7 +73,7 @@ def test_the_scene_is_the_sum_of_its_parts(picture):
         (("-o", "a.gif", "--background", "transparent"), 2, "transparency"),
         (("-o", "a.gif", "--depth"), 2, "depth"),
         (("-o", "a.png", "--orbit", "2"), 2, "one picture"),
-        (("-o", "a.png", "--device", "cuda"), 5, "CPU only"),
+        (("-o", "a.png", "--device", "cuda"), 5, "no GPU"),
         (("-o", "a.png", "--cameras", "none.json"), 3, "none.json"),
     ],
 )

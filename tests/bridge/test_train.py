@@ -140,8 +140,23 @@ def test_a_checkpoint_of_something_else_is_refused(run, folder):
 
 
 @pytest.mark.parametrize("device, code", [("cuda", 5), ("cpu", 0)])
-def test_only_the_cpu_computes(run, device, code):
-    assert run("train", "photos", "-o", "out.rfpack", *WORDS, "--device", device).exit_code == code
+def test_a_gpu_that_is_not_there_is_told(run, device, code, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--device", device)
+    assert result.exit_code == code and ("--device cpu" in result.stderr) == (code == 5)
+
+
+def test_the_compiler_for_gpus_is_asked_for(run, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--device", "cuda")
+    assert result.exit_code == 5 and "fusedrf[gpu]" in result.stderr
+
+
+def test_a_network_is_not_for_gpus(run):
+    words = ("train", "photos", "-o", "out.rfpack", *WORDS, "--device", "cuda", "--colour", "mlp")
+    result = run(*words)
+    assert result.exit_code == 2 and "CPU only" in result.stderr
 
 
 def test_an_output_in_the_way_is_left_alone(run, folder):

@@ -110,7 +110,7 @@ def test_a_matrix_goes_with_no_other_word():
 
 # --- commands and their bridge ------------------------------------------------------------------------------
 
-COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False}
+COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False, "memory": None}
 
 
 def test_train_hands_on_what_was_asked(run, bridge):
@@ -170,7 +170,8 @@ def test_delete_hands_on_its_names(run, bridge):
     run("delete", "chair.rfpack", "a", "b", "-o", "out")
     name, words, given_options = bridge.call
     assert (name, words) == ("delete", ("chair.rfpack", ("a", "b"), "out"))
-    assert set(given_options) == {*COMMON, "time_budget", "rgb", "precision", "allow_outside", "progress"}
+    wanted = {*COMMON, "time_budget", "rgb", "precision", "allow_outside", "progress"} - {"memory"}
+    assert set(given_options) == wanted
 
 
 @pytest.mark.parametrize(
@@ -194,7 +195,7 @@ def test_eval_hands_on_both_sides(run, bridge):
     run("eval", "chair.rfpack", "--against", "table.rfpack", "--size", "40x30")
     name, words, given_options = bridge.call
     assert (name, words, given_options["size"]) == ("evaluate", ("chair.rfpack", "table.rfpack"), (40, 30))
-    assert set(given_options) == {"split", "size", "allow_outside", "device", "threads", "progress"}
+    assert set(given_options) == {"split", "size", "memory", "allow_outside", "device", "threads", "progress"}
 
 
 # --- what every command does --------------------------------------------------------------------------------

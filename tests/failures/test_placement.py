@@ -17,6 +17,7 @@ from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.detail import block_details, opacity_off
 from fusedrf_cli.engine.distillation.distill import DistillSettings, distill, empty_student
 from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.analytic import scenes
@@ -185,7 +186,7 @@ def test_a3_a_mirror_survives_files(row, tmp_path, kind):
     if kind == "vm":
         done(tmp_path, "fuse", "scene.json", "-o", "fused.rfpack")
         fused = load_scene(str(tmp_path / "fused.rfpack")).fields[0].placed
-        assert np.linalg.det(fused.field.blocks[0].object_to_field[:3, :3]) < 0
+        assert np.linalg.det(opened(fused.field).blocks[0].object_to_field[:3, :3]) < 0
         assert psnr(photo(fused.field, EYE, fused.object_to_world[:3, 3]), found) >= 60
     wanted = photo(*pair(ways(scene, kind)["composed"], EYE))
     row.check("A3", f"{kind}: saved and read again", psnr(found, wanted), 50, scene="S3", unit="dB")

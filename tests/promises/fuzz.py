@@ -70,9 +70,9 @@ def reading(read):
 
 
 def edited(path: str) -> None:
-    bundle, node, field = edit.read_fused(path)
-    edit.names_in(bundle, field, node.name)
-    edit.remaining(bundle, Path(path), (), node.object_to_world[:3, 3], False, Silence())
+    scene, members, node, field = edit.read_fused(path)
+    edit.names_in(scene, field, node.name)
+    edit.remaining(scene, members, Path(path), (), node.object_to_world[:3, 3], False, Silence())
 
 
 class Silence:

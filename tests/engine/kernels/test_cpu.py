@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, cpu, reference
+from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, bodies, cpu, reference
 from tests.engine.conftest import (
     BOX,
     DIRECTIONS_26,
@@ -326,7 +326,7 @@ def reference_loss(
     reference."""
     out = reference.render_rays(
         field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, step, early_stop,
-        torch.from_numpy(jitter), cpu.COLOUR_FROM,
+        torch.from_numpy(jitter), bodies.COLOUR_FROM,
     )  # fmt: skip
     target, background = torch.from_numpy(target), torch.from_numpy(background)
     shown = out[:, :3] + (1 - out[:, 3:4]) * background
@@ -417,7 +417,8 @@ def test_render_is_the_reference(cells, early_stop):
     rays_d[36:40] *= -1  # and some that miss
     found = render(field, rays_o, rays_d, early_stop=early_stop)
     rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
-    wanted = reference.render_rays(field, *rays, 0.0, 0.05, early_stop, colour_from=cpu.COLOUR_FROM).numpy()
+    cuts = dict(early_stop=early_stop, colour_from=bodies.COLOUR_FROM)
+    wanted = reference.render_rays(field, *rays, 0.0, 0.05, **cuts).numpy()
     assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.3
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
 
