@@ -25,7 +25,7 @@ class Peaks:
     """Cache lines per second of that array, read at random and asked for ahead."""
 
 
-@njit(fastmath=True, _nrt=False)
+@njit(fastmath={"contract"}, _nrt=False)  # free to fuse, not to find the chain's end by algebra
 def multiply_add_task(rounds, values):
     """128 independent chains of multiply-adds."""
     factor, term = np.float32(0.999), np.float32(1e-3)
