@@ -147,6 +147,8 @@ def load_checkpoint(output: str, command: str) -> tuple[dict[str, np.ndarray], d
         with safe_open(path, "numpy") as file:
             state = json.loads((file.metadata() or {}).get("fusedrf", "{}"))
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (no mapping)
+        if not isinstance(state, dict):
+            raise ValueError("its state is no object")
     except Exception as error:
         raise InvalidInput(
             f"{path}: not a readable checkpoint ({error}); delete it and run without --resume"

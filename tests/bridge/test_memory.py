@@ -1,9 +1,12 @@
 """`--memory`: what is foretold is what is taken, and too much is refused before any of it is."""
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -130,16 +133,21 @@ def large(tmp_path_factory) -> Path:
 
 
 def measured(folder: Path, *words: str) -> tuple[dict, int]:
-    """The JSON report of a command in a process of its own, and the system's word on its peak in bytes."""
+    """The JSON report of a command in a process of its own, and the most bytes it was seen to hold."""
     code = "from fusedrf_cli.main import main; main()"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     words = [sys.executable, "-c", code, *words, "--json", *(("-w",) if "-o" in words else ())]
-    with subprocess.Popen(words, cwd=folder, env=environment, stdout=subprocess.PIPE) as process:
-        output = process.stdout.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0
-    return json.loads(output), usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    peak, page = 0, os.sysconf("SC_PAGE_SIZE")
+    with tempfile.TemporaryFile() as output:
+        with subprocess.Popen(words, cwd=folder, env=environment, stdout=output) as process:
+            held = Path(f"/proc/{process.pid}/statm")  # the usage told by wait4 may be this process's own
+            while process.poll() is None:
+                with contextlib.suppress(OSError, IndexError):
+                    peak = max(peak, int(held.read_text().split()[1]) * page)
+                time.sleep(0.01)
+        output.seek(0)
+        assert process.returncode == 0
+        return json.loads(output.read()), peak
 
 
 @pytest.mark.slow
@@ -147,12 +155,11 @@ def measured(folder: Path, *words: str) -> tuple[dict, int]:
 def test_the_peak_is_as_foretold(large, name):
     measured(large, *BIG[name])  # compiles, which takes memory of its own
     said, peak = measured(large, *BIG[name])
-    assert said["memory"]["peak_bytes"] == pytest.approx(peak, rel=0.02)
+    assert said["memory"]["peak_bytes"] == pytest.approx(peak, rel=0.1)
     assert said["memory"]["predicted_bytes"] == pytest.approx(peak, rel=0.25)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=False, reason="sources that are read again and again leave holes in the heap")
 def test_teachers_are_streamed_where_memory_is_short(large):
     """From two teachers to eight under one limit: a tenth of a teacher each, at the most, and the same bytes
     as with all of them in memory."""

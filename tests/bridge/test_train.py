@@ -6,6 +6,7 @@ from functools import partial
 from types import SimpleNamespace
 
 import pytest
+from safetensors.numpy import save
 
 from formats import atomic
 from formats.bundle import read_bundle
@@ -130,7 +131,9 @@ def test_divergence_is_exit_6(run, folder, monkeypatch):
 
 
 def test_a_checkpoint_of_something_else_is_refused(run, folder):
-    for content, says in ((b"junk", "not a readable checkpoint"), (None, "no checkpoint")):
+    listed = save({}, {"fusedrf": "[1]"})
+    contents = (b"junk", "not a readable"), (listed, "no object"), (None, "no checkpoint")
+    for content, says in contents:
         path = folder / "out.rfpack.checkpoint"
         path.unlink(missing_ok=True)
         if content:

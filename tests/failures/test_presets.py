@@ -36,8 +36,8 @@ PLACINGS = {
     "A4": ("turned by 40°", affine(turn(40), (0.2, 0, 0.1))),
     "A7": ("moved by 1e6", affine(1.0, np.array([1, -1, 1]) * 1e6)),
 }
-PLACING_COSTS = 0.1  # dB that a placement may take off the worst view of the field as it was trained
-MEETING_COSTS = 2.0  # and two fields that meet, which have more outlines
+PLACING_COSTS = 1.0  # dB between the worst views of the field placed and as it was trained: C8's spread
+MEETING = 30.0  # dB of the worst view of two fields that meet
 
 
 @cache
@@ -83,7 +83,6 @@ def test_b5_trained_fields_through_each_other(row, preset):
     """The subject and a turned copy in one place: whoever is denser at a point, both are the union."""
     other = affine(turn(90, (0, 0, 1)), (0.1, 0.1, 0.3))
     truth = Scene(SUBJECT.parts + SUBJECT.under(other).parts)
-    bar = worst_view(preset, [np.eye(4)], SUBJECT, np.eye(4))[0] - MEETING_COSTS
     figure, seconds = worst_view(preset, [np.eye(4), other], truth, np.eye(4))
     what = "trained, two through each other"
-    row.check("B5", what, figure, bar, scene="S8", unit="dB", preset=preset, seconds=seconds)
+    row.check("B5", what, figure, MEETING, scene="S8", unit="dB", preset=preset, seconds=seconds)

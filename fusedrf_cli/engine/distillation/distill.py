@@ -22,7 +22,7 @@ from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import TeacherPool, ask, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, harmless_depth
 from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -38,6 +38,7 @@ MOST_LIFT = 1e30
 COLOUR_WEIGHT = 2.0
 POINTS_PER_STEP = 1 << 15
 RAYS_AT_FIRST = 1024
+LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
 WHITE = np.ones(3)
 JUDGED_SEED = 7_000_001  # views the student is judged on are drawn from a stream of their own
 
@@ -420,7 +421,8 @@ def pruned(student: VMField) -> OccupancyGrid:
     student.loops.density_at_cells(
         student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma
     )
-    occupied = np.zeros_like(grid.occupied)
-    occupied[tuple(cells[sigma * grid.cell.min() > EMPTY_BELOW].T)] = True
+    depth = np.zeros(grid.occupied.shape, np.float32)
+    depth[tuple(cells.T)] = sigma * grid.cell.min()
+    occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)
     kept = OccupancyGrid(grid.aabb, occupied).dilated().occupied & grid.occupied
     return OccupancyGrid(grid.aabb, kept)

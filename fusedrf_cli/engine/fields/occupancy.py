@@ -83,6 +83,18 @@ class OccupancyGrid:
         return self.aabb[:3] + (np.argwhere(self.occupied) + 0.5) * self.cell
 
 
+def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:
+    """The largest optical depth, at most `most`, up to which cells may be left out of a grid of optical
+    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin fog is no
+    emptiness.
+    """
+    for threshold in most * 0.25 ** np.arange(12):
+        lost = np.where(depth <= threshold, depth, 0)
+        if max(lost.sum(axis).max() for axis in range(3)) <= shown:
+            return float(threshold)
+    return 0.0
+
+
 def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     """Cells per axis of near-cubic cells, `longest` of them on the longest axis."""
     extent = np.asarray(aabb, np.float64)[3:] - np.asarray(aabb, np.float64)[:3]

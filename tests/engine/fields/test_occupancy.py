@@ -9,6 +9,7 @@ import pytest
 from fusedrf_cli.engine.fields.occupancy import (
     OccupancyGrid,
     cell_counts,
+    harmless_depth,
     marked_cells,
     placed_cells,
     transformed_aabb,
@@ -111,3 +112,16 @@ def test_one_large_cell_reaches_what_many_small_ones_do():
     one, many = (marked_cells(OccupancyGrid.full(box, cells), matrix, wide, 160) for cells in (1, 16))
     assert time.process_time() - began < 20
     np.testing.assert_array_equal(one, many)
+
+
+def test_what_is_left_out_adds_up_to_little_along_every_line():
+    """Fog of 1e-3 per cell along 40 cells is 0.04 in all, so it stays; noise of 1e-5 goes; so does a lone
+    cell under the limit."""
+    depth = np.zeros((40, 5, 5))
+    depth[:, 2, 2] = 1e-3
+    depth[:, 0, 0] = 1e-5
+    assert 1e-5 <= harmless_depth(depth, 0.01, 5e-3) < 1e-3
+    depth[:, 2, 2] = 0
+    depth[3, 3, 3] = 4e-3
+    assert harmless_depth(depth, 0.01, 5e-3) == 0.01
+    assert harmless_depth(np.full((400, 1, 1), 1e-3), 0.01, 0.0) < 1e-3
