@@ -21,6 +21,7 @@ from fusedrf_cli.engine.distillation.distill import (
     student_from,
 )
 from fusedrf_cli.engine.distillation.fit import texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
 
