@@ -27,7 +27,7 @@ from fusedrf_cli.bridge.scene import (
     placed_on,
     write_field,
 )
-from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, warn_of_numbers
+from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, check_size, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -46,6 +46,7 @@ from fusedrf_cli.engine.distillation.distill import (
     resolution_for,
     student_from,
 )
+from fusedrf_cli.engine.distillation.fit import texels
 from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.fields.streamed import opened
@@ -101,6 +102,8 @@ def fuse(
                 time_budget=time_budget,
                 max_numbers=numbers,
             )
+            least = settings.shape.size(texels(composed.aabb, 16)) * BYTES_PER_NUMBER[precision]
+            check_size(least, limit - overhead)
             make_room(budget, loaded, *vm_memory(loaded, composed, settings))
             asked = settings, rgb, from_scratch, output, resume
             field, figures = fuse_vm(loaded, composed, *asked, place, progress)
@@ -231,7 +234,9 @@ def fuse_blocks(
         id(p.field): sum(t.occupancy.occupied.size for t in opened(p.field).tensors) // 8
         for p in composed.placed
     }
-    field = blocks_of(composed.placed, int(0.99 * limit) - sum(occupancies.values()) - 65536, precision)
+    room = int(0.99 * limit) - sum(occupancies.values()) - 65536
+    field = blocks_of(composed.placed, room, precision)
+    check_size(field.params.numel() * BYTES_PER_NUMBER[precision], room)
     details = block_details(composed.placed, field)
     warn_of_detail(details, "a larger --max-size", progress)
     seconds = {"blocks": time.monotonic() - started}

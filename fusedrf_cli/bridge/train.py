@@ -20,6 +20,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import QualityNotReached, UsageProblem
+from fusedrf_cli.report import readable_size
 
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
@@ -85,6 +86,7 @@ def train(
         )
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
         numbers = settings.shape.size(texels(box, settings.longest))
+        check_size(numbers * BYTES_PER_NUMBER[precision], max_size)
         check_space(output, numbers * BYTES_PER_NUMBER[precision])
         budget.expect(
             fit_memory(capture, box, settings), advice="use fewer or smaller photos, or a lower --quality"
@@ -167,6 +169,15 @@ def fitting_longest(aabb: np.ndarray, settings: FitSettings, max_size: int | Non
     ):
         longest -= 4
     return longest
+
+
+def check_size(smallest: int, allowed: float | None) -> None:
+    """UsageProblem where even the smallest output, in bytes, is more than --max-size allows its numbers."""
+    if allowed is not None and smallest > allowed:
+        raise UsageProblem(
+            f"--max-size is too small: the coarsest numbers take {readable_size(smallest)} besides "
+            "what tells where they are; give more"
+        )
 
 
 def camera_of(view: View) -> Camera:

@@ -81,6 +81,13 @@ def test_a_stretched_object_is_warned_of(report, folder):
     assert any("'red' is stretched by 2.00" in w for w in said["warnings"])
 
 
+@pytest.mark.parametrize("kind", ["blocks", "vm"])
+def test_a_size_that_nothing_fits_is_refused(run, folder, kind):
+    result = run("fuse", "pair.json", "-o", "no.rfpack", "--kind", kind, "--no-rgb", "--max-size", "12")
+    assert result.exit_code == 2 and "--max-size is too small" in result.stderr
+    assert not (folder / "no.rfpack").exists()
+
+
 WITH_RGB = ("fuse", "pair.json", "--kind", "vm", "--max-size", "300kB", "-o")
 
 

@@ -112,8 +112,14 @@ def test_holdout_measures_on_views_left_out(report):
 
 def test_max_size_makes_it_smaller(report):
     whole = train(report, "whole.rfpack")["bytes"]
-    less = train(report, "less.rfpack", "--max-size", "60kB")
-    assert less["bytes"] < whole and max(less["resolution"]) < 24
+    less = train(report, "less.rfpack", "--max-size", "100kB")
+    assert less["bytes"] < min(whole, 100_000) and max(less["resolution"]) < 24
+
+
+def test_a_size_that_nothing_fits_is_refused(run, folder):
+    result = run("train", "photos", "-o", "no.rfpack", *WORDS, "--max-size", "1kB")
+    assert result.exit_code == 2 and "--max-size is too small" in result.stderr
+    assert not (folder / "no.rfpack").exists()
 
 
 def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
