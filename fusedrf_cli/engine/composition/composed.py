@@ -60,7 +60,8 @@ class ComposedField:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
         # Sums in double, rounded once: single ones would differ in the last bit with the order of the nodes.
-        sigma, rgb = points.new_zeros(len(points)).double(), points.new_zeros(len(points), 3).double()
+        kind = torch.float64 if self.rule == "add" else torch.float32
+        sigma, rgb = torch.zeros(len(points), dtype=kind), torch.zeros(len(points), 3, dtype=kind)
         ask = self._densest if self.rule == "max" else self._sum
         for placed in self.placed:  # one after the other: not all of them need to be in memory
             box = torch.from_numpy(placed.aabb)
@@ -82,20 +83,20 @@ class ComposedField:
 
     def _sum(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
         """A field's density at points of indices `inside`, and its colour by that weight, added."""
-        found = _sigma(placed, points[inside], dirs[inside])
+        found = _sigma(placed, points[inside], dirs[inside]).double()
         sigma[inside] += found
         seen = inside[found > 0]
         if with_colour and len(seen):
-            rgb[seen] += found[found > 0, None] * _colour(placed, points[seen], dirs[seen])
+            rgb[seen] += found[found > 0, None] * _colour(placed, points[seen], dirs[seen]).double()
 
 
 def _sigma(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
-    """(N,) density of a placed field per unit of the frame it is placed in: float32's values, in double."""
+    """(N,) float32 density of a placed field per unit of the frame it is placed in."""
     x, d, stretch = placed.to_object(points, dirs)
-    return (placed.field.query(x, d, with_colour=False)[0].double() * stretch).float().double()
+    return (placed.field.query(x, d, with_colour=False)[0].double() * stretch).float()
 
 
 def _colour(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
-    """(N, 3) colour of a placed field, in double."""
+    """(N, 3) float32 colour of a placed field."""
     x, d, _ = placed.to_object(points, dirs)
-    return placed.field.query(x, d)[1].double()
+    return placed.field.query(x, d)[1].float()
