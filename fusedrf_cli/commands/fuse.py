@@ -30,7 +30,7 @@ from fusedrf_cli import options
 @options.seeded
 @options.reporting
 def command(scene, output, **words):
-    """Distil a whole scene into one field.
+    """Turn a whole scene into one field.
 
     SCENE is a scene.json, a bundle, or - for a scene on stdin.
 

@@ -265,13 +265,13 @@ def train_rays(
 ):  # fmt: skip
     """See cpu.train_rays; all is added to row 0 of grads and loss."""
     kernel = ray_kernels(len(ranks), len(colour_ranks), vm.params.dtype).train_rays
-    rays = min(len(rays_o), RAYS_IN_FLIGHT)
-    scratch = training_scratch(max_samples, rays, vm.params.dtype)
+    # as much for few rays as for many: their number changes from step to step, and memory is slow to be had
+    scratch = training_scratch(max_samples, RAYS_IN_FLIGHT, vm.params.dtype)
     inputs = (
         ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
         background, opacity_weight, *scratch,
     )  # fmt: skip
-    launch(kernel, rays, inputs, (grads, loss))
+    launch(kernel, min(len(rays_o), RAYS_IN_FLIGHT), inputs, (grads, loss))
 
 
 def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
