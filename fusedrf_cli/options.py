@@ -199,12 +199,12 @@ debug = click.option(
     help="Show the traceback of an error.",
 )
 overwrite = click.option("-w", "--overwrite", is_flag=True, help="Replace the output if it exists.")
+PRECISION = click.Choice(["float16", "float32", "int8", "int4"])
 precision = click.option(
-    "--precision",
-    type=click.Choice(["float16", "float32"]),
-    default="float16",
-    show_default=True,
-    help="How numbers are stored.",
+    "--precision", type=PRECISION, default="float16", show_default=True, help="How numbers are stored."
+)
+edited_precision = click.option(
+    "--precision", type=PRECISION, help="How numbers are stored; default: as those of FUSED are."
 )
 time_budget = click.option("--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds.")
 max_size = click.option("--max-size", type=BYTES, help="Largest output file, such as 25MB.")

@@ -113,7 +113,7 @@ HOSTILE = {
     "two metadata keys": (raw({"__metadata__": {"fusedrf": "{}", "x": ""}}), errors.BadHeader),
     "content no object": (raw(field(content=[1])), errors.BadSchema),
     "version boolean": (raw(field(content=CONTENT | {"version": True})), errors.BadSchema),
-    "version newer": (raw(field(content=CONTENT | {"version": 2})), errors.NewerVersion),
+    "version newer": (raw(field(content=CONTENT | {"version": 3})), errors.NewerVersion),
     "version old": (raw(field(content=CONTENT | {"version": 0})), errors.BadSchema),
     "kind": (raw(field(content=CONTENT | {"kind": "../x"})), errors.BadSchema),
     "key unknown": (raw(field(content=CONTENT | {"x": 1})), errors.BadSchema),
