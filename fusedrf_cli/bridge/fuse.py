@@ -6,12 +6,14 @@ from dataclasses import asdict, replace
 import numpy as np
 import torch
 
+from fusedrf_cli.bridge.fuse_blocks import BlocksAsked, fuse_blocks
 from fusedrf_cli.bridge.memory import (
     FLOAT,
     READING,
     RESAMPLING,
     Memory,
     learning,
+    lesson,
     ownership,
     picture,
     result,
@@ -27,25 +29,24 @@ from fusedrf_cli.bridge.scene import (
     placed_on,
     write_field,
 )
+from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, check_size, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import (
     ENOUGH_VOXELS,
     LOST_NOTED,
     Detail,
-    block_details,
     tensor_details,
 )
 from fusedrf_cli.engine.distillation.distill import (
     DistillRun,
     DistillSettings,
-    Judge,
     empty_student,
     resolution_for,
     student_from,
 )
+from fusedrf_cli.engine.distillation.finish import RAYS as FINISHING_RAYS
 from fusedrf_cli.engine.distillation.fit import texels
 from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.base import holds_matter
@@ -72,7 +73,9 @@ def fuse(
     from_scratch: bool,
     keep_sources: bool,
     memory: int | None,
-    precision: str,
+    precision: str | None,
+    ranks: tuple[int, int] | None,
+    sh_degree: int | None,
     resume: bool,
     allow_outside: bool,
     overwrite: bool,
@@ -90,29 +93,35 @@ def fuse(
         chosen = choose_kind(kind, loaded)
         limit = max_size or DEFAULT_MAX_SIZE
         started = time.monotonic()
+        kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
+        nodes = history_nodes(loaded, output, kept)
+        overhead = graph_bytes(nodes)
         if chosen == "blocks":
-            numbers = limit // BYTES_PER_NUMBER[precision]
-            make_room(budget, loaded, *blocks_memory(loaded, composed, numbers))
-            field, figures = fuse_blocks(loaded, composed, limit, precision, seed, place, progress)
+            asked = BlocksAsked(
+                limit, overhead, target_psnr, precision, ranks, sh_degree, rgb, seed, time_budget
+            )
+            whole = blocks_memory(budget, loaded, composed, asked)
+            field, precision, figures = fuse_blocks(composed, asked, whole, place, progress)
+            warn_of_detail(figures.pop("details"), "a larger --max-size", progress)
         else:
-            overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
-            numbers = max(1, (limit - overhead) // BYTES_PER_NUMBER[precision])
+            precision = precision or "float16"
+            room = limit - overhead - composed.occupancy.occupied.size // 8 + HEADER_BYTES
+            numbers = max(1, int(room / BYTES_PER_NUMBER[precision]))
             settings = DistillSettings(
                 seed=seed,
                 time_budget=time_budget,
                 max_numbers=numbers,
             )
-            least = settings.shape.size(texels(composed.aabb, 16)) * BYTES_PER_NUMBER[precision]
-            check_size(least, limit - overhead)
+            least = int(settings.shape.size(texels(composed.aabb, 16)) * BYTES_PER_NUMBER[precision])
+            check_size(least, room)
             make_room(budget, loaded, *vm_memory(loaded, composed, settings))
             asked = settings, rgb, from_scratch, output, resume
             field, figures = fuse_vm(loaded, composed, *asked, place, progress)
-        kept = {f.member: f.path for f in loaded.fields} if keep_sources else {}
         entry = {
             "event": "fused",
             "kind": chosen,
             "composition": loaded.composition,
-            "nodes": history_nodes(loaded, output, kept),
+            "nodes": nodes,
             "settings": {"seed": seed, "max_size": limit, "rgb": rgb, "from_scratch": from_scratch},
             "psnr": figures["psnr"],
         }
@@ -157,14 +166,24 @@ def make_room(budget: Memory, loaded: LoadedScene, *stages: tuple[float, dict[st
 
 
 def blocks_memory(
-    loaded: LoadedScene, composed: ComposedField, numbers: int
-) -> list[tuple[float, dict[str, float]]]:
-    """The stages of compiling a scene to blocks of at most so many numbers: putting together, measuring."""
-    numbers, grids = min(numbers, sum(loaded.sizes) // FLOAT), ownership(composed.aabb)
-    return [
+    budget: Memory, loaded: LoadedScene, composed: ComposedField, asked: BlocksAsked
+) -> bool:
+    """Make room for compiling a scene to blocks: putting together, measuring, learning. Whether all sources
+    together may be in memory as a teacher."""
+    own = sum(loaded.sizes) // FLOAT
+    numbers, grids = min(int(asked.limit / BYTES_PER_NUMBER["int4"]), own), ownership(composed.aabb)
+    if asked.target is None and asked.precision is None:  # then either nothing learns or it is much smaller
+        numbers = min(numbers, max(asked.limit // 2, own // 2))
+    threads = torch.get_num_threads()
+    learnt = learning(numbers, threads) | lesson(FINISHING_RAYS) | grids if asked.finish else {}
+    make_room(
+        budget,
+        loaded,
         (RESAMPLING, result(numbers, measured=False) | grids),
         (0.0, result(numbers) | grids | judged()),
-    ]
+        (0.0, learnt),
+    )
+    return budget.room(learnt) > sum(loaded.sizes) + FLOAT * own
 
 
 def judged() -> dict[str, float]:
@@ -219,54 +238,6 @@ def source_bytes(loaded: LoadedScene) -> int:
     """Bytes of the distinct source files."""
     return sum(
         path.stat().st_size for path in {f.path for f in loaded.fields} if path is not None and path.is_file()
-    )
-
-
-def fuse_blocks(
-    loaded: LoadedScene, composed: ComposedField, limit: int, precision: str, seed: int, place: str, progress
-) -> tuple[VMField, dict]:
-    """Compile the scene to blocks, resampled where it would be larger than the limit, and measure what that
-    cost.
-    """
-    progress.phase("blocks", None)
-    started = time.monotonic()
-    occupancies = {
-        id(p.field): sum(t.occupancy.occupied.size for t in opened(p.field).tensors) // 8
-        for p in composed.placed
-    }
-    room = int(0.99 * limit) - sum(occupancies.values()) - 65536
-    field = blocks_of(composed.placed, room, precision)
-    check_size(field.params.numel() * BYTES_PER_NUMBER[precision], room)
-    details = block_details(composed.placed, field)
-    warn_of_detail(details, "a larger --max-size", progress)
-    seconds = {"blocks": time.monotonic() - started}
-    progress.phase("measuring", None)
-    views = DistillSettings.views
-    reached = Judge(composed, views, DistillSettings.view_size, seed)(stored(field, precision).to(place))
-    seconds["measuring"] = time.monotonic() - started - seconds["blocks"]
-    whole = len({id(p.field) for p in composed.placed})
-    resolution = [list(t.resolution) for t in field.tensors]
-    why = (
-        f"{len(field.blocks)} blocks over {whole} tensors, each in its object's own axes, under {limit} bytes"
-    )
-    return field, {
-        "psnr": {"before_rgb": reached, "after_rgb": None, "views": views},
-        "seconds": seconds,
-        "chosen": {
-            "resolution": resolution,
-            "ranks": [field.shape.density_rank, field.shape.colour_rank],
-            "why": why,
-        },
-        "objects": [asdict(d) for d in details],
-    }
-
-
-def stored(field: VMField, precision: str) -> VMField:
-    """The field as it will come back from a bundle of that precision."""
-    if precision == "float32":
-        return field
-    return VMField(
-        field.shape, field.tensors, field.blocks, field.params.half().float(), field.occupancy, field.owners
     )
 
 

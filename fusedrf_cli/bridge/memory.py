@@ -156,3 +156,8 @@ def fitting(settings: FitSettings, aabb: np.ndarray, threads: int) -> dict[str, 
 def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
     """What is asked of the teachers."""
     return {"the teachers' answers": settings.rays * PER_RAY + points * PER_POINT}
+
+
+def lesson(rays: int) -> dict[str, float]:
+    """Rays to learn from, and what they show."""
+    return {"rays to learn from": rays * PER_RAY}

@@ -1,24 +1,22 @@
-"""How many bytes a field takes in a bundle, told from its shape before its numbers are made, or from them."""
+"""How many bytes a field takes in a bundle, told from its shape before its numbers are made."""
 
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 
-from formats.quantised import BLOCKS, code_bytes, is_coded, scales_shape
-from formats.records import FieldRecord, decode_field, encode_field
+from formats.quantised import BLOCKS, code_bytes, is_coded
+from formats.records import BITS, coded_bytes
 from fusedrf_cli.engine.composition.trimming import read_texels
-from fusedrf_cli.engine.fields.vm import VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.vm import VMShape, VMTensor
 
-BITS = {"int8": 8, "int4": 4}
-FLOAT_BYTES = {"float16": 2, "float32": 4}
 HEADER = 4096  # of a field: its metadata but for the tensors
 HEADER_PER_TENSOR = 3072  # 13 sections' names and offsets, twice where they are coded
 HEADER_PER_BLOCK = 512
 GRAPH = 4096  # of a bundle: scene graph and file headers but for the history
 
 
-def vm_bytes(shape: VMShape, tensors: list[VMTensor], blocks: int, precision: str) -> int:
+def vm_bytes(shape: VMShape, tensors: Sequence[VMTensor], blocks: int, precision: str) -> int:
     """At most so many bytes for a vm field of tensors without unread texels (trimming.py), coded or not."""
     total = HEADER + HEADER_PER_BLOCK * blocks
     for tensor in tensors:
@@ -30,44 +28,23 @@ def vm_bytes(shape: VMShape, tensors: list[VMTensor], blocks: int, precision: st
 
 def section_bytes(tensor: VMTensor, name: str, section: tuple[int, ...], precision: str) -> int:
     """Bytes of one section (TensoRF's planes, lines, basis) of a tensor."""
-    numbers = int(np.prod(section))
-    if precision not in BITS:
-        return numbers * FLOAT_BYTES[precision]
-    if not is_coded(section):
-        return numbers * FLOAT_BYTES["float16"]
-    scales = scales_shape(section)
-    kept = numbers
-    if "_plane_" in name:
-        kept = section[2] * kept_texels(read_texels(tensor, int(name[-1])), scales[:2])
-    return code_bytes(kept, BITS[precision]) + int(np.prod(scales)) * FLOAT_BYTES["float16"]
+    most = coded_bytes(section, precision)
+    if precision not in BITS or not is_coded(section) or "_plane_" not in name:
+        return most
+    kept = section[2] * kept_texels(read_texels(tensor, int(name[-1])))
+    return most - code_bytes(int(np.prod(section)), BITS[precision]) + code_bytes(kept, BITS[precision])
 
 
-def kept_texels(read: np.ndarray, blocks: tuple[int, int]) -> int:
-    """Texels in those of the blocks (counts per axis) of a plane (na, nb) of which at least one is read."""
+def kept_texels(read: np.ndarray) -> int:
+    """Texels in those blocks of a plane (na, nb) of which at least one is read: the others have no codes."""
     held, sides = read, []
-    for axis, (n, count) in enumerate(zip(read.shape, blocks, strict=True)):
-        starts = np.arange(count) * BLOCKS[3][axis]
+    for axis, side in enumerate(BLOCKS[3][:2]):
+        starts = np.arange(0, read.shape[axis], side)
         held = np.logical_or.reduceat(held, starts, axis=axis)
-        sides.append(np.diff(np.append(starts, n)))
+        sides.append(np.diff(np.append(starts, read.shape[axis])))
     return int(sides[0] @ held @ sides[1])
 
 
-@dataclass(frozen=True)
-class Stored:
-    """A field as it will come back from a bundle, and its bytes there."""
-
-    field: VMField
-    bytes: int
-
-
-def stored(field: VMField, precision: str) -> Stored:
-    """Write a vm field to bytes and read its numbers back."""
-    arrays, metadata = field.state()
-    data = encode_field(FieldRecord(field.kind, arrays, metadata), precision)
-    read = decode_field(data, "the field as it is stored").arrays
-    params = field.params.clone()
-    back = VMField(field.shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
-    for t in range(len(back.tensors)):
-        for name, view in back.sections(t).items():
-            view.copy_(torch.from_numpy(read[f"tensor_{t}.{name}"]))
-    return Stored(back, len(data))
+def graph_bytes(history: list[dict]) -> int:
+    """At most so many bytes for all of a bundle but its field."""
+    return GRAPH + 2 * len(json.dumps(history, indent=2))

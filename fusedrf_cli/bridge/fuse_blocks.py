@@ -1,0 +1,213 @@
+"""A scene to blocks: as they are where they fit, else in the way that shows most under a size, or in the
+smallest that shows enough.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from fusedrf_cli.bridge.choose import Choosing, Tried, Way
+from fusedrf_cli.bridge.scene import stored
+from fusedrf_cli.bridge.sizes import vm_bytes
+from fusedrf_cli.bridge.train import check_size
+from fusedrf_cli.engine.composition.blocks import blocks_of
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.detail import block_details
+from fusedrf_cli.engine.composition.trimming import without_unread
+from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
+from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.fields.vm import VMField, VMShape, VMTensor
+
+# Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md).
+RANKS = ((8, 16), (8, 24), None)
+CHEAP_FIRST = ("int4", "int8", "float16")
+UNREDUCED = VMShape(1024, 1024, 3)
+FINISHING_GAIN = 5.0  # dB, the most that was seen
+PRECISE = "float16"
+VIEWS_TO_CHOOSE_BY = 8
+
+
+@dataclass(frozen=True)
+class BlocksAsked:
+    """What a person fixed of the way blocks are stored; None is left to choose."""
+
+    limit: int
+    """Bytes of the file."""
+    overhead: int
+    """Bytes of the file besides the field."""
+    target: float | None
+    precision: str | None
+    ranks: tuple[int, int] | None
+    sh_degree: int | None
+    finish: bool
+    seed: int
+    time_budget: float | None = None
+    """Seconds of choosing after which nothing more is learnt."""
+
+    def ways(self) -> list[list[Way]]:
+        """The ways that are left, in groups of one precision, the cheapest first."""
+        precisions = [self.precision] if self.precision else CHEAP_FIRST
+        ranks = [self.ranks] if self.ranks else RANKS
+        return [[Way(p, r, self.sh_degree) for r in ranks] for p in precisions]
+
+    def plain(self) -> Way:
+        """The way that leaves most as it is."""
+        return Way(self.precision or PRECISE, self.ranks, self.sh_degree)
+
+
+class BlocksMaker:
+    """Makes, stores and measures the blocks of one scene."""
+
+    def __init__(self, composed: ComposedField, asked: BlocksAsked, whole_in_memory: bool, place: str):
+        self.composed, self.asked, self.place = composed, asked, place
+        views = VIEWS_TO_CHOOSE_BY if asked.target is not None else DistillSettings.views
+        self.judge = Judge(composed, views, DistillSettings.view_size, asked.seed)
+        self.views, self.whole_in_memory, self._lesson = views, whole_in_memory, None
+        self.started = time.monotonic()
+        self.last: tuple[Tried, VMField] | None = None
+
+    def try_way(self, way: Way, limit: int, finished: bool) -> Tried | None:
+        """Blocks of at most `limit` bytes; None where not even the coarsest are that small."""
+        field, bytes_, whole = self.make(way, limit)
+        if bytes_ > limit:
+            return None
+        before = psnr = self.measured(field, way)
+        if finished and self.learns() and not (whole and way.ranks is None):
+            learnt = replace_params(field)
+            self.lesson().teach(learnt)
+            psnr = self.measured(learnt, way)
+            field, psnr = (learnt, psnr) if psnr > before else (field, before)
+        tried = Tried(way, limit, bytes_, psnr, before, whole)
+        self.last = tried, field
+        return tried
+
+    def learns(self) -> bool:
+        """Whether finishing was asked for and there is time left for it."""
+        budget = self.asked.time_budget
+        return self.asked.finish and (budget is None or time.monotonic() - self.started < budget)
+
+    def field_of(self, tried: Tried) -> VMField:
+        """The field of an earlier try; made again where another was tried since."""
+        if self.last is None or self.last[0] != tried:
+            self.try_way(tried.way, tried.limit, True)
+        return self.last[1]
+
+    def make(self, way: Way, limit: int) -> tuple[VMField, int, bool]:
+        """Blocks before learning, their bytes, and whether they keep their own resolution."""
+        ranks = self.shape_of(way)
+        sizes = []
+
+        def fits(shape: VMShape, tensors: list[VMTensor]) -> bool:
+            sizes.append(self.bytes_of(shape, tensors, way))
+            return sizes[-1] <= limit
+
+        field = blocks_of(self.composed.placed, fits, ranks)
+        whole = sizes[0] <= limit  # the first that is asked is their own resolution
+        bytes_ = self.bytes_of(field.shape, field.tensors, way)
+        return field if whole and way == Way(PRECISE) else without_unread(field), bytes_, whole
+
+    def bytes_of(self, shape: VMShape, tensors: Sequence[VMTensor], way: Way) -> int:
+        """Bytes of the file with blocks over such tensors."""
+        blocks = sum(len(opened(p.field).blocks) for p in self.composed.placed)
+        return self.asked.overhead + vm_bytes(shape, tensors, blocks, way.precision)
+
+    def shape_of(self, way: Way) -> VMShape | None:
+        """The most ranks and bands that a way keeps, None for all."""
+        if way.ranks is None and way.sh_degree is None:
+            return None
+        ranks = way.ranks or (UNREDUCED.density_rank, UNREDUCED.colour_rank)
+        return VMShape(*ranks, UNREDUCED.sh_degree if way.sh_degree is None else way.sh_degree)
+
+    def measured(self, field: VMField, way: Way) -> float:
+        """PSNR (dB) of the field as it will be read back."""
+        return self.judge(stored(field, way.precision).to(self.place))
+
+    def lesson(self) -> RayLesson:
+        """What there is to learn from: the blocks as they are, which render fast, or the composed scene where
+        memory does not hold them."""
+        if self._lesson is None:
+            composed = self.composed
+            teacher = blocks_of(composed.placed) if self.whole_in_memory else composed
+            # in an order that does not depend on the nodes', so that equal scenes draw equal rays
+            boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
+            self._lesson = RayLesson(teacher, boxes, self.asked.seed)
+        return self._lesson
+
+
+def replace_params(field: VMField) -> VMField:
+    """The same field with a copy of its numbers."""
+    return VMField(
+        field.shape, field.tensors, field.blocks, field.params.clone(), field.occupancy, field.owners
+    )
+
+
+def fuse_blocks(
+    composed: ComposedField, asked: BlocksAsked, whole_in_memory: bool, place: str, progress
+) -> tuple[VMField, str, dict]:
+    """The field, the precision to store it in, and figures for the report.
+
+    UsageProblem where not even the coarsest blocks fit the limit.
+    """
+    started = time.monotonic()
+    maker = BlocksMaker(composed, asked, whole_in_memory, place)
+    choosing = Choosing(maker.try_way, "blocks", progress.note)
+    progress.phase("blocks", None)
+    seconds = {"measuring the scene": time.monotonic() - started}
+    chosen = choose(maker, choosing, asked, progress)
+    field = maker.field_of(chosen)
+    seconds["blocks"] = time.monotonic() - started - seconds["measuring the scene"]
+    details = block_details(composed.placed, field)
+    neighbours = choosing.neighbours(chosen) if len(choosing.tried) > 1 else {}
+    seconds["neighbours"] = time.monotonic() - started - sum(seconds.values())
+    learnt = chosen.psnr > chosen.before
+    return field, chosen.way.precision, {
+        "psnr": {
+            "before_rgb": chosen.before,
+            "after_rgb": chosen.psnr if learnt else None,
+            "views": maker.views,
+        },
+        "seconds": seconds,
+        "chosen": {
+            "resolution": [list(t.resolution) for t in field.tensors],
+            "ranks": [field.shape.density_rank, field.shape.colour_rank],
+            "sh_degree": field.shape.sh_degree,
+            "precision": chosen.way.precision,
+            "flags": chosen.way.flags("blocks", chosen.limit),
+            "why": why(composed, field, chosen, asked, len(choosing.tried)),
+            **neighbours,
+        },
+        "objects": [asdict(d) for d in details],
+        "details": details,
+    }  # fmt: skip
+
+
+def choose(maker: BlocksMaker, choosing: Choosing, asked: BlocksAsked, progress) -> Tried:
+    """The way to store the blocks."""
+    if asked.target is None:
+        plain = maker.try_way(asked.plain(), asked.limit, asked.plain().ranks is not None)
+        if plain is not None and plain.whole:
+            return plain
+    ways = asked.ways()
+    progress.phase("choosing", None)
+    found = None
+    if asked.target is not None:
+        gain = FINISHING_GAIN if asked.finish else 0.0
+        found = choosing.smallest_reaching(ways, asked.target, asked.limit, gain)
+    if found is None:
+        found = choosing.best_within([way for group in ways for way in group], asked.limit)
+    if found is None:
+        cheapest = min((way for group in ways for way in group), key=lambda way: maker.make(way, 1)[1])
+        check_size(maker.make(cheapest, 1)[1], asked.limit)
+    return found
+
+
+def why(composed: ComposedField, field: VMField, chosen: Tried, asked: BlocksAsked, tried: int) -> str:
+    """One sentence on the choice."""
+    own = len({id(p.field) for p in composed.placed})
+    blocks = f"{len(field.blocks)} blocks over {own} fields, each in its object's own axes"
+    if asked.target is not None and chosen.psnr >= asked.target:
+        return f"{blocks}: the smallest of {tried} choices that reach {asked.target:g} dB"
+    if tried:
+        return f"{blocks}: the best of {tried} choices under {asked.limit} bytes"
+    return f"{blocks}, as the sources have them"
