@@ -11,7 +11,7 @@ from functools import cache
 
 from fusedrf_cli.report import readable_size
 
-DB_PER_E_FOLD = 8.0  # that PSNR gains about when the bytes grow by a factor e: only the next guess rests on it
+DB_PER_E_FOLD = 8.0  # that PSNR gains about when the bytes grow by e: only the next guess rests on it
 CLOSE = 1.06  # between the smallest size that reaches the target and the largest that does not
 MOST_GROWTH = 3.0  # from one size that is tried to the next
 OVERSHOOT = 0.1  # dB aimed above a target, so that the next try is likely to reach it

@@ -94,7 +94,7 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(vm, "OWNERSHIP_CELLS", 48)
     patch.setattr(composed, "OCCUPANCY_CELLS", 48)
     patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
-    for name in ("fuse", "edit"):
+    for name in ("fuse_blocks", "edit"):
         patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
     patch.setattr(part("fuse"), "DistillSettings", TinySettings)
     patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
