@@ -3,6 +3,7 @@
 import itertools
 import struct
 import time
+from pathlib import Path
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
@@ -23,6 +24,7 @@ from formats.records import (
     exact_bytes,
 )
 
+SPEC = Path(__file__).parents[2] / "formats" / "SPEC.md"
 SMALLEST = 2.0**-24  # of the float16 above 0
 TWO = st.tuples(st.integers(1, 200), st.integers(1, 3))
 THREE = st.tuples(st.integers(1, 20), st.integers(1, 20), st.integers(1, 3))
@@ -152,7 +154,8 @@ def test_the_bytes_of_a_coded_field_are_the_specifications():
     array = np.zeros((64, 65, 1), np.float32)
     array[56:, 64, 0] = [0, 1, -1, 0.5, -0.5, 0.26, 0.001, 2]
     scales = struct.pack("<72e", *[0] * 71, 2)
-    codes = bytes(128 + code for code in (0, 64, -64, 32, -32, 17, 0, 127))
+    codes = bytes.fromhex("80 c0 40 a0 60 91 80 ff")
+    assert "80 c0 40 a0 60 91 80 ff" in SPEC.read_text()
     text = (
         b'{"__metadata__":{"fusedrf":"{\\"coded\\":{\\"a\\":{\\"bits\\":8,\\"shape\\":[64,65,1]}},'
         b'\\"kind\\":\\"dense\\",\\"metadata\\":{},\\"version\\":2}"},'
