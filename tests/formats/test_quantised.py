@@ -273,6 +273,15 @@ def test_random_bytes_are_refused_or_finite():
     assert taken > 10
 
 
+def test_scales_of_zero_for_2_gigabytes_cost_neither_time_nor_memory():
+    """P14: the array is there, but none of its pages."""
+    shape = (8192, 8192, 8)
+    began = time.process_time()
+    array = dequantised(np.zeros(scales_shape(shape), np.float16), np.zeros(0, np.uint8), 8, shape, "here")
+    assert array.nbytes == 2 << 30 and not array[::4096, ::4096].any()
+    assert time.process_time() - began < 2
+
+
 @pytest.mark.parametrize("bits", [8, 4])
 def test_a_trained_size_decodes_in_no_time(bits):
     """100 MB/s; it is ten times that on an idle core."""
