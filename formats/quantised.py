@@ -81,15 +81,15 @@ def dequantised(
         raise BadArray(f"{where}: has a code 0, expected 1 to {2 * levels + 1}; make the file again")
     array, at = np.zeros(shape, np.float32), 0
     for rows, blocks in _slabs(shape):
+        if not scales[blocks].any():
+            continue  # pages of zeros are never touched
         spread = _spread(scales[blocks], array[rows].shape)
         kept = spread > 0
         count = np.count_nonzero(kept)
-        if count:  # pages of zeros are never touched
-            signed = np.zeros(kept.shape, np.float32)
-            signed[kept] = codes[at : at + count]
-            signed[kept] -= levels + 1
-            array[rows] = spread * signed / np.float32(levels)
-            at += count
+        signed = np.zeros(kept.shape, np.float32)
+        signed[kept] = codes[at : at + count].astype(np.float32) - (levels + 1)
+        array[rows] = spread * signed / np.float32(levels)
+        at += count
     return array
 
 

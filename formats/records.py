@@ -154,11 +154,11 @@ def exact_bytes(array: np.ndarray, precision: str) -> int:
     return most - code_bytes(array.size, BITS[precision]) + exact_code_bytes(array, BITS[precision])
 
 
-def as_stored(array: np.ndarray, precision: str) -> np.ndarray:
+def as_stored(array: np.ndarray, precision: str, name: str = "") -> np.ndarray:
     """The float32 numbers that a float array comes back as from a field. Raises NotFinite."""
-    cast = _cast("", array, precision, f"{array.shape} numbers")
+    cast = _cast(name, array, precision, "the field")
     if precision in BITS and is_coded(array.shape):
-        return dequantised(*quantised(array, BITS[precision]), BITS[precision], array.shape, "numbers")
+        return dequantised(*quantised(array, BITS[precision]), BITS[precision], array.shape, name)
     return cast.astype(np.float32)
 
 

@@ -224,7 +224,7 @@ def stored(field: VMField, precision: str) -> VMField:
     for t in range(len(field.tensors)):
         target = back.sections(t)
         for name, view in field.sections(t).items():
-            target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), precision)))
+            target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), precision, name)))
     return back
 
 
