@@ -32,7 +32,7 @@ from formats.quantised import (
 KEY = "fusedrf"
 VERSION = 2  # written where arrays are coded; fields without such are of version 1
 MAX_HEADER = 1 << 20
-MAX_ARRAYS = 256
+MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30
 MAX_DECODED_BYTES = 8 << 30  # of a field: what a whole pack of F16 comes to
 MAX_RANK = 5

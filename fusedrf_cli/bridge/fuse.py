@@ -29,7 +29,7 @@ from fusedrf_cli.bridge.scene import (
     placed_on,
     write_field,
 )
-from fusedrf_cli.bridge.sizes import graph_bytes
+from fusedrf_cli.bridge.sizes import HEADER, HEADER_PER_TENSOR, graph_bytes
 from fusedrf_cli.bridge.train import BYTES_PER_NUMBER, check_size, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -57,7 +57,6 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached
 DEFAULT_MAX_SIZE = 25_000_000
 RECKONED_RAYS = 2000  # of which the number of points is reckoned
 KEPT_POINTS = 0.35  # of a distillation's samples
-HEADER_BYTES = 16384  # scene graph, history and headers of a bundle, about
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -105,7 +104,7 @@ def fuse(
             warn_of_detail(figures.pop("details"), "a larger --max-size", progress)
         else:
             precision = precision or "float16"
-            room = limit - overhead - composed.occupancy.occupied.size // 8 + HEADER_BYTES
+            room = limit - overhead - HEADER - HEADER_PER_TENSOR - composed.occupancy.occupied.size // 8
             numbers = max(1, int(room / BYTES_PER_NUMBER[precision]))
             settings = DistillSettings(
                 seed=seed,

@@ -1,19 +1,21 @@
 """How many bytes a field takes in a bundle, told from its shape before its numbers are made."""
 
-import json
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from formats.quantised import BLOCKS, code_bytes, is_coded
 from formats.records import BITS, coded_bytes
+from formats.scene import SceneGraph, dump_scene, make_node
 from fusedrf_cli.engine.composition.trimming import read_texels
 from fusedrf_cli.engine.fields.vm import VMShape, VMTensor
 
-HEADER = 4096  # of a field: its metadata but for the tensors
-HEADER_PER_TENSOR = 3072  # 13 sections' names and offsets, twice where they are coded
-HEADER_PER_BLOCK = 512
-GRAPH = 4096  # of a bundle: scene graph and file headers but for the history
+HEADER = 512  # of a field: its metadata but for tensors and blocks
+HEADER_PER_TENSOR = 2000  # its shape, and 14 arrays' names and offsets
+HEADER_PER_PLANE = 250  # of those: as codes and scales
+HEADER_PER_BLOCK = 700
+BESIDES = 1024  # of a bundle: settings, figures and file headers
 
 
 def vm_bytes(shape: VMShape, tensors: Sequence[VMTensor], blocks: int, precision: str) -> int:
@@ -32,7 +34,8 @@ def section_bytes(tensor: VMTensor, name: str, section: tuple[int, ...], precisi
     if precision not in BITS or not is_coded(section) or "_plane_" not in name:
         return most
     kept = section[2] * kept_texels(read_texels(tensor, int(name[-1])))
-    return most - code_bytes(int(np.prod(section)), BITS[precision]) + code_bytes(kept, BITS[precision])
+    left_out = code_bytes(int(np.prod(section)), BITS[precision]) - code_bytes(kept, BITS[precision])
+    return HEADER_PER_PLANE + most - left_out
 
 
 def kept_texels(read: np.ndarray) -> int:
@@ -45,6 +48,7 @@ def kept_texels(read: np.ndarray) -> int:
     return int(sides[0] @ held @ sides[1])
 
 
-def graph_bytes(history: list[dict]) -> int:
-    """At most so many bytes for all of a bundle but its field."""
-    return GRAPH + 2 * len(json.dumps(history, indent=2))
+def graph_bytes(nodes: list[dict]) -> int:
+    """At most so many bytes for all of a fused bundle but its field; nodes are those of its history."""
+    node = make_node("fused", field=f"fields/{'0' * 16}.safetensors", translation=(math.pi,) * 3)
+    return BESIDES + len(dump_scene(SceneGraph((node,), history=({"nodes": nodes},))))

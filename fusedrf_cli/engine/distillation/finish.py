@@ -34,10 +34,13 @@ class RayLesson:
         """(R, 4) float32: colour over white, opacity."""
         self.target[:, :3] += 1 - self.target[:, 3:]
 
-    def teach(self, student, steps: int = STEPS, advance: Callable[[float], None] = lambda share: None):
-        """Steps of Adam on a student's numbers, in place, by the squared error of colour over white and of
-        opacity. Raises FloatingPointError when they do not stay finite.
+    def teach(
+        self, student, steps: int | None = None, advance: Callable[[float], None] = lambda share: None
+    ) -> None:
+        """Steps (default: STEPS) of Adam on a student's numbers, in place, by the squared error of colour
+        over white and of opacity. Raises FloatingPointError when they do not stay finite.
         """
+        steps = steps or STEPS
         generator = torch.Generator().manual_seed(self.seed + 1)
         epochs, optimiser = Epochs(len(self.rays_o), generator), Adam.of(student)
         guard = Guard(optimiser.numbers)
