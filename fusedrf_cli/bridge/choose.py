@@ -137,15 +137,19 @@ class Choosing:
         return min(most, max(1, round(size)))
 
     def neighbours(self, chosen: Tried) -> dict[str, dict]:
-        """The next larger and the next smaller choice, with what they give."""
+        """The next larger choice that shows more and the next smaller one, with what they give."""
         found = {}
-        for name, ratio in (("smaller", 1 / NEIGHBOUR), ("larger", NEIGHBOUR)):
-            others = [t for t in self.tried if (t.bytes - chosen.bytes) * (ratio - 1) > 0]
-            near = [t for t in others if abs(math.log(t.bytes / chosen.bytes)) < 2 * math.log(NEIGHBOUR)]
-            if not near and not (chosen.whole and ratio > 1):
-                made = self.make(chosen.way, round(chosen.bytes * ratio), True)
+        for name, side in (("smaller", -1), ("larger", 1)):
+            near = [
+                t
+                for t in self.tried
+                if CLOSE**0.5 < (t.bytes / chosen.bytes) ** side < NEIGHBOUR * CLOSE
+                and (t.psnr - chosen.psnr) * side > 0
+            ]
+            if not near and not (chosen.whole and side > 0):
+                made = self.make(chosen.way, round(chosen.bytes * NEIGHBOUR**side), True)
                 near = [made] if made is not None else []
             if near:
-                nearest = min(near, key=lambda t: abs(math.log(t.bytes / chosen.bytes)))
-                found[f"next_{name}"] = nearest.told(self.kind)
+                best = max(near, key=lambda t: (t.psnr - chosen.psnr) / abs(math.log(t.bytes / chosen.bytes)))
+                found[f"next_{name}"] = best.told(self.kind)
         return found
