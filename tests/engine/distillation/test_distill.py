@@ -113,7 +113,7 @@ def test_bad_steps_are_skipped_and_told(monkeypatch):
 def test_a_teacher_of_nan_is_an_error(monkeypatch):
     def spoilt(teacher, *words, **more):
         pool = ask(teacher, *words, **more)
-        pool.sigma[:] = float("nan")
+        pool.points.sigma[:] = float("nan")
         return pool
 
     ask = module.ask
