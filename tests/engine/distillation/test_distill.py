@@ -12,6 +12,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import (
+    DistillRun,
     DistillSettings,
     Judge,
     distill,
@@ -40,9 +41,9 @@ def small_steps(monkeypatch):
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
 
 
-def taught(settings: DistillSettings, rgb: bool = True):
+def taught(settings: DistillSettings, rgb: bool = True, recipe: module.Recipe = module.DEFAULT_RECIPE):
     student = empty_student(TEACHER, settings, torch.Generator().manual_seed(settings.seed), "ball")
-    return distill(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings, rgb)
+    return DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings, rgb, recipe).finish()
 
 
 def test_a_ball_is_learnt():
@@ -86,11 +87,10 @@ def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
     assert torch.equal(student.params, plain.params) is not kept
 
 
-def test_a_harmful_rgb_phase_is_not_kept(monkeypatch):
+def test_a_harmful_rgb_phase_is_not_kept():
     """At a rate of 3 the pictures spoil what the points taught; the student is the one of before."""
-    monkeypatch.setattr(module.RayPass, "rate", 3.0)
     brief = replace(SETTINGS, rays=2000, rgb_steps=10)
-    student, report = taught(brief)
+    student, report = taught(brief, recipe=module.Recipe(rgb_rate=3.0))
     plain, before = taught(brief, rgb=False)
     assert report.psnr_after_rgb < report.psnr_before_rgb - 3 and report.rgb_kept is False
     assert report.psnr_before_rgb == before.psnr_before_rgb and torch.equal(student.params, plain.params)
