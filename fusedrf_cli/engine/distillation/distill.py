@@ -40,6 +40,8 @@ RATE = 0.08  # four times what pictures are learnt at: points say at once where 
 RGB_RATE = 0.01
 OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
+COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
+COARSE_FROM = 64  # texels along a student's longest axis from which it starts at half of them
 RAYS_AT_FIRST = 1024
 HELD_OUT = 1 << 12  # rays whose PSNR is the learning curve
 HELD_OUT_SEED = 9_000_001
@@ -68,6 +70,12 @@ class DistillSettings:
     view_size: int = 160
 
 
+def starts_coarse(student: RadianceField) -> bool:
+    """Whether a student is one VM tensor large enough to have half its resolution first."""
+    single = type(student) is VMField and len(student.blocks) == 1
+    return single and max(student.tensors[0].resolution) >= COARSE_FROM
+
+
 @dataclass(frozen=True)
 class Recipe:
     """The parts of the method, of which benchmarks/ablation.py replaces one at a time."""
@@ -77,6 +85,8 @@ class Recipe:
     visibility: Visibility = mostly_seen
     rate: float = RATE
     rgb_rate: float = RGB_RATE
+    coarse: Callable[[RadianceField], bool] = starts_coarse
+    """Whether a student begins at half its resolution."""
     schedule: type[Schedule] = Schedule
 
 
@@ -187,6 +197,18 @@ def student_from(
     return student
 
 
+def halved(student: VMField) -> VMField:
+    """A one-block student at half its resolution, over the same occupancy."""
+    resolution = tuple((n + 1) // 2 for n in student.tensors[0].resolution)
+    return student.resampled(student.tensors[0].aabb, resolution).with_occupancy(student.occupancy)
+
+
+def resampled_like(student: VMField, other: VMField) -> VMField:
+    """A one-block student's numbers at the resolution of another over the same box."""
+    tensor = other.tensors[0]
+    return student.resampled(tensor.aabb, tensor.resolution).with_occupancy(student.occupancy)
+
+
 def wake(student: VMField, generator: torch.Generator) -> None:
     """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for
     ever.
@@ -229,8 +251,10 @@ class DistillRun:
         recipe: Recipe = DEFAULT_RECIPE,
     ):
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth."""
-        self.teacher, self.student, self.boxes, self.rgb = teacher, student, boxes, rgb
+        self.teacher, self.boxes, self.rgb = teacher, boxes, rgb
         self.settings, self.recipe, self.step = settings, recipe, 0.5 * student.voxel_size
+        self.student, self.refined = (halved(student), student) if recipe.coarse(student) else (student, None)
+        """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
         self.report = DistillReport()
         self.optimiser = Adam.of(student)
@@ -286,6 +310,8 @@ class DistillRun:
 
     def _begin_pictures(self) -> None:
         """What was learnt from points is the RGB phase's start, and what it has to surpass."""
+        if self.refined is not None:
+            self._refine()
         self.guard.check()
         self.before = self.student.params.clone()
         self._prune()
@@ -294,6 +320,13 @@ class DistillRun:
         self.report.steps["points"] = self.steps
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
         self.schedule = self.recipe.schedule()
+
+    def _refine(self) -> None:
+        """Go on at the full resolution, with moments that start anew."""
+        self.guard.check()
+        self.student, self.refined = resampled_like(self.student, self.refined), None
+        self.optimiser = Adam.of(self.student)
+        self.guard.renew()
 
     def _prune(self) -> None:
         """Leave out the cells that turned out empty, unless that would be all of them; only a student of one
@@ -317,6 +350,8 @@ class DistillRun:
         started = time.monotonic() - self.elapsed
         while (share := self._share(steps, time.monotonic() - started)) < self.schedule.end:
             with whole():
+                if self.refined is not None and share >= COARSE_UNTIL:
+                    self._refine()
                 self.guard.keep()
                 sums, figures = gradient()
                 if self.guard.accepts(sums, self.optimiser):
@@ -332,7 +367,8 @@ class DistillRun:
     def _look(self, held_out: HeldOut, share: float) -> None:
         """A point of the learning curve, which the schedule follows."""
         found = held_out(self.student)
-        self.schedule.look(share, found)
+        if self.refined is None:
+            self.schedule.look(share, found)
         made = self.steps + self.report.steps.get("points", 0)
         self.report.curve.append((time.monotonic() - self.began, made, found))
 
@@ -361,6 +397,7 @@ class DistillRun:
             "rays": self.count,
             "guard": self.guard.state(),
             "schedule": self.schedule.state(),
+            "coarse": self.refined is not None,
             "points_steps": self.report.steps.get("points"),
             "curve": self.report.curve,
             **drawn,
@@ -369,6 +406,8 @@ class DistillRun:
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
         """Take up a run that `checkpoint` saved, over the same teacher and settings."""
+        if self.refined is not None and not state["coarse"]:
+            self._refine()
         if "before" in arrays:
             self.student.params.copy_(torch.from_numpy(arrays["before"]))
             self._begin_pictures()
