@@ -37,7 +37,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 
 RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
-RGB_RATE = 0.01
+RGB_RATE = 0.003
 OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
 COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
@@ -58,8 +58,8 @@ class DistillSettings:
     max_numbers: int = 12_000_000
     """Numbers the student may have; its resolution follows."""
     rays: int = 400_000
-    steps: int = 1200
-    rgb_steps: int = 1500
+    steps: int = 1000
+    rgb_steps: int = 600
     rgb_samples: int = 1 << 15
     time_budget: float | None = None
     """Seconds of learning, half for points and half for rays where there is an RGB phase. None: the steps
