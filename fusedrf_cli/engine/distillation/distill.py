@@ -253,7 +253,8 @@ class DistillRun:
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth."""
         self.teacher, self.boxes, self.rgb = teacher, boxes, rgb
         self.settings, self.recipe, self.step = settings, recipe, 0.5 * student.voxel_size
-        self.student, self.refined = (halved(student), student) if recipe.coarse(student) else (student, None)
+        coarse = settings.steps > 0 and recipe.coarse(student)
+        self.student, self.refined = (halved(student), student) if coarse else (student, None)
         """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
         self.report = DistillReport()
@@ -375,7 +376,7 @@ class DistillRun:
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given."""
         if self.settings.time_budget is None:
-            return self.steps / steps
+            return self.steps / steps if steps else 1.0
         return seconds / (self.settings.time_budget / (2 if self.rgb else 1))
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
