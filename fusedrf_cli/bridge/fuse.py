@@ -330,6 +330,8 @@ def fuse_vm(
             "views": settings.views,
         },
         "seconds": did.seconds,
+        "steps": did.steps,
+        "curve": [dict(zip(("seconds", "steps", "psnr"), point, strict=True)) for point in did.curve],
         "chosen": {
             "resolution": list(student.tensors[0].resolution),
             "ranks": [student.shape.density_rank, student.shape.colour_rank],
