@@ -56,7 +56,6 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000
 RECKONED_RAYS = 2000  # of which the number of points is reckoned
-KEPT_POINTS = 0.35  # of a distillation's samples
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -203,7 +202,7 @@ def vm_memory(
     boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
     few = random_rays(boxes, RECKONED_RAYS, generator)
     step = 0.5 * float(np.max((box[3:] - box[:3]) / (np.asarray(resolution) - 1)))
-    kept = len(ask(composed, *few, step, generator, KEPT_POINTS).points)
+    kept = len(ask(composed, *few, step, generator).points)
     answers = teaching(settings, kept * settings.rays // RECKONED_RAYS) | ownership(box)
     return [
         (0.0, result(numbers, measured=False) | answers | picture(256, 256, composed=True)),
@@ -301,6 +300,8 @@ def fuse_vm(
             "views": settings.views,
         },
         "seconds": did.seconds,
+        "steps": did.steps,
+        "curve": [dict(zip(("seconds", "steps", "psnr"), point, strict=True)) for point in did.curve],
         "chosen": {
             "resolution": list(student.tensors[0].resolution),
             "ranks": [student.shape.density_rank, student.shape.colour_rank],
