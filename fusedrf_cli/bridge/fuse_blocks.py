@@ -4,10 +4,14 @@ smallest that shows enough.
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 
+import torch
+
+from formats.records import BYTES_PER_NUMBER
 from fusedrf_cli.bridge.choose import Choosing, Tried, Way
-from fusedrf_cli.bridge.scene import stored
+from fusedrf_cli.bridge.fusing import Asked, Fused, make_room
+from fusedrf_cli.bridge.memory import FLOAT, RESAMPLING, Memory, learning, lesson, ownership, picture, result
+from fusedrf_cli.bridge.scene import LoadedScene, stored
 from fusedrf_cli.bridge.sizes import vm_bytes
 from fusedrf_cli.bridge.train import check_size
 from fusedrf_cli.engine.composition.blocks import blocks_of
@@ -15,7 +19,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import block_details
 from fusedrf_cli.engine.composition.trimming import without_unread
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
-from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.finish import RAYS, RayLesson
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField, VMShape, VMTensor
 
@@ -28,38 +32,22 @@ PRECISE = "float16"
 VIEWS_TO_CHOOSE_BY = 8
 
 
-@dataclass(frozen=True)
-class BlocksAsked:
-    """What a person fixed of the way blocks are stored; None is left to choose."""
+def ways(asked: Asked) -> list[list[Way]]:
+    """The ways that are left to choose from, in groups of one precision, the cheapest first."""
+    precisions = [asked.precision] if asked.precision else CHEAP_FIRST
+    ranks = [asked.ranks] if asked.ranks else RANKS
+    return [[Way(p, r, asked.sh_degree) for r in ranks] for p in precisions]
 
-    limit: int
-    """Bytes of the file."""
-    overhead: int
-    """Bytes of the file besides the field."""
-    target: float | None
-    precision: str | None
-    ranks: tuple[int, int] | None
-    sh_degree: int | None
-    finish: bool
-    seed: int
-    time_budget: float | None = None
-    """Seconds of choosing after which nothing more is learnt."""
 
-    def ways(self) -> list[list[Way]]:
-        """The ways that are left, in groups of one precision, the cheapest first."""
-        precisions = [self.precision] if self.precision else CHEAP_FIRST
-        ranks = [self.ranks] if self.ranks else RANKS
-        return [[Way(p, r, self.sh_degree) for r in ranks] for p in precisions]
-
-    def plain(self) -> Way:
-        """The way that leaves most as it is."""
-        return Way(self.precision or PRECISE, self.ranks, self.sh_degree)
+def plain_way(asked: Asked) -> Way:
+    """The way that leaves most as it is."""
+    return Way(asked.precision or PRECISE, asked.ranks, asked.sh_degree)
 
 
 class BlocksMaker:
     """Makes, stores and measures the blocks of one scene."""
 
-    def __init__(self, composed: ComposedField, asked: BlocksAsked, whole_in_memory: bool, place: str):
+    def __init__(self, composed: ComposedField, asked: Asked, whole_in_memory: bool, place: str):
         self.composed, self.asked, self.place = composed, asked, place
         views = VIEWS_TO_CHOOSE_BY if asked.target is not None else DistillSettings.views
         self.judge = Judge(composed, views, DistillSettings.view_size, asked.seed)
@@ -85,7 +73,7 @@ class BlocksMaker:
     def learns(self) -> bool:
         """Whether finishing was asked for and there is time left for it."""
         budget = self.asked.time_budget
-        return self.asked.finish and (budget is None or time.monotonic() - self.started < budget)
+        return self.asked.rgb and (budget is None or time.monotonic() - self.started < budget)
 
     def field_of(self, tried: Tried) -> VMField:
         """The field of an earlier try; made again where another was tried since."""
@@ -143,28 +131,31 @@ def replace_params(field: VMField) -> VMField:
 
 
 def fuse_blocks(
-    composed: ComposedField, asked: BlocksAsked, whole_in_memory: bool, place: str, progress
-) -> tuple[VMField, str, dict]:
-    """The field, the precision to store it in, and figures for the report.
+    composed: ComposedField, asked: Asked, whole_in_memory: bool, place: str, progress
+) -> Fused:
+    """The scene as blocks, in the way that was asked for or found.
 
     UsageProblem where not even the coarsest blocks fit the limit.
     """
-    started = time.monotonic()
+    started, seconds = time.monotonic(), {}
+
+    def lap(name: str) -> None:
+        seconds[name] = time.monotonic() - started - sum(seconds.values())
+
     maker = BlocksMaker(composed, asked, whole_in_memory, place)
     choosing = Choosing(maker.try_way, "blocks", progress.note)
+    lap("measuring the scene")
     progress.phase("blocks", None)
-    seconds = {"measuring the scene": time.monotonic() - started}
     chosen = choose(maker, choosing, asked, progress)
     field = maker.field_of(chosen)
-    seconds["blocks"] = time.monotonic() - started - seconds["measuring the scene"]
-    details = block_details(composed.placed, field)
+    lap("blocks")
     neighbours = choosing.neighbours(chosen) if len(choosing.tried) > 1 else {}
-    seconds["neighbours"] = time.monotonic() - started - sum(seconds.values())
-    learnt = chosen.psnr > chosen.before
-    return field, chosen.way.precision, {
+    lap("neighbours")
+    figures = {
         "psnr": {
             "before_rgb": chosen.before,
-            "after_rgb": chosen.psnr if learnt else None,
+            "after_rgb": chosen.psnr if chosen.psnr > chosen.before else None,
+            "stored": chosen.psnr,
             "views": maker.views,
         },
         "seconds": seconds,
@@ -177,32 +168,33 @@ def fuse_blocks(
             "why": why(composed, field, chosen, asked, len(choosing.tried)),
             **neighbours,
         },
-        "objects": [asdict(d) for d in details],
-        "details": details,
-    }  # fmt: skip
+    }
+    details = block_details(composed.placed, field)
+    return Fused(field, chosen.way.precision, figures, details, "a larger --max-size")
 
 
-def choose(maker: BlocksMaker, choosing: Choosing, asked: BlocksAsked, progress) -> Tried:
+def choose(maker: BlocksMaker, choosing: Choosing, asked: Asked, progress) -> Tried:
     """The way to store the blocks."""
     if asked.target is None:
-        plain = maker.try_way(asked.plain(), asked.limit, asked.plain().ranks is not None)
+        way = plain_way(asked)
+        plain = maker.try_way(way, asked.limit, way.ranks is not None)
         if plain is not None and plain.whole:
             return plain
-    ways = asked.ways()
+    groups = ways(asked)
     progress.phase("choosing", None)
     found = None
     if asked.target is not None:
-        gain = FINISHING_GAIN if asked.finish else 0.0
-        found = choosing.smallest_reaching(ways, asked.target, asked.limit, gain)
+        gain = FINISHING_GAIN if asked.rgb else 0.0
+        found = choosing.smallest_reaching(groups, asked.target, asked.limit, gain)
     if found is None:
-        found = choosing.best_within([way for group in ways for way in group], asked.limit)
+        found = choosing.best_within([way for group in groups for way in group], asked.limit)
     if found is None:
-        cheapest = min((way for group in ways for way in group), key=lambda way: maker.make(way, 1)[1])
+        cheapest = min((way for group in groups for way in group), key=lambda way: maker.make(way, 1)[1])
         check_size(maker.make(cheapest, 1)[1], asked.limit)
     return found
 
 
-def why(composed: ComposedField, field: VMField, chosen: Tried, asked: BlocksAsked, tried: int) -> str:
+def why(composed: ComposedField, field: VMField, chosen: Tried, asked: Asked, tried: int) -> str:
     """One sentence on the choice."""
     own = len({id(p.field) for p in composed.placed})
     blocks = f"{len(field.blocks)} blocks over {own} fields, each in its object's own axes"
@@ -211,3 +203,29 @@ def why(composed: ComposedField, field: VMField, chosen: Tried, asked: BlocksAsk
     if tried:
         return f"{blocks}: the best of {tried} choices under {asked.limit} bytes"
     return f"{blocks}, as the sources have them"
+
+
+def blocks_memory(
+    budget: Memory, loaded: LoadedScene, composed: ComposedField, asked: Asked
+) -> bool:
+    """Make room for compiling a scene to blocks: putting together, measuring, learning. Whether all sources
+    together may be in memory as a teacher."""
+    own = sum(loaded.sizes) // FLOAT
+    numbers, grids = min(int(asked.limit / BYTES_PER_NUMBER["int4"]), own), ownership(composed.aabb)
+    if asked.target is None and asked.precision is None:  # then either nothing learns or it is much smaller
+        numbers = min(numbers, max(asked.limit // 2, own // 2))
+    threads = torch.get_num_threads()
+    learnt = learning(numbers, threads) | lesson(RAYS) | grids if asked.rgb else {}
+    make_room(
+        budget,
+        loaded,
+        (RESAMPLING, result(numbers, measured=False) | grids),
+        (0.0, result(numbers) | grids | judged()),
+        (0.0, learnt),
+    )
+    return budget.room(learnt) > sum(loaded.sizes) + FLOAT * own
+
+
+def judged() -> dict[str, float]:
+    """Looking at a scene to measure; it covers about half of a picture that frames it."""
+    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)

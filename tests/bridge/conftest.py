@@ -94,9 +94,9 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(vm, "OWNERSHIP_CELLS", 48)
     patch.setattr(composed, "OCCUPANCY_CELLS", 48)
     patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
-    for name in ("fuse_blocks", "edit"):
+    for name in ("fuse_blocks", "fuse_vm", "edit"):
         patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
-    patch.setattr(part("fuse"), "DistillSettings", TinySettings)
+    patch.setattr(part("fuse_vm"), "DistillSettings", TinySettings)
     patch.setattr(part("fuse_blocks"), "RANKS", (None,))  # others would be compiled
     patch.setattr(part("fuse_blocks"), "VIEWS_TO_CHOOSE_BY", 2)
     patch.setattr(finish, "RAYS_PER_STEP", 500)
