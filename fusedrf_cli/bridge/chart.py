@@ -1,0 +1,284 @@
+"""`chart`: a scene fused in the ways that are worth it, each measured against the scene as composed."""
+
+import contextlib
+import csv
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from formats.atomic import atomic_folder, hidden_sibling
+from fusedrf_cli import plots
+from fusedrf_cli.bridge.fuse import fuse, source_bytes
+from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
+from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
+from fusedrf_cli.bridge.render import renderable
+from fusedrf_cli.bridge.running import checkpoint_path, engine
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.bridge.shelf import Shelf
+from fusedrf_cli.bridge.train import WHITE
+from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
+from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
+from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.errors import FusedRFError, Interrupted, InvalidInput, UsageProblem
+from fusedrf_cli.progress import NullProgress
+
+VIEWS = 8
+HELD_OUT = (JUDGED_SEED, 2)  # a pair seeds a stream that no single number, such as a person's --seed, does
+ROUNDS = 5  # of frames, all fields taking turns
+PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
+COSTS = ("seconds", "bytes", "ms")
+NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
+
+
+@dataclass
+class Point:
+    """One way to fuse the scene, and what it gave."""
+
+    flags: str
+    kind: str
+    psnr: float
+    """dB against the scene as composed, mean of VIEWS views over white that nothing was trained on."""
+    ssim: float
+    seconds: float
+    """Of fusing, once the kernels are loaded."""
+    bytes: int
+    ms: float = float("nan")
+    """Median time of a frame."""
+    frontier: list[str] = field(default_factory=list)
+    """The COSTS at which no other point is as good for less."""
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What all fused fields of a scene are held to."""
+
+    scene: str
+    memory: Memory
+    size: tuple[int, int]
+    allow_outside: bool
+    place: str
+    box: np.ndarray
+    """(6,) of the scene's matter, in the world."""
+    truth: list[np.ndarray]
+    """(H, W, 3) float32 over white, of every camera."""
+    source_bytes: int
+
+    @classmethod
+    def lay(cls, scene: str, memory: Memory, size: tuple[int, int], allow_outside: bool, place: str):
+        """Render the scene as composed."""
+        loaded = load_scene(scene, allow_outside, memory, place)
+        composed = loaded.composed()
+        needed = sources(loaded.sizes) | picture(*size, composed=True) | measured(*size)
+        needed["the pictures to compare with"] = VIEWS * size[0] * size[1] * PER_PIXEL_KEPT
+        memory.expect(needed, advice="give a smaller --size")
+        box = composed.occupancy.tight_aabb(0) + np.tile(composed.origin, 2)
+        cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
+        truth = [render_image(composed, c, origin=composed.origin).over(WHITE) for c in cameras]
+        return cls(scene, memory, size, allow_outside, place, box, truth, source_bytes(loaded))
+
+    def quality(self, bundle: Path) -> tuple[float, float]:
+        """Mean PSNR and SSIM of a fused bundle."""
+        render, origin = renderable(load_scene(str(bundle), budget=self.memory, place=self.place))
+        cameras = scattered(self.box, VIEWS, *self.size, seed=HELD_OUT)
+        shots = [render_image(render, c, origin=origin).over(WHITE) for c in cameras]
+        pairs = list(zip(shots, self.truth, strict=True))
+        return float(np.mean([psnr(*p) for p in pairs])), float(np.mean([ssim(*p) for p in pairs]))
+
+    def frame_times(self, bundles: Sequence[Path], advance: Callable[[int], None]) -> list[float]:
+        """Median milliseconds of a frame of the scene as composed, and of every fused bundle: all take
+        turns, so that what else the machine does meets them alike.
+        """
+        shelf = Shelf(self.memory.room(picture(*self.size, composed=True)))
+        camera = framing_camera(self.box, 0.9, 0.45, *self.size)
+        loaded = load_scene(self.scene, self.allow_outside, self.memory, self.place)
+        composed = loaded.composed()
+        sizes = [sum(load_scene(str(path), budget=self.memory).sizes) for path in bundles]
+        seconds = [[] for _ in range(1 + len(bundles))]
+        for done in range(1 + ROUNDS):  # the first warms up
+            seconds[0].append(frame_seconds(composed, camera, composed.origin))
+            for i, (path, size) in enumerate(zip(bundles, sizes, strict=True), 1):
+                found = shelf.take(
+                    str(path), size, lambda path=path: renderable(load_scene(str(path), place=self.place))
+                )
+                seconds[i].append(frame_seconds(found[0], camera, found[1]))
+            advance(done + 1)
+        return [1000 * statistics.median(taken[1:]) for taken in seconds]
+
+
+def frame_seconds(render, camera, origin: np.ndarray) -> float:
+    """Time of one frame."""
+    started = time.perf_counter()
+    render_image(render, camera, origin=origin)
+    return time.perf_counter() - started
+
+
+def chart(
+    scene: str,
+    output: str,
+    *,
+    budget: float,
+    kinds: Sequence[str],
+    least_psnr: float,
+    size: tuple[int, int],
+    memory: int | None,
+    allow_outside: bool,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    fuse_words: Callable[[Flags], dict | None],
+    progress,
+) -> dict:
+    """Fuse a scene in the ways that are worth it, measure each, and draw them in a folder.
+
+    `fuse_words` makes of a command line's flags what `fuse` takes, None where it has no such flags: so every
+    label is the flags that gave the point. Raises the error of fusing where no way can be gone.
+    """
+    plots.check()
+    where = {"memory": memory, "allow_outside": allow_outside, "seed": seed, "device": device}
+    where |= {"threads": threads, "overwrite": True}
+    with engine(device, threads, progress) as place, scratch(output) as paths:
+        progress.phase("the scene as composed", None)
+        course = Course.lay(scene, Memory(memory), size, allow_outside, place)
+        run = Charting(course, paths, fuse_words, where, progress)
+        progress.phase("fusing", budget)
+        left = run.climb({kind: list(ladders(kind, least_psnr)) for kind in kinds}, budget)
+        progress.phase("frames", 1 + ROUNDS)
+        composed_ms, *ms = course.frame_times(run.bundles, progress.advance)
+    for point, value in zip(run.points, ms, strict=True):
+        point.ms = value
+    mark_frontiers(run.points)
+    best = sorted((p for p in run.points if p.frontier), key=lambda p: (-p.psnr, p.bytes))
+    composed = {"ms": composed_ms, "bytes": course.source_bytes}
+    with atomic_folder(output, overwrite=overwrite) as folder:
+        write_csv(folder / "chart.csv", run.points, composed)
+        for suffix in ("png", "svg"):
+            plots.chart(run.points, best, composed, Path(scene).name, folder / f"chart.{suffix}")
+    if left:
+        progress.warn(f"{left} ladders were left off where --budget {budget:g} ended; give more to go on")
+    columns = ("flags", "psnr", "ssim", "bytes", "seconds", "ms")
+    return {
+        "output": output,
+        "views": f"{VIEWS} of {size[0]}x{size[1]}, which nothing was trained or chosen on",
+        "composed": composed,
+        "tried": len(run.points),
+        "frontier": [{"no": i} | {c: getattr(p, c) for c in columns} for i, p in enumerate(best, 1)],
+        "points": [asdict(p) for p in run.points],
+    }
+
+
+@contextlib.contextmanager
+def scratch(output: str) -> Iterator[Iterator[Path]]:
+    """Names for bundles beside the output, which are removed at the end: sources are found from there by the
+    same paths as from a bundle that a person puts there, so that the bytes are the same.
+    """
+    target, made = Path(os.path.realpath(output)), []
+
+    def names() -> Iterator[Path]:
+        for number in count():
+            made.append(hidden_sibling(target, f"{number}.rfpack"))
+            yield made[-1]
+
+    try:
+        yield names()
+    except Interrupted as interrupt:
+        interrupt.sentence = "interrupted; nothing was written"  # and no checkpoint is left to go on from
+        raise
+    finally:
+        for path in made:
+            path.unlink(missing_ok=True)
+            checkpoint_path(str(path)).unlink(missing_ok=True)
+
+
+class Charting:
+    """The points found so far, and the bundles they were measured on."""
+
+    def __init__(self, course: Course, paths: Iterator[Path], fuse_words, where: dict, progress):
+        self.course, self.paths, self.fuse_words, self.where = course, paths, fuse_words, where
+        self.progress = progress
+        self.points: list[Point] = []
+        self.bundles: list[Path] = []
+        self.refused: dict[str, FusedRFError] = {}
+
+    def climb(self, waiting: dict[str, list[Ladder]], budget: float) -> int:
+        """Try rung after rung until the seconds are spent: next comes the kind that has had the least time,
+        and of its ladders the one with the fewest rungs. Returns how many ladders were left off.
+        """
+        started, spent = time.monotonic(), dict.fromkeys(waiting, 0.0)
+        rungs = {kind: [(ladder, next(ladder)) for ladder in found] for kind, found in waiting.items()}
+        while any(rungs.values()) and (now := time.monotonic() - started) < budget:
+            self.progress.advance(now)
+            kind = min((k for k in rungs if rungs[k]), key=spent.get)
+            ladder, flags = rungs[kind].pop(0)
+            point = self.try_flags(kind, flags)
+            with contextlib.suppress(StopIteration):
+                rungs[kind].append((ladder, ladder.send(point and (point.bytes, point.psnr))))
+            if kind in self.refused:
+                rungs[kind] = []
+            spent[kind] += time.monotonic() - started - now
+        if not self.points:
+            raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
+        return sum(map(len, rungs.values()))
+
+    def try_flags(self, kind: str, flags: Flags) -> Point | None:
+        """The point of some flags; None where they are not to be had, and a warning where that is the
+        scene's fault.
+        """
+        if self.where["seed"]:
+            flags = (*flags, "--seed", str(self.where["seed"]))
+        words = self.fuse_words(flags)
+        if words is None:
+            return None
+        path = next(self.paths)
+        try:
+            if kind not in {p.kind for p in self.points}:
+                self.fuse(path, words)  # the first of a kind also loads kernels: it is timed the second time
+            report, warnings = self.fuse(path, words)
+        except FusedRFError as error:
+            if isinstance(error, InvalidInput):  # this scene never becomes that kind
+                self.refused[kind] = error
+            self.progress.warn(f"left out {' '.join(flags)}: {error}")
+            return None
+        quality = self.course.quality(path)
+        point = Point(" ".join(flags), kind, *quality, report["total_seconds"], report["bytes"])
+        point.warnings = warnings
+        self.points.append(point)
+        self.bundles.append(path)
+        self.progress.note(f"{point.flags}: {point.psnr:.2f} dB, {point.bytes:,} bytes")
+        return point
+
+    def fuse(self, path: Path, words: dict) -> tuple[dict, list[str]]:
+        """A fuse's report, and what it warned of."""
+        heard = NullProgress()
+        report = fuse(self.course.scene, str(path), **words | self.where, progress=heard)
+        return report, heard.warnings
+
+
+def mark_frontiers(points: list[Point]) -> None:
+    """Note at every point for which COSTS no other one is as good for less."""
+    for cost in COSTS:
+        best = -np.inf
+        for point in sorted(points, key=lambda p: (getattr(p, cost), -p.psnr)):
+            if point.psnr > best:
+                best = point.psnr
+                point.frontier.append(cost)
+
+
+def write_csv(path: Path, points: list[Point], composed: dict) -> None:
+    """All points, and the scene as composed, one per line."""
+    columns = ("flags", "kind", "psnr", "ssim", "seconds", "bytes", "ms")
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow([*columns, "frontier"])
+        table.writerow(["", "composed", "", "", "", composed["bytes"], f"{composed['ms']:.3f}"])
+        for p in points:
+            values = (p.flags, p.kind, f"{p.psnr:.3f}", f"{p.ssim:.5f}", f"{p.seconds:.3f}")
+            table.writerow([*values, p.bytes, f"{p.ms:.3f}", " ".join(p.frontier)])
