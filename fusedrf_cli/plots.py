@@ -12,6 +12,8 @@ AXES = {"seconds": "seconds to fuse", "bytes": "bytes", "ms": "milliseconds per 
 PALE = 0.25
 ROW_INCHES = 0.19
 FONT = 8  # points
+FEW_TICKS = 20  # times the smallest value, from which on an axis is marked at 1, 2 and 5 alone
+FAR = 3  # times the largest point, from which on a reference is off the scale
 AROUND = [(dx, dy) for r in (9, 15, 22) for dx, dy in ((-r, r), (0, r), (r, r), (r, 0), (r, -r), (0, -r))]
 
 
@@ -48,17 +50,9 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
     above, below = figure.subfigures(2, 1, height_ratios=(4.4, height - 4.4))
     panels = above.subplots(1, 3, sharey=True)
     for panel, cost in zip(panels, AXES, strict=True):
-        draw_panel(panel, cost, points, best)
+        draw_panel(panel, cost, points)
         if cost in composed:
-            panel.axvline(composed[cost], color="black", linewidth=1, linestyle=":")
-            panel.annotate(
-                "the sources" if cost == "bytes" else "not fused",
-                (composed[cost], 0.02),
-                xycoords=("data", "axes fraction"),
-                rotation=90,
-                ha="right",
-                fontsize=FONT,
-            )
+            draw_composed(panel, cost, composed[cost], max(getattr(p, cost) for p in points))
     panels[0].set_ylabel("PSNR against the scene as composed, dB")
     above.suptitle(title, parse_math=False)
     panels[0].legend(handles=kind_handles(points), loc="lower right", fontsize=FONT)
@@ -69,25 +63,43 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
     save(figure, path)
 
 
-def draw_panel(panel, cost: str, points: Sequence, best: Sequence) -> None:
+def draw_panel(panel, cost: str, points: Sequence) -> None:
     """The points over one cost, the surpassed ones pale, and the frontier as a line."""
     from matplotlib import ticker
 
     for point in points:
         colour, marker = LOOKS[point.kind]
-        x, alpha = getattr(point, cost), 1 if point in best else PALE
-        panel.plot(x, point.psnr, marker, color=colour, alpha=alpha, markersize=6, markeredgewidth=0)
-    line = sorted((getattr(p, cost), p.psnr) for p in best if cost in p.frontier)
+        alpha = 1 if cost in point.frontier else PALE
+        look = {"color": colour, "alpha": alpha, "markersize": 6, "markeredgewidth": 0}
+        panel.plot(getattr(point, cost), point.psnr, marker, **look)
+    line = sorted((getattr(p, cost), p.psnr) for p in points if cost in p.frontier)
     panel.plot(*zip(*line, strict=True), color="0.4", linewidth=1, zorder=0)
+    values = [getattr(p, cost) for p in points]
     panel.set_xscale("log")
+    panel.set_xlim(min(values) / 1.2, max(values) * 1.2)
     panel.set_xlabel(AXES[cost])
-    panel.margins(0.1)
+    panel.margins(y=0.1)
     panel.grid(alpha=0.3)
     tell = (lambda x, _: readable_size(x)) if cost == "bytes" else (lambda x, _: f"{x:g}")
-    panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+    few = max(values) > FEW_TICKS * min(values)
+    panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if few else (1, 1.5, 2, 3, 4, 5, 6, 8)))
     panel.xaxis.set_major_formatter(tell)
-    panel.xaxis.set_minor_formatter(ticker.NullFormatter())
+    panel.xaxis.set_minor_locator(ticker.NullLocator())
     panel.tick_params(labelsize=FONT)
+
+
+def draw_composed(panel, cost: str, value: float, largest: float) -> None:
+    """A line where the scene stands as composed: at the panel's end where it is far beyond all points."""
+    left, right = panel.get_xlim()
+    text = "all sources" if cost == "bytes" else "as composed"
+    if value > FAR * largest:
+        text += f": {readable_size(value) if cost == 'bytes' else f'{value:,.0f} ms'}, off the scale"
+    else:
+        panel.set_xlim(min(left, value / 1.2), max(right, value * 1.2))
+    at = min(value, 0.985 * panel.get_xlim()[1])
+    panel.axvline(at, color="black", linewidth=1, linestyle=":")
+    where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": FONT}
+    panel.annotate(text, (at, 0.02), (-4, 0), rotation=90, ha="right", va="bottom", **where)
 
 
 def kind_handles(points: Sequence) -> list:

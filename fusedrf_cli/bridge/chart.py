@@ -34,6 +34,7 @@ HELD_OUT = (JUDGED_SEED, 2)  # a pair seeds a stream that no single number, such
 ROUNDS = 5  # of frames, all fields taking turns
 PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
 COSTS = ("seconds", "bytes", "ms")
+NOISE = 0.05
 NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
 
 
@@ -212,8 +213,8 @@ class Charting:
         """Try rung after rung until the seconds are spent: next comes the kind that has had the least time,
         and of its ladders the one with the fewest rungs. Returns how many ladders were left off.
         """
+        rungs = {kind: self.known(found) for kind, found in waiting.items()}
         started, spent = time.monotonic(), dict.fromkeys(waiting, 0.0)
-        rungs = {kind: [(ladder, next(ladder)) for ladder in found] for kind, found in waiting.items()}
         while any(rungs.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
             kind = min((k for k in rungs if rungs[k]), key=spent.get)
@@ -228,16 +229,16 @@ class Charting:
             raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
         return sum(map(len, rungs.values()))
 
+    def known(self, found: list[Ladder]) -> list[tuple[Ladder, Flags]]:
+        """The ladders whose flags `fuse` has, and their first rungs."""
+        first = [(ladder, next(ladder)) for ladder in found]
+        return [(ladder, flags) for ladder, flags in first if self.fuse_words(flags) is not None]
+
     def try_flags(self, kind: str, flags: Flags) -> Point | None:
-        """The point of some flags; None where they are not to be had, and a warning where that is the
-        scene's fault.
-        """
+        """The point of some flags, or None and a warning where the scene cannot be fused so."""
         if self.where["seed"]:
             flags = (*flags, "--seed", str(self.where["seed"]))
-        words = self.fuse_words(flags)
-        if words is None:
-            return None
-        path = next(self.paths)
+        words, path = self.fuse_words(flags), next(self.paths)
         try:
             if kind not in {p.kind for p in self.points}:
                 self.fuse(path, words)  # the first of a kind also loads kernels: it is timed the second time
@@ -263,12 +264,14 @@ class Charting:
 
 
 def mark_frontiers(points: list[Point]) -> None:
-    """Note at every point for which COSTS no other one is as good for less."""
+    """Note at every point for which COSTS no other one is at least as good for less. Times that differ by
+    less than NOISE are taken as equal.
+    """
     for cost in COSTS:
-        best = -np.inf
-        for point in sorted(points, key=lambda p: (getattr(p, cost), -p.psnr)):
-            if point.psnr > best:
-                best = point.psnr
+        margin, least = 1 if cost == "bytes" else 1 + NOISE, np.inf
+        for point in sorted(points, key=lambda p: (-p.psnr, getattr(p, cost))):
+            if getattr(point, cost) * margin < least:
+                least = getattr(point, cost)
                 point.frontier.append(cost)
 
 
