@@ -9,7 +9,7 @@ PACKS ?= 10000
 KILLS ?= 200
 SEED ?= 0
 
-.PHONY: help demo test test-slow fuzz lint bench stability clean
+.PHONY: help demo test test-slow fuzz lint bench bench-paper stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -33,6 +33,9 @@ lint: $(VENV)  ## ruff
 
 bench: $(VENV)  ## the measurements that the claims rest on
 	$(PYTHON) -m benchmarks
+
+bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder with chair/ and fuze/
+	$(PYTHON) -m benchmarks.paper $(if $(DATA),--data $(DATA))
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

@@ -67,20 +67,29 @@ class Course:
     allow_outside: bool
     place: str
     box: np.ndarray
-    """(6,) of the scene's matter, in the world."""
+    """(6,) of the world, which the views frame."""
     truth: list[np.ndarray]
     """(H, W, 3) float32 over white, of every camera."""
     source_bytes: int
 
     @classmethod
-    def lay(cls, scene: str, memory: Memory, size: tuple[int, int], allow_outside: bool, place: str):
-        """Render the scene as composed."""
+    def lay(
+        cls,
+        scene: str,
+        memory: Memory,
+        size: tuple[int, int],
+        allow_outside: bool = False,
+        place: str = "cpu",
+        box: np.ndarray | None = None,
+    ):
+        """Render the scene as composed; the views frame a box (6,) of the world, by default all matter."""
         loaded = load_scene(scene, allow_outside, memory, place)
         composed = loaded.composed()
         needed = sources(loaded.sizes) | picture(*size, composed=True) | measured(*size)
         needed["the pictures to compare with"] = VIEWS * size[0] * size[1] * PER_PIXEL_KEPT
         memory.expect(needed, advice="give a smaller --size")
-        box = composed.occupancy.tight_aabb(0) + np.tile(composed.origin, 2)
+        if box is None:
+            box = composed.occupancy.tight_aabb(0) + np.tile(composed.origin, 2)
         cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
         truth = [render_image(composed, c, origin=composed.origin).over(WHITE) for c in cameras]
         return cls(scene, memory, size, allow_outside, place, box, truth, source_bytes(loaded))
