@@ -14,6 +14,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_THINGS = 32
 DRAFT = ("--quality", "draft", "--time-budget", "6", "--views", "40", "--size", "160")
 NORMAL = ("--time-budget", "20", "--views", "60", "--size", "300")
+LEAST_TRAINED = 22.0  # dB, below which a field is no object to experiment with
 STAND = 0.06  # height of the ground's top
 GOLDEN = np.pi * (3 - np.sqrt(5))
 SPREAD, SHRUNK = 0.312, 0.55  # of the places and the things, so that 32 stand on the ground
@@ -48,7 +49,10 @@ def train(folder: Path, name: str, *words: str) -> None:
     """A mesh to a field, unless it is there."""
     if not (folder / f"{name}.rfpack").exists():
         tell(f"training {name}")
-        fusedrf(folder, "train", f"{name}.glb", "-o", f"{name}.rfpack", *words)
+        report = fusedrf(folder, "train", f"{name}.glb", "-o", f"{name}.rfpack", *words)
+        if report["training_psnr"] < LEAST_TRAINED:
+            (folder / f"{name}.rfpack").unlink()
+            raise RuntimeError(f"{name}: {report['training_psnr']:.1f} dB in training; is the machine busy?")
 
 
 def own_fields(work: Work) -> None:

@@ -160,7 +160,7 @@ def chart(
         course = Course.lay(scene, Memory(memory), size, allow_outside, place)
         run = Charting(course, paths, fuse_words, where, progress)
         progress.phase("fusing", budget)
-        left = run.climb({kind: list(ladders(kind, least_psnr)) for kind in kinds}, budget)
+        left = run.climb({kind: ladders(kind, least_psnr) for kind in kinds}, budget)
         progress.phase("frames", 1 + ROUNDS)
         composed_ms, *ms = course.frame_times(run.bundles, progress.advance)
     for point, value in zip(run.points, ms, strict=True):
@@ -217,23 +217,24 @@ class Charting:
         self.points: list[Point] = []
         self.bundles: list[Path] = []
         self.refused: dict[str, FusedRFError] = {}
+        self.warm: set[tuple[str, str]] = set()
 
-    def climb(self, waiting: dict[str, list[Ladder]], budget: float) -> int:
-        """Try rung after rung until the seconds are spent: next comes the kind that has had the least time,
-        and of its ladders the one with the fewest rungs. Returns how many ladders were left off.
+    def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
+        """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
+        next comes the group that has had the least time, and of its ladders the one with the fewest rungs.
+        Returns how many ladders were left off.
         """
-        rungs = {kind: self.known(found) for kind, found in waiting.items()}
-        started, spent = time.monotonic(), dict.fromkeys(waiting, 0.0)
+        rungs = {(k, g): self.known(found) for k, groups in waiting.items() for g, found in groups.items()}
+        started, spent = time.monotonic(), dict.fromkeys(rungs, 0.0)
         while any(rungs.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
-            kind = min((k for k in rungs if rungs[k]), key=spent.get)
-            ladder, flags = rungs[kind].pop(0)
-            point = self.try_flags(kind, flags)
+            group = min((g for g in rungs if rungs[g]), key=spent.get)
+            ladder, flags = rungs[group].pop(0)
+            point = self.try_flags(group, flags)
             with contextlib.suppress(StopIteration):
-                rungs[kind].append((ladder, ladder.send(point and (point.bytes, point.psnr))))
-            if kind in self.refused:
-                rungs[kind] = []
-            spent[kind] += time.monotonic() - started - now
+                rungs[group].append((ladder, ladder.send(point and (point.bytes, point.psnr))))
+            spent[group] += time.monotonic() - started - now
+            rungs = {g: found for g, found in rungs.items() if g[0] not in self.refused}
         if not self.points:
             raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
         return sum(map(len, rungs.values()))
@@ -243,14 +244,18 @@ class Charting:
         first = [(ladder, next(ladder)) for ladder in found]
         return [(ladder, flags) for ladder, flags in first if self.fuse_words(flags) is not None]
 
-    def try_flags(self, kind: str, flags: Flags) -> Point | None:
-        """The point of some flags, or None and a warning where the scene cannot be fused so."""
+    def try_flags(self, group: tuple[str, str], flags: Flags) -> Point | None:
+        """The point of some flags, or None and a warning where the scene cannot be fused so; group is the
+        kind, and a name of what loads the same kernels.
+        """
+        kind, _ = group
         if self.where["seed"]:
             flags = (*flags, "--seed", str(self.where["seed"]))
         words, path = self.fuse_words(flags), next(self.paths)
         try:
-            if kind not in {p.kind for p in self.points}:
-                self.fuse(path, words)  # the first of a kind also loads kernels: it is timed the second time
+            if group not in self.warm:  # the first of a group also loads kernels, so the second one counts
+                self.fuse(path, words)
+                self.warm.add(group)
             report, warnings = self.fuse(path, words)
         except FusedRFError as error:
             if isinstance(error, InvalidInput):  # this scene never becomes that kind
