@@ -35,6 +35,7 @@ ROUNDS = 5  # of frames, all fields taking turns
 PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
 COSTS = ("seconds", "bytes", "ms")
 NOISE = 0.05
+BEHIND = 0.5  # dB
 NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
 
 
@@ -208,6 +209,33 @@ def scratch(output: str) -> Iterator[Iterator[Path]]:
             checkpoint_path(str(path)).unlink(missing_ok=True)
 
 
+@dataclass(eq=False)
+class Climber:
+    """How far one ladder was climbed."""
+
+    ladder: Ladder
+    flags: Flags
+    """Of the next rung."""
+    points: list[Point] = field(default_factory=list)
+
+    def climb(self, point: Point | None) -> bool:
+        """Take what the rung gave, if anything; whether there is another one."""
+        self.points += [point] if point is not None else []
+        with contextlib.suppress(StopIteration):
+            self.flags = self.ladder.send(point and (point.bytes, point.psnr))
+            return True
+        return False
+
+    def behind(self, others: list["Climber"]) -> bool:
+        """Whether its last point is well surpassed by another ladder's with no more bytes. It may overtake at
+        smaller sizes, so that it only waits.
+        """
+        if not self.points:
+            return False
+        last, found = self.points[-1], [p for other in others for p in other.points]
+        return any(p.bytes <= last.bytes and p.psnr >= last.psnr + BEHIND for p in found)
+
+
 class Charting:
     """The points found so far, and the bundles they were measured on."""
 
@@ -221,28 +249,28 @@ class Charting:
 
     def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
         """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
-        next comes the group that has had the least time, and of its ladders the one with the fewest rungs.
-        Returns how many ladders were left off.
+        next comes the group that has had the least time, and of its ladders one that is not behind, with the
+        fewest rungs. Returns how many ladders were left off.
         """
-        rungs = {(k, g): self.known(found) for k, groups in waiting.items() for g, found in groups.items()}
-        started, spent = time.monotonic(), dict.fromkeys(rungs, 0.0)
-        while any(rungs.values()) and (now := time.monotonic() - started) < budget:
+        climbers = {(k, g): self.known(found) for k, groups in waiting.items() for g, found in groups.items()}
+        started, spent = time.monotonic(), dict.fromkeys(climbers, 0.0)
+        while any(climbers.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
-            group = min((g for g in rungs if rungs[g]), key=spent.get)
-            ladder, flags = rungs[group].pop(0)
-            point = self.try_flags(group, flags)
-            with contextlib.suppress(StopIteration):
-                rungs[group].append((ladder, ladder.send(point and (point.bytes, point.psnr))))
+            group = min((g for g in climbers if climbers[g]), key=spent.get)
+            climber = min(climbers[group], key=lambda c: (c.behind(climbers[group]), len(c.points)))
+            point = self.try_flags(group, climber.flags)
+            if not climber.climb(point):
+                climbers[group].remove(climber)
             spent[group] += time.monotonic() - started - now
-            rungs = {g: found for g, found in rungs.items() if g[0] not in self.refused}
+            climbers = {g: found for g, found in climbers.items() if g[0] not in self.refused}
         if not self.points:
             raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
-        return sum(map(len, rungs.values()))
+        return sum(map(len, climbers.values()))
 
-    def known(self, found: list[Ladder]) -> list[tuple[Ladder, Flags]]:
-        """The ladders whose flags `fuse` has, and their first rungs."""
-        first = [(ladder, next(ladder)) for ladder in found]
-        return [(ladder, flags) for ladder, flags in first if self.fuse_words(flags) is not None]
+    def known(self, found: list[Ladder]) -> list["Climber"]:
+        """Climbers of the ladders whose flags `fuse` has, on their first rungs."""
+        first = [Climber(ladder, next(ladder)) for ladder in found]
+        return [climber for climber in first if self.fuse_words(climber.flags) is not None]
 
     def try_flags(self, group: tuple[str, str], flags: Flags) -> Point | None:
         """The point of some flags, or None and a warning where the scene cannot be fused so; group is the

@@ -176,6 +176,18 @@ def test_the_kind_that_had_least_time_is_next(monkeypatch):
     assert left == 2
 
 
+def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
+    """The second one's first rung shows 2 dB less than the other in more bytes, its next ones are as good."""
+    chart = part("chart")
+    ahead, slow = chart.Climber(shrinking(("a",), 30), ("a",)), chart.Climber(shrinking(("b",), 30), ("b",))
+    for climber, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
+        climber.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
+    assert slow.behind([ahead, slow]) and not ahead.behind([ahead, slow])
+    slow.points.append(point(psnr=46.9, bytes=6, seconds=1.0))
+    assert not slow.behind([ahead, slow])
+    assert not chart.Climber(shrinking((), 30), ()).behind([ahead, slow])
+
+
 def test_a_kind_that_does_not_fit_leaves_the_others(monkeypatch):
     refusals = {"blocks": InvalidInput("no blocks"), "vm": ResourceProblem("no room")}
     seconds = dict.fromkeys(("blocks", "vm", "sparse"), 2.0)
