@@ -12,7 +12,7 @@ SEED ?= 0
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-slow fuzz lint bench ablation stability clean
+.PHONY: help demo test test-slow fuzz lint bench bench-paper ablation stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -40,6 +40,9 @@ bench: $(VENV)  ## the measurements that the claims rest on
 ablation: $(VENV)  ## what each part of distilling is worth; SCENE= for one of your own, SHARE= for fewer steps
 	mkdir -p build
 	$(PYTHON) -m benchmarks.ablation build/ablation $(SCENE) --share $(SHARE)
+
+bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder with chair/ and fuze/
+	$(PYTHON) -m benchmarks.paper $(if $(DATA),--data $(DATA))
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build
