@@ -37,42 +37,43 @@ AT_ONCE = 1 << 18
 ATTEMPTS = 5
 FULL_ENOUGH = 0.93  # of the numbers allowed
 DILATIONS = 3
-SEEING_RAYS = 1_000_000
-SEEN = 1e-3  # weight of a voxel in all rays together
+SEEING_RAYS = 600_000
+SEEN = 3e-8  # weight of a voxel in a picture of the scene, at least, to be held
 CORRECTIONS = 3
 
 
-def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tuple[SparseField, float]:
-    """The teacher as a sparse field in its frame with at most so many numbers, and the factor by which its voxels
-    are wider than the teachers need. Raises ValueError where the teacher shows nothing, or not even the widest
-    voxels fit.
+def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
+    """The teacher as a sparse field in its frame with at most so many numbers. Raises ValueError where the teacher
+    shows nothing, or not even the widest voxels fit.
     """
-    tree, sigma, factor = fitted(teacher, shape, max_numbers)
+    tree, sigma = fitted(teacher, shape, max_numbers)
     field = SparseField(shape, Lattice(tree, SIDE), 1 / tree.unit)
     fill(field, teacher, sigma)
-    return field, factor
+    return field
 
 
 def fitted(
     teacher: RadianceField, shape: SparseShape, max_numbers: int
-) -> tuple[BrickTree, dict[int, float], float]:
-    """The finest tree with at most so many numbers, the densities at its vertices by their keys, and the factor."""
-    factor, best, tried = 4.0, None, []
+) -> tuple[BrickTree, tuple[np.ndarray, np.ndarray]]:
+    """The finest tree found with at most so many numbers, and (keys, σ) of its vertices."""
+    own = [p.voxel_size for p in placed_in(teacher)]
+    common, best, tried = 2 * max(own), None, []
     for _ in range(ATTEMPTS):
-        tree, known = occupied_tree(teacher, factor)
-        count = number_count(tree, shape)
-        tried.append((np.log(factor), np.log(count)))
-        if count <= max_numbers and (best is None or factor < best[2]):
-            best = tree, known, factor
-        if count <= max_numbers and (factor <= 1 or count >= FULL_ENOUGH * max_numbers):
+        found = occupied_tree(teacher, common)
+        count = number_count(found[0], shape)
+        tried.append((np.log(common), np.log(count)))
+        if count <= max_numbers and (best is None or common < best[0]):
+            best = common, found
+        if count <= max_numbers and (common <= min(own) or count >= FULL_ENOUGH * max_numbers):
             break
-        slope = -2.3
+        slope = -1.5
         if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
-            slope = min(-1.0, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
-        factor = max(1.0, float(np.exp(tried[-1][0] + (np.log(0.97 * max_numbers) - tried[-1][1]) / slope)))
+            slope = min(-0.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
+        wanted = tried[-1][0] + (np.log(0.97 * max_numbers) - tried[-1][1]) / slope
+        common = float(np.exp(np.clip(wanted, np.log(min(own)), tried[-1][0] + 2)))
     if best is None:
         raise ValueError(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
-    return best
+    return best[1]
 
 
 def number_count(tree: BrickTree, shape: SparseShape) -> int:
@@ -89,26 +90,31 @@ def placed_in(teacher: RadianceField) -> list[Placed]:
     return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
 
 
-def frame_of(teacher: RadianceField, factor: float) -> tuple[np.ndarray, float, tuple, list[int]]:
-    """(lower corner, side of a top cell, top cells per axis, level of each placed field) for voxels `factor` wider
-    than the placed fields'."""
-    needs = np.array([p.voxel_size for p in placed_in(teacher)]) * factor
+def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, tuple, list[int]]:
+    """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should be no
+    finer than each placed field's own, nor than the geometric mean of that and a common one.
+
+    With an error that grows as the square of the voxel over a field's own, and numbers that fall with its square,
+    the mean is what gives the least error for the numbers.
+    """
+    own = np.array([p.voxel_size for p in placed_in(teacher)])
+    needs = np.sqrt(own * np.maximum(own, common))
     depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
+    top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
     box = teacher.occupancy.tight_aabb(0)
     while True:
-        top = SIDE * needs.min() * 2**depth
         counts = np.maximum(np.ceil((box[3:] - box[:3]) / top + 0.5), 1).astype(int)
-        if np.prod(counts) <= MAX_TOP_CELLS // 4:
+        if np.prod(counts) <= MAX_TOP_CELLS // 4 or depth == DEEPEST + 1:
             break
-        depth += 1
+        depth, top = depth + 1, 2 * top
     lo = (box[:3] + box[3:] - top * counts) / 2
     levels = np.clip(np.round(np.log2(top / (SIDE * needs))), 0, depth).astype(int)
     return lo, float(top), tuple(counts), [int(level) for level in levels]
 
 
-def occupied_tree(teacher: RadianceField, factor: float) -> tuple[BrickTree, tuple[np.ndarray, np.ndarray]]:
+def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, tuple[np.ndarray, np.ndarray]]:
     """The tree whose active voxels hold all matter that shows, and (keys, σ) of its vertices in units."""
-    lo, top, counts, levels = frame_of(teacher, factor)
+    lo, top, counts, levels = frame_of(teacher, common)
     wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
     for placed, level in zip(placed_in(teacher), levels, strict=True):
         wanted[level].append(demanded(teacher, placed, level, lo, top, counts))
@@ -130,16 +136,13 @@ def occupied_tree(teacher: RadianceField, factor: float) -> tuple[BrickTree, tup
 
 
 def visible(lattice: Lattice, sigma: np.ndarray, teacher: RadianceField) -> np.ndarray:
-    """(N, 4, 4, 4) bool: voxels that a ray from outside sees, and those that touch one."""
+    """(N, 4, 4, 4) bool: voxels that rays from outside see."""
     field = SparseField(SparseShape(0), lattice, 1 / lattice.tree.unit)
     set_density(field, sigma)
     boxes = [teacher.occupancy.tight_aabb(0), *sorted((p.aabb for p in placed_in(teacher)), key=list)]
     generator = torch.Generator().manual_seed(0)
     rays = random_rays(boxes, SEEING_RAYS, generator)
-    seen = field.seen(*rays).ravel() > SEEN
-    touched = np.zeros(len(lattice.vertices), bool)
-    touched[lattice.corners[seen]] = True
-    return touched[lattice.corners].any(1).reshape(-1, SIDE, SIDE, SIDE)
+    return field.seen(*rays) > SEEN * SEEING_RAYS
 
 
 def demanded(
@@ -263,7 +266,7 @@ def density(source, places: np.ndarray) -> np.ndarray:
 
 def fill(field: SparseField, teacher: RadianceField, known: tuple[np.ndarray, np.ndarray]) -> None:
     """Give the vertices what the teacher says there; known are (ascending keys, σ) of all vertices in units."""
-    fine, unit = field.fine, field.tree.unit
+    fine = field.fine
     sigma = known[1][np.searchsorted(known[0], node_keys(fine.vertices))]
     set_density(field, sigma)
     depth = sigma * fine.finest_voxel
