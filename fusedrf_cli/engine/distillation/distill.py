@@ -36,6 +36,7 @@ DEPTH_GAIN = 10.0  # in log1p(gain τ): how much thin fog counts
 FAINT = 1e-8  # optical depth of a step under which a student that should be denser learns as if it had it
 MOST_LIFT = 1e30
 COLOUR_WEIGHT = 2.0
+OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
 RAYS_AT_FIRST = 1024
 LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
@@ -246,7 +247,10 @@ class DistillRun:
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
 
     def _prune(self) -> None:
-        """Leave out the cells that turned out empty, unless that would be all of them."""
+        """Leave out the cells that turned out empty, unless that would be all of them; only a student of one
+        block over its own box has cells to give up."""
+        if type(self.student) is not VMField or len(self.student.blocks) != 1:
+            return
         occupancy = pruned(self.student)
         self.report.found_nothing = bool(self.teacher.occupancy.occupied.any() > occupancy.occupied.any())
         if not self.report.found_nothing:
@@ -358,16 +362,7 @@ def point_step(
     n = len(chosen)
     d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step * lift
     d_rgb = 2 / n * COLOUR_WEIGHT * alpha[:, None] * off
-    student.loops.query_backward(
-        *student.kernel_shape,
-        student.arrays,
-        student.grid,
-        points.numpy(),
-        dirs.numpy(),
-        d_sigma.numpy(),
-        d_rgb.numpy(),
-        optimiser.grads,
-    )
+    student.query_backward(points, dirs, d_sigma, d_rgb, optimiser.grads)
     return float((error**2).mean() + COLOUR_WEIGHT * (alpha[:, None] * off**2).mean())
 
 
@@ -380,8 +375,6 @@ class RayPass:
         self.pool, self.run = pool, run
         self.target = pool.pixels.clone()
         self.target[:, :3] += 1 - self.target[:, 3:]
-        extent = run.student.aabb[3:] - run.student.aabb[:3]
-        self.slots = int(np.linalg.norm(extent) / run.step) + 2
 
     def __call__(self) -> tuple[np.ndarray, dict]:
         """Leave the gradient of the next rays with the optimiser; the losses, and figures to tell."""
@@ -389,23 +382,10 @@ class RayPass:
         chosen = run.epochs.draw(run.count).numpy()
         jitter = torch.rand(len(chosen), generator=run.generator, dtype=torch.float64).numpy()
         loss = np.zeros((run.optimiser.parts, 3))
-        run.student.loops.train_rays(
-            *run.student.kernel_shape,
-            run.student.arrays,
-            run.student.grid,
-            pool.rays_o[chosen],
-            pool.rays_d[chosen],
-            0.0,
-            jitter,
-            run.step,
-            EARLY_STOP,
-            self.target[chosen].numpy(),
-            np.ones((len(chosen), 3), np.float32),
-            0.1,
-            self.slots,
-            run.optimiser.grads,
-            loss,
-        )
+        white = np.ones((len(chosen), 3), np.float32)
+        rays = pool.rays_o[chosen], pool.rays_d[chosen], jitter, run.step, EARLY_STOP
+        target = self.target[chosen].numpy()
+        run.student.train_rays(*rays, target, white, OPACITY_WEIGHT, run.optimiser.grads, loss)
         sums = loss.sum(0)
         wanted = run.settings.rgb_samples * len(chosen) / max(sums[2], 1)
         run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))

@@ -52,13 +52,13 @@ class Adam:
         self.steps += 1
         correction1, correction2 = 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
         params = self.field.arrays.params
-        for low, high, ratio in self.slices():
+        for low, high, is_basis in self.field.parameter_groups():
             self.field.loops.adam(
                 params,
                 self.grads,
                 self.moment1,
                 self.moment2,
-                np.float32(rate * ratio),
+                np.float32(rate * (BASIS_RATE_RATIO if is_basis else 1)),
                 low,
                 high,
                 np.float32(BETA1),
@@ -69,23 +69,18 @@ class Adam:
             )
 
     def sound(self) -> bool:
-        """Whether the gradients are finite, judged by those of the colour bases (some thousand numbers).
+        """Whether the gradients are finite, judged by those of the colour bases (some thousand numbers), or
+        by all where a field has none.
 
         Every shaded sample adds to its basis what it sends back, times its features: a gradient or a colour
         factor that is not finite shows there. What only a density factor could hide, an infinite σ, is left
         to the guard's look at all numbers.
         """
-        bases = [row[low:high] for low, high, ratio in self.slices() if ratio != 1.0 for row in self.gradient]
-        return all(bool(torch.dot(part, part).isfinite()) for part in bases)
+        groups = self.field.parameter_groups()
+        looked_at = [g for g in groups if g[2]] or groups
+        parts = [row[low:high] for low, high, _ in looked_at for row in self.gradient]
+        return all(bool(torch.dot(part, part).isfinite()) for part in parts)
 
     def clear(self) -> None:
         """Forget the gradients without a step."""
         self.gradient.zero_()
-
-    def slices(self) -> list[tuple[int, int, float]]:
-        """(low, high, rate ratio) of every group of parameters."""
-        ends = [*self.field.layout[1:, 0], self.field.params.numel()]
-        groups = []
-        for row, end in zip(self.field.layout, ends, strict=True):
-            groups += [(int(row[0]), int(row[12]), 1.0), (int(row[12]), int(end), BASIS_RATE_RATIO)]
-        return groups

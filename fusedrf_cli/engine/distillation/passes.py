@@ -69,24 +69,10 @@ class FusedPass:
     def gradient(self, field: VMField, batch: Batch, grads: np.ndarray) -> np.ndarray:
         """See Pass."""
         loss = np.zeros((grads.shape[0], 3))
-        diagonal = float(np.linalg.norm(field.aabb[3:] - field.aabb[:3]))
-        field.loops.train_rays(
-            *field.kernel_shape,
-            field.arrays,
-            field.grid,
-            batch.rays_o,
-            batch.rays_d,
-            batch.near,
-            batch.jitter,
-            batch.step,
-            batch.early_stop,
-            batch.target,
-            batch.background,
-            batch.opacity_weight,
-            int(diagonal / batch.step) + 2,
-            grads,
-            loss,
-        )
+        field.train_rays(
+            batch.rays_o, batch.rays_d, batch.jitter, batch.step, batch.early_stop, batch.target,
+            batch.background, batch.opacity_weight, grads, loss, batch.near,
+        )  # fmt: skip
         return loss.sum(0)
 
     def step(self, decay: float) -> None:

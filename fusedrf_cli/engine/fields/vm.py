@@ -336,6 +336,51 @@ class VMField:
         read = *self.kernel_shape, self.arrays, self.grid
         self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
+    # -- learning --------------------------------------------------------------------------------------------
+
+    def query_backward(
+        self,
+        points: torch.Tensor,
+        dirs: torch.Tensor,
+        d_sigma: torch.Tensor,
+        d_rgb: torch.Tensor,
+        grads: np.ndarray,
+    ) -> None:
+        """Adjoint of `query`: add to the rows of grads (parts, P) what the derivatives d_sigma (N,) and d_rgb
+        (N, 3) of a loss send back to `params`."""
+        back = points.numpy(), dirs.numpy(), d_sigma.numpy(), d_rgb.numpy()
+        self.loops.query_backward(*self.kernel_shape, self.arrays, self.grid, *back, grads)
+
+    def train_rays(
+        self,
+        rays_o: np.ndarray,
+        rays_d: np.ndarray,
+        jitter: np.ndarray,
+        step: float,
+        early_stop: float,
+        target: np.ndarray,
+        background: np.ndarray,
+        opacity_weight: float,
+        grads: np.ndarray,
+        loss: np.ndarray,
+        near: float = 0.0,
+    ) -> None:
+        """Render rays (N, 3), compare with target (N, 4), add the gradient to the rows of grads (parts, P)
+        and the losses and samples to those of loss (parts, 3); see cpu.train_rays for the loss."""
+        diagonal = float(np.linalg.norm(self.aabb[3:] - self.aabb[:3]))
+        self.loops.train_rays(
+            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop,
+            target, background, opacity_weight, int(diagonal / step) + 2, grads, loss,
+        )  # fmt: skip
+
+    def parameter_groups(self) -> list[tuple[int, int, bool]]:
+        """(low, high, whether it is a colour basis) of every group of `params`, in order."""
+        ends = [*self.layout[1:, 0], self.params.numel()]
+        groups = []
+        for row, end in zip(self.layout, ends, strict=True):
+            groups += [(int(row[0]), int(row[12]), False), (int(row[12]), int(end), True)]
+        return groups
+
     # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:

@@ -7,12 +7,12 @@ from fusedrf_cli.engine.distillation.optimiser import BASIS_RATE_RATIO, Adam
 from tests.engine.conftest import THIRTY_TWO, random_vm
 
 
-def test_slices_cover_all_and_part_at_the_bases():
+def test_groups_cover_all_and_part_at_the_bases():
     field = random_vm(THIRTY_TWO, dtype=torch.float32)
-    slices = Adam(field, 1).slices()
-    assert slices[0][0] == 0 and slices[-1][1] == field.params.numel()
-    assert all(a[1] == b[0] for a, b in zip(slices, slices[1:], strict=False))
-    assert all(low % 16 == 0 == high % 16 for low, high, _ in slices)
+    groups = field.parameter_groups()
+    assert groups[0][0] == 0 and groups[-1][1] == field.params.numel()
+    assert all(a[1] == b[0] for a, b in zip(groups, groups[1:], strict=False))
+    assert all(low % 16 == 0 == high % 16 for low, high, _ in groups)
 
 
 def test_first_step_moves_factors_by_the_rate_and_bases_by_its_share():
