@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from benchmarks.peaks import Peaks, measured_peaks
-from fusedrf_cli.engine.distillation.distill import point_step
+from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
-from fusedrf_cli.engine.distillation.teacher import TeacherPool
+from fusedrf_cli.engine.distillation.teacher import Points
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.kernels import cpu, reference
@@ -194,11 +194,11 @@ def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, ray
     points = centres[torch.randint(len(centres), (POINTS,), generator=generator)]
     dirs = torch.from_numpy(rays_d).repeat(POINTS // RAYS, 1)
     asked = torch.full((POINTS,), 20.0), torch.full((POINTS, 3), 0.5)
-    pool = TeacherPool(rays_o, rays_d, torch.zeros(RAYS, 4), points, dirs, *asked)
-    mine, chosen = Adam.of(field), torch.arange(1 << 15)
+    mine, pool = Adam.of(field), Points(points, dirs, *asked, torch.ones(POINTS))
+    batch, chosen = pool.batch(0, 1 << 15), torch.arange(1 << 15)
 
     def ours():
-        point_step(field, pool, chosen, STEP, mine)
+        point_step(field, batch, STEP, mine)
         mine.step(0.0)
 
     sections = {name: view.clone().requires_grad_() for name, view in field.sections(0).items()}

@@ -55,7 +55,6 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000
 RECKONED_RAYS = 2000  # of which the number of points is reckoned
-KEPT_POINTS = 0.35  # of a distillation's samples
 HEADER_BYTES = 16384  # scene graph, history and headers of a bundle, about
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
@@ -185,7 +184,7 @@ def vm_memory(
     boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
     few = random_rays(boxes, RECKONED_RAYS, generator)
     step = 0.5 * float(np.max((box[3:] - box[:3]) / (np.asarray(resolution) - 1)))
-    kept = len(ask(composed, *few, step, generator, KEPT_POINTS).points)
+    kept = len(ask(composed, *few, step, generator).points)
     answers = teaching(settings, kept * settings.rays // RECKONED_RAYS) | ownership(box)
     return [
         (0.0, result(numbers, measured=False) | answers | picture(256, 256, composed=True)),

@@ -15,11 +15,11 @@ import torch
 
 from fusedrf_cli.bridge.train import QUALITY
 from fusedrf_cli.engine.distillation import fit as module
-from fusedrf_cli.engine.distillation.distill import point_step
 from fusedrf_cli.engine.distillation.fit import RATE, RETRY_AFTER, FitRun, FitSettings, fit
+from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import FusedPass
-from fusedrf_cli.engine.distillation.teacher import TeacherPool
+from fusedrf_cli.engine.distillation.teacher import Points
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, orbit, scattered
@@ -254,12 +254,12 @@ def test_t14_no_start_is_dead(row, opaque, empty):
     points[:, 0] = np.where(solid, BOX[0], BOX[3] - 1e-9)
     sigma, rgb = torch.from_numpy(np.where(solid, 20.0, 0.0)).float(), torch.full((2000, 3), 0.5)
     dirs = torch.tensor([[0.0, 0, 1]], dtype=torch.float64).expand(2000, 3).contiguous()
-    pool = TeacherPool(None, None, None, torch.from_numpy(points), dirs, sigma, rgb)
+    pool = Points(torch.from_numpy(points), dirs, sigma, rgb, torch.ones(2000))
     optimiser, generator = Adam(field, 1), torch.Generator().manual_seed(0)
     for _ in range(1000):
         chosen = torch.randint(2000, (500,), generator=generator)
-        point_step(field, pool, chosen, step, optimiser)
+        point_step(field, Points(*(column[chosen] for column in pool.columns())), step, optimiser)
         optimiser.step(0.02)
-    depth = field.query(pool.points, dirs)[0] * step
+    depth = field.query(pool.where, dirs)[0] * step
     row.check("T14", "optical depth of a step learnt from empty", depth[solid].min(), 5)
     row.check("T15", "optical depth of a step learnt from opaque", depth[~solid].max(), 1e-3, at_most=True)

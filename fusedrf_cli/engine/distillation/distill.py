@@ -19,26 +19,32 @@ from fusedrf_cli.engine.composition.blocks import reshaped
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.fit import EARLY_STOP, EMPTY_BELOW, texels
 from fusedrf_cli.engine.distillation.guard import Guard
+from fusedrf_cli.engine.distillation.losses import (
+    DensityLoss,
+    Visibility,
+    log_depth,
+    mostly_seen,
+    point_step,
+)
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.teacher import TeacherPool, ask, random_rays
+from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
+from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, matter_first, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, harmless_depth
 from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 
-RATE = 0.02
-RATE_DECAY = 0.1
-RGB_RATE = 0.1 * RATE
-OPAQUE = 5.0  # optical depth of a step beyond which more density cannot be seen
-DEPTH_GAIN = 10.0  # in log1p(gain τ): how much thin fog counts
-FAINT = 1e-8  # optical depth of a step under which a student that should be denser learns as if it had it
-MOST_LIFT = 1e30
-COLOUR_WEIGHT = 2.0
+RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
+RGB_RATE = 0.01
 OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
+COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
+COARSE_FROM = 64  # texels along a student's longest axis from which it starts at half of them
 RAYS_AT_FIRST = 1024
+HELD_OUT = 1 << 12  # rays whose PSNR is the learning curve
+HELD_OUT_SEED = 9_000_001
 LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
 WHITE = np.ones(3)
 JUDGED_SEED = 7_000_001  # views the student is judged on are drawn from a stream of their own
@@ -64,6 +70,29 @@ class DistillSettings:
     view_size: int = 160
 
 
+def starts_coarse(student: RadianceField) -> bool:
+    """Whether a student is one VM tensor large enough to have half its resolution first."""
+    single = type(student) is VMField and len(student.blocks) == 1
+    return single and max(student.tensors[0].resolution) >= COARSE_FROM
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The parts of the method, of which benchmarks/ablation.py replaces one at a time."""
+
+    chance: Chance = matter_first
+    density_loss: DensityLoss = log_depth
+    visibility: Visibility = mostly_seen
+    rate: float = RATE
+    rgb_rate: float = RGB_RATE
+    coarse: Callable[[RadianceField], bool] = starts_coarse
+    """Whether a student begins at half its resolution."""
+    schedule: type[Schedule] = Schedule
+
+
+DEFAULT_RECIPE = Recipe()
+
+
 @dataclass
 class DistillReport:
     """What a distillation did."""
@@ -74,6 +103,10 @@ class DistillReport:
     rgb_kept: bool | None = None
     found_nothing: bool = False
     """Whether the student held no matter after the points, so that the teacher's occupancy was kept."""
+    steps: dict[str, int] = field(default_factory=dict)
+    """Steps made, by phase."""
+    curve: list[tuple[float, int, float]] = field(default_factory=list)
+    """(seconds since the start, steps of all phases, PSNR in dB on rays that nothing is trained on)."""
     numeric: dict[str, int] = field(default_factory=dict)
     """Steps skipped and returns to a good state, where there were any (guard.py)."""
 
@@ -91,6 +124,24 @@ class Judge:
         return psnr(
             np.stack([render_image(student, c).over(WHITE) for c in self.cameras]), np.stack(self.truth)
         )
+
+
+class HeldOut:
+    """PSNR of a student on a few rays that nothing is trained on: quick to ask, for curves and schedules."""
+
+    def __init__(self, teacher: RadianceField, boxes: list[np.ndarray], step: float, seed: int):
+        generator = torch.Generator().manual_seed(HELD_OUT_SEED + seed)
+        self.rays, self.step = random_rays(boxes, HELD_OUT, generator), step
+        self.truth = over_white(ask(teacher, *self.rays, step, generator).pixels.numpy())
+
+    def __call__(self, student: RadianceField) -> float:
+        """PSNR in dB of all rays together, over white."""
+        return psnr(over_white(render_rays(student, *self.rays, step=self.step)), self.truth)
+
+
+def over_white(pixels: np.ndarray) -> np.ndarray:
+    """(N, 3) of pixels (N, 4 or more): rgb premultiplied by opacity, opacity."""
+    return pixels[:, :3] + 1 - pixels[:, 3:4]
 
 
 def resolution_for(aabb: np.ndarray, finest: float, shape: VMShape, max_numbers: int) -> tuple[int, int, int]:
@@ -146,6 +197,18 @@ def student_from(
     return student
 
 
+def halved(student: VMField) -> VMField:
+    """A one-block student at half its resolution, over the same occupancy."""
+    resolution = tuple((n + 1) // 2 for n in student.tensors[0].resolution)
+    return student.resampled(student.tensors[0].aabb, resolution).with_occupancy(student.occupancy)
+
+
+def resampled_like(student: VMField, other: VMField) -> VMField:
+    """A one-block student's numbers at the resolution of another over the same box."""
+    tensor = other.tensors[0]
+    return student.resampled(tensor.aabb, tensor.resolution).with_occupancy(student.occupancy)
+
+
 def wake(student: VMField, generator: torch.Generator) -> None:
     """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for
     ever.
@@ -185,15 +248,20 @@ class DistillRun:
         boxes: list[np.ndarray],
         settings: DistillSettings,
         rgb: bool = True,
+        recipe: Recipe = DEFAULT_RECIPE,
     ):
-        """The arguments are those of `distill`."""
-        self.teacher, self.student, self.boxes, self.rgb = teacher, student, boxes, rgb
-        self.settings, self.step = settings, 0.5 * student.voxel_size
+        """The arguments are those of `distill`; the recipe is for measuring what its parts are worth."""
+        self.teacher, self.boxes, self.rgb = teacher, boxes, rgb
+        self.settings, self.recipe, self.step = settings, recipe, 0.5 * student.voxel_size
+        self.student, self.refined = (halved(student), student) if recipe.coarse(student) else (student, None)
+        """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
         self.report = DistillReport()
         self.optimiser = Adam.of(student)
         self.guard = Guard(lambda: self.optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
+        self.schedule = recipe.schedule()
+        self.began = time.monotonic()
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
         self.epochs, self.count = Epochs(settings.rays, self.generator), RAYS_AT_FIRST
@@ -208,12 +276,14 @@ class DistillRun:
     ) -> tuple[VMField, DistillReport]:
         """Run to the end. Every step happens inside a `whole()`, which may hold an interrupt back."""
         report, settings = self.report, self.settings
+        self.began = time.monotonic() - (report.curve[-1][0] if report.curve else 0.0)
         clock = _Clock(report.seconds)
         phase("asking the teachers")
         self.generator.manual_seed(settings.seed + 1)
         judge = Judge(self.teacher, settings.views, settings.view_size, settings.seed)
         rays_o, rays_d = random_rays(self.boxes, settings.rays, self.generator)
-        pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, keep_points=0.35)
+        pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)
+        held_out = HeldOut(self.teacher, self.boxes, self.step, settings.seed)
         if self.random is not None:
             self.generator.set_state(self.random)
         self.asked = True
@@ -221,14 +291,15 @@ class DistillRun:
         if self.phase == "points":
             phase("points")
             if len(pool.points):
-                self._learn(PointPass(pool, self), settings.steps, advance, whole)
+                self._learn(PointPass(pool, self), settings.steps, held_out, advance, whole)
             with whole():
                 self._begin_pictures()
                 report.psnr_before_rgb = judge(self.student)
             clock.lap("points")
         if self.rgb:
             phase("pictures")
-            self._learn(RayPass(pool, self), settings.rgb_steps, advance, whole)
+            self._learn(RayPass(pool, self), settings.rgb_steps, held_out, advance, whole)
+            report.steps["pictures"] = self.steps
             report.psnr_after_rgb = judge(self.student)
             report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
             if not report.rgb_kept:
@@ -239,12 +310,23 @@ class DistillRun:
 
     def _begin_pictures(self) -> None:
         """What was learnt from points is the RGB phase's start, and what it has to surpass."""
+        if self.refined is not None:
+            self._refine()
         self.guard.check()
         self.before = self.student.params.clone()
         self._prune()
         self.optimiser = Adam.of(self.student)
         self.guard.renew()
+        self.report.steps["points"] = self.steps
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
+        self.schedule = self.recipe.schedule()
+
+    def _refine(self) -> None:
+        """Go on at the full resolution, with moments that start anew."""
+        self.guard.check()
+        self.student, self.refined = resampled_like(self.student, self.refined), None
+        self.optimiser = Adam.of(self.student)
+        self.guard.renew()
 
     def _prune(self) -> None:
         """Leave out the cells that turned out empty, unless that would be all of them; only a student of one
@@ -256,20 +338,39 @@ class DistillRun:
         if not self.report.found_nothing:
             self.student = self.student.with_occupancy(occupancy)
 
-    def _learn(self, gradient: "PointPass | RayPass", steps: int, advance: Callable, whole: Callable) -> None:
+    def _learn(
+        self,
+        gradient: "PointPass | RayPass",
+        steps: int,
+        held_out: HeldOut,
+        advance: Callable,
+        whole: Callable,
+    ) -> None:
         """The steps of one phase."""
         started = time.monotonic() - self.elapsed
-        while (share := self._share(steps, time.monotonic() - started)) < 1:
+        while (share := self._share(steps, time.monotonic() - started)) < self.schedule.end:
             with whole():
+                if self.refined is not None and share >= COARSE_UNTIL:
+                    self._refine()
                 self.guard.keep()
                 sums, figures = gradient()
                 if self.guard.accepts(sums, self.optimiser):
-                    self.optimiser.step(gradient.rate * RATE_DECAY**share * self.guard.rate)
+                    self.optimiser.step(gradient.rate * self.schedule.factor(share) * self.guard.rate)
                 self.steps += 1
+                if self.steps % LOOK_EVERY == 0:
+                    self._look(held_out, share)
                 self.elapsed = time.monotonic() - started
             if self.steps % 20 == 1:
-                advance(share, figures)
+                advance(share / self.schedule.end, figures)
         self.guard.check()
+
+    def _look(self, held_out: HeldOut, share: float) -> None:
+        """A point of the learning curve, which the schedule follows."""
+        found = held_out(self.student)
+        if self.refined is None:
+            self.schedule.look(share, found)
+        made = self.steps + self.report.steps.get("points", 0)
+        self.report.curve.append((time.monotonic() - self.began, made, found))
 
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given."""
@@ -295,21 +396,30 @@ class DistillRun:
             "psnr_before_rgb": self.report.psnr_before_rgb,
             "rays": self.count,
             "guard": self.guard.state(),
+            "schedule": self.schedule.state(),
+            "coarse": self.refined is not None,
+            "points_steps": self.report.steps.get("points"),
+            "curve": self.report.curve,
             **drawn,
         }
         return arrays, state
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
         """Take up a run that `checkpoint` saved, over the same teacher and settings."""
+        if self.refined is not None and not state["coarse"]:
+            self._refine()
         if "before" in arrays:
             self.student.params.copy_(torch.from_numpy(arrays["before"]))
             self._begin_pictures()
             self.report.psnr_before_rgb = state["psnr_before_rgb"]
+            self.report.steps["points"] = state["points_steps"]
         self.student.params.copy_(torch.from_numpy(arrays["params"]))
         self.optimiser.restore(arrays, state["adam_steps"])
         self.count = state["rays"]
         self.phase, self.steps, self.elapsed = state["phase"], state["steps"], state["elapsed"]
         self.guard.restore(state["guard"])
+        self.schedule.restore(state["schedule"])
+        self.report.curve = [tuple(point) for point in state["curve"]]
         self.epochs.restore(arrays, state)
         self.random = torch.from_numpy(arrays["random"]) if "random" in arrays else None
 
@@ -326,53 +436,25 @@ class _Clock:
 
 
 class PointPass:
-    """The 3D losses: (log1p(g τ_s) - log1p(g τ_t))^2 at the step's optical depth τ = σ δ, and colour
-    weighted by alpha.
-
-    Depths beyond OPAQUE look the same and are not told apart; a saturated student still feels a gradient,
-    which an alpha loss would not give it.
-    """
-
-    rate = RATE
+    """The 3D losses at the points of the pool, in its random order (losses.py)."""
 
     def __init__(self, pool: TeacherPool, run: DistillRun):
-        self.pool, self.run = pool, run
+        self.pool, self.run, self.rate = pool, run, run.recipe.rate
 
     def __call__(self) -> tuple[np.ndarray, dict]:
-        """Leave the gradient of random points with the optimiser; the losses, and figures to tell."""
-        run = self.run
-        chosen = torch.randint(len(self.pool.points), (POINTS_PER_STEP,), generator=run.generator)
-        loss = point_step(run.student, self.pool, chosen, run.step, run.optimiser)
+        """Leave the gradient of the next points with the optimiser; the losses, and figures to tell."""
+        run, recipe = self.run, self.run.recipe
+        points = self.pool.points.batch(run.steps, POINTS_PER_STEP)
+        how = recipe.density_loss, recipe.visibility
+        loss = point_step(run.student, points, run.step, run.optimiser, *how)
         return np.array([loss]), {"loss": loss}
-
-
-def point_step(
-    student: VMField, pool: TeacherPool, chosen: torch.Tensor, step: float, optimiser: Adam
-) -> float:
-    """Loss of the chosen points, its gradient added to the optimiser's."""
-    points, dirs = pool.points[chosen], pool.dirs[chosen]
-    sigma, rgb = student.query(points, dirs)
-    tau, wanted = sigma * step, (pool.sigma[chosen] * step).clamp_max(OPAQUE)
-    error = torch.log1p(DEPTH_GAIN * tau) - torch.log1p(DEPTH_GAIN * wanted)
-    error[(tau >= OPAQUE) & (wanted >= OPAQUE)] = 0
-    # σ = softplus(f) and its slope vanish together: far below FAINT the gradient would be too small a number
-    lift = torch.where(error < 0, (FAINT / tau).clamp(1, MOST_LIFT), 1)
-    alpha = 1 - torch.exp(-wanted)
-    off = rgb - pool.rgb[chosen]
-    n = len(chosen)
-    d_sigma = 2 / n * error * DEPTH_GAIN / (1 + DEPTH_GAIN * tau) * step * lift
-    d_rgb = 2 / n * COLOUR_WEIGHT * alpha[:, None] * off
-    student.query_backward(points, dirs, d_sigma, d_rgb, optimiser.grads)
-    return float((error**2).mean() + COLOUR_WEIGHT * (alpha[:, None] * off**2).mean())
 
 
 class RayPass:
     """The RGB loss over the teacher's own rays, colour over white and opacity."""
 
-    rate = RGB_RATE
-
     def __init__(self, pool: TeacherPool, run: DistillRun):
-        self.pool, self.run = pool, run
+        self.pool, self.run, self.rate = pool, run, run.recipe.rgb_rate
         self.target = pool.pixels.clone()
         self.target[:, :3] += 1 - self.target[:, 3:]
 

@@ -2,19 +2,65 @@
 rays.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
+from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, waves, weights_from_sigma
 
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
+MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
+EMPTY_SHARE = 0.15  # of the samples with less that are kept: nine in ten are such, and without them fog stays
 WHOLE_SCENE_SHARE = (
     0.5  # of the rays; the others are shared out over the objects, so that a small one is not missed
 )
 BELOW_SHARE = 0.1  # of the rays that look from under the horizon
+
+Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+"""The chances (N,) that samples are kept as points, by their optical depths (N,) and transmittances (N,)."""
+
+
+def matter_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
+    """All that can be seen of matter, and a share of the emptiness before it."""
+    return torch.where(depth > MATTER, 1.0, EMPTY_SHARE)
+
+
+@dataclass
+class Points:
+    """Samples of a teacher, in the teacher's frame."""
+
+    where: torch.Tensor
+    dirs: torch.Tensor
+    """(N, 3) float64 samples on rays in front of what is opaque, empty ones among them."""
+    sigma: torch.Tensor
+    """(N,) float32, per unit of length."""
+    rgb: torch.Tensor
+    """(N, 3) float32; 0 where there is nothing to see."""
+    transmittance: torch.Tensor
+    """(N,) float32, of the ray up to the sample."""
+
+    def __len__(self) -> int:
+        return len(self.where)
+
+    def columns(self) -> tuple[torch.Tensor, ...]:
+        """The fields in their order."""
+        return self.where, self.dirs, self.sigma, self.rgb, self.transmittance
+
+    def batch(self, number: int, size: int) -> "Points":
+        """The number-th run of `size` points, or of all where there are fewer, one run after the other and
+        over again.
+
+        In a pool the points lie in random order, so that a run of them is a random choice that costs no
+        search in memory."""
+        size = min(size, len(self))
+        start = number * size % len(self)
+        over = start + size - len(self)
+        if over <= 0:
+            return Points(*(column[start : start + size] for column in self.columns()))
+        return Points(*(torch.cat([column[start:], column[:over]]) for column in self.columns()))
 
 
 @dataclass
@@ -26,12 +72,7 @@ class TeacherPool:
     """(R, 3) float64."""
     pixels: torch.Tensor
     """(R, 4) float32: rgb premultiplied by opacity, opacity."""
-    points: torch.Tensor
-    dirs: torch.Tensor
-    """(N, 3) float64 samples on the rays in front of what is opaque, empty ones among them."""
-    sigma: torch.Tensor
-    rgb: torch.Tensor
-    """(N,), (N, 3) float32, what the teacher answered there."""
+    points: Points
 
 
 def random_rays(
@@ -67,18 +108,19 @@ def ask(
     rays_d: np.ndarray,
     step: float,
     generator: torch.Generator,
-    keep_points: float = 1.0,
+    chance: Chance = matter_first,
     at_once: int = 1 << 16,
 ) -> TeacherPool:
-    """Render rays (R, 3) through a teacher and keep a share of the samples in front of what is opaque as
-    points.
+    """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
+    random order.
     """
     parts = []
     for start in range(0, len(rays_o), at_once):
         part = slice(start, start + at_once)
-        parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, keep_points))
-    pixels, points, dirs, sigma, rgb = (torch.cat(column) for column in zip(*parts, strict=True))
-    return TeacherPool(rays_o, rays_d, pixels, points, dirs, sigma, rgb)
+        parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
+    pixels, *columns = (torch.cat(column) for column in zip(*parts, strict=True))
+    order = torch.randperm(len(columns[0]), generator=generator)
+    return TeacherPool(rays_o, rays_d, pixels, Points(*(column[order] for column in columns)))
 
 
 def _ask_part(
@@ -87,25 +129,33 @@ def _ask_part(
     rays_d: np.ndarray,
     step: float,
     generator: torch.Generator,
-    keep: float,
+    chance: Chance,
 ) -> tuple[torch.Tensor, ...]:
     n = len(rays_o)
     trans, pixels = np.ones(n, np.float32), np.zeros((n, 4), np.float32)
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
-    kept = []
+    place = torch.zeros(0, 3, dtype=torch.float64)
+    kept = [(place, place, torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
     for ray, ts, counts in waves(teacher, rays_o, rays_d, 0.0, jitter, step, lambda: trans > 1e-3):
         mask = np.arange(ts.shape[1]) < counts[:, None]
         points = torch.from_numpy((rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None])[mask])
         dirs = torch.from_numpy(np.broadcast_to(rays_d[ray][:, None], (*ts.shape, 3))[mask])
-        found, colour = teacher.query(points, dirs)
-        sigma, rgb = np.zeros(ts.shape, np.float32), np.zeros((*ts.shape, 3), np.float32)
-        sigma[mask], rgb[mask] = found.numpy(), colour.numpy()
-        before = trans[ray]
-        weights, trans[ray] = weights_from_sigma(sigma, step, before)
+        found = teacher.query(points, dirs, with_colour=False)[0].float()
+        sigma = np.zeros(ts.shape, np.float32)
+        sigma[mask] = found.numpy()
+        weights, after = weights_from_sigma(sigma, step, trans[ray])
+        before = torch.from_numpy((trans[ray][:, None] - np.cumsum(weights, 1) + weights)[mask])
+        trans[ray] = after
+        depth = found * step
+        chosen = (before > SEEN) & (torch.rand(len(points), generator=generator) < chance(depth, before))
+        # most samples are empty, and a colour costs more than a density
+        shown = torch.from_numpy(weights[mask] > SEEN_WEIGHT) | (chosen & (depth > SEEN_WEIGHT))
+        colour = torch.zeros(len(points), 3)
+        if shown.any():
+            colour[shown] = teacher.query(points[shown], dirs[shown])[1].float()
+        rgb = np.zeros((*ts.shape, 3), np.float32)
+        rgb[mask] = colour.numpy()
         pixels[ray, :3] += (weights[..., None] * rgb).sum(1)
-        seen = (before[:, None] - np.cumsum(weights, 1) + weights)[mask] > SEEN
-        chosen = torch.from_numpy(seen) & (torch.rand(len(points), generator=generator) < keep)
-        kept.append((points[chosen], dirs[chosen], found[chosen].float(), colour[chosen].float()))
+        kept.append(tuple(column[chosen] for column in (points, dirs, found, colour, before)))
     pixels[:, 3] = 1 - trans
-    nothing = (torch.zeros(0, 3, dtype=torch.float64),) * 2 + (torch.zeros(0), torch.zeros(0, 3))
-    return torch.from_numpy(pixels), *(torch.cat(column) for column in zip(*(kept or [nothing]), strict=True))
+    return torch.from_numpy(pixels), *(torch.cat(column) for column in zip(*kept, strict=True))

@@ -12,6 +12,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import (
+    DistillRun,
     DistillSettings,
     Judge,
     distill,
@@ -40,9 +41,9 @@ def small_steps(monkeypatch):
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
 
 
-def taught(settings: DistillSettings, rgb: bool = True):
+def taught(settings: DistillSettings, rgb: bool = True, recipe: module.Recipe = module.DEFAULT_RECIPE):
     student = empty_student(TEACHER, settings, torch.Generator().manual_seed(settings.seed), "ball")
-    return distill(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings, rgb)
+    return DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings, rgb, recipe).finish()
 
 
 def test_a_ball_is_learnt():
@@ -86,11 +87,10 @@ def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
     assert torch.equal(student.params, plain.params) is not kept
 
 
-def test_a_harmful_rgb_phase_is_not_kept(monkeypatch):
+def test_a_harmful_rgb_phase_is_not_kept():
     """At a rate of 3 the pictures spoil what the points taught; the student is the one of before."""
-    monkeypatch.setattr(module.RayPass, "rate", 3.0)
     brief = replace(SETTINGS, rays=2000, rgb_steps=10)
-    student, report = taught(brief)
+    student, report = taught(brief, recipe=module.Recipe(rgb_rate=3.0))
     plain, before = taught(brief, rgb=False)
     assert report.psnr_after_rgb < report.psnr_before_rgb - 3 and report.rgb_kept is False
     assert report.psnr_before_rgb == before.psnr_before_rgb and torch.equal(student.params, plain.params)
@@ -113,7 +113,7 @@ def test_bad_steps_are_skipped_and_told(monkeypatch):
 def test_a_teacher_of_nan_is_an_error(monkeypatch):
     def spoilt(teacher, *words, **more):
         pool = ask(teacher, *words, **more)
-        pool.sigma[:] = float("nan")
+        pool.points.sigma[:] = float("nan")
         return pool
 
     ask = module.ask
@@ -135,9 +135,13 @@ def test_a_student_that_holds_nothing_yet_keeps_its_cells(monkeypatch):
     np.testing.assert_array_equal(student.occupancy.occupied, TEACHER.occupancy.occupied)
 
 
-@pytest.mark.parametrize("at", [0, 7, 20, 25, 30])
-def test_a_restored_run_goes_on_to_the_same_bits(at):
-    """Stopped before the first step, in the points (20 steps) and in the pictures (10)."""
+@pytest.mark.parametrize("coarse_from", [16, 64])
+@pytest.mark.parametrize("at", [0, 3, 6, 7, 20, 25, 30])
+def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
+    """Stopped before the first step, in the points (20 steps, of which the first six may be coarse), in the
+    pictures (10) and after the last; the schedule looks every fourth step."""
+    monkeypatch.setattr(module, "COARSE_FROM", coarse_from)
+    monkeypatch.setattr(module, "LOOK_EVERY", 4)
     brief = replace(SETTINGS, rays=1000, steps=20, rgb_steps=10)
     straight, told = taught(brief)
 
@@ -162,6 +166,37 @@ def test_a_restored_run_goes_on_to_the_same_bits(at):
     assert torch.equal(student.params, straight.params)
     assert np.array_equal(student.occupancy.occupied, straight.occupancy.occupied)
     assert report.psnr_after_rgb == told.psnr_after_rgb and report.rgb_kept == told.rgb_kept
+    assert report.steps == told.steps
+    assert [point[1:] for point in report.curve] == [point[1:] for point in told.curve]
+    seconds = [point[0] for point in report.curve]
+    assert seconds == sorted(seconds)
+
+
+def test_a_phase_ends_on_a_plateau(monkeypatch):
+    """With a look every other step and a gain that no look can bring, the third one is the last at full rate,
+    and two thirds of its steps more follow."""
+    monkeypatch.setattr(module, "LOOK_EVERY", 2)
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.schedule.LEAST_GAIN", 1e3)
+    report = taught(replace(SETTINGS, rays=1000), rgb=False)[1]
+    assert report.steps["points"] < 20 and len(report.curve) == report.steps["points"] // 2
+
+
+def test_the_curve_rises_and_is_of_rays_of_its_own(monkeypatch):
+    monkeypatch.setattr(module, "LOOK_EVERY", 10)
+    report = taught(SETTINGS)[1]
+    seconds, steps, values = zip(*report.curve, strict=True)
+    assert steps == tuple(range(10, 91, 10)) and values[5] > values[0] + 3
+    assert list(seconds) == sorted(seconds) and report.steps == {"points": 60, "pictures": 30}
+
+
+def test_half_the_resolution_first_ends_at_all_of_it(monkeypatch):
+    """What comes out has the resolution that was asked, and is no worse."""
+    straight, told = taught(SETTINGS, rgb=False)
+    monkeypatch.setattr(module, "COARSE_FROM", 16)
+    student, report = taught(SETTINGS, rgb=False)
+    assert student.tensors[0].resolution == straight.tensors[0].resolution
+    assert student.params.shape == straight.params.shape
+    assert report.psnr_before_rgb > told.psnr_before_rgb - 0.5
 
 
 def a_run(settings: DistillSettings) -> module.DistillRun:

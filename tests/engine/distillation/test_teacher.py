@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.teacher import ask, random_rays
+from fusedrf_cli.engine.distillation.teacher import EMPTY_SHARE, MATTER, ask, random_rays
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.engine.conftest import BOX, Gaussian, Slab, chord_of_box
 
@@ -59,23 +59,56 @@ def test_pixels_are_those_of_the_renderer():
 def test_points_are_samples_with_the_teachers_answers():
     field = Gaussian(density=8.0)
     rays_o, rays_d = random_rays([BOX], 100, seeded())
-    pool = ask(field, rays_o, rays_d, 0.05, seeded(3))
-    sigma, rgb = field.query(pool.points, pool.dirs)
-    assert len(pool.points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
-    assert torch.equal(sigma, pool.sigma) and torch.equal(rgb, pool.rgb)
-    fewer = ask(field, rays_o, rays_d, 0.05, seeded(3), keep_points=0.25)
-    assert 0.2 < len(fewer.points) / len(pool.points) < 0.3
+    points = ask(field, rays_o, rays_d, 0.05, seeded(3), everything).points
+    sigma, rgb = field.query(points.where, points.dirs)
+    assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
+    assert torch.equal(sigma, points.sigma)
+    shown = sigma * 0.05 > 1e-5
+    assert torch.equal(rgb[shown], points.rgb[shown])
+
+
+def everything(depth, transmittance):
+    return torch.ones_like(depth)
+
+
+def test_all_matter_is_kept_and_a_share_of_the_emptiness():
+    field, rays = Gaussian(density=8.0), random_rays([BOX], 2000, seeded())
+    whole = ask(field, *rays, 0.05, seeded(3), everything).points
+    kept = ask(field, *rays, 0.05, seeded(3)).points
+    matter = [(points.sigma * 0.05 > MATTER).sum() for points in (whole, kept)]
+    assert matter[0] == matter[1] > 1000
+    assert abs((len(kept) - matter[1]) / (len(whole) - matter[0]) - EMPTY_SHARE) < 0.02
+
+
+def test_transmittance_of_points_is_the_rays():
+    """In a medium of σ = 4, behind a length x of it, exp(-4 x) to within the step."""
+    rays_o, rays_d = np.array([[-3.0, 0, 0]] * 200), np.array([[1.0, 0, 0]] * 200)
+    points = ask(Slab(density=4.0), rays_o, rays_d, 0.02, seeded(), everything).points
+    deep = (points.where[:, 0] + 0.3).clamp(0, 0.7)
+    wanted = torch.exp(-4 * deep)
+    assert ((points.transmittance / wanted).log().abs() < 4 * 0.021).all()
+
+
+def test_points_come_in_random_order_and_round_again():
+    points = ask(Gaussian(density=8.0), *random_rays([BOX], 100, seeded()), 0.05, seeded(3)).points
+    jumps = (points.where[1:] - points.where[:-1]).norm(dim=1)
+    assert jumps.mean() > 0.3  # along a ray they would be 0.05 apart
+    n, size = len(points), len(points) // 3 + 5
+    drawn = torch.cat([points.batch(i, size).sigma for i in range(3)])
+    assert torch.equal(drawn, torch.cat([points.sigma, points.sigma[: 3 * size - n]]))
+    assert len(points.batch(7, 10 * n)) == n
 
 
 def test_no_points_behind_what_is_opaque():
     """Behind the wall at x in [-0.3, 0.4] of optical depth 35 nothing is kept of a ray along +x."""
     rays_o, rays_d = np.array([[-3.0, 0, 0]] * 20), np.array([[1.0, 0, 0]] * 20)
     pool = ask(Slab(density=50.0), rays_o, rays_d, 0.02, seeded())
-    assert -0.3 < pool.points[:, 0].max() < -0.1 and pool.points[:, 0].min() < -0.9
+    x = pool.points.where[:, 0]
+    assert -0.3 < x.max() < -0.1 and x.min() < -0.9
     assert (pool.pixels[:, 3] > 0.999).all()
 
 
 def test_rays_past_everything_give_no_points():
     rays_o, rays_d = np.array([[-3.0, 0, 5]]), np.array([[1.0, 0, 0]])
     pool = ask(Slab(), rays_o, rays_d, 0.02, seeded())
-    assert len(pool.points) == len(pool.sigma) == 0 and not pool.pixels.any()
+    assert len(pool.points) == 0 and not pool.pixels.any()

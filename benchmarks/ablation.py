@@ -1,0 +1,198 @@
+"""What each part of distilling is worth: python -m benchmarks.ablation FOLDER [SCENE.json] [--steps P,R]
+
+Distils a scene into one `vm` tensor of 25 MB by the recipe of `fuse --kind vm`, with five seeds, and with one
+part at a time left out or put back to what FusedRF says; all within the same steps, and judged on the same
+views, which nothing is trained on. Without a scene, one is made in FOLDER: four objects of
+examples/make_scene.py, trained briefly. Prints a Markdown table and writes FOLDER/ablation.csv.
+"""
+
+import argparse
+import csv
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fusedrf_cli.bridge.fuse import DEFAULT_MAX_SIZE, HEADER_BYTES
+from fusedrf_cli.bridge.scene import background_of, load_scene
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.distill import (
+    DistillReport,
+    DistillRun,
+    DistillSettings,
+    Recipe,
+    empty_student,
+    student_from,
+)
+from fusedrf_cli.engine.distillation.losses import OPAQUE
+from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
+from fusedrf_cli.engine.fields.streamed import opened
+
+TRAINED = ("--quality", "draft", "--views", "40", "--size", "200x200", "--max-size", "4MB")
+PLACES = (
+    ("ground.rfpack", ("--background-node",)),
+    ("tower.rfpack", ("-t", "-0.8,0.4,0.06")),
+    ("arch.rfpack", ("-t", "0.5,0.6,0.06", "-r", "35,0,0,1")),
+    ("ball.rfpack", ("-t", "0.6,-0.7,0.06", "-s", "0.5")),
+)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to distil."""
+
+    name: str
+    recipe: Recipe = Recipe()
+    from_scratch: bool = False
+    rgb: bool = True
+    seed: int = 0
+
+
+class Steady(Schedule):
+    """The rate falls from the first step to the last, whatever is found on the way."""
+
+    end = 1.0
+
+    def look(self, share: float, psnr: float) -> None:
+        """Nothing follows from it."""
+
+    def factor(self, share: float) -> float:
+        """An exponential fall."""
+        return RATE_DECAY**share
+
+
+def evenly(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
+    """About as many points as `matter_first` keeps, whatever they hold."""
+    return torch.full_like(depth, 0.25)
+
+
+def all_alike(transmittance: torch.Tensor) -> torch.Tensor:
+    """Every point counts as much as any other."""
+    return torch.ones_like(transmittance)
+
+
+def raw_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The squared error of σ itself, in optical depths of a step."""
+    return (depth - wanted) ** 2, 2 * (depth - wanted)
+
+
+def opacity(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The squared error of alpha; a student that is opaque feels nothing of it."""
+    off = torch.exp(-wanted) - torch.exp(-depth)
+    return off**2, 2 * off * torch.exp(-depth)
+
+
+def capped_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The squared error of optical depth up to what looks opaque."""
+    off = depth - wanted.clamp_max(OPAQUE)
+    off[(depth >= OPAQUE) & (wanted >= OPAQUE)] = 0
+    return off**2, 2 * off
+
+
+WHOLE = Recipe()
+PAPER = Recipe(evenly, raw_depth, all_alike, 0.02, 0.002, Steady)
+VARIANTS = (
+    *(Variant(f"nothing, seed {seed}", seed=seed) for seed in range(5)),
+    Variant("the pictures", rgb=False),
+    Variant("the background's weights", from_scratch=True),
+    Variant("points where matter is seen: evenly instead", replace(WHOLE, chance=evenly)),
+    Variant("points by transmittance: all alike", replace(WHOLE, visibility=all_alike)),
+    Variant("log1p of depth: raw depth", replace(WHOLE, density_loss=raw_depth)),
+    Variant("log1p of depth: depth up to opaque", replace(WHOLE, density_loss=capped_depth)),
+    Variant("log1p of depth: alpha", replace(WHOLE, density_loss=opacity)),
+    Variant("the high rate: a quarter", replace(WHOLE, rate=0.25 * WHOLE.rate)),
+    Variant("the schedule: a steady fall", replace(WHOLE, schedule=Steady)),
+    Variant("all of it: points evenly, raw depth, a steady fall of a low rate", PAPER),
+)
+
+
+def made_scene(folder: Path) -> Path:
+    """The scene of PLACES in a folder, made and trained where it is not there yet."""
+    scene = folder / "scene.json"
+    if scene.exists():
+        return scene
+    maker = Path(__file__).parent.parent / "examples" / "make_scene.py"
+    subprocess.run([sys.executable, str(maker), str(folder)], check=True, stdout=subprocess.DEVNULL)
+    call = [sys.executable, "-m", "fusedrf_cli"]
+    for source, _ in PLACES:
+        if not (folder / source).exists():
+            mesh = Path(source).with_suffix(".glb").name
+            subprocess.run([*call, "train", mesh, "-o", source, *TRAINED], cwd=folder, check=True)
+    words = [word for source, placed in PLACES for word in (source, *placed)]
+    subprocess.run([*call, "compose", *words, "-o", scene.name], cwd=folder, check=True)
+    return scene
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scene to be distilled, and how large the student may be."""
+
+    composed: ComposedField
+    background: Placed
+    boxes: list[np.ndarray]
+    settings: DistillSettings
+
+    @classmethod
+    def of(cls, scene: Path, steps: tuple[int, int]) -> "Task":
+        """The scene as `fuse --kind vm` takes it up."""
+        loaded = load_scene(str(scene))
+        composed = loaded.composed()
+        name = background_of(loaded).placed.name
+        placed = composed.placed[[p.name for p in loaded.placed].index(name)]
+        background = Placed(name, opened(placed.field), placed.object_to_world)
+        boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
+        numbers = (DEFAULT_MAX_SIZE - composed.occupancy.occupied.size // 8 - HEADER_BYTES) // 2
+        settings = DistillSettings(max_numbers=numbers, steps=steps[0], rgb_steps=steps[1])
+        return cls(composed, background, boxes, settings)
+
+    def distilled(self, variant: Variant) -> DistillReport:
+        """What distilling by a variant's recipe gives."""
+        settings = replace(self.settings, seed=variant.seed)
+        generator, student = torch.Generator().manual_seed(settings.seed), None
+        if not variant.from_scratch:
+            student = student_from(self.background, self.composed, settings, generator)
+        if student is None:
+            student = empty_student(self.composed, settings, generator, "fused")
+        run = DistillRun(self.composed, student, self.boxes, settings, variant.rgb, variant.recipe)
+        return run.finish()[1]
+
+
+COLUMNS = ("left out", "psnr after points", "psnr after pictures", "seconds", "steps")
+
+
+def row_of(variant: Variant, report: DistillReport) -> list[str]:
+    """A row of the table."""
+    after = "" if report.psnr_after_rgb is None else f"{report.psnr_after_rgb:.2f}"
+    steps = " + ".join(str(count) for count in report.steps.values())
+    seconds = f"{sum(report.seconds.values()):.0f}"
+    return [variant.name, f"{report.psnr_before_rgb:.2f}", after, seconds, steps]
+
+
+def main() -> None:
+    """Measure all variants."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("scene", type=Path, nargs="?")
+    default = f"{DistillSettings.steps},{DistillSettings.rgb_steps}"
+    parser.add_argument("--steps", default=default, help="at most so many on points, and on rays")
+    given = parser.parse_args()
+    given.folder.mkdir(parents=True, exist_ok=True)
+    points, rays = (int(count) for count in given.steps.split(","))
+    task = Task.of(given.scene or made_scene(given.folder), (points, rays))
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+    with (given.folder / "ablation.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(COLUMNS)
+        for variant in VARIANTS:
+            row = row_of(variant, task.distilled(variant))
+            print(f"| {' | '.join(row)} |", flush=True)
+            table.writerow(row)
+            file.flush()
+
+
+if __name__ == "__main__":
+    main()
