@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import torch
 
+from fusedrf_cli.bridge.fuse_sparse import fuse_sparse
 from fusedrf_cli.bridge.memory import (
     FLOAT,
     READING,
@@ -93,6 +94,9 @@ def fuse(
             numbers = limit // BYTES_PER_NUMBER[precision]
             make_room(budget, loaded, *blocks_memory(loaded, composed, numbers))
             field, figures = fuse_blocks(loaded, composed, limit, precision, seed, place, progress)
+        elif chosen == "sparse":
+            settings = DistillSettings(seed=seed, time_budget=time_budget)
+            field, figures = fuse_sparse(composed, limit, precision, settings, rgb, place, progress)
         else:
             overhead = composed.occupancy.occupied.size // 8 + HEADER_BYTES
             numbers = max(1, (limit - overhead) // BYTES_PER_NUMBER[precision])

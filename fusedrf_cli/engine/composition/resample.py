@@ -31,7 +31,7 @@ DEEPEST = 6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the
 FAINT = 1e-5  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
 COLOURED = 1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
-STEEPEST = 10.0  # the density feature lies in ±10: an even slope keeps a surface in the middle of its voxel
+LEAST, MOST = -4.0, 20.0  # of the density feature: from far below, a slope would draw surfaces inwards
 LOGITS = 8.0  # colours are told apart up to sigmoid(8)
 AT_ONCE = 1 << 18
 ATTEMPTS = 5
@@ -47,7 +47,7 @@ def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> S
     shows nothing, or not even the widest voxels fit.
     """
     tree, sigma = fitted(teacher, shape, max_numbers)
-    field = SparseField(shape, Lattice(tree, SIDE), 1 / tree.unit)
+    field = SparseField(shape, Lattice(tree, SIDE), density_scale(tree))
     fill(field, teacher, sigma)
     return field
 
@@ -137,7 +137,7 @@ def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, tup
 
 def visible(lattice: Lattice, sigma: np.ndarray, teacher: RadianceField) -> np.ndarray:
     """(N, 4, 4, 4) bool: voxels that rays from outside see."""
-    field = SparseField(SparseShape(0), lattice, 1 / lattice.tree.unit)
+    field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree))
     set_density(field, sigma)
     boxes = [teacher.occupancy.tight_aabb(0), *sorted((p.aabb for p in placed_in(teacher)), key=list)]
     generator = torch.Generator().manual_seed(0)
@@ -283,15 +283,21 @@ def fill(field: SparseField, teacher: RadianceField, known: tuple[np.ndarray, np
         weight[rest] = -np.expm1(-depth[rest])
     field.rows[:, 1:] = torch.from_numpy(base)
     if field.coarse:
-        field.bands[:] = torch.from_numpy(coarser(fine, field.coarse, bands, weight))
+        held, known = coarser(fine, field.coarse, bands, weight)
+        field.bands[:] = torch.from_numpy(dilated(field.coarse, held, known)[0])
     field.settle()
+
+
+def density_scale(tree: BrickTree) -> float:
+    """σ of a feature of 1, about: an optical depth of 1 in the widest voxel."""
+    return SIDE / (tree.top / 2 ** int(tree.level.min()))
 
 
 def set_density(field: SparseField, sigma: np.ndarray) -> None:
     """Give the vertices densities (V,), as far as the feature's range goes."""
     with np.errstate(divide="ignore"):
         feature = inverse_softplus(sigma / field.scale)
-    field.rows[:, 0] = torch.from_numpy(np.clip(feature, -STEEPEST, STEEPEST))
+    field.rows[:, 0] = torch.from_numpy(np.clip(feature, LEAST, MOST))
     field.settle()
 
 
@@ -336,9 +342,10 @@ def dilated(lattice: Lattice, values: np.ndarray, weight: np.ndarray) -> tuple[n
     return values, weight > 0
 
 
-def coarser(fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def coarser(fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(W, D) values of the coarse vertices whose interpolation comes near to values (V, D) of the fine ones, where
-    these have a weight (V,)."""
+    these have a weight (V,), and their own weights (W,)."""
     matrix = interpolation(fine, coarse)
     weighted = matrix.T @ sparse.diags(weight.astype(np.float32))
     total = np.asarray(weighted.sum(1)).ravel()
@@ -347,7 +354,7 @@ def coarser(fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarr
     found = share * (weighted @ values)
     for _ in range(CORRECTIONS):
         found += share * (weighted @ (values - matrix @ found))
-    return found
+    return found, total
 
 
 def interpolation(fine: Lattice, coarse: Lattice) -> sparse.csr_matrix:

@@ -226,6 +226,18 @@ class Lattice:
         np.minimum.at(found, self.rows[self.used], brick)
         return found * self.tree.unit
 
+    @cached_property
+    def spreading(self) -> tuple[np.ndarray, ...]:
+        """(start, source, weight, target) as `sums_of_rows` takes them: hanging rows from free ones."""
+        return (*csr(self.spread), np.arange(self.free, len(self.vertices)))
+
+    @cached_property
+    def gathering(self) -> tuple[np.ndarray, ...]:
+        """The adjoint of `spreading`: what free rows gain from hanging ones."""
+        start, source, weight = csr(self.spread.T)
+        target = np.flatnonzero(np.diff(start))
+        return np.append(start[target], start[-1]), source + self.free, weight, target
+
     def _keys(self) -> np.ndarray:
         """Keys of all used vertices, brick by brick."""
         brick, vertex = np.nonzero(self.used)
@@ -289,6 +301,12 @@ class Lattice:
         while (step := through @ step).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
             total = total + step
         return total.tocsr()
+
+
+def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(start, source, weight) of a sparse matrix, row by row."""
+    rows = matrix.tocsr()
+    return rows.indptr.astype(np.int64), rows.indices.astype(np.int64), rows.data
 
 
 def corner_offsets(n: int) -> np.ndarray:

@@ -201,41 +201,60 @@ class SparseField:
 
     # -- learning --------------------------------------------------------------------------------------------
 
-    def query_backward(self, points, dirs, d_sigma, d_rgb, grads: np.ndarray) -> None:
-        """Adjoint of `query`: adds to the rows of grads (parts, P) what d_sigma (N,), d_rgb (N, 3) of points
-        (N, 3) seen along dirs (N, 3) send back, all numpy arrays."""
-        self.loops.query_backward(*self.kernel_shape, self.arrays, points, dirs, d_sigma, d_rgb, grads)
+    def query_backward(
+        self,
+        points: torch.Tensor,
+        dirs: torch.Tensor,
+        d_sigma: torch.Tensor,
+        d_rgb: torch.Tensor,
+        grads: np.ndarray,
+    ) -> None:
+        """Adjoint of `query`: add to the rows of grads (parts, P) what the derivatives d_sigma (N,) and d_rgb
+        (N, 3) of a loss send back to `params`."""
+        back = points.numpy(), dirs.numpy(), d_sigma.numpy(), d_rgb.numpy()
+        self.loops.query_backward(*self.kernel_shape, self.arrays, *back, grads)
         self._collect(grads)
 
     def train_rays(
-        self, rays_o, rays_d, jitter, step, early_stop, target, background, opacity_weight, grads, loss
+        self,
+        rays_o: np.ndarray,
+        rays_d: np.ndarray,
+        jitter: np.ndarray,
+        step: float,
+        early_stop: float,
+        target: np.ndarray,
+        background: np.ndarray,
+        opacity_weight: float,
+        grads: np.ndarray,
+        loss: np.ndarray,
+        near: float = 0.0,
     ) -> None:
-        """One pass over rays as of `cpu.train_rays`, near 0: adds to the rows of grads (parts, P) and loss
-        (parts, 3)."""
+        """Render rays (N, 3), compare with target (N, 4), add the gradient to the rows of grads (parts, P)
+        and the losses and samples to those of loss (parts, 3); see cpu.train_rays for the loss."""
         slots = int(np.linalg.norm(self.aabb[3:] - self.aabb[:3]) / step) + 2
         self.loops.train_rays(
-            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, 0.0, jitter, step, early_stop, target,
+            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop, target,
             background, opacity_weight, slots, grads, loss,
         )  # fmt: skip
         self._collect(grads)
+
+    def parameter_groups(self) -> list[tuple[int, int, bool]]:
+        """(low, high, whether it is a colour basis) of every group of `params`, in order."""
+        return [(0, self.params.numel(), False)]
 
     def settle(self) -> None:
         """Make the hanging rows follow from the free ones, after these have changed."""
         for lattice, base, width in self._lattices():
             if lattice.spread.shape[0]:
-                edges = csr(lattice.spread)
-                target = np.arange(lattice.free, len(lattice.vertices))
+                *edges, target = lattice.spreading
                 self.loops.sums_of_rows(self.arrays.params, base, width, *edges, target, False)
 
     def _collect(self, grads: np.ndarray) -> None:
         """Hand the gradients of hanging rows on to what they hang on; their own no longer count."""
         for lattice, base, width in self._lattices():
             if lattice.spread.shape[0]:
-                start, source, weight = csr(lattice.spread.T)
-                target = np.flatnonzero(np.diff(start))
-                start = np.append(start[target], start[-1])
+                *edges, target = lattice.gathering
                 for row in grads:
-                    edges = start, source + lattice.free, weight
                     self.loops.sums_of_rows(row, base, width, *edges, target, True)
 
     def _lattices(self) -> list[tuple[Lattice, int, int]]:
@@ -276,12 +295,6 @@ class SparseField:
             view[: lattice.free] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
         field.settle()
         return field
-
-
-def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(start, source, weight) of a sparse matrix, row by row."""
-    rows = matrix.tocsr()
-    return rows.indptr.astype(np.int64), rows.indices.astype(np.int64), rows.data
 
 
 def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
