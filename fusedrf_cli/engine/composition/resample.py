@@ -5,6 +5,7 @@ much, all is coarser by one factor.
 """
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,13 +26,17 @@ from fusedrf_cli.engine.fields.bricks import (
 )
 from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kernels.reference import sh_basis
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE, Y0
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
 DEEPEST = 6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
 FAINT = 1e-5  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
 COLOURED = 1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
 LEAST, MOST = -4.0, 20.0  # of the density feature: from far below, a slope would draw surfaces inwards
+DIRECTIONS = 32
+ONE_SIDED = 0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
+LOOKS = 9  # places along a look through the voxels before and behind a vertex
+RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
 LOGITS = 8.0  # colours are told apart up to sigmoid(8)
 AT_ONCE = 1 << 18
 ATTEMPTS = 5
@@ -42,20 +47,33 @@ SEEN = 3e-8  # weight of a voxel in a picture of the scene, at least, to be held
 CORRECTIONS = 3
 
 
+class Known(NamedTuple):
+    """What was asked of a teacher at vertices, by ascending keys of their places in units."""
+
+    keys: np.ndarray  # (M,) int64
+    sigma: np.ndarray  # (M,) float64
+    facing: np.ndarray  # (M, 3) mean direction along which a vertex is seen
+
+    def of(self, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+        """σ (V,) and facing (V, 3) of a lattice's vertices, all of them among the known."""
+        at = np.searchsorted(self.keys, node_keys(lattice.vertices))
+        return self.sigma[at], self.facing[at]
+
+
 def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
     """The teacher as a sparse field in its frame with at most so many numbers. Raises ValueError where the teacher
     shows nothing, or not even the widest voxels fit.
     """
-    tree, sigma = fitted(teacher, shape, max_numbers)
+    tree, known = fitted(teacher, shape, max_numbers)
     field = SparseField(shape, Lattice(tree, SIDE), density_scale(tree))
-    fill(field, teacher, sigma)
+    fill(field, teacher, known)
     return field
 
 
 def fitted(
     teacher: RadianceField, shape: SparseShape, max_numbers: int
-) -> tuple[BrickTree, tuple[np.ndarray, np.ndarray]]:
-    """The finest tree found with at most so many numbers, and (keys, σ) of its vertices."""
+) -> tuple[BrickTree, Known]:
+    """The finest tree found with at most so many numbers, and what is known of its vertices."""
     own = [p.voxel_size for p in placed_in(teacher)]
     common, best, tried = 2 * max(own), None, []
     for _ in range(ATTEMPTS):
@@ -112,8 +130,8 @@ def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, 
     return lo, float(top), tuple(counts), [int(level) for level in levels]
 
 
-def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, tuple[np.ndarray, np.ndarray]]:
-    """The tree whose active voxels hold all matter that shows, and (keys, σ) of its vertices in units."""
+def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, Known]:
+    """The tree whose active voxels hold all matter that shows, and what is known of its vertices."""
     lo, top, counts, levels = frame_of(teacher, common)
     wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
     for placed, level in zip(placed_in(teacher), levels, strict=True):
@@ -126,23 +144,40 @@ def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, tup
     matter = depth > harmless(depth, lattice)
     if not matter.any():
         raise ValueError("the scene shows nothing")
-    mask = matter[lattice.corners].any(1).reshape(-1, SIDE, SIDE, SIDE)
-    mask &= visible(lattice, sigma, teacher)
-    kept = mask.any((1, 2, 3))
-    tree = BrickTree.of(lo, top, counts, whole.level[kept], whole.at[kept], mask[kept])
+    weight, facing = looked_at(lattice, sigma, teacher)
+    mask = matter[lattice.corners].any(1).reshape(-1, SIDE**3) & (weight > SEEN * SEEING_RAYS)
+    kept = mask.any(1)
+    tree = BrickTree.of(lo, top, counts, whole.level[kept], whole.at[kept], mask[kept].reshape(-1, SIDE, SIDE, SIDE))
     keys = node_keys(lattice.vertices >> (whole.depth - tree.depth))
     order = np.argsort(keys)
-    return tree, (keys[order], sigma[order])
+    return tree, Known(keys[order], sigma[order], around(lattice, facing, weight)[order])
 
 
-def visible(lattice: Lattice, sigma: np.ndarray, teacher: RadianceField) -> np.ndarray:
-    """(N, 4, 4, 4) bool: voxels that rays from outside see."""
+def looked_at(
+    lattice: Lattice, sigma: np.ndarray, teacher: RadianceField
+) -> tuple[np.ndarray, np.ndarray]:
+    """`SparseField.seen` of densities (V,) for rays from outside at the whole and at the placed fields."""
     field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree))
     set_density(field, sigma)
     boxes = [teacher.occupancy.tight_aabb(0), *sorted((p.aabb for p in placed_in(teacher)), key=list)]
-    generator = torch.Generator().manual_seed(0)
-    rays = random_rays(boxes, SEEING_RAYS, generator)
-    return field.seen(*rays) > SEEN * SEEING_RAYS
+    return field.seen(*random_rays(boxes, SEEING_RAYS, torch.Generator().manual_seed(0)))
+
+
+def around(lattice: Lattice, facing: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(V, 3) mean direction, by weight, along which the voxels around each vertex are seen: of length 1 where it
+    is seen from one side alone, 0 where from all or never."""
+    told = np.concatenate([facing.reshape(-1, 3), weight.reshape(-1, 1)], 1)[lattice.active.ravel()]
+    summed = touching(lattice).T @ told
+    return summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
+
+
+def touching(lattice: Lattice) -> sparse.csr_matrix:
+    """(K, V) ones where an active voxel has a vertex as a corner."""
+    count = len(lattice.corners)
+    start = np.arange(0, 8 * count + 1, 8)
+    return sparse.csr_matrix(
+        (np.ones(8 * count, np.float32), lattice.corners.ravel(), start), (count, len(lattice.vertices))
+    )
 
 
 def demanded(
@@ -228,22 +263,6 @@ def harmless(depth: np.ndarray, lattice: Lattice) -> float:
 # -- what ----------------------------------------------------------------------------------------------------
 
 
-def directions(degree: int) -> np.ndarray:
-    """(K, 3) unit directions over which products of two harmonics up to a degree sum as over the sphere: corners of
-    an octahedron, an icosahedron, or for degree 3 those of a truncated one of equal weights, nearly."""
-    if degree <= 1:
-        return np.concatenate([np.eye(3), -np.eye(3)])
-    golden = (1 + 5**0.5) / 2
-    corners = [np.roll([0, a, b * golden], shift) for a in (-1, 1) for b in (-1, 1) for shift in range(3)]
-    points = np.array(corners)
-    if degree == 3:  # and the middles of its faces and edges
-        pairs = points[:, None] + points[None]
-        far = np.linalg.norm(points[:, None] - points[None], axis=-1)
-        i, j = np.nonzero(np.triu(np.abs(far - 2) < 1e-9))
-        points = np.concatenate([points, pairs[i, j]])
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
 def density(source, places: np.ndarray) -> np.ndarray:
     """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends on
     the direction."""
@@ -264,28 +283,48 @@ def density(source, places: np.ndarray) -> np.ndarray:
     return found
 
 
-def fill(field: SparseField, teacher: RadianceField, known: tuple[np.ndarray, np.ndarray]) -> None:
-    """Give the vertices what the teacher says there; known are (ascending keys, σ) of all vertices in units."""
-    fine = field.fine
-    sigma = known[1][np.searchsorted(known[0], node_keys(fine.vertices))]
+def fill(field: SparseField, teacher: RadianceField, known: Known) -> None:
+    """Give the vertices what the teacher says there."""
+    fine, degree = field.fine, field.shape.sh_degree
+    sigma, facing = known.of(fine)
     set_density(field, sigma)
-    depth = sigma * fine.finest_voxel
-    coefficients, weight = np.zeros((len(sigma), 3, field.shape.coefficients), np.float32), np.zeros(len(sigma))
-    seen = np.flatnonzero(depth > COLOURED)
-    coefficients[seen] = colours(teacher, fine.places[seen], field.shape.sh_degree)
-    weight[seen] = -np.expm1(-depth[seen])
-    bands = coefficients[..., 1:].reshape(len(sigma), -1)
-    base, reached = dilated(fine, coefficients[..., 0], weight)
-    rest = np.flatnonzero(~reached & (depth > FAINT))
-    if len(rest):
-        found = colours(teacher, fine.places[rest], field.shape.sh_degree)
-        base[rest], bands[rest] = found[..., 0], found[..., 1:].reshape(len(rest), -1)
-        weight[rest] = -np.expm1(-depth[rest])
-    field.rows[:, 1:] = torch.from_numpy(base)
+    places, weight = shown(teacher, fine, sigma, facing)
+    coefficients = np.zeros((len(sigma), 3, field.shape.coefficients), np.float32)
+    asked = np.flatnonzero(weight > COLOURED)
+    coefficients[asked] = colours(teacher, places[asked], facing[asked], degree)
+    weight[weight <= COLOURED] = 0
+    field.rows[:, 1:] = torch.from_numpy(dilated(fine, coefficients[..., 0], weight)[0])
     if field.coarse:
-        held, known = coarser(fine, field.coarse, bands, weight)
-        field.bands[:] = torch.from_numpy(dilated(field.coarse, held, known)[0])
+        bands, held = coarser(fine, field.coarse, coefficients[..., 1:].reshape(len(sigma), -1), weight)
+        field.bands[:] = torch.from_numpy(dilated(field.coarse, bands, held)[0])
     field.settle()
+
+
+def shown(
+    teacher: RadianceField, lattice: Lattice, sigma: np.ndarray, facing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each vertex's colour is to be asked (V, 3), and by how much that can be seen (V,).
+
+    What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour from
+    where a look along its facing, from a voxel before it to a voxel behind, ends.
+    """
+    places, size = lattice.places.copy(), lattice.finest_voxel
+    weight = -np.expm1(-sigma * size)
+    length = np.linalg.norm(facing, axis=1)
+    one_sided = np.flatnonzero(length > ONE_SIDED)
+    along = facing[one_sided] / length[one_sided, None] * size[one_sided, None]
+    spots = np.linspace(-1, 1, LOOKS)
+    trans, best = np.ones(len(one_sided)), np.zeros(len(one_sided))
+    end = np.zeros(len(one_sided))
+    for spot in spots:
+        depth = density(teacher, places[one_sided] + spot * along) * size[one_sided] * (spots[1] - spots[0])
+        found = -trans * np.expm1(-depth)
+        trans *= np.exp(-depth)
+        end = np.where(found > best, spot, end)
+        best = np.maximum(best, found)
+    places[one_sided] += end[:, None] * along
+    weight[one_sided] = 1 - trans
+    return places, weight
 
 
 def density_scale(tree: BrickTree) -> float:
@@ -306,40 +345,55 @@ def inverse_softplus(y: np.ndarray) -> np.ndarray:
     return np.where(y > 15, y, np.log(np.expm1(np.minimum(y, 15))))
 
 
-def colours(teacher: RadianceField, places: np.ndarray, degree: int) -> np.ndarray:
+def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
     """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3), by least
-    squares over `directions`: exact where the teacher has no higher degree, however it is turned."""
-    dirs = directions(max(degree, 1))
+    squares over the directions along which they are seen (facing (N, 3), as `around` has it).
+
+    What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit is
+    exact, however the teacher is turned, but for what ONE_SIDED leaves.
+    """
+    dirs = even_directions(DIRECTIONS)
     basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
-    solve = np.linalg.pinv(basis)
-    if degree == 0:
-        solve = np.full((1, len(dirs)), 1 / (Y0 * len(dirs)))
     found = np.empty((len(places), 3, len(basis[0])), np.float32)
-    for part in pieces(len(places), AT_ONCE // len(dirs)):
-        points = np.repeat(places[part], len(dirs), 0)
-        along = np.tile(dirs, (len(points) // len(dirs), 1))
-        rgb = teacher.query(torch.from_numpy(points), torch.from_numpy(along))[1].double().numpy()
-        edge = 1 / (1 + np.exp(LOGITS))
-        rgb = np.clip(rgb, edge, 1 - edge)
-        logits = np.log(rgb / (1 - rgb)).reshape(-1, len(dirs), 3)
-        found[part] = np.einsum("kd,ndc->nck", solve, logits)
+    one_sided = np.linalg.norm(facing, axis=1) > ONE_SIDED
+    side = np.where(one_sided, (facing @ dirs.T).argmax(1), len(dirs))
+    for group in np.unique(side):
+        counts = np.ones(len(dirs)) if group == len(dirs) else np.maximum(dirs @ dirs[group], 0)
+        asked = np.flatnonzero(counts > 0.1)
+        weighted = basis[asked] * counts[asked, None]
+        ridge = RIDGE * np.diag([0.0] + [1.0] * (len(basis[0]) - 1))
+        solve = np.linalg.solve(weighted.T @ basis[asked] + ridge, weighted.T)
+        own = np.flatnonzero(side == group)
+        for part in pieces(len(own), AT_ONCE // len(asked)):
+            points = np.repeat(places[own[part]], len(asked), 0)
+            along = np.tile(dirs[asked], (len(points) // len(asked), 1))
+            rgb = teacher.query(torch.from_numpy(points), torch.from_numpy(along))[1].double().numpy()
+            edge = 1 / (1 + np.exp(LOGITS))
+            rgb = np.clip(rgb, edge, 1 - edge)
+            logits = np.log(rgb / (1 - rgb)).reshape(-1, len(asked), 3)
+            found[own[part]] = np.einsum("kd,ndc->nck", solve, logits)
     return found
 
 
+def even_directions(count: int) -> np.ndarray:
+    """(count, 3) unit directions, evenly spread along a spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.arange(count) * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
+
+
 def dilated(lattice: Lattice, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (V, D) where their weight (V,) is 0 from the vertices around, step by step; and which have one now."""
-    corners = lattice.corners
-    count = len(corners)
-    touches = sparse.csr_matrix(
-        (np.ones(8 * count, np.float32), corners.ravel(), np.arange(0, 8 * count + 1, 8)), (count, len(weight))
-    )
+    """Values (V, D) where their weight (V,) is 0 from the vertices around, step by step; and the weights
+    (V,) then."""
+    touches = touching(lattice)
     values, weight = values.astype(np.float32).copy(), weight.astype(np.float32)
     for _ in range(DILATIONS):
         gathered = touches.T @ (touches @ np.concatenate([values * weight[:, None], weight[:, None]], 1))
         new = (weight == 0) & (gathered[:, -1] > 0)
         values[new] = gathered[new, :-1] / gathered[new, -1:]
         weight[new] = 1e-3
-    return values, weight > 0
+    return values, weight
 
 
 def coarser(fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray

@@ -21,6 +21,8 @@ from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
 
 COARSE = 2  # voxels of the bands' lattice along a brick's side
 LINE = 16  # floats: the bands begin on a cache line, and a row of them is a whole number of half ones
+MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
+MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
 OCCUPANCY_CELLS = 192  # along the longest axis, at most, unless there are more top cells
 """Bits of a mask: voxel (i, j, k) is bit (i * 4 + j) * 4 + k."""
 
@@ -193,11 +195,13 @@ class SparseField:
         read = *self.kernel_shape, self.arrays, self.grid
         self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
-    def seen(self, rays_o: np.ndarray, rays_d: np.ndarray) -> np.ndarray:
-        """(N, 4, 4, 4) float32, how much each voxel weighs in the pictures of rays (R, 3), summed over them."""
-        weights = np.zeros((torch.get_num_threads(), len(self.tree.mask) * SIDE**3), np.float32)
+    def seen(self, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How much each voxel weighs in the pictures of rays (R, 3), summed over them, (N, 64) float32, and the
+        sum of the directions it is seen along by that weight, (N, 64, 3)."""
+        weights = np.zeros((torch.get_num_threads(), len(self.tree.mask) * SIDE**3 * 4), np.float32)
         self.loops.see(self.arrays, self.grid, rays_o, rays_d, 0.5 * self.voxel_size, 1e-3, weights)
-        return weights.sum(0).reshape(self.tree.mask.shape)
+        found = weights.sum(0).reshape(-1, SIDE**3, 4)
+        return found[..., 0], found[..., 1:]
 
     # -- learning --------------------------------------------------------------------------------------------
 
@@ -292,6 +296,8 @@ class SparseField:
             if found is None or found.shape != expected:
                 have = "nothing" if found is None else list(found.shape)
                 raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
+            if not float(np.abs(found).max(initial=0)) * max(field.scale, MAX_TERMS) <= MAX_ANSWER:
+                raise ValueError(f"array '{name}' holds numbers whose answers would be beyond {MAX_ANSWER:g}")
             view[: lattice.free] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
         field.settle()
         return field

@@ -238,7 +238,7 @@ def query_sparse_point_backward(
 
 @body
 def beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k):
-    """First sample index beyond the empty node of a level around the point of sample k."""
+    """First sample index beyond the node of a level around the point of sample k."""
     side = sparse.top / (1 << level)
     i = math.floor((x - sparse.lo[0]) / side)
     j = math.floor((y - sparse.lo[1]) / side)
@@ -251,12 +251,22 @@ def beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k):
 
 
 @body
+def next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps):
+    """First index after k that is a multiple of a brick's steps or lies beyond the brick."""
+    if steps == 1:
+        return k + 1
+    beyond = beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k)
+    return min((k | (steps - 1)) + 1, beyond)
+
+
+@body
 def render_sparse_ray(
     widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, i, sh, bands, logits, out
 ):
     """Marches, shades and composites ray i in one pass: out[i] is premultiplied rgb, opacity, Σ w t.
 
-    In a brick of level l one sample stands for 2^(finest - l) steps.
+    In a brick of level l one step in 2^(finest - l), counted from the ray's first, is a sample, and stands for as
+    many: which they are does not depend on what was skipped before.
     """
     ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
     dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
@@ -271,10 +281,12 @@ def render_sparse_ray(
         t = t0 + k * step
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         brick, level = brick_at(sparse, x, y, z)
+        steps = 1 << (sparse.finest - level)
         if brick < 0:
             k = beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k)
+        elif k & (steps - 1) != 0:
+            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         else:
-            steps = 1 << (sparse.finest - level)
             first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
             if first >= 0:
                 s = sparse.scale * softplus(feature_at(sparse, brick, first, u, v, w))
@@ -290,14 +302,15 @@ def render_sparse_ray(
                     green += waiting * sigmoid(logits[1])
                     blue += waiting * sigmoid(logits[2])
                     waiting = 0.0
-            k += steps
+            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k)
     out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
 
 
 @body
 def see_sparse_ray(sparse, grid, rays_o, rays_d, step, early_stop, i, seen):
-    """Adds the weight of every sample of ray i to its voxel's place in seen (64 N,)."""
+    """Adds the weight of every sample of ray i, and that times the ray's direction, to its voxel's place in seen
+    (64 N * 4,)."""
     ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
     dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
     t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
@@ -308,10 +321,12 @@ def see_sparse_ray(sparse, grid, rays_o, rays_d, step, early_stop, i, seen):
         t = t0 + k * step
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         brick, level = brick_at(sparse, x, y, z)
+        steps = 1 << (sparse.finest - level)
         if brick < 0:
             k = beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k)
+        elif k & (steps - 1) != 0:
+            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         else:
-            steps = 1 << (sparse.finest - level)
             first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
             if first >= 0:
                 s = sparse.scale * softplus(feature_at(sparse, brick, first, u, v, w))
@@ -319,8 +334,12 @@ def see_sparse_ray(sparse, grid, rays_o, rays_d, step, early_stop, i, seen):
                 trans -= weight
                 n = SIDE + 1
                 voxel = (first // n**2 * SIDE + first // n % n) * SIDE + first % n
-                accumulate(seen, brick * SIDE**3 + voxel, weight)
-            k += steps
+                at = 4 * (brick * SIDE**3 + voxel)
+                accumulate(seen, at, weight)
+                accumulate(seen, at + 1, weight * dx)
+                accumulate(seen, at + 2, weight * dy)
+                accumulate(seen, at + 3, weight * dz)
+            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k)
 
 
@@ -348,10 +367,12 @@ def train_sparse_ray(
         t = t0 + k * step
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         brick, level = brick_at(sparse, x, y, z)
+        steps = 1 << (sparse.finest - level)
         if brick < 0:
             k = beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k)
+        elif k & (steps - 1) != 0:
+            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         else:
-            steps = 1 << (sparse.finest - level)
             first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
             if first >= 0:
                 f = feature_at(sparse, brick, first, u, v, w)
@@ -372,7 +393,7 @@ def train_sparse_ray(
                     carried[count] = waiting
                     waiting = 0.0
                 count += 1
-            k += steps
+            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k)
 
     e_r = red + trans * background[i, 0] - target[i, 0]

@@ -111,7 +111,8 @@ def see_task(sparse, grid, rays_o, rays_d, step, early_stop, low, high, seen):
 
 @loop
 def see(sparse, grid, rays_o, rays_d, step, early_stop, seen):
-    """Which voxels rays see: adds to row p of seen (parts, 64 N) the weights of part p's samples."""
+    """Which voxels rays see: adds to row p of seen (parts, 64 N * 4) what part p's samples weigh, and that times
+    their directions."""
     n = rays_o.shape[0]
     parts = seen.shape[0]
     for p in prange(parts):
