@@ -4,6 +4,7 @@ import time
 from dataclasses import asdict, replace
 
 from fusedrf_cli.bridge.fuse_blocks import blocks_memory, fuse_blocks
+from fusedrf_cli.bridge.fuse_sparse import fuse_sparse, sparse_memory
 from fusedrf_cli.bridge.fuse_vm import fuse_vm, vm_memory
 from fusedrf_cli.bridge.fusing import Asked, make_room, warn_of_detail
 from fusedrf_cli.bridge.memory import Memory
@@ -65,6 +66,9 @@ def fuse(
         if chosen == "blocks":
             whole = blocks_memory(budget, loaded, composed, asked)
             fused = fuse_blocks(composed, asked, whole, place, progress)
+        elif chosen == "sparse":
+            make_room(budget, loaded, *sparse_memory(composed, asked))
+            fused = fuse_sparse(composed, asked, place, progress)
         else:
             make_room(budget, loaded, *vm_memory(composed, asked))
             fused = fuse_vm(loaded, composed, asked, from_scratch, output, resume, place, progress)

@@ -10,7 +10,7 @@ import torch
 from formats.records import BYTES_PER_NUMBER
 from fusedrf_cli.bridge.choose import Choosing, Tried, Way
 from fusedrf_cli.bridge.fusing import Asked, Fused, make_room
-from fusedrf_cli.bridge.memory import FLOAT, RESAMPLING, Memory, learning, lesson, ownership, picture, result
+from fusedrf_cli.bridge.memory import FLOAT, RESAMPLING, Memory, judged, learning, lesson, ownership, result
 from fusedrf_cli.bridge.scene import LoadedScene, stored
 from fusedrf_cli.bridge.sizes import vm_bytes
 from fusedrf_cli.bridge.train import check_size
@@ -224,8 +224,3 @@ def blocks_memory(
         (0.0, learnt),
     )
     return budget.room(learnt) > sum(loaded.sizes) + FLOAT * own
-
-
-def judged() -> dict[str, float]:
-    """Looking at a scene to measure; it covers about half of a picture that frames it."""
-    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)

@@ -161,3 +161,8 @@ def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
 def lesson(rays: int) -> dict[str, float]:
     """Rays to learn from, and what they show."""
     return {"rays to learn from": rays * PER_RAY}
+
+
+def judged() -> dict[str, float]:
+    """Looking at a scene to measure; it covers about half of a picture that frames it."""
+    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)

@@ -10,10 +10,11 @@ from fusedrf_cli import options
 @options.writing("The fused field to write, OUT.rfpack.")
 @click.option(
     "--kind",
-    type=click.Choice(["auto", "vm", "blocks"]),
+    type=click.Choice(["auto", "vm", "blocks", "sparse"]),
     default="auto",
     show_default=True,
-    help="blocks: tensors in their objects' own axes; vm: one distilled tensor; auto: blocks where it can.",
+    help="blocks: tensors in their objects' own axes; vm: one distilled tensor; sparse: bricks of voxels, as "
+    "fine as each place needs; auto: blocks where it can.",
 )
 @options.max_size
 @options.smallest

@@ -67,6 +67,8 @@ class Adam:
                 np.float32(correction1),
                 np.float32(correction2),
             )
+        if hasattr(self.field, "settle"):  # some of its numbers follow from others
+            self.field.settle()
 
     def sound(self) -> bool:
         """Whether the gradients are finite, judged by those of the colour bases (some thousand numbers), or

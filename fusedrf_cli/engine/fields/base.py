@@ -76,6 +76,6 @@ def register(cls: type) -> type:
 
 def field_kinds() -> dict[str, type]:
     """All registered kinds by name."""
-    from fusedrf_cli.engine.fields import vm, vm_mlp  # noqa: F401  (they register themselves)
+    from fusedrf_cli.engine.fields import sparse, vm, vm_mlp  # noqa: F401  (they register themselves)
 
     return dict(_KINDS)

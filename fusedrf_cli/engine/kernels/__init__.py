@@ -23,7 +23,7 @@ def kernel_cache() -> Path:
 
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
-    inlined = [Path(__file__).with_name(f"{name}.py") for name in ("bodies", "prefetch", "items")]
+    inlined = [Path(__file__).with_name(f"{name}.py") for name in ("bodies", "prefetch", "items", "sparse_bodies")]
     bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined)).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = Path(home) / "fusedrf" / "kernels" / bodies
@@ -76,6 +76,17 @@ def loops(device: str) -> ModuleType:
     return cpu
 
 
+def sparse_loops(device: str) -> ModuleType:
+    """As `loops`, those of the `sparse` field."""
+    if device == "cuda":
+        from fusedrf_cli.engine.kernels import sparse_cuda
+
+        return sparse_cuda
+    from fusedrf_cli.engine.kernels import sparse_cpu
+
+    return sparse_cpu
+
+
 def set_threads(count: int) -> None:
     """Use that many cores, at most as many as numba started with."""
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
@@ -109,5 +120,6 @@ __all__ = [
     "kernel_cache",
     "loops",
     "set_threads",
+    "sparse_loops",
     "telling_of_compilation",
 ]

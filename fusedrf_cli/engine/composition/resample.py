@@ -1,0 +1,441 @@
+"""Any field as a sparse one, by asking it at the vertices: no learning.
+
+A place is as fine as the object that is densest there needs in world units, not finer; where all of that is too
+much, all is coarser by one factor.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import sparse
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.bricks import (
+    MAX_TOP_CELLS,
+    OCTANTS,
+    BrickTree,
+    Lattice,
+    children,
+    corner_offsets,
+    key_places,
+    node_keys,
+)
+from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
+from fusedrf_cli.engine.kernels.reference import sh_basis
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+
+DEEPEST = 6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
+FAINT = 1e-5  # optical depth of a voxel under which there is nothing
+LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
+COLOURED = 1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
+LEAST, MOST = -4.0, 20.0  # of the density feature: from far below, a slope would draw surfaces inwards
+DIRECTIONS = 32
+ONE_SIDED = 0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
+LOOKS = 9  # places along a look through the voxels before and behind a vertex
+RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
+LOGITS = 8.0  # colours are told apart up to sigmoid(8)
+AT_ONCE = 1 << 18
+ATTEMPTS = 5
+FULL_ENOUGH = 0.93  # of the numbers allowed
+DILATIONS = 3
+SEEING_RAYS = 600_000
+SEEN = 3e-8  # weight of a voxel in a picture of the scene, at least, to be held
+CORRECTIONS = 3
+
+
+class TooFewNumbers(ValueError):
+    """Not even the widest voxels fit."""
+
+
+class Known(NamedTuple):
+    """What was asked of a teacher at vertices, by ascending keys of their places in units."""
+
+    keys: np.ndarray  # (M,) int64
+    sigma: np.ndarray  # (M,) float64
+    facing: np.ndarray  # (M, 3) mean direction along which a vertex is seen
+
+    def of(self, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+        """σ (V,) and facing (V, 3) of a lattice's vertices, all of them among the known."""
+        at = np.searchsorted(self.keys, node_keys(lattice.vertices))
+        return self.sigma[at], self.facing[at]
+
+
+def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
+    """The teacher as a sparse field in its frame with at most so many numbers. Raises ValueError where the teacher
+    shows nothing, TooFewNumbers where not even the widest voxels fit.
+    """
+    tree, known = fitted(teacher, shape, max_numbers)
+    field = SparseField(shape, Lattice(tree, SIDE), density_scale(tree))
+    fill(field, teacher, known)
+    return field
+
+
+def fitted(
+    teacher: RadianceField, shape: SparseShape, max_numbers: int
+) -> tuple[BrickTree, Known]:
+    """The finest tree found with at most so many numbers, and what is known of its vertices."""
+    own = [p.voxel_size for p in placed_in(teacher)]
+    common, best, tried = 2 * max(own), None, []
+    for _ in range(ATTEMPTS):
+        found = occupied_tree(teacher, common)
+        count = number_count(found[0], shape)
+        tried.append((np.log(common), np.log(count)))
+        if count <= max_numbers and (best is None or common < best[0]):
+            best = common, found
+        if count <= max_numbers and (common <= min(own) or count >= FULL_ENOUGH * max_numbers):
+            break
+        slope = -1.5
+        if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
+            slope = min(-0.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
+        wanted = tried[-1][0] + (np.log(0.97 * max_numbers) - tried[-1][1]) / slope
+        common = float(np.exp(np.clip(wanted, np.log(min(own)), tried[-1][0] + 2)))
+    if best is None:
+        raise TooFewNumbers(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
+    return best[1]
+
+
+def number_count(tree: BrickTree, shape: SparseShape) -> int:
+    """Numbers of a sparse field over a tree."""
+    count = 4 * Lattice(tree, SIDE).free
+    return count + (shape.band_numbers * Lattice(tree, COARSE).free if shape.sh_degree else 0)
+
+
+# -- where ---------------------------------------------------------------------------------------------------
+
+
+def placed_in(teacher: RadianceField) -> list[Placed]:
+    """The placed fields of a composed one; any other field by itself."""
+    return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
+
+
+def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, tuple, list[int]]:
+    """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should be no
+    finer than each placed field's own, nor than the geometric mean of that and a common one.
+
+    With an error that grows as the square of the voxel over a field's own, and numbers that fall with its square,
+    the mean is what gives the least error for the numbers.
+    """
+    own = np.array([p.voxel_size for p in placed_in(teacher)])
+    needs = np.sqrt(own * np.maximum(own, common))
+    depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
+    top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
+    box = teacher.occupancy.tight_aabb(0)
+    while True:
+        counts = np.maximum(np.ceil((box[3:] - box[:3]) / top + 0.5), 1).astype(int)
+        if np.prod(counts) <= MAX_TOP_CELLS // 4 or depth == DEEPEST + 1:
+            break
+        depth, top = depth + 1, 2 * top
+    lo = (box[:3] + box[3:] - top * counts) / 2
+    levels = np.clip(np.round(np.log2(top / (SIDE * needs))), 0, depth).astype(int)
+    return lo, float(top), tuple(counts), [int(level) for level in levels]
+
+
+def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, Known]:
+    """The tree whose active voxels hold all matter that shows, and what is known of its vertices."""
+    lo, top, counts, levels = frame_of(teacher, common)
+    wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
+    for placed, level in zip(placed_in(teacher), levels, strict=True):
+        wanted[level].append(demanded(teacher, placed, level, lo, top, counts))
+    level, at = leaves([np.unique(np.concatenate(w)) if w else np.zeros(0, np.int64) for w in wanted])
+    whole = BrickTree.of(lo, top, counts, level, at, np.ones((len(level), SIDE, SIDE, SIDE), bool))
+    lattice = Lattice(whole, SIDE)
+    sigma = density(teacher, lattice.places)
+    depth = sigma * lattice.finest_voxel
+    matter = depth > harmless(depth, lattice)
+    if not matter.any():
+        raise ValueError("the scene shows nothing")
+    weight, facing = looked_at(lattice, sigma, teacher)
+    mask = matter[lattice.corners].any(1).reshape(-1, SIDE**3) & (weight > SEEN * SEEING_RAYS)
+    kept = mask.any(1)
+    tree = BrickTree.of(lo, top, counts, whole.level[kept], whole.at[kept], mask[kept].reshape(-1, SIDE, SIDE, SIDE))
+    keys = node_keys(lattice.vertices >> (whole.depth - tree.depth))
+    order = np.argsort(keys)
+    return tree, Known(keys[order], sigma[order], around(lattice, facing, weight)[order])
+
+
+def looked_at(
+    lattice: Lattice, sigma: np.ndarray, teacher: RadianceField
+) -> tuple[np.ndarray, np.ndarray]:
+    """`SparseField.seen` of densities (V,) for rays from outside at the whole and at the placed fields."""
+    field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree))
+    set_density(field, sigma)
+    boxes = [teacher.occupancy.tight_aabb(0), *sorted((p.aabb for p in placed_in(teacher)), key=list)]
+    return field.seen(*random_rays(boxes, SEEING_RAYS, torch.Generator().manual_seed(0)))
+
+
+def around(lattice: Lattice, facing: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(V, 3) mean direction, by weight, along which the voxels around each vertex are seen: of length 1 where it
+    is seen from one side alone, 0 where from all or never."""
+    told = np.concatenate([facing.reshape(-1, 3), weight.reshape(-1, 1)], 1)[lattice.active.ravel()]
+    summed = touching(lattice).T @ told
+    return summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
+
+
+def touching(lattice: Lattice) -> sparse.csr_matrix:
+    """(K, V) ones where an active voxel has a vertex as a corner."""
+    count = len(lattice.corners)
+    start = np.arange(0, 8 * count + 1, 8)
+    return sparse.csr_matrix(
+        (np.ones(8 * count, np.float32), lattice.corners.ravel(), start), (count, len(lattice.vertices))
+    )
+
+
+def demanded(
+    teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: float, counts: tuple
+) -> np.ndarray:
+    """Keys of the bricks of a level at one of whose vertices the placed field is the densest there is."""
+    side = top / 2**level
+    bricks = touched(placed, side, lo, np.asarray(counts) << level)
+    n = SIDE + 1
+    inner = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    keys, inverse = np.unique(node_keys((bricks[:, None] * SIDE + inner).reshape(-1, 3)), return_inverse=True)
+    places = lo + key_places(keys) * (side / SIDE)
+    own = density(placed, places)
+    dense = own * side / SIDE > FAINT
+    for other in placed_in(teacher):
+        beside = dense & (places >= other.aabb[:3]).all(1) & (places <= other.aabb[3:]).all(1)
+        if other is not placed and beside.any():
+            dense[beside] = own[beside] >= density(other, places[beside])
+    kept = dense[inverse].reshape(-1, n**3).any(1)
+    return node_keys(bricks[kept])
+
+
+def touched(placed: Placed, side: float, lo: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(M, 3) the bricks of a side that the occupied cells of a placed field reach, and a voxel around them."""
+    grid, matrix = placed.field.occupancy, placed.object_to_world
+    stretch = np.linalg.norm(matrix[:3, :3], axis=0)
+    margin = side / SIDE / np.maximum(stretch, 1e-30)
+    steps = np.ceil((grid.cell + 2 * margin) * stretch / (0.7 * side)).astype(int) + 1
+    spots = [np.linspace(-m, c + m, s) for m, c, s in zip(margin, grid.cell, steps, strict=True)]
+    inner = np.stack(np.meshgrid(*spots, indexing="ij"), -1).reshape(-1, 3) @ matrix[:3, :3].T
+    corners = (grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell) @ matrix[:3, :3].T + matrix[:3, 3]
+    first = np.clip(np.floor((placed.aabb[:3] - lo) / side).astype(int) - 1, 0, counts - 1)
+    last = np.clip(np.floor((placed.aabb[3:] - lo) / side).astype(int) + 1, 0, counts - 1)
+    found = np.zeros(last - first + 1, bool)
+    start = ((corners - lo) / side - first).astype(np.float32)
+    fewer, more = sorted((start, (inner / side).astype(np.float32)), key=len)
+    for part in pieces(len(more), AT_ONCE):
+        for offset in fewer:
+            index = np.clip((more[part] + offset).astype(np.int32), 0, last - first)
+            found[index[:, 0], index[:, 1], index[:, 2]] = True
+    return np.argwhere(found) + first
+
+
+def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """(level (N,), place (N, 3)) of the leaves of the tree in which every wanted brick (keys by level) is held at
+    its level or a finer one: where a finer brick lies inside, the rest of the wanted one is split around it."""
+    finer = [
+        np.unique(
+            np.concatenate(
+                [np.zeros(0, np.int64)]
+                + [node_keys(key_places(keys) >> (deep - level)) for deep, keys in enumerate(wanted) if deep > level]
+            )
+        )
+        for level in range(len(wanted))
+    ]
+    levels, places = [], []
+    nodes = np.union1d(wanted[0], finer[0])
+    covered = np.isin(nodes, wanted[0])
+    for level in range(len(wanted)):
+        covered = covered | np.isin(nodes, wanted[level])
+        split = np.isin(nodes, finer[level])
+        leaf = covered & ~split
+        places.append(key_places(nodes[leaf]))
+        levels.append(np.full(len(places[-1]), level, np.uint8))
+        nodes, covered = node_keys(children(key_places(nodes[split]))), np.repeat(covered[split], 8)
+    return np.concatenate(levels), np.concatenate(places)
+
+
+def harmless(depth: np.ndarray, lattice: Lattice) -> float:
+    """The largest optical depth of a voxel up to which vertices may be left out without any axis-parallel line of
+    them losing more than LOST_DEPTH: thin fog is no emptiness."""
+    lines = []
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        line = lattice.vertices[:, a] << 21 | lattice.vertices[:, b]
+        lines.append(np.unique(line, return_inverse=True)[1])
+    for threshold in LOST_DEPTH * 0.25 ** np.arange(12):
+        lost = np.where(depth <= threshold, depth, 0)
+        if max(np.bincount(line, lost).max() for line in lines) <= LOST_DEPTH:
+            return float(threshold)
+    return 0.0
+
+
+# -- what ----------------------------------------------------------------------------------------------------
+
+
+def density(source, places: np.ndarray) -> np.ndarray:
+    """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends on
+    the direction."""
+    parts = [source] if isinstance(source, Placed) else placed_in(source)
+    stretched = any(p.condition > 1 + 1e-6 for p in parts)
+    found = np.zeros(len(places))
+    axes = np.eye(3)[: 3 if stretched else 1]
+    for part in pieces(len(places), AT_ONCE):
+        points = torch.from_numpy(places[part])
+        for axis in axes:
+            dirs = torch.from_numpy(np.broadcast_to(axis, points.shape).copy())
+            if isinstance(source, Placed):
+                x, d, stretch = source.to_object(points, dirs)
+                sigma = source.field.query(x, d, False)[0].double() * stretch
+            else:
+                sigma = source.query(points, dirs, False)[0].double()
+            found[part] += sigma.numpy() / len(axes)
+    return found
+
+
+def fill(field: SparseField, teacher: RadianceField, known: Known) -> None:
+    """Give the vertices what the teacher says there."""
+    fine, degree = field.fine, field.shape.sh_degree
+    sigma, facing = known.of(fine)
+    set_density(field, sigma)
+    places, weight = shown(teacher, fine, sigma, facing)
+    coefficients = np.zeros((len(sigma), 3, field.shape.coefficients), np.float32)
+    asked = np.flatnonzero(weight > COLOURED)
+    coefficients[asked] = colours(teacher, places[asked], facing[asked], degree)
+    weight[weight <= COLOURED] = 0
+    field.rows[:, 1:] = torch.from_numpy(dilated(fine, coefficients[..., 0], weight)[0])
+    if field.coarse:
+        bands, held = coarser(fine, field.coarse, coefficients[..., 1:].reshape(len(sigma), -1), weight)
+        field.bands[:] = torch.from_numpy(dilated(field.coarse, bands, held)[0])
+    field.settle()
+
+
+def shown(
+    teacher: RadianceField, lattice: Lattice, sigma: np.ndarray, facing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each vertex's colour is to be asked (V, 3), and by how much that can be seen (V,).
+
+    What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour from
+    where a look along its facing, from a voxel before it to a voxel behind, ends.
+    """
+    places, size = lattice.places.copy(), lattice.finest_voxel
+    weight = -np.expm1(-sigma * size)
+    length = np.linalg.norm(facing, axis=1)
+    one_sided = np.flatnonzero(length > ONE_SIDED)
+    along = facing[one_sided] / length[one_sided, None] * size[one_sided, None]
+    spots = np.linspace(-1, 1, LOOKS)
+    trans, best = np.ones(len(one_sided)), np.zeros(len(one_sided))
+    end = np.zeros(len(one_sided))
+    for spot in spots:
+        depth = density(teacher, places[one_sided] + spot * along) * size[one_sided] * (spots[1] - spots[0])
+        found = -trans * np.expm1(-depth)
+        trans *= np.exp(-depth)
+        end = np.where(found > best, spot, end)
+        best = np.maximum(best, found)
+    places[one_sided] += end[:, None] * along
+    weight[one_sided] = 1 - trans
+    return places, weight
+
+
+def density_scale(tree: BrickTree) -> float:
+    """σ of a feature of 1, about: an optical depth of 1 in the widest voxel."""
+    return SIDE / (tree.top / 2 ** int(tree.level.min()))
+
+
+def set_density(field: SparseField, sigma: np.ndarray) -> None:
+    """Give the vertices densities (V,), as far as the feature's range goes."""
+    with np.errstate(divide="ignore"):
+        feature = inverse_softplus(sigma / field.scale)
+    field.rows[:, 0] = torch.from_numpy(np.clip(feature, LEAST, MOST))
+    field.settle()
+
+
+def inverse_softplus(y: np.ndarray) -> np.ndarray:
+    """f with log(1 + e^f) = y; -inf at 0."""
+    return np.where(y > 15, y, np.log(np.expm1(np.minimum(y, 15))))
+
+
+def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
+    """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3), by least
+    squares over the directions along which they are seen (facing (N, 3), as `around` has it).
+
+    What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit is
+    exact, however the teacher is turned, but for what ONE_SIDED leaves.
+    """
+    dirs = even_directions(DIRECTIONS)
+    basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
+    found = np.empty((len(places), 3, len(basis[0])), np.float32)
+    one_sided = np.linalg.norm(facing, axis=1) > ONE_SIDED
+    side = np.where(one_sided, (facing @ dirs.T).argmax(1), len(dirs))
+    for group in np.unique(side):
+        counts = np.ones(len(dirs)) if group == len(dirs) else np.maximum(dirs @ dirs[group], 0)
+        asked = np.flatnonzero(counts > 0.1)
+        weighted = basis[asked] * counts[asked, None]
+        ridge = RIDGE * np.diag([0.0] + [1.0] * (len(basis[0]) - 1))
+        solve = np.linalg.solve(weighted.T @ basis[asked] + ridge, weighted.T)
+        own = np.flatnonzero(side == group)
+        for part in pieces(len(own), AT_ONCE // len(asked)):
+            points = np.repeat(places[own[part]], len(asked), 0)
+            along = np.tile(dirs[asked], (len(points) // len(asked), 1))
+            rgb = teacher.query(torch.from_numpy(points), torch.from_numpy(along))[1].double().numpy()
+            edge = 1 / (1 + np.exp(LOGITS))
+            rgb = np.clip(rgb, edge, 1 - edge)
+            logits = np.log(rgb / (1 - rgb)).reshape(-1, len(asked), 3)
+            found[own[part]] = np.einsum("kd,ndc->nck", solve, logits)
+    return found
+
+
+def even_directions(count: int) -> np.ndarray:
+    """(count, 3) unit directions, evenly spread along a spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.arange(count) * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
+
+
+def dilated(lattice: Lattice, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (V, D) where their weight (V,) is 0 from the vertices around, step by step; and the weights
+    (V,) then."""
+    touches = touching(lattice)
+    values, weight = values.astype(np.float32).copy(), weight.astype(np.float32)
+    for _ in range(DILATIONS):
+        gathered = touches.T @ (touches @ np.concatenate([values * weight[:, None], weight[:, None]], 1))
+        new = (weight == 0) & (gathered[:, -1] > 0)
+        values[new] = gathered[new, :-1] / gathered[new, -1:]
+        weight[new] = 1e-3
+    return values, weight
+
+
+def coarser(fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(W, D) values of the coarse vertices whose interpolation comes near to values (V, D) of the fine ones, where
+    these have a weight (V,), and their own weights (W,)."""
+    matrix = interpolation(fine, coarse)
+    weighted = matrix.T @ sparse.diags(weight.astype(np.float32))
+    total = np.asarray(weighted.sum(1)).ravel()
+    values = values.astype(np.float32)
+    share = (1 / np.maximum(total, 1e-12))[:, None].astype(np.float32)
+    found = share * (weighted @ values)
+    for _ in range(CORRECTIONS):
+        found += share * (weighted @ (values - matrix @ found))
+    return found, total
+
+
+def interpolation(fine: Lattice, coarse: Lattice) -> sparse.csr_matrix:
+    """(V, W) weights of the coarse vertices at the fine ones, both over one tree."""
+    n, m = SIDE + 1, COARSE
+    at = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3) * m / SIDE
+    voxel = np.minimum(at.astype(int), m - 1)
+    share = at - voxel
+    weights = np.where(OCTANTS == 1, share[:, None], 1 - share[:, None]).prod(2)
+    first = (voxel[:, 0] * (m + 1) + voxel[:, 1]) * (m + 1) + voxel[:, 2]
+    inner = first[:, None] + corner_offsets(m)
+    row, first = np.unique(fine.rows, return_index=True)  # every vertex by the first brick that has it
+    row, first = row[row >= 0], first[row >= 0]
+    brick, vertex = np.divmod(first, n**3)
+    columns, data = coarse.rows[brick[:, None], inner[vertex]], weights[vertex]
+    kept = (columns >= 0) & (data > 0)
+    return sparse.csr_matrix(
+        (data[kept].astype(np.float32), (np.broadcast_to(row[:, None], kept.shape)[kept], columns[kept])),
+        (len(fine.vertices), len(coarse.vertices)),
+    )
+
+
+def pieces(count: int, size: int) -> Iterator[slice]:
+    """Slices of at most a size that cover 0 to count."""
+    for start in range(0, count, size):
+        yield slice(start, min(count, start + size))

@@ -1,0 +1,360 @@
+"""Where a sparse field's numbers are: a tree of bricks, and lattices of vertices over it.
+
+The box is cut into cubic *top cells*. A node of level l is 2^-l top cells wide; it is empty, a brick of 4 x 4 x 4
+voxels, or split into eight nodes. Vertices are counted in *units*, voxel sides of the finest level, so that
+neighbours know each other's vertices whatever their levels.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import sparse
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+
+MAX_LEVEL = 7
+MAX_TOP_CELLS = 1 << 22
+MAX_ENTRIES = 1 << 26  # of all top cells' tables: 256 MB
+MAX_BRICKS = 1 << 22
+OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+EMPTY, BRICK, SPLIT = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class BrickTree:
+    """Bricks of several levels in a box, ordered by level, then as a walk through the tree meets them."""
+
+    lo: np.ndarray
+    """(3,) float64 lower corner of the box."""
+    top: float
+    """Side of a top cell, in units of the frame."""
+    counts: tuple[int, int, int]
+    """Top cells per axis."""
+    level: np.ndarray
+    """(N,) uint8."""
+    at: np.ndarray
+    """(N, 3) int64, lower corner of each brick in bricks of its level."""
+    mask: np.ndarray
+    """(N, 4, 4, 4) bool, the voxels that are active."""
+
+    @classmethod
+    def of(cls, lo, top: float, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
+        """The tree of bricks in any order, none inside another. Raises ValueError where there are too many."""
+        key = walk_order(level, at, counts)
+        order = np.lexsort((key, level))
+        return cls(np.asarray(lo, np.float64), float(top), tuple(int(n) for n in counts), level[order], at[order], mask[order])
+
+    @property
+    def depth(self) -> int:
+        """The finest level that there is."""
+        return int(self.level.max(initial=0))
+
+    @property
+    def aabb(self) -> np.ndarray:
+        """(6,) the box."""
+        return np.concatenate([self.lo, self.lo + self.top * np.asarray(self.counts)])
+
+    @property
+    def unit(self) -> float:
+        """Side of a voxel of the finest level."""
+        return self.top / (SIDE << self.depth)
+
+    @cached_property
+    def codes(self) -> tuple[np.ndarray, ...]:
+        """By level: EMPTY, BRICK or SPLIT of every node, (M,) uint8, in the order of the walk, and where it is,
+        (M, 3) int64."""
+        found, nodes = [], np.argwhere(np.ones(self.counts, bool))
+        for level in range(self.depth + 1):
+            own = node_keys(self.at[self.level == level])
+            finer = [
+                node_keys(self.at[self.level == deep] >> (deep - level)) for deep in range(level + 1, self.depth + 1)
+            ]
+            keys = node_keys(nodes)
+            code = np.where(np.isin(keys, own), BRICK, EMPTY)
+            if finer:
+                code = np.where(np.isin(keys, np.unique(np.concatenate(finer))), SPLIT, code)
+            found.append((code.astype(np.uint8), nodes))
+            nodes = children(nodes[code == SPLIT])
+        return tuple(found)
+
+    def packed(self) -> tuple[np.ndarray, np.ndarray]:
+        """(bytes of the nodes' codes, two bits each, and of the masks, eight per brick)."""
+        code = np.concatenate([code for code, _ in self.codes])
+        bits = np.stack([code >> 1, code & 1], 1)
+        return np.packbits(bits), np.packbits(self.mask.reshape(-1, SIDE**3), axis=1).ravel()
+
+    @classmethod
+    def unpacked(cls, lo, top: float, counts, nodes: np.ndarray, masks: np.ndarray) -> "BrickTree":
+        """Inverse of `packed`. Whatever the bytes, nothing is made that is not in proportion to them; ValueError
+        where they are no tree."""
+        if 4 * len(nodes) < np.prod(counts):
+            raise ValueError(f"array 'nodes' should tell of {np.prod(counts)} top cells, found {len(nodes)} bytes")
+        code = np.unpackbits(nodes).reshape(-1, 4, 2)
+        code = (code[..., 0] * 2 + code[..., 1]).ravel()
+        here, start, levels, places = np.argwhere(np.ones(counts, bool)), 0, [], []
+        for level in range(MAX_LEVEL + 2):
+            own = code[start : start + len(here)]
+            if len(own) < len(here) or (own > SPLIT).any() or (level > MAX_LEVEL and len(here)):
+                raise ValueError("array 'nodes' is no tree of bricks")
+            start += len(here)
+            places.append(here[own == BRICK])
+            levels.append(np.full(len(places[-1]), level, np.uint8))
+            here = children(here[own == SPLIT])
+            if not len(here):
+                break
+        if -(-start // 4) != len(nodes) or code[start:].any():
+            raise ValueError(f"array 'nodes' should have {-(-start // 4)} bytes, found {len(nodes)}")
+        level, at = np.concatenate(levels), np.concatenate(places)
+        if masks.shape != (8 * len(level),):
+            raise ValueError(f"array 'masks' should have shape {[8 * len(level)]}, found {list(masks.shape)}")
+        mask = np.unpackbits(masks).reshape(-1, SIDE, SIDE, SIDE).astype(bool)
+        return cls(np.asarray(lo, np.float64), float(top), tuple(counts), level, at, mask)
+
+    @cached_property
+    def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as SparseArrays has them. Raises
+        ValueError where they would be too large."""
+        depth = np.zeros(self.counts, np.uint8)
+        held = np.zeros(self.counts, bool)
+        for level in range(self.depth + 1):
+            cell = tuple((self.at[self.level == level] >> level).T)
+            depth[cell], held[cell] = level, True
+        sizes = np.where(held, 1 << (3 * depth.astype(np.int64)), 0)
+        if sizes.sum() > MAX_ENTRIES:
+            raise ValueError(f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {MAX_ENTRIES:,}")
+        offset = np.where(held, (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape), -1)
+        table = np.empty(int(sizes.sum()), np.int32)
+        for level, (code, nodes) in enumerate(self.codes):
+            bare = nodes[code == EMPTY]
+            fill_cubes(table, offset, depth, level, bare, np.full(len(bare), -1 - level, np.int32))
+            own = np.flatnonzero(self.level == level).astype(np.int32)
+            fill_cubes(table, offset, depth, level, self.at[own], own)
+        return offset, depth, table
+
+    def voxels_at(self, halves: np.ndarray, n: int, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3) int64
+        given in odd halves of a unit."""
+        offset, depth, table = self.tables
+        span = 2 * SIDE << self.depth
+        cell = halves // span
+        inside = ((cell >= 0) & (cell < np.asarray(self.counts))).all(1)
+        cell = np.where(inside[:, None], cell, 0)
+        start, deep = offset[tuple(cell.T)], depth[tuple(cell.T)].astype(np.int64)
+        inside &= start >= 0
+        entry = ((halves - cell * span) << deep[:, None]) // span
+        entry = (entry[:, 0] << 2 * deep) + (entry[:, 1] << deep) + entry[:, 2] + start
+        brick = np.where(inside, table[np.where(inside, entry, 0)], -1)
+        held = brick >= 0
+        safe = np.where(held, brick, 0)
+        side = span >> self.level[safe].astype(np.int64)
+        voxel = (halves - self.at[safe] * side[:, None]) * n // side[:, None]
+        voxel = np.where(held[:, None], voxel, 0)
+        voxel = (voxel[:, 0] * n + voxel[:, 1]) * n + voxel[:, 2]
+        return np.where(held, brick, -1), voxel, held & active[safe, voxel]
+
+    def occupancy(self, longest: int) -> OccupancyGrid:
+        """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of them
+        lie along an axis."""
+        fine = max(s for s in range(3) if s == 0 or max(self.counts) << s <= longest)
+        occupied = np.zeros(tuple(n << fine for n in self.counts), bool)
+        for level in range(self.depth + 1):
+            own = self.level == level
+            brick, *inner = np.nonzero(self.mask[own])
+            # a cell is at least a voxel of level 0 wide, so a voxel lies in one of them
+            voxel = self.at[own][brick] * SIDE + np.stack(inner, 1)
+            occupied[tuple((voxel >> (level + 2 - fine)).T)] = True
+        return OccupancyGrid(self.aabb, occupied)
+
+
+class Lattice:
+    """The vertices of a tree's voxels, with n of these along a brick's side: 4, or 2 or 1 of wider ones.
+
+    A vertex that lies on an edge or a face of a wider voxel without being its corner *hangs*: its numbers are
+    that voxel's, interpolated, so that neighbouring levels join without a crack. Rows are those of the free
+    vertices, in the order in which bricks need them, and behind them those of the hanging ones.
+    """
+
+    def __init__(self, tree: BrickTree, n: int):
+        """Raises ValueError where the tree is too large."""
+        self.tree, self.n = tree, n
+        m = SIDE // n
+        wide = tree.mask.reshape(-1, n, m, n, m, n, m).any((2, 4, 6))
+        self.active = wide.reshape(-1, n**3)
+        used = np.zeros((len(wide), n + 1, n + 1, n + 1), bool)
+        for a, b, c in OCTANTS:
+            used[:, a : a + n, b : b + n, c : c + n] |= wide
+        self.used = used.reshape(-1, (n + 1) ** 3)
+        keys, first, inverse = np.unique(self._keys(), return_index=True, return_inverse=True)
+        vertices = key_places(keys)
+        hanging, parents = self._constraints(vertices)
+        rank = np.empty(len(keys), np.int64)
+        rank[np.lexsort((first, hanging))] = np.arange(len(keys))
+        self.free = int(np.count_nonzero(~hanging))
+        self.rows = np.full(self.used.shape, -1, np.int32)
+        self.rows[self.used] = rank[inverse]
+        self.vertices = np.empty_like(vertices)
+        """(V, 3) int64 in units of the tree, free ones first."""
+        self.vertices[rank] = vertices
+        self.spread = self._spread(keys, rank, hanging, parents)
+
+    @property
+    def width(self) -> np.ndarray:
+        """(N,) int64 side of the bricks' voxels, in units."""
+        return (SIDE // self.n) << (self.tree.depth - self.tree.level.astype(np.int64))
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """(V, 3) float64 vertices in the frame of the tree."""
+        return self.tree.lo + self.vertices * self.tree.unit
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """(K, 8) int32 rows of every active voxel's corners, bricks in order."""
+        n = self.n
+        brick, voxel = np.nonzero(self.active)
+        i, j, k = voxel // n**2, voxel // n % n, voxel % n
+        first = (i * (n + 1) + j) * (n + 1) + k
+        return self.rows[brick[:, None], first[:, None] + corner_offsets(n)]
+
+    @cached_property
+    def finest_voxel(self) -> np.ndarray:
+        """(V,) float64 side of the smallest voxel around each vertex, in the tree's frame."""
+        brick = np.broadcast_to(self.width[:, None], self.used.shape)[self.used]
+        found = np.full(len(self.vertices), np.iinfo(np.int64).max)
+        np.minimum.at(found, self.rows[self.used], brick)
+        return found * self.tree.unit
+
+    @cached_property
+    def spreading(self) -> tuple[np.ndarray, ...]:
+        """(start, source, weight, target) as `sums_of_rows` takes them: hanging rows from free ones."""
+        return (*csr(self.spread), np.arange(self.free, len(self.vertices)))
+
+    @cached_property
+    def gathering(self) -> tuple[np.ndarray, ...]:
+        """The adjoint of `spreading`: what free rows gain from hanging ones."""
+        start, source, weight = csr(self.spread.T)
+        target = np.flatnonzero(np.diff(start))
+        return np.append(start[target], start[-1]), source + self.free, weight, target
+
+    def _keys(self) -> np.ndarray:
+        """Keys of all used vertices, brick by brick."""
+        brick, vertex = np.nonzero(self.used)
+        n = self.n + 1
+        inner = np.stack([vertex // n**2, vertex // n % n, vertex % n], 1)
+        width = self.width[brick][:, None]
+        return node_keys((self.tree.at[brick] * self.n + inner) * width)
+
+    def _constraints(self, vertices: np.ndarray) -> tuple[np.ndarray, tuple]:
+        """(V,) bool which vertices hang, and of those (rows' keys (H, 8), weights (H, 8)) of what they hang on."""
+        tree, n = self.tree, self.n
+        hanging = np.zeros(len(vertices), bool)
+        nothing = np.zeros((0, 8), np.int64), np.zeros((0, 8))
+        if len(np.unique(tree.level)) < 2:
+            return hanging, nothing
+        tried = np.flatnonzero(self._beside_wider(vertices))
+        widest = np.zeros(len(tried), np.int64)
+        holder = np.zeros((2, len(tried)), np.int64)
+        for octant in OCTANTS:
+            brick, voxel, active = tree.voxels_at(2 * vertices[tried] + 2 * octant - 1, n, self.active)
+            width = np.where(active, self.width[brick], 0)
+            wider = width > widest
+            widest = np.where(wider, width, widest)
+            holder = np.where(wider, [brick, voxel], holder)
+        base = tree.at[holder[0]] * (n * widest)[:, None]
+        voxel = np.stack([holder[1] // n**2, holder[1] // n % n, holder[1] % n], 1)
+        low = base + voxel * widest[:, None]
+        share = (vertices[tried] - low) / np.maximum(widest, 1)[:, None]
+        hangs = ((share > 0) & (share < 1)).any(1)
+        hanging[tried[hangs]] = True
+        low, share, wide = low[hangs], share[hangs], widest[hangs]
+        corners = low[:, None] + OCTANTS * wide[:, None, None]
+        weights = np.where(OCTANTS == 1, share[:, None], 1 - share[:, None]).prod(2)
+        return hanging, (node_keys(corners.reshape(-1, 3)).reshape(-1, 8), weights)
+
+    def _beside_wider(self, vertices: np.ndarray) -> np.ndarray:
+        """(V,) bool, which vertices belong to bricks beside, or at a corner of, one of a coarser level."""
+        tree = self.tree
+        span = 2 * SIDE << (tree.depth - tree.level.astype(np.int64))
+        everywhere = np.ones((len(tree.level), 1), bool)
+        found = np.zeros(len(tree.level), bool)
+        for step in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
+            beside = tree.at * span[:, None] + span[:, None] // 2 + step * span[:, None]
+            brick, _, _ = tree.voxels_at(beside, 1, everywhere)
+            found |= (brick >= 0) & (tree.level[brick] < tree.level)
+        keys = self._keys()[np.repeat(found, self.used.sum(1))]
+        return np.isin(node_keys(vertices), keys)
+
+    def _spread(self, known: np.ndarray, rank: np.ndarray, hanging: np.ndarray, parents: tuple) -> sparse.csr_matrix:
+        """(H, F) weights by which hanging rows follow from free ones."""
+        keys, weights = parents
+        count, free = len(rank), self.free
+        if not len(keys):
+            return sparse.csr_matrix((0, free))
+        wanted, kept = keys[weights > 0], np.nonzero(weights > 0)[0]
+        found = rank[np.searchsorted(known, wanted)]
+        own = rank[hanging] - free
+        whole = sparse.csr_matrix((weights[weights > 0], (own[kept], found)), shape=(count - free, count))
+        direct, through = whole[:, :free], whole[:, free:]
+        total, step = direct, direct
+        while (step := through @ step).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
+            total = total + step
+        return total.tocsr()
+
+
+def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(start, source, weight) of a sparse matrix, row by row."""
+    rows = matrix.tocsr()
+    return rows.indptr.astype(np.int64), rows.indices.astype(np.int64), rows.data
+
+
+def corner_offsets(n: int) -> np.ndarray:
+    """(8,) offsets of a voxel's corners from its first in a brick of n voxels a side, as `corner` of
+    sparse_bodies.py."""
+    return (OCTANTS * [(n + 1) ** 2, n + 1, 1]).sum(1)
+
+
+def children(nodes: np.ndarray) -> np.ndarray:
+    """(8 M, 3) the eight nodes that each of (M, 3) is split into."""
+    return (2 * nodes[:, None] + OCTANTS).reshape(-1, 3)
+
+
+def node_keys(places: np.ndarray) -> np.ndarray:
+    """(M,) one int64 for each of (M, 3) whole numbers from 0 to 2^21 - 1, in their order."""
+    return (places[:, 0] << 42) | (places[:, 1] << 21) | places[:, 2]
+
+
+def key_places(keys: np.ndarray) -> np.ndarray:
+    """Inverse of `node_keys`."""
+    low = (1 << 21) - 1
+    return np.stack([keys >> 42, keys >> 21 & low, keys & low], 1)
+
+
+def walk_order(level: np.ndarray, at: np.ndarray, counts) -> np.ndarray:
+    """(N,) int64 that sorts nodes of one level as a walk through the tree, all levels at once, meets them."""
+    cell = at >> level[:, None].astype(np.int64)
+    key = (cell[:, 0] * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
+    for bit in range(MAX_LEVEL - 1, -1, -1):
+        below = level > bit
+        digit = (at >> bit) & 1
+        key = np.where(below, key * 8 + digit @ [4, 2, 1], key)
+    return key
+
+
+def fill_cubes(
+    table: np.ndarray, offset: np.ndarray, depth: np.ndarray, level: int, nodes: np.ndarray, values: np.ndarray
+) -> None:
+    """Write values (M,) into the entries that nodes (M, 3) of a level cover, in those top cells that have a
+    table."""
+    cell = nodes >> level
+    start, deep = offset[tuple(cell.T)], depth[tuple(cell.T)].astype(np.int64)
+    for finer in range(MAX_LEVEL - level + 1):
+        own = (start >= 0) & (deep == level + finer)
+        if own.any():
+            a, b, c = ((nodes[own] - (cell[own] << level)) << finer).T
+            side = np.arange(1 << finer)
+            n = 1 << (level + finer)
+            entry = ((a[:, None] + side) * n)[:, :, None] + (b[:, None] + side)[:, None, :]
+            entry = (entry * n)[..., None] + (c[:, None] + side)[:, None, None, :]
+            table[entry + start[own][:, None, None, None]] = values[own][:, None, None, None]

@@ -1,0 +1,101 @@
+"""Trees of bricks and the lattices over them: packing, indices against slow loops, vertices that hang."""
+
+import numpy as np
+import pytest
+
+from fusedrf_cli.engine.fields.bricks import BrickTree, Lattice, children, key_places, node_keys
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from tests.engine.fields.sparse_cases import random_tree
+
+
+def test_keys_keep_places_and_their_order(rng):
+    places = rng.integers(0, 1 << 21, (200, 3))
+    np.testing.assert_array_equal(key_places(node_keys(places)), places)
+    order = np.lexsort((places[:, 2], places[:, 1], places[:, 0]))
+    np.testing.assert_array_equal(np.argsort(node_keys(places)), order)
+
+
+@pytest.mark.parametrize("depth", [0, 1, 3])
+def test_packed_and_unpacked_it_is_the_same(depth):
+    tree = random_tree(depth)
+    again = BrickTree.unpacked(tree.lo, tree.top, tree.counts, *tree.packed())
+    for name in ("level", "at", "mask"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(tree, name))
+    assert again.depth == depth
+
+
+def test_bricks_of_any_order_make_the_same_tree(rng):
+    tree = random_tree(2)
+    order = rng.permutation(len(tree.level))
+    again = BrickTree.of(tree.lo, tree.top, tree.counts, tree.level[order], tree.at[order], tree.mask[order])
+    np.testing.assert_array_equal(again.at, tree.at)
+
+
+@pytest.mark.parametrize("what", ["nodes", "masks"])
+def test_bytes_that_are_no_tree_are_refused(what):
+    tree = random_tree(2)
+    nodes, masks = tree.packed()
+    for bad in (nodes[:-1], np.append(nodes, 0).astype(np.uint8), np.full_like(nodes, 255), np.full_like(nodes, 170)):
+        with pytest.raises(ValueError, match="nodes"):
+            BrickTree.unpacked(tree.lo, tree.top, tree.counts, bad, masks)
+    with pytest.raises(ValueError, match="masks"):
+        BrickTree.unpacked(tree.lo, tree.top, tree.counts, nodes, masks[:-8])
+
+
+@pytest.mark.parametrize("n", [4, 2])
+def test_points_find_their_voxel(n, rng):
+    """Against a loop over all bricks."""
+    tree = random_tree(2)
+    lattice = Lattice(tree, n)
+    halves = 2 * rng.integers(-2, (np.array(tree.counts) * SIDE << tree.depth) + 2, (300, 3)) + 1
+    brick, voxel, active = tree.voxels_at(halves, n, lattice.active)
+    for point, b, v, a in zip(halves, brick, voxel, active, strict=True):
+        side = 2 * (SIDE << (tree.depth - tree.level.astype(int)))
+        inside = (tree.at * side[:, None] <= point).all(1) & (point < (tree.at + 1) * side[:, None]).all(1)
+        held = np.flatnonzero(inside)
+        assert len(held) <= 1 and b == (held[0] if len(held) else -1)
+        if len(held):
+            i, j, k = (point - tree.at[b] * side[b]) * n // side[b]
+            assert v == (i * n + j) * n + k and a == lattice.active[b, v]
+    assert (brick >= 0).any() and (brick < 0).any()
+
+
+@pytest.mark.parametrize("n", [4, 2])
+def test_every_place_is_one_vertex(n):
+    """Free and hanging rows are different places; corners of active voxels have one, in ascending order of need."""
+    tree = random_tree(2)
+    lattice = Lattice(tree, n)
+    assert len(np.unique(node_keys(lattice.vertices))) == len(lattice.vertices)
+    assert (lattice.corners >= 0).all()
+    free = lattice.rows[lattice.rows >= 0]
+    free = free[free < lattice.free]
+    first = np.unique(free, return_index=True)[1]
+    assert (np.diff(first) > 0).all() and len(first) == lattice.free
+
+
+@pytest.mark.parametrize("n", [4, 2])
+def test_hanging_rows_are_averages_of_free_ones(n):
+    """Weights are positive, sum to 1, and keep linear functions of the place."""
+    lattice = Lattice(random_tree(3), n)
+    spread = lattice.spread
+    assert spread.shape[0] > 10 and spread.data.min() > 0
+    np.testing.assert_allclose(spread.sum(1), 1)
+    vertices = lattice.vertices.astype(float)
+    np.testing.assert_allclose(spread @ vertices[: lattice.free], vertices[lattice.free :], atol=1e-9)
+
+
+def test_the_occupancy_covers_every_active_voxel(rng):
+    tree = random_tree(2)
+    grid = tree.occupancy(64)
+    brick, i, j, k = np.nonzero(tree.mask)
+    side = tree.top / (SIDE << tree.level[brick].astype(int))[:, None]
+    middle = tree.lo + (tree.at[brick] * SIDE + np.stack([i, j, k], 1) + 0.5) * side
+    for offset in rng.uniform(-0.499, 0.499, (4, 3)):
+        assert grid.contains(middle + offset * side).all()
+    assert not grid.occupied.all()
+
+
+def test_children_fill_their_parent():
+    kids = children(np.array([[1, 2, 3]]))
+    assert len(np.unique(node_keys(kids))) == 8
+    np.testing.assert_array_equal(kids >> 1, np.tile([1, 2, 3], (8, 1)))
