@@ -55,7 +55,7 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
             draw_composed(panel, cost, composed[cost], max(getattr(p, cost) for p in points))
     panels[0].set_ylabel("PSNR against the scene as composed, dB")
     above.suptitle(title, parse_math=False)
-    panels[0].legend(handles=kind_handles(points), loc="lower right", fontsize=FONT)
+    above.legend(handles=kind_handles(points), loc="outside upper right", ncols=len(LOOKS), fontsize=FONT)
     write_list(below, best)
     figure.draw_without_rendering()  # places are final from here on
     for panel, cost in zip(panels, AXES, strict=True):

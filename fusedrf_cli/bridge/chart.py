@@ -311,7 +311,7 @@ def mark_frontiers(points: list[Point]) -> None:
     """
     for cost in COSTS:
         margin, least = 1 if cost == "bytes" else 1 + NOISE, np.inf
-        for point in sorted(points, key=lambda p: (-p.psnr, getattr(p, cost))):
+        for point in sorted(points, key=lambda p: (-p.psnr, getattr(p, cost), p.seconds)):
             if getattr(point, cost) * margin < least:
                 least = getattr(point, cost)
                 point.frontier.append(cost)
