@@ -1,9 +1,8 @@
 """Distil any radiance field into a VM student (FusedRF; PVD for one teacher).
 
 Three phases: ask the teacher on rays through it, fit the student's σ and colour at the points of those rays
-(3D losses), then a
-few passes over the rays themselves (RGB loss) at a tenth of the rate, kept only if the student got better on
-views of its own.
+(3D losses), at half the resolution first, then pass over the rays themselves (RGB loss) at a far lower rate,
+kept only if the student got better on views of its own.
 """
 
 import time
