@@ -151,7 +151,7 @@ HOSTILE = {
     "data over": (raw(field({"a": SIGMA}), b"\0" * 5), errors.BadHeader),
     "gap": (raw(field({"a": SIGMA | {"data_offsets": [4, 8]}}), b"\0" * 8), errors.BadHeader),
     "overlap": (raw(field({"a": SIGMA, "b": SIGMA})), errors.BadHeader),
-    "too many": (raw(field({f"a{i}": SIGMA for i in range(257)})), errors.LimitExceeded),
+    "too many": (raw(field({f"a{i}": SIGMA for i in range(4097)})), errors.LimitExceeded),
     "infinite": (raw(field({"a": SIGMA}), np.float32(np.inf).tobytes()), errors.NotFinite),
     "coded in version 1": (raw(field(content=CONTENT | {"coded": {}})), errors.BadSchema),
     "coded missing": (raw(field(content=CONTENT | {"version": 2})), errors.BadSchema),
@@ -193,7 +193,7 @@ HOSTILE = {
     "code 0": (coded(told(), data=ONE[:-1] + b"\0"), errors.BadArray),
     "scale negative": (coded(told(), data=b"\0\xbc" + ONE[2:]), errors.BadArray),
     "scale infinite": (coded(told(), data=b"\0\x7c" + ONE[2:]), errors.NotFinite),
-    "too many coded": (coded({f"a{i}": A_CODED for i in range(257)}), errors.LimitExceeded),
+    "too many coded": (coded({f"a{i}": A_CODED for i in range(4097)}), errors.LimitExceeded),
 }
 
 
