@@ -16,6 +16,7 @@ from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
 MAX_LEVEL = 7
 MAX_TOP_CELLS = 1 << 22
+LONGEST = (1 << 20) // (SIDE << MAX_LEVEL)  # top cells along an axis: places in units fit in 21 bits
 MAX_ENTRIES = 1 << 26  # of all top cells' tables: 256 MB
 MAX_BRICKS = 1 << 22
 OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
@@ -133,11 +134,13 @@ class BrickTree:
             fill_cubes(table, offset, depth, level, self.at[own], own)
         return offset, depth, table
 
-    def voxels_at(self, halves: np.ndarray, n: int, active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def voxels_at(
+        self, halves: np.ndarray, n: int, active: np.ndarray, finest: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3) int64
-        given in odd halves of a unit."""
+        given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own depth."""
         offset, depth, table = self.tables
-        span = 2 * SIDE << self.depth
+        span = 2 * SIDE << (self.depth if finest is None else finest)
         cell = halves // span
         inside = ((cell >= 0) & (cell < np.asarray(self.counts))).all(1)
         cell = np.where(inside[:, None], cell, 0)
@@ -153,6 +156,16 @@ class BrickTree:
         voxel = np.where(held[:, None], voxel, 0)
         voxel = (voxel[:, 0] * n + voxel[:, 1]) * n + voxel[:, 2]
         return np.where(held, brick, -1), voxel, held & active[safe, voxel]
+
+    def extended(self, aabb: np.ndarray) -> "BrickTree":
+        """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where those
+        would be too many."""
+        before = np.maximum(np.ceil((self.lo - aabb[:3]) / self.top), 0).astype(np.int64)
+        behind = np.maximum(np.ceil((aabb[3:] - self.aabb[3:]) / self.top), 0).astype(np.int64)
+        counts = before + np.asarray(self.counts) + behind
+        check_counts(counts)
+        at = self.at + (before << self.level[:, None].astype(np.int64))
+        return BrickTree.of(self.lo - before * self.top, self.top, counts, self.level, at, self.mask)
 
     def occupancy(self, longest: int) -> OccupancyGrid:
         """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of them
@@ -301,6 +314,14 @@ class Lattice:
         while (step := through @ step).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
             total = total + step
         return total.tocsr()
+
+
+def check_counts(counts) -> None:
+    """Raise ValueError where there are more top cells than a tree may have."""
+    if max(counts) > LONGEST or np.prod(np.asarray(counts, np.float64)) > MAX_TOP_CELLS:
+        raise ValueError(
+            f"counts should be at most {LONGEST} top cells each and {MAX_TOP_CELLS} in all, found {list(counts)}"
+        )
 
 
 def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

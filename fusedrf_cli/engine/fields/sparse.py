@@ -14,7 +14,7 @@ import torch
 
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.base import register
-from fusedrf_cli.engine.fields.bricks import MAX_BRICKS, MAX_LEVEL, MAX_TOP_CELLS, BrickTree, Lattice
+from fusedrf_cli.engine.fields.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
@@ -309,9 +309,7 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     if not isinstance(counts, list) or len(counts) != 3:
         raise ValueError(f"counts should be three whole numbers, found {counts}")
     counts = tuple(whole(n, "counts", 1, MAX_TOP_CELLS) for n in counts)
-    longest = (1 << 20) // (SIDE << MAX_LEVEL)
-    if max(counts) > longest or np.prod(counts) > MAX_TOP_CELLS:
-        raise ValueError(f"counts should be at most {longest} each and {MAX_TOP_CELLS} in all, found {list(counts)}")
+    check_counts(counts)
     top, aabb = positive(metadata["top"], "top"), np.asarray(metadata["aabb"], np.float64)
     if aabb.shape != (6,) or not np.isfinite(aabb).all() or not np.allclose(aabb[3:] - aabb[:3], top * np.array(counts)):
         raise ValueError("aabb should be as many top cells wide as counts says")
