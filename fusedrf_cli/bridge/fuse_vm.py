@@ -13,8 +13,8 @@ from fusedrf_cli.bridge.fusing import Asked, Fused
 from fusedrf_cli.bridge.memory import learning, ownership, picture, result, teaching
 from fusedrf_cli.bridge.running import checkpoint_path, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, placed_on, stored
-from fusedrf_cli.bridge.sizes import HEADER, HEADER_PER_BLOCK, HEADER_PER_TENSOR
-from fusedrf_cli.bridge.train import check_size, warn_of_numbers
+from fusedrf_cli.bridge.sizes import HEADER, HEADER_PER_BLOCK, HEADER_PER_PLANE, HEADER_PER_TENSOR
+from fusedrf_cli.bridge.train import check_size, tensor_bytes, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import tensor_details
@@ -28,13 +28,13 @@ from fusedrf_cli.engine.distillation.distill import (
     resolution_for,
     student_from,
 )
-from fusedrf_cli.engine.distillation.fit import texels
 from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.errors import InvalidInput
 
 RECKONED_RAYS = 2000  # of which the number of points is reckoned
+SMALLER = 0.98  # steps in which a size is looked for that fits
 GROWTH = 2  # of the numbers, from one size to the next
 SMALLEST = 32  # times less numbers than the limit allows: where growing begins
 CHEAP_FIRST = ("int4", "int8")
@@ -97,9 +97,19 @@ def largest(composed: ComposedField, asked: Asked) -> DistillSettings:
     shape = VMShape(*(ranks or (default.density_rank, default.colour_rank)), degree)
     each = BYTES_PER_NUMBER[precisions(asked)[-1]]
     room = asked.limit - besides(composed, asked)
-    check_size(int(shape.size(texels(composed.aabb, 16)) * each), room)
-    settings = DistillSettings(shape=shape, seed=asked.seed, time_budget=asked.time_budget)
-    return replace(settings, max_numbers=max(1, int(room / each)))
+    check_size(needed(composed, shape, 1, precisions(asked)[-1]), room)
+    numbers = max(1, int(room / each))
+    while needed(composed, shape, numbers, precisions(asked)[-1]) > room:  # small planes are not coded
+        numbers = int(SMALLER * numbers)
+    return DistillSettings(
+        shape=shape, max_numbers=numbers, seed=asked.seed, time_budget=asked.time_budget
+    )
+
+
+def needed(composed: ComposedField, shape: VMShape, numbers: int, precision: str) -> int:
+    """Bytes of a tensor of at most so many numbers over the scene."""
+    resolution = resolution_for(composed.aabb, composed.voxel_size, shape, numbers)
+    return tensor_bytes(shape, resolution, precision) + 6 * HEADER_PER_PLANE
 
 
 def besides(composed: ComposedField, asked: Asked) -> int:

@@ -7,24 +7,14 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.resample import (
-    COLOURED,
     FAINT,
-    LEAST,
     SEEING_RAYS,
-    SEEN,
-    around,
-    coarser,
-    colours,
     demanded,
     density,
-    dilated,
-    feature_of,
-    leaves,
-    shown,
 )
 from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.bricks import MAX_LEVEL, OCTANTS, BrickTree, Lattice, key_places, node_keys
+from fusedrf_cli.engine.fields.bricks import MAX_LEVEL, BrickTree, Lattice, key_places
 from fusedrf_cli.engine.fields.sparse import SparseField
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
