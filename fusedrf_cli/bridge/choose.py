@@ -12,7 +12,7 @@ from functools import cache
 from fusedrf_cli.report import readable_size
 
 DB_PER_E_FOLD = 8.0  # that PSNR gains about when the bytes grow by e: only the next guess rests on it
-CLOSE = 1.06  # between the smallest size that reaches the target and the largest that does not
+CLOSE = 1.08  # between the smallest size that reaches the target and the largest that does not
 MOST_GROWTH = 3.0  # from one size that is tried to the next
 OVERSHOOT = 0.1  # dB aimed above a target, so that the next try is likely to reach it
 NEIGHBOUR = 1.3  # ratio of bytes at which the next larger and smaller choice is looked at
@@ -104,7 +104,7 @@ class Choosing:
         """The smallest size of one way that reaches the target. `contested`: another way reaches it at `most`
         already, so that this one has to show at once that it does too.
         """
-        size = most if contested else max(top // 8, 1)
+        size = most if contested else max(top // 4, 1)
         low, high = None, None
         for _ in range(TRIES):
             found = self.make(way, size, True)

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.rendering.volume import STEP_PER_VOXEL, render_rays
 RATE, RATE_DECAY = 3e-3, 0.1
 RAYS = 200_000
 RAYS_PER_STEP = 3000
-STEPS = 240
+STEPS = 160
 OPACITY_WEIGHT = 0.1
 
 
