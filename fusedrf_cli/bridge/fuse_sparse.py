@@ -14,8 +14,8 @@ from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
 
 BYTES_PER_BRICK = 10  # masks and nodes
 VERTICES_PER_BRICK = 25  # at least, in scenes of surfaces
-FINISH = DistillSettings(rays=150_000, steps=200, rgb_steps=600)
-RECIPE = Recipe(rate=0.05, rgb_rate=0.02)
+FINISH = DistillSettings(rays=150_000, steps=0, rgb_steps=400)
+RECIPE = Recipe(rgb_rate=0.015)
 
 
 def fuse_sparse(

@@ -12,7 +12,6 @@ import torch
 from scipy import sparse
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.bricks import (
     MAX_TOP_CELLS,
@@ -29,12 +28,12 @@ from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
 DEEPEST = 6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
-FAINT = 1e-5  # optical depth of a voxel under which there is nothing
+FAINT = 1e-4  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
 COLOURED = 1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
 LEAST, MOST = -8.0, 60.0  # of the density feature
 REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these
-DIRECTIONS = 32
+LOOKED_FROM, DIRECTIONS = 20, 32  # directions along which voxels are sought, and colours asked
 ONE_SIDED = 0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
 LOOKS = 9  # places along a look through the voxels before and behind a vertex
 RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
@@ -43,9 +42,12 @@ AT_ONCE = 1 << 18
 ATTEMPTS = 5
 FULL_ENOUGH = 0.93  # of the numbers allowed
 DILATIONS = 3
-SEEING_RAYS = 1_000_000
-SEEN = 1e-8  # weight of a voxel in a picture of the scene, at least, to be held
+CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which a voxel has to be seen
+BLOCKED = 0.05  # transmittance under which nothing is seen
+MOST_LOST = 0.05  # optical depth of a voxel that is always held
+ODD_LINES = 20
 CORRECTIONS = 3
+
 
 
 class Known(NamedTuple):
@@ -141,35 +143,49 @@ def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, Kno
     whole = BrickTree.of(lo, top, counts, level, at, np.ones((len(level), SIDE, SIDE, SIDE), bool))
     lattice = Lattice(whole, SIDE)
     sigma = density(teacher, lattice.places)
-    depth = sigma * lattice.finest_voxel
-    matter = depth > harmless(depth, lattice)
-    if not matter.any():
+    dense = (sigma * lattice.finest_voxel > FAINT)[lattice.corners].any(1)
+    tree, known = held(lattice, dense, sigma, np.zeros((len(sigma), 3)))
+    lattice = Lattice(tree, SIDE)
+    field = SparseField(SparseShape(0), lattice, density_scale(tree))
+    sigma = known.of(lattice)[0]
+    set_density(field, sigma)
+    kept, facing = shown(field)
+    return held(lattice, kept, sigma, facing)
+
+
+def held(lattice: Lattice, kept: np.ndarray, sigma: np.ndarray, facing: np.ndarray) -> tuple[BrickTree, Known]:
+    """The tree of those active voxels of a lattice that are kept (K,), and what is known of its vertices."""
+    if not kept.any():
         raise ValueError("the scene shows nothing")
-    weight, facing = looked_at(lattice, sigma, teacher)
-    mask = matter[lattice.corners].any(1).reshape(-1, SIDE**3) & (weight > SEEN * SEEING_RAYS)
-    kept = mask.any(1)
-    tree = BrickTree.of(lo, top, counts, whole.level[kept], whole.at[kept], mask[kept].reshape(-1, SIDE, SIDE, SIDE))
+    whole = lattice.tree
+    mask = np.zeros(lattice.active.shape, bool)
+    mask[lattice.active] = kept
+    own = mask.any(1)
+    mask = mask[own].reshape(-1, SIDE, SIDE, SIDE)
+    tree = BrickTree.of(whole.lo, whole.top, whole.counts, whole.level[own], whole.at[own], mask)
     keys = node_keys(lattice.vertices >> (whole.depth - tree.depth))
     order = np.argsort(keys)
-    return tree, Known(keys[order], sigma[order], around(lattice, facing, weight)[order])
+    return tree, Known(keys[order], sigma[order], facing[order])
 
 
-def looked_at(
-    lattice: Lattice, sigma: np.ndarray, teacher: RadianceField
-) -> tuple[np.ndarray, np.ndarray]:
-    """`SparseField.seen` of densities (V,) for rays from outside at the whole and at the placed fields."""
-    field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree))
-    set_density(field, sigma)
-    boxes = [teacher.occupancy.tight_aabb(0), *sorted((p.aabb for p in placed_in(teacher)), key=list)]
-    return field.seen(*random_rays(boxes, SEEING_RAYS, torch.Generator().manual_seed(0)))
+def shown(field: SparseField) -> tuple[np.ndarray, np.ndarray]:
+    """Which active voxels (K,) a camera sees anything of that is not closer than CAMERA_FAR times the box; and the
+    mean direction (V, 3) along which each vertex is seen, of length 1 where from one side alone.
 
-
-def around(lattice: Lattice, facing: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(V, 3) mean direction, by weight, along which the voxels around each vertex are seen: of length 1 where it
-    is seen from one side alone, 0 where from all or never."""
-    told = np.concatenate([facing.reshape(-1, 3), weight.reshape(-1, 1)], 1)[lattice.active.ravel()]
-    summed = touching(lattice).T @ told
-    return summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
+    What is hidden in solids is not held, and of haze as much is left out as no line of sight misses.
+    """
+    lattice = field.fine
+    box = field.aabb
+    far = CAMERA_FAR * float(np.linalg.norm(box[3:] - box[:3]))
+    clearest, facing = field.exposed(even_directions(LOOKED_FROM), far, BLOCKED)
+    sigma = field.scale * np.logaddexp(0, field.rows[:, 0].numpy())
+    sigma[field.rows[:, 0].numpy() <= LEAST] = 0
+    low = lattice.vertices[lattice.corners[:, 0]]
+    side = lattice.places[lattice.corners[:, 7], 0] - lattice.places[lattice.corners[:, 0], 0]
+    depth = sigma[lattice.corners].max(1) * side * clearest
+    kept = depth > harmless(depth, low)
+    summed = touching(lattice).T @ (np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * kept)[:, None])
+    return kept, summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
 
 
 def touching(lattice: Lattice) -> sparse.csr_matrix:
@@ -247,16 +263,15 @@ def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(levels), np.concatenate(places)
 
 
-def harmless(depth: np.ndarray, lattice: Lattice) -> float:
-    """The largest optical depth of a voxel up to which vertices may be left out without any axis-parallel line of
-    them losing more than LOST_DEPTH: thin fog is no emptiness."""
+def harmless(depth: np.ndarray, places: np.ndarray) -> float:
+    """The largest optical depth of a voxel up to which voxels (K,) at places (K, 3) may be left out, when one in
+    ODD_LINES of the axis-parallel lines through them may lose more than LOST_DEPTH: thin fog is no emptiness."""
     lines = []
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        line = lattice.vertices[:, a] << 21 | lattice.vertices[:, b]
-        lines.append(np.unique(line, return_inverse=True)[1])
-    for threshold in LOST_DEPTH * 0.25 ** np.arange(12):
+        lines.append(np.unique(places[:, a] << 21 | places[:, b], return_inverse=True)[1])
+    for threshold in MOST_LOST * 0.5 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)
-        if max(np.bincount(line, lost).max() for line in lines) <= LOST_DEPTH:
+        if max(np.quantile(np.bincount(line, lost), 1 - 1 / ODD_LINES) for line in lines) <= LOST_DEPTH:
             return float(threshold)
     return 0.0
 

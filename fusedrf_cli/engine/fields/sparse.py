@@ -195,13 +195,15 @@ class SparseField:
         read = *self.kernel_shape, self.arrays, self.grid
         self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
-    def seen(self, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How much each voxel weighs in the pictures of rays (R, 3), summed over them, (N, 64) float32, and the
-        sum of the directions it is seen along by that weight, (N, 64, 3)."""
-        weights = np.zeros((torch.get_num_threads(), len(self.tree.mask) * SIDE**3 * 4), np.float32)
-        self.loops.see(self.arrays, self.grid, rays_o, rays_d, 0.5 * self.voxel_size, 1e-3, weights)
-        found = weights.sum(0).reshape(-1, SIDE**3, 4)
-        return found[..., 0], found[..., 1:]
+    def exposed(self, directions: np.ndarray, far: float, blocked: float) -> tuple[np.ndarray, np.ndarray]:
+        """How much light reaches each active voxel (K,) along the clearest of the directions (D, 3), from `far` away
+        or from outside the box, and the mean direction along which it is seen (K, 3), of length 1 where from one
+        side alone. Light of less than `blocked` counts as none."""
+        low, high = (self.fine.places[self.fine.corners[:, q]] for q in (0, 7))
+        clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
+        sides = high[:, 0] - low[:, 0]
+        self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
+        return clearest, facing
 
     # -- learning --------------------------------------------------------------------------------------------
 
