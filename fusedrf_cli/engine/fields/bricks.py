@@ -223,6 +223,17 @@ class Lattice:
         return self.tree.lo + self.vertices * self.tree.unit
 
     @cached_property
+    def keys(self) -> np.ndarray:
+        """(V,) int64, one for each vertex, that stays the same whatever else the box holds."""
+        return node_keys(self.vertices << (MAX_LEVEL - self.tree.depth))
+
+    def find(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) rows of the vertices of those keys, and whether there is such a vertex."""
+        order = np.argsort(self.keys)
+        row = order[np.minimum(np.searchsorted(self.keys, keys, sorter=order), len(order) - 1)]
+        return row, self.keys[row] == keys
+
+    @cached_property
     def corners(self) -> np.ndarray:
         """(K, 8) int32 rows of every active voxel's corners, bricks in order."""
         n = self.n

@@ -195,13 +195,14 @@ class SparseField:
         read = *self.kernel_shape, self.arrays, self.grid
         self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
-    def exposed(self, directions: np.ndarray, far: float, blocked: float) -> tuple[np.ndarray, np.ndarray]:
-        """How much light reaches each active voxel (K,) along the clearest of the directions (D, 3), from `far` away
-        or from outside the box, and the mean direction along which it is seen (K, 3), of length 1 where from one
-        side alone. Light of less than `blocked` counts as none."""
-        low, high = (self.fine.places[self.fine.corners[:, q]] for q in (0, 7))
+    def exposed(
+        self, low: np.ndarray, high: np.ndarray, directions: np.ndarray, far: float, blocked: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions (D, 3),
+        (K,), from `far` away or from outside the box, and the mean direction along which each is seen (K, 3), of
+        length 1 where from one side alone. Light of less than `blocked` counts as none."""
         clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
-        sides = high[:, 0] - low[:, 0]
+        sides = np.ascontiguousarray((high - low)[:, 0])
         self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
         return clearest, facing
 
