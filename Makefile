@@ -9,7 +9,10 @@ PACKS ?= 10000
 KILLS ?= 200
 SEED ?= 0
 
-.PHONY: help demo test test-slow fuzz lint bench stability clean
+SCENE ?=
+SHARE ?= 1
+
+.PHONY: help demo test test-slow fuzz lint bench bench-paper ablation stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -33,6 +36,13 @@ lint: $(VENV)  ## ruff
 
 bench: $(VENV)  ## the measurements that the claims rest on
 	$(PYTHON) -m benchmarks
+
+ablation: $(VENV)  ## what each part of distilling is worth; SCENE= for one of your own, SHARE= for fewer steps
+	mkdir -p build
+	$(PYTHON) -m benchmarks.ablation build/ablation $(SCENE) --share $(SHARE)
+
+bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder with chair/ and fuze/
+	$(PYTHON) -m benchmarks.paper $(if $(DATA),--data $(DATA))
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

@@ -1,9 +1,10 @@
-"""What each part of distilling is worth: python -m benchmarks.ablation FOLDER [SCENE.json] [--steps P,R]
+"""What each part of distilling is worth: python -m benchmarks.ablation FOLDER [SCENE.json] [--share S]
 
 Distils a scene into one `vm` tensor of 25 MB by the recipe of `fuse --kind vm`, with five seeds, and with one
 part at a time left out or put back to what FusedRF says; all within the same steps, and judged on the same
 views, which nothing is trained on. Without a scene, one is made in FOLDER: four objects of
-examples/make_scene.py, trained briefly. Prints a Markdown table and writes FOLDER/ablation.csv.
+examples/make_scene.py, trained briefly. With --share, a share of the rays and steps that `fuse` takes. Prints
+a Markdown table and writes FOLDER/ablation.csv.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fusedrf_cli.bridge.fuse import DEFAULT_MAX_SIZE, HEADER_BYTES
+from fusedrf_cli.bridge.fuse import DEFAULT_MAX_SIZE
 from fusedrf_cli.bridge.scene import background_of, load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -31,12 +32,14 @@ from fusedrf_cli.engine.distillation.distill import (
 from fusedrf_cli.engine.distillation.losses import OPAQUE
 from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.fields.vm import VMField
 
-TRAINED = ("--quality", "draft", "--views", "40", "--size", "200x200", "--max-size", "4MB")
+BESIDES = 16384  # bytes of a bundle that are no numbers, about
+TRAINED = ("--quality", "draft", "--views", "40", "--size", "200", "--max-size", "4MB")
 PLACES = (
     ("ground.rfpack", ("--background-node",)),
     ("tower.rfpack", ("-t", "-0.8,0.4,0.06")),
-    ("arch.rfpack", ("-t", "0.5,0.6,0.06", "-r", "35,0,0,1")),
+    ("arch.rfpack", ("-t", "0.5,0.6,0.06", "-r", "0,0,35")),
     ("ball.rfpack", ("-t", "0.6,-0.7,0.06", "-s", "0.5")),
 )
 
@@ -93,8 +96,13 @@ def capped_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tenso
     return off**2, 2 * off
 
 
+def never(student: VMField) -> bool:
+    """No student starts at half its resolution."""
+    return False
+
+
 WHOLE = Recipe()
-PAPER = Recipe(evenly, raw_depth, all_alike, 0.02, 0.002, Steady)
+PAPER = Recipe(evenly, raw_depth, all_alike, 0.02, 0.002, never, Steady)
 VARIANTS = (
     *(Variant(f"nothing, seed {seed}", seed=seed) for seed in range(5)),
     Variant("the pictures", rgb=False),
@@ -105,8 +113,9 @@ VARIANTS = (
     Variant("log1p of depth: depth up to opaque", replace(WHOLE, density_loss=capped_depth)),
     Variant("log1p of depth: alpha", replace(WHOLE, density_loss=opacity)),
     Variant("the high rate: a quarter", replace(WHOLE, rate=0.25 * WHOLE.rate)),
+    Variant("half the resolution first", replace(WHOLE, coarse=never)),
     Variant("the schedule: a steady fall", replace(WHOLE, schedule=Steady)),
-    Variant("all of it: points evenly, raw depth, a steady fall of a low rate", PAPER),
+    Variant("all of it: points evenly, raw depth, one resolution, a steady fall of a low rate", PAPER),
 )
 
 
@@ -137,16 +146,18 @@ class Task:
     settings: DistillSettings
 
     @classmethod
-    def of(cls, scene: Path, steps: tuple[int, int]) -> "Task":
-        """The scene as `fuse --kind vm` takes it up."""
+    def of(cls, scene: Path, share: float) -> "Task":
+        """The scene as `fuse --kind vm` takes it up, with a share of its rays and steps."""
         loaded = load_scene(str(scene))
         composed = loaded.composed()
         name = background_of(loaded).placed.name
         placed = composed.placed[[p.name for p in loaded.placed].index(name)]
         background = Placed(name, opened(placed.field), placed.object_to_world)
         boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
-        numbers = (DEFAULT_MAX_SIZE - composed.occupancy.occupied.size // 8 - HEADER_BYTES) // 2
-        settings = DistillSettings(max_numbers=numbers, steps=steps[0], rgb_steps=steps[1])
+        numbers = (DEFAULT_MAX_SIZE - composed.occupancy.occupied.size // 8 - BESIDES) // 2
+        whole = DistillSettings(max_numbers=numbers)
+        fewer = {name: round(share * getattr(whole, name)) for name in ("rays", "steps", "rgb_steps")}
+        settings = replace(whole, **fewer)
         return cls(composed, background, boxes, settings)
 
     def distilled(self, variant: Variant) -> DistillReport:
@@ -177,12 +188,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("scene", type=Path, nargs="?")
-    default = f"{DistillSettings.steps},{DistillSettings.rgb_steps}"
-    parser.add_argument("--steps", default=default, help="at most so many on points, and on rays")
+    parser.add_argument("--share", type=float, default=1.0)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
-    points, rays = (int(count) for count in given.steps.split(","))
-    task = Task.of(given.scene or made_scene(given.folder), (points, rays))
+    task = Task.of(given.scene or made_scene(given.folder), given.share)
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     with (given.folder / "ablation.csv").open("w", newline="") as file:
         table = csv.writer(file)

@@ -1,6 +1,7 @@
 """The `.rfpack` bundle: a scene graph and the fields it places, in one file; see `formats/SPEC.md`."""
 
 import hashlib
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -253,11 +254,12 @@ def world_aabb(aabb: list[float], object_to_world: np.ndarray) -> list[float]:
 
 
 def _field_summary(name: str, header: FieldHeader) -> dict:
-    arrays = {key: {"dtype": str(s.dtype), "shape": list(s.shape)} for key, s in sorted(header.specs.items())}
-    count = sum(int(np.prod(spec.shape)) for spec in header.specs.values())
+    arrays = {key: {"dtype": dtype, "shape": list(s)} for key, (dtype, s) in sorted(header.arrays.items())}
+    count = sum(math.prod(shape) for _, shape in header.arrays.values())
     return {
         "member": name,
         "kind": header.kind,
+        "precision": header.precision,
         "bytes": header.size,
         "parameters": count,
         "arrays": arrays,

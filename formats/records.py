@@ -18,16 +18,31 @@ from formats.errors import (
     TruncatedBundle,
 )
 from formats.inputs import parse_json
+from formats.quantised import (
+    BLOCKS,
+    LEVELS,
+    code_bytes,
+    dequantised,
+    exact_code_bytes,
+    is_coded,
+    quantised,
+    scales_shape,
+)
 
 KEY = "fusedrf"
-VERSION = 1
+VERSION = 2  # written where arrays are coded; fields without such are of version 1
 MAX_HEADER = 1 << 20
-MAX_ARRAYS = 256
+MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30
+MAX_DECODED_BYTES = 8 << 30  # of a field: what a whole pack of F16 comes to
 MAX_RANK = 5
 MAX_DIMENSION = 2**31 - 1
 DTYPES = {"F16": np.dtype("<f2"), "F32": np.dtype("<f4"), "U8": np.dtype("u1"), "I32": np.dtype("<i4")}
-PRECISIONS = {"float16": np.float16, "float32": np.float32}
+BITS = {"int8": 8, "int4": 4}
+# How floats that are not coded are stored, by precision.
+PRECISIONS = {"float16": np.float16, "float32": np.float32, "int8": np.float16, "int4": np.float16}
+# Of a trained field, about: with its scales, and the small arrays that stay float16.
+BYTES_PER_NUMBER = {"float16": 2, "float32": 4, "int8": 1.04, "int4": 0.54}
 NAME = re.compile(r"[A-Za-z0-9_.\-]{1,64}")
 KIND = re.compile(r"[a-z][a-z0-9_\-]{0,31}")
 
@@ -52,54 +67,117 @@ class ArraySpec:
 
 
 @dataclass(frozen=True)
+class CodedSpec:
+    """An array that is stored as codes of so many bits and their scales."""
+
+    bits: int
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class FieldHeader:
     """What a field says of itself before any array is read."""
 
     kind: str
     metadata: dict
     specs: dict[str, ArraySpec]
+    """Of the arrays as they are stored."""
+    coded: dict[str, CodedSpec]
+    """Of the arrays that lie in two of those, NAME.scales and NAME.codes."""
     size: int
     """Bytes of the whole field in its file."""
+
+    @property
+    def arrays(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """How each array is stored ("int8", "float16", ...) and the shape that it decodes to, by name."""
+        found = {name: (str(self.specs[name].dtype), self.specs[name].shape) for name in self.plain}
+        return found | {name: (f"int{spec.bits}", spec.shape) for name, spec in self.coded.items()}
+
+    @property
+    def plain(self) -> list[str]:
+        """Names of the arrays that are not coded."""
+        parts = {part for name in self.coded for part in coded_parts(name)}
+        return [name for name in self.specs if name not in parts]
+
+    @property
+    def precision(self) -> str:
+        """The one of PRECISIONS that it was written with, told from its arrays: the most exact of them, where
+        another program mixed several.
+        """
+        if any(self.specs[name].dtype == DTYPES["F32"] for name in self.plain):
+            return "float32"
+        bits = max((spec.bits for spec in self.coded.values()), default=None)
+        return "float16" if bits is None else f"int{bits}"
 
     @property
     def decoded_size(self) -> int:
         """Bytes of its arrays once decoded: floats as float32."""
         return sum(
-            math.prod(s.shape) * (4 if s.dtype.kind == "f" else s.dtype.itemsize) for s in self.specs.values()
+            math.prod(shape) * (1 if dtype == "uint8" else 4) for dtype, shape in self.arrays.values()
         )
 
 
 def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
     """Safetensors bytes of `record`; equal records give equal bytes.
 
-    Floats are cast to `precision` ("float16" or "float32"), bool becomes uint8, other integers int32.
-    Raises NotFinite (NaN, infinity, overflow in the cast), BadArray, BadSchema, LimitExceeded.
+    Floats are cast to `precision`, "float16" or "float32"; in "int8" and "int4" large arrays of two or three
+    dimensions are coded (formats/quantised.py), others cast to float16. Bool becomes uint8, other integers
+    int32. Raises NotFinite (NaN, infinity, overflow in the cast), BadArray, BadSchema, LimitExceeded.
     """
     where = f"field of kind {record.kind!r}"
-    content = {"kind": record.kind, "metadata": record.metadata, "version": VERSION}
+    stored, coded = _stored_arrays(record.arrays, precision, where)
+    content = {"kind": record.kind, "metadata": record.metadata, "version": 1}
+    if coded:
+        content |= {"version": VERSION, "coded": coded}
     try:
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
     except (TypeError, ValueError, RecursionError) as error:
         raise BadSchema(f"{where}: its metadata cannot be written as JSON ({error})") from error
-    stored = {name: _stored(name, array, precision, where) for name, array in record.arrays.items()}
     data = safetensors.numpy.save(stored, metadata={KEY: text})
     decode_header(data, where)
     return data
 
 
+def coded_bytes(shape: tuple[int, ...], precision: str) -> int:
+    """The most bytes that a float array of that shape takes in a field."""
+    numbers = math.prod(shape)
+    if precision not in BITS or not is_coded(shape):
+        return numbers * np.dtype(PRECISIONS[precision]).itemsize
+    return math.prod(scales_shape(shape)) * DTYPES["F16"].itemsize + code_bytes(numbers, BITS[precision])
+
+
+def exact_bytes(array: np.ndarray, precision: str) -> int:
+    """The bytes that a float array takes in a field: blocks that are all zero have no codes."""
+    most = coded_bytes(array.shape, precision)
+    if precision not in BITS or not is_coded(array.shape):
+        return most
+    return most - code_bytes(array.size, BITS[precision]) + exact_code_bytes(array, BITS[precision])
+
+
+def as_stored(array: np.ndarray, precision: str, name: str = "") -> np.ndarray:
+    """The float32 numbers that a float array comes back as from a field. Raises NotFinite."""
+    cast = _cast(name, array, precision, "the field")
+    if precision in BITS and is_coded(array.shape):
+        return dequantised(*quantised(array, BITS[precision]), BITS[precision], array.shape, name)
+    return cast.astype(np.float32)
+
+
 def decode_field(data: bytes | memoryview, where: str) -> FieldRecord:
-    """The record in `data`, float16 widened to float32, every array its own writable memory.
+    """The record in `data`, float16 and codes widened to float32, every array its own writable memory.
 
     `where` leads error sentences. Raises TruncatedBundle, BadHeader, BadArray, BadSchema, BadJson,
     LimitExceeded, NewerVersion, NotFinite.
     """
     header = decode_header(data, where)
     arrays = {}
-    for name, spec in header.specs.items():
-        array = np.frombuffer(data, spec.dtype, math.prod(spec.shape), spec.start).reshape(spec.shape)
-        array = array.astype(np.float32 if spec.dtype.kind == "f" else spec.dtype.newbyteorder("="))
+    for name in header.plain:
+        array = _mapped(data, header.specs[name])
+        array = array.astype(np.float32 if array.dtype.kind == "f" else array.dtype.newbyteorder("="))
         _check_finite(name, array, where)
         arrays[name] = array
+    for name, spec in header.coded.items():
+        scales, codes = (_mapped(data, header.specs[part]) for part in coded_parts(name))
+        arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, f"{where}: array {name!r}")
     return FieldRecord(header.kind, arrays, header.metadata)
 
 
@@ -114,12 +192,24 @@ def decode_header(data: bytes | memoryview, where: str) -> FieldHeader:
     header = parse_json(bytes(data[8 : 8 + length]), where)
     if not isinstance(header, dict):
         raise BadHeader(f"{where}: expected a JSON object as header, found {type(header).__name__}")
-    kind, metadata = _content(header.pop("__metadata__", None), where)
-    if len(header) > MAX_ARRAYS:
-        raise LimitExceeded(f"{where}: {len(header)} arrays, at most {MAX_ARRAYS} are read")
+    kind, metadata, coded = _content(header.pop("__metadata__", None), where)
+    arrays = max(len(coded), len(header) - len(coded))  # a coded one lies in two
+    if arrays > MAX_ARRAYS:
+        raise LimitExceeded(f"{where}: {arrays} arrays, at most {MAX_ARRAYS} are read")
     specs = {name: _spec(name, entry, 8 + length, where) for name, entry in header.items()}
     _check_cover(specs, 8 + length, size, where)
-    return FieldHeader(kind, metadata, specs, size)
+    coded = {name: _coded_spec(name, entry, specs, where) for name, entry in coded.items()}
+    found = FieldHeader(kind, metadata, specs, coded, size)
+    if found.decoded_size > MAX_DECODED_BYTES:
+        raise LimitExceeded(
+            f"{where}: decodes to {found.decoded_size:,} bytes, the most is {MAX_DECODED_BYTES:,}"
+        )
+    return found
+
+
+def coded_parts(name: str) -> tuple[str, str]:
+    """The names of the two arrays that a coded one lies in: its scales and its codes."""
+    return f"{name}.scales", f"{name}.codes"
 
 
 def _plain(value: object) -> object:
@@ -128,19 +218,47 @@ def _plain(value: object) -> object:
     raise TypeError(f"{type(value).__name__} is no JSON value")
 
 
+def _mapped(data: bytes | memoryview, spec: ArraySpec) -> np.ndarray:
+    """An array as it lies in its field's bytes."""
+    return np.frombuffer(data, spec.dtype, math.prod(spec.shape), spec.start).reshape(spec.shape)
+
+
+def _stored_arrays(
+    arrays: dict[str, np.ndarray], precision: str, where: str
+) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+    """Arrays by the names under which they are stored, and what the metadata say of coded ones."""
+    stored, coded = {}, {}
+    for name, array in arrays.items():
+        shape = np.shape(array)
+        if precision in BITS and np.asarray(array).dtype.kind == "f" and is_coded(shape):
+            _cast(name, array, precision, where)  # what float16 cannot hold no scale can
+            parts = dict(zip(coded_parts(name), quantised(array, BITS[precision]), strict=True))
+            coded[name] = {"bits": BITS[precision], "shape": list(shape)}
+        else:
+            parts = {name: _stored(name, array, precision, where)}
+        if twice := parts.keys() & stored.keys():
+            raise BadArray(f"{where}: array {min(twice)!r} would be there twice; rename it")
+        stored |= parts
+    return stored, coded
+
+
 def _stored(name: str, array: np.ndarray, precision: str, where: str) -> np.ndarray:
     array = np.asarray(array)
     if array.dtype.kind == "f":
-        _check_finite(name, array, where)
-        with np.errstate(over="ignore"):
-            cast = array.astype(PRECISIONS[precision])
-        _check_finite(name, cast, where, f"too large for {precision}; use --precision float32")
-        return np.asarray(cast, order="C")
+        return np.asarray(_cast(name, array, precision, where), order="C")
     if array.dtype == np.bool_ or array.dtype == np.uint8:
         return np.asarray(array, np.uint8, order="C")
     if array.dtype.kind not in "iu" or (array.size and not -(2**31) <= array.min() <= array.max() < 2**31):
         raise BadArray(f"{where}: array {name!r} of {array.dtype} fits neither float32 nor int32")
     return np.asarray(array, np.int32, order="C")
+
+
+def _cast(name: str, array: np.ndarray, precision: str, where: str) -> np.ndarray:
+    _check_finite(name, array, where)
+    with np.errstate(over="ignore"):
+        cast = array.astype(PRECISIONS[precision])
+    _check_finite(name, cast, where, f"too large for {precision}; use --precision float32")
+    return cast
 
 
 def _check_finite(name: str, array: np.ndarray, where: str, what: str = "NaN or infinite") -> None:
@@ -149,7 +267,7 @@ def _check_finite(name: str, array: np.ndarray, where: str, what: str = "NaN or 
         raise NotFinite(f"{where}: array {name!r} has {count:,} of {array.size:,} values {what}")
 
 
-def _content(entry: object, where: str) -> tuple[str, dict]:
+def _content(entry: object, where: str) -> tuple[str, dict, dict]:
     if not isinstance(entry, dict) or set(entry) != {KEY} or not isinstance(entry[KEY], str):
         raise BadHeader(f"{where}: expected one metadata key {KEY!r} holding a string; no field of fusedrf")
     content = parse_json(entry[KEY].encode(), where)
@@ -158,13 +276,19 @@ def _content(entry: object, where: str) -> tuple[str, dict]:
     version, kind, metadata = content["version"], content.get("kind"), content.get("metadata")
     if version > VERSION:
         raise NewerVersion(f"{where}: field version {version}, this fusedrf reads {VERSION}; update fusedrf")
-    if version < 1 or set(content) != {"kind", "metadata", "version"} or not isinstance(metadata, dict):
-        raise BadSchema(f"{where}: expected kind, metadata and version 1, found {sorted(content)}")
+    coded = content.get("coded", {})
+    expected = {"kind", "metadata", "version"} | ({"coded"} if version == VERSION else set())
+    if version < 1 or set(content) != expected or not isinstance(metadata, dict):
+        raise BadSchema(
+            f"{where}: expected {', '.join(sorted(expected))} in version {version}, found {sorted(content)}"
+        )
+    if not isinstance(coded, dict) or (version == VERSION and not coded):
+        raise BadSchema(f"{where}: 'coded' should name the arrays that are")
     if not isinstance(kind, str) or not KIND.fullmatch(kind):
         raise BadSchema(f"{where}: kind {kind!r} is not a lower-case word")
     if "aabb" in metadata:
         _check_aabb(metadata["aabb"], where)
-    return kind, metadata
+    return kind, metadata, coded
 
 
 def _check_aabb(aabb: object, where: str) -> None:
@@ -190,6 +314,35 @@ def _spec(name: str, entry: object, base: int, where: str) -> ArraySpec:
     if not _counts(offsets) or len(offsets) != 2 or offsets[1] - offsets[0] != size:
         raise BadHeader(f"{where}: array {name!r} lies at {offsets!r}, expected offsets {size} bytes apart")
     return ArraySpec(dtype, tuple(shape), base + offsets[0], base + offsets[1])
+
+
+def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: str) -> CodedSpec:
+    if not NAME.fullmatch(name) or name in specs:
+        raise BadArray(f"{where}: coded array {name[:80]!r} has no name of its own; make the file again")
+    if not isinstance(entry, dict) or set(entry) != {"bits", "shape"}:
+        raise BadSchema(f"{where}: coded array {name!r} does not state bits and shape alone")
+    bits, shape = entry["bits"], entry["shape"]
+    if type(bits) is not int or bits not in LEVELS:
+        raise BadSchema(f"{where}: array {name!r} is coded in {bits!r} bits, expected 4 or 8")
+    if not _counts(shape) or len(shape) not in BLOCKS or not all(1 <= n <= MAX_DIMENSION for n in shape):
+        raise BadArray(f"{where}: coded array {name!r} has shape {shape!r}, expected two or three sizes")
+    numbers, least = math.prod(shape), scales_shape(shape)
+    if 4 * numbers > MAX_ARRAY_BYTES:
+        raise LimitExceeded(
+            f"{where}: array {name!r} decodes to {4 * numbers:,} bytes, the most is {MAX_ARRAY_BYTES:,}"
+        )
+    scales, codes = (specs.get(part) for part in coded_parts(name))
+    if scales is None or codes is None:
+        raise BadArray(f"{where}: coded array {name!r} lacks its scales or its codes; make the file again")
+    if scales.dtype != DTYPES["F16"] or scales.shape != least:
+        found = f"{scales.dtype} {list(scales.shape)}"
+        raise BadArray(f"{where}: array {name!r} has scales {found}, expected float16 {list(least)}")
+    if codes.dtype != DTYPES["U8"] or len(codes.shape) != 1 or codes.shape[0] > code_bytes(numbers, bits):
+        found = f"{codes.dtype} {list(codes.shape)}"
+        raise BadArray(
+            f"{where}: array {name!r} has codes {found}, expected at most {code_bytes(numbers, bits):,} bytes"
+        )
+    return CodedSpec(bits, tuple(shape))
 
 
 def _counts(values: object) -> bool:

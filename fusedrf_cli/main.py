@@ -14,7 +14,10 @@ from formats.errors import FormatError, printable
 from fusedrf_cli import __version__, options
 from fusedrf_cli.errors import FusedRFError, Interrupted
 
-COMMANDS = ("train", "compose", "fuse", "add", "delete", "render", "eval", "info", "validate", "completion")
+COMMANDS = (
+    *("train", "compose", "fuse", "add", "delete", "render", "eval", "chart"),
+    *("info", "validate", "completion"),
+)
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"
 
 _MISSING_INPUT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)

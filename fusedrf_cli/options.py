@@ -178,6 +178,19 @@ class InputType(click.Path):
         return value
 
 
+class RanksType(_Text):
+    """'D,C' -> components per mode of density and of colour."""
+
+    name, expected = "D,C", "two multiples of 8, of density and colour components, such as 8,16"
+
+    def parse(self, text):
+        ranks = tuple(int(word) for word in text.split(","))
+        if len(ranks) != 2 or any(rank < 8 or rank % 8 or rank > 1024 for rank in ranks):
+            raise ValueError(text)
+        return ranks
+
+
+RANKS = RanksType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
 INPUT, SCENE = InputType(), InputType(stdin=True)
@@ -199,12 +212,21 @@ debug = click.option(
     help="Show the traceback of an error.",
 )
 overwrite = click.option("-w", "--overwrite", is_flag=True, help="Replace the output if it exists.")
+PRECISION = click.Choice(["float16", "float32", "int8", "int4"])
 precision = click.option(
-    "--precision",
-    type=click.Choice(["float16", "float32"]),
-    default="float16",
-    show_default=True,
-    help="How numbers are stored.",
+    "--precision", type=PRECISION, default="float16", show_default=True, help="How numbers are stored."
+)
+edited_precision = click.option(
+    "--precision", type=PRECISION, help="How numbers are stored; default: as those of FUSED are."
+)
+fused_precision = click.option(
+    "--precision", type=PRECISION, help="How numbers are stored; default: float16, or what the size asks for."
+)
+ranks = click.option(
+    "--ranks", type=RANKS, help="Keep at most so many density and colour components per mode, such as 8,16."
+)
+sh_degree = click.option(
+    "--sh-degree", type=click.IntRange(0, 3), help="Keep colour's dependence on the view up to this SH band."
 )
 time_budget = click.option("--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds.")
 max_size = click.option("--max-size", type=BYTES, help="Largest output file, such as 25MB.")
@@ -212,7 +234,16 @@ memory = click.option(
     "--memory", type=BYTES, help="Most memory to take, such as 8GiB; default: 80 % of what is free."
 )
 target_psnr = click.option(
-    "--target-psnr", type=POSITIVE, metavar="DB", help="Quality to reach, else exit code 7."
+    "--target-psnr",
+    type=POSITIVE,
+    metavar="DB",
+    help="Quality to reach, else exit code 7.",
+)
+smallest = click.option(
+    "--target-psnr",
+    type=POSITIVE,
+    metavar="DB",
+    help="Take the fewest bytes that reach this quality; exit code 7 where none do.",
 )
 resume = click.option("--resume", is_flag=True, help="Go on from the checkpoint of an interrupted run.")
 rgb = click.option("--rgb/--no-rgb", default=True, show_default=True, help="Finish on rendered views.")

@@ -13,11 +13,10 @@ import torch
 from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
 from formats.scene import Leaf, Matrix4, SceneGraph
-from fusedrf_cli.bridge.fuse import stored
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, make_field, write_field
+from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, make_field, stored, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -54,7 +53,7 @@ def add(
     time_budget: float | None,
     rgb: bool,
     memory: int | None,
-    precision: str,
+    precision: str | None,
     overwrite: bool,
     seed: int,
     device: str,
@@ -62,13 +61,14 @@ def add(
     progress,
 ) -> dict:
     """Put one more object into a fused field. Its blocks are appended; cells that it does not reach keep
-    their owner and numbers.
+    their owner and numbers. Without a precision the field keeps its own.
     """
     with engine(device, threads, progress):
         started = time.monotonic()
         progress.phase("reading", None)
         budget = Memory(memory)
-        scene, members, node, field = read_fused(fused, budget)
+        scene, members, node, field, own = read_fused(fused, budget)
+        precision = precision or own
         if name in names_in(scene, field, node.name):
             raise InvalidInput(f"{fused}: there is a '{name}' already; choose another --name")
         new = load_scene(source, budget=budget)
@@ -129,7 +129,7 @@ def delete(
     *,
     time_budget: float | None,
     rgb: bool,
-    precision: str,
+    precision: str | None,
     allow_outside: bool,
     overwrite: bool,
     seed: int,
@@ -141,12 +141,13 @@ def delete(
     they reached are cut.
 
     What an object hid inside the tensor is learned again from the remaining sources where these are known,
-    else left empty.
+    else left empty. Without a precision the field keeps its own.
     """
     with engine(device, threads, progress):
         started = time.monotonic()
         progress.phase("reading", None)
-        scene, members, node, field = read_fused(fused)
+        scene, members, node, field, own = read_fused(fused)
+        precision = precision or own
         known = names_in(scene, field, node.name)
         for name in names:
             if name not in known:
@@ -216,9 +217,9 @@ def addition_memory(field: VMField, new: LoadedScene) -> list[dict[str, float]]:
     ]
 
 
-def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, list[str], Leaf, VMField]:
-    """The scene of a bundle of one field, its other members (kept sources), the field's leaf, and the field;
-    InvalidInput when it is something else.
+def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, list[str], Leaf, VMField, str]:
+    """The scene of a bundle of one field, its other members (kept sources), the field's leaf, the field, and
+    its precision; InvalidInput when it is something else.
     """
     if not is_bundle(path):
         raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
@@ -236,7 +237,8 @@ def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, lis
     field = make_field(read_field(path, leaves[0].field), path)
     if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
-    return scene, [m for m in headers if m != leaves[0].field], leaves[0], field
+    own = headers[leaves[0].field].precision
+    return scene, [m for m in headers if m != leaves[0].field], leaves[0], field, own
 
 
 def check_history(scene: SceneGraph, path: str) -> None:

@@ -32,7 +32,7 @@ PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances 
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
-PER_POINT = 128  # of a teacher's points, in pieces and joined
+PER_POINT = 144  # of a teacher's points, in pieces and joined
 PER_PIXEL_OF_PHOTOS = 4 + 16  # colours, and two orders of drawing
 PER_OWN_RAY = 100  # of a camera's pixel: directions in float64 while they are made, float32 afterwards
 
@@ -156,3 +156,13 @@ def fitting(settings: FitSettings, aabb: np.ndarray, threads: int) -> dict[str, 
 def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
     """What is asked of the teachers."""
     return {"the teachers' answers": settings.rays * PER_RAY + points * PER_POINT}
+
+
+def lesson(rays: int) -> dict[str, float]:
+    """Rays to learn from, and what they show."""
+    return {"rays to learn from": rays * PER_RAY}
+
+
+def judged() -> dict[str, float]:
+    """Looking at a scene to measure; it covers about half of a picture that frames it."""
+    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
-from formats.records import FieldHeader, FieldRecord
+from formats.records import FieldHeader, FieldRecord, as_stored
 from formats.scene import SceneGraph, expand_scene, inline_scenes, make_node, parse_scene, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import READING, Memory, sources
@@ -214,6 +215,17 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
             node |= {"source": os.path.relpath(f.path.resolve(), folder), "sha256": hashes[f.path]}
         nodes.append(node)
     return nodes
+
+
+def stored(field: VMField, precision: str) -> VMField:
+    """The field as it will come back from a bundle of that precision."""
+    params = torch.zeros_like(field.params)
+    back = VMField(field.shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
+    for t in range(len(field.tensors)):
+        target = back.sections(t)
+        for name, view in field.sections(t).items():
+            target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), precision, name)))
+    return back
 
 
 def write_field(

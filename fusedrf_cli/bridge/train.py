@@ -10,6 +10,8 @@ import torch
 from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_images, read_capture
 from formats.meshes import mesh_capture
+from formats.records import BYTES_PER_NUMBER as BYTES_PER_NUMBER
+from formats.records import coded_bytes
 from formats.views import Capture, View
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
@@ -28,7 +30,6 @@ QUALITY = {
     "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
 }
 WHITE = (1.0, 1.0, 1.0)
-BYTES_PER_NUMBER = {"float16": 2, "float32": 4}
 
 
 def train(
@@ -85,9 +86,9 @@ def train(
             device=place,
         )
         settings = replace(settings, longest=fitting_longest(box, settings, max_size, precision))
-        numbers = settings.shape.size(texels(box, settings.longest))
-        check_size(numbers * BYTES_PER_NUMBER[precision], max_size)
-        check_space(output, numbers * BYTES_PER_NUMBER[precision])
+        needed = tensor_bytes(settings.shape, texels(box, settings.longest), precision)
+        check_size(needed, max_size)
+        check_space(output, needed)
         budget.expect(
             fit_memory(capture, box, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
@@ -165,10 +166,15 @@ def fitting_longest(aabb: np.ndarray, settings: FitSettings, max_size: int | Non
     while (
         max_size
         and longest > 16
-        and settings.shape.size(texels(aabb, longest)) * BYTES_PER_NUMBER[precision] > max_size
+        and tensor_bytes(settings.shape, texels(aabb, longest), precision) > max_size
     ):
         longest -= 4
     return longest
+
+
+def tensor_bytes(shape: VMShape, resolution: tuple[int, int, int], precision: str) -> int:
+    """The most bytes that a tensor's numbers take in a bundle."""
+    return sum(coded_bytes(section, precision) for _, section in shape.sections(resolution))
 
 
 def check_size(smallest: int, allowed: float | None) -> None:

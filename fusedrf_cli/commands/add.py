@@ -15,7 +15,7 @@ from fusedrf_cli.placement import node_words
 @options.time_budget
 @options.rgb
 @options.memory
-@options.precision
+@options.edited_precision
 @options.seeded
 @options.reporting
 def command(fused, source, output, name, translate, rotate, scale, matrix, **words):

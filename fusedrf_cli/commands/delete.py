@@ -11,7 +11,7 @@ from fusedrf_cli import options
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @options.time_budget
 @options.rgb
-@options.precision
+@options.edited_precision
 @options.allow_outside
 @options.seeded
 @options.reporting

@@ -17,7 +17,7 @@ from fusedrf_cli import options
     "fine as each place needs; auto: blocks where it can.",
 )
 @options.max_size
-@options.target_psnr
+@options.smallest
 @options.time_budget
 @options.rgb
 @click.option("--from-scratch", is_flag=True, help="Do not start from the background's weights.")
@@ -25,7 +25,9 @@ from fusedrf_cli import options
     "--keep-sources", is_flag=True, help="Keep the sources inside; delete then restores what was hidden."
 )
 @options.memory
-@options.precision
+@options.fused_precision
+@options.ranks
+@options.sh_degree
 @options.resume
 @options.allow_outside
 @options.seeded

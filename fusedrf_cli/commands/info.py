@@ -18,7 +18,7 @@ def _brief(summary: dict) -> dict:
         }
         for node in summary["nodes"]
     ]
-    shown = ("member", "kind", "bytes", "parameters")
+    shown = ("member", "kind", "precision", "bytes", "parameters")
     fields = [{key: field[key] for key in shown} for field in summary["fields"]]
     history = [_scalars(event) for event in summary["history"]]
     return {**summary, "nodes": nodes, "fields": fields, "history": history}

@@ -19,7 +19,7 @@ from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.composition import composed
-from fusedrf_cli.engine.distillation import distill
+from fusedrf_cli.engine.distillation import distill, finish
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.optimiser import Adam
@@ -94,9 +94,13 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(vm, "OWNERSHIP_CELLS", 48)
     patch.setattr(composed, "OCCUPANCY_CELLS", 48)
     patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
-    for name in ("fuse", "edit"):
+    for name in ("fuse_blocks", "fuse_vm", "edit"):
         patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
-    patch.setattr(part("fuse"), "DistillSettings", TinySettings)
+    patch.setattr(part("fuse_vm"), "DistillSettings", TinySettings)
+    patch.setattr(part("fuse_blocks"), "RANKS", (None,))  # others would be compiled
+    patch.setattr(part("fuse_blocks"), "VIEWS_TO_CHOOSE_BY", 2)
+    patch.setattr(finish, "RAYS_PER_STEP", 500)
+    patch.setattr(finish, "STEPS", 30)
     patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
     patch.setattr(part("train"), "VMShape", partial(VMShape, SHAPE.density_rank, SHAPE.colour_rank))
     draft = FitSettings(longest=24, steps=60, samples=1 << 13)

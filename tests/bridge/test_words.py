@@ -14,6 +14,7 @@ CALLS = {
     "add": ("add", "in", "in", "-o", "out", "--name", "n"),
     "delete": ("delete", "in", "n", "-o", "out"),
     "render": ("render", "in", "-o", "out"),
+    "chart": ("chart", "in", "-o", "out"),
     "evaluate": ("eval", "in", "--against", "in"),
 }
 

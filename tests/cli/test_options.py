@@ -151,7 +151,9 @@ def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
         "rgb": False,
         "from_scratch": False,
         "keep_sources": False,
-        "precision": "float16",
+        "precision": None,
+        "ranks": None,
+        "sh_degree": None,
         "resume": False,
         "allow_outside": False,
     }

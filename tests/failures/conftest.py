@@ -75,8 +75,11 @@ def quick(monkeypatch) -> None:
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 48)
     monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 48)
     monkeypatch.setattr("fusedrf_cli.engine.distillation.distill.POINTS_PER_STEP", 1 << 13)
-    monkeypatch.setattr(part("fuse"), "DistillSettings", TinySettings)
-    for name in ("fuse", "edit"):
+    monkeypatch.setattr(part("fuse_vm"), "DistillSettings", TinySettings)
+    monkeypatch.setattr(part("fuse_blocks"), "RANKS", (None,))  # others would be compiled
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.RAYS_PER_STEP", 500)
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.STEPS", 30)
+    for name in ("fuse_blocks", "fuse_vm", "edit"):
         judge = lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed)  # noqa: E731
         monkeypatch.setattr(part(name), "Judge", judge)
 

@@ -9,7 +9,7 @@ import safetensors.numpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from formats import errors
+from formats import errors, records
 from formats.records import MAX_HEADER, FieldRecord, decode_field, decode_header, encode_field
 
 CONTENT = {"kind": "dense", "metadata": {}, "version": 1}
@@ -101,6 +101,22 @@ def test_metadata_that_is_no_json(value):
         encode_field(FieldRecord("vm", {}, {"x": value}))
 
 
+A_CODED = {"bits": 8, "shape": [3, 1, 2]}
+A_SCALES = {"dtype": "F16", "shape": [1, 1, 2], "data_offsets": [0, 4]}
+A_CODES = {"dtype": "U8", "shape": [3], "data_offsets": [4, 7]}
+ONE = b"\0\x3c\0\0" + b"\x80" * 3  # a scale of 1, one of 0, three codes of 0
+
+
+def coded(told, scales=A_SCALES, codes=A_CODES, data=ONE, **others) -> bytes:
+    """A field of version 2 with that word about its coded arrays, of which 'a' is there."""
+    arrays = {"a.scales": scales, "a.codes": codes, **others}
+    return raw(field({k: v for k, v in arrays.items() if v}, CONTENT | {"version": 2, "coded": told}), data)
+
+
+def told(**words) -> dict:
+    return {"a": A_CODED | words}
+
+
 HOSTILE = {
     "empty": (b"", errors.TruncatedBundle),
     "header cut": (raw(field())[:20], errors.TruncatedBundle),
@@ -113,7 +129,7 @@ HOSTILE = {
     "two metadata keys": (raw({"__metadata__": {"fusedrf": "{}", "x": ""}}), errors.BadHeader),
     "content no object": (raw(field(content=[1])), errors.BadSchema),
     "version boolean": (raw(field(content=CONTENT | {"version": True})), errors.BadSchema),
-    "version newer": (raw(field(content=CONTENT | {"version": 2})), errors.NewerVersion),
+    "version newer": (raw(field(content=CONTENT | {"version": 3})), errors.NewerVersion),
     "version old": (raw(field(content=CONTENT | {"version": 0})), errors.BadSchema),
     "kind": (raw(field(content=CONTENT | {"kind": "../x"})), errors.BadSchema),
     "key unknown": (raw(field(content=CONTENT | {"x": 1})), errors.BadSchema),
@@ -135,8 +151,49 @@ HOSTILE = {
     "data over": (raw(field({"a": SIGMA}), b"\0" * 5), errors.BadHeader),
     "gap": (raw(field({"a": SIGMA | {"data_offsets": [4, 8]}}), b"\0" * 8), errors.BadHeader),
     "overlap": (raw(field({"a": SIGMA, "b": SIGMA})), errors.BadHeader),
-    "too many": (raw(field({f"a{i}": SIGMA for i in range(257)})), errors.LimitExceeded),
+    "too many": (raw(field({f"a{i}": SIGMA for i in range(4097)})), errors.LimitExceeded),
     "infinite": (raw(field({"a": SIGMA}), np.float32(np.inf).tobytes()), errors.NotFinite),
+    "coded in version 1": (raw(field(content=CONTENT | {"coded": {}})), errors.BadSchema),
+    "coded missing": (raw(field(content=CONTENT | {"version": 2})), errors.BadSchema),
+    "coded nothing": (coded({}), errors.BadSchema),
+    "coded list": (coded(["a"]), errors.BadSchema),
+    "coded name": (coded({"../x": A_CODED}), errors.BadArray),
+    "coded twice": (coded({"a": A_CODED, "a.scales": A_CODED}), errors.BadArray),
+    "coded without bits": (coded({"a": {"shape": [3, 1, 2]}}), errors.BadSchema),
+    "coded with more": (coded(told(scale=1)), errors.BadSchema),
+    "coded no object": (coded({"a": [8]}), errors.BadSchema),
+    "coded 5 bits": (coded(told(bits=5)), errors.BadSchema),
+    "coded 8.0 bits": (coded(told(bits=8.0)), errors.BadSchema),
+    "coded true bits": (coded(told(bits=True)), errors.BadSchema),
+    "coded list of bits": (coded(told(bits=[8])), errors.BadSchema),
+    "coded vector": (coded(told(shape=[6])), errors.BadArray),
+    "coded in 4 dimensions": (coded(told(shape=[3, 1, 2, 1])), errors.BadArray),
+    "coded nowhere": (coded(told(shape=[0, 1, 2])), errors.BadArray),
+    "coded shape of text": (coded(told(shape="312")), errors.BadArray),
+    "coded negative": (coded(told(shape=[-3, 1, 2])), errors.BadArray),
+    "coded too wide": (coded(told(shape=[2**31, 1, 2])), errors.BadArray),
+    "coded too large": (coded(told(shape=[2**30, 2**30, 2])), errors.LimitExceeded),
+    "coded of another shape": (coded(told(shape=[9, 1, 2])), errors.BadArray),
+    "coded on its side": (coded(told(shape=[3, 2, 1])), errors.BadArray),
+    "scales missing": (coded(told(), None, A_CODES | {"data_offsets": [0, 3]}, ONE[4:]), errors.BadArray),
+    "codes missing": (coded(told(), codes=None, data=ONE[:4]), errors.BadArray),
+    "scales of bytes": (
+        coded(told(), {"dtype": "U8", "shape": [1, 1, 4], "data_offsets": [0, 4]}),
+        errors.BadArray,
+    ),
+    "codes in a square": (coded(told(), codes=A_CODES | {"shape": [3, 1]}), errors.BadArray),
+    "codes for more": (
+        coded(told(), codes=A_CODES | {"shape": [7], "data_offsets": [4, 11]}, data=ONE + ONE[-4:]),
+        errors.BadArray,
+    ),
+    "codes for fewer": (
+        coded(told(), codes=A_CODES | {"shape": [2], "data_offsets": [4, 6]}, data=ONE[:-1]),
+        errors.BadArray,
+    ),
+    "code 0": (coded(told(), data=ONE[:-1] + b"\0"), errors.BadArray),
+    "scale negative": (coded(told(), data=b"\0\xbc" + ONE[2:]), errors.BadArray),
+    "scale infinite": (coded(told(), data=b"\0\x7c" + ONE[2:]), errors.NotFinite),
+    "too many coded": (coded({f"a{i}": A_CODED for i in range(4097)}), errors.LimitExceeded),
 }
 
 
@@ -146,6 +203,26 @@ def test_hostile_bytes(data, error):
     with pytest.raises(error, match="^here: ") as caught:
         decode_field(data, "here")
     assert type(caught.value) is error and "\n" not in str(caught.value)
+
+
+def test_a_coded_field_without_a_fault_is_taken():
+    """So that each of the hostile ones has its own."""
+    record = decode_field(coded(told()), "here")
+    np.testing.assert_array_equal(record.arrays["a"], np.zeros((3, 1, 2), np.float32))
+    assert list(record.arrays) == ["a"]
+
+
+def test_what_all_arrays_decode_to_is_bounded(monkeypatch):
+    """P14: a scale alone may stand for 64 numbers."""
+    assert decode_header(coded(told()), "here").decoded_size == 24
+    monkeypatch.setattr(records, "MAX_DECODED_BYTES", 23)
+    with pytest.raises(errors.LimitExceeded, match="here: decodes to 24 bytes, the most is 23"):
+        decode_header(coded(told()), "here")
+
+
+def test_as_many_arrays_are_read_whether_they_are_coded_or_not():
+    record = FieldRecord("vm", {f"a{i}": np.ones((16, 16, 16)) for i in range(256)})
+    assert len(decode_field(encode_field(record, "int4"), "here").arrays) == 256
 
 
 def test_the_header_alone_tells_kind_and_shapes():

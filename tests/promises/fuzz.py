@@ -31,7 +31,7 @@ from tests.promises.packs import GOLDEN
 
 PATIENCE = 5.0  # seconds of computing; other processes may slow the clock on the wall
 WAITING = 60.0
-GOOD = ("lamp.rfpack", "pair.rfpack", "later.rfpack")
+GOOD = ("lamp.rfpack", "pair.rfpack", "later.rfpack", "coded-8.rfpack", "coded-4.rfpack")
 CELLS = 16  # of ownership grids, here: a good pack of two blocks then loads in a hundredth of the time
 
 
@@ -70,7 +70,7 @@ def reading(read):
 
 
 def edited(path: str) -> None:
-    scene, members, node, field = edit.read_fused(path)
+    scene, members, node, field, _ = edit.read_fused(path)
     edit.names_in(scene, field, node.name)
     edit.remaining(scene, members, Path(path), (), node.object_to_world[:3, 3], False, Silence())
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from formats import errors, inputs, scene
+from formats import errors, inputs, records, scene
 from formats.archive import MAX_MEMBERS, write_archive
 from formats.bundle import member_name
 from formats.records import MAX_HEADER
@@ -255,3 +255,4 @@ def test_limits_are_those_of_the_specification():
     assert (MAX_MEMBERS, MAX_HEADER, scene.MAX_SCENE_BYTES) == (10_001, 1 << 20, 4 << 20)
     assert f"{inputs.MAX_VALUES:,}" in spec and f"{inputs.MAX_KEYS:,}" in spec
     assert f"{inputs.MAX_NESTING} levels" in spec
+    assert "those of a field 8 GiB" in spec and records.MAX_DECODED_BYTES == 8 << 30

@@ -34,12 +34,20 @@ def decibels(one: np.ndarray, other: np.ndarray) -> float:
     return float("inf") if error == 0 else float(-10 * np.log10(error))
 
 
-@pytest.mark.parametrize("name", ["pair.rfpack", "later.rfpack"])
-def test_kept_packs_render_as_they_did(name):
-    """P1: these files are kept for ever, and show what pair.png shows."""
+@pytest.mark.parametrize(
+    ("name", "picture"),
+    [
+        ("pair.rfpack", "pair.png"),
+        ("later.rfpack", "pair.png"),
+        ("coded-8.rfpack", "coded.png"),
+        ("coded-4.rfpack", "coded.png"),
+    ],
+)
+def test_kept_packs_render_as_they_did(name, picture):
+    """P1: these files are kept for ever, and show what their pictures show."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)
-        assert decibels(rendered(GOLDEN / name), read_image(GOLDEN / "pair.png")[..., :3]) >= 60
+        assert decibels(rendered(GOLDEN / name), read_image(GOLDEN / picture)[..., :3]) >= 60
 
 
 def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
@@ -53,6 +61,14 @@ def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
         lambda i, stored, *rest: real(i, {**stored, "scale": 1.1 * stored["scale"]}, *rest),
     )
     assert decibels(rendered(GOLDEN / "pair.rfpack"), read_image(GOLDEN / "pair.png")[..., :3]) < 50
+
+
+def test_another_meaning_of_codes_would_show(monkeypatch):
+    """P1 with its defence removed: a reader that divides by 128 instead of 127."""
+    from formats import quantised
+
+    monkeypatch.setitem(quantised.LEVELS, 8, 128)
+    assert decibels(rendered(GOLDEN / "coded-8.rfpack"), read_image(GOLDEN / "coded.png")[..., :3]) < 50
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.rfpack")), ids=lambda path: path.stem)

@@ -7,25 +7,32 @@ tensor, and appending or
 dropping a block leaves all others bit for bit as they were.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.trimming import smaller_shape, truncated
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
 
-BYTES_PER_NUMBER = {"float16": 2, "float32": 4}
 MAX_BLOCKS = 255
+FINER = 1 / 8  # of the finest voxel: with a stretched block a common voxel may lie under it
+TOLERANCE = 1 + 1e-4  # to which a common voxel is found
 
 
-def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str = "float16") -> VMField:
+def blocks_of(
+    placed: list[Placed],
+    fits: Callable[[VMShape, list[VMTensor]], bool] | None = None,
+    ranks: VMShape | None = None,
+) -> VMField:
     """One VM field that answers as the max composition of placed VM fields does, in their common frame.
 
-    With `max_bytes` the tensors are resampled to the finest common voxel (in the common frame) whose numbers
-    fit. Raises ValueError
-    when a placed field is no VM field or there are more than MAX_BLOCKS blocks.
+    With `fits` the tensors are resampled to the finest common voxel (in the common frame) at which it says
+    so of their shape and what they are. With `ranks` they keep at most those, truncated by energy. Raises
+    ValueError when a placed field is no VM field or there are more than MAX_BLOCKS blocks.
     """
     for p in placed:
         if p.field.kind != VMField.kind:
@@ -38,7 +45,8 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
         tensors += field.tensors
         shapes.append(field.shape)
         dtype = field.params.dtype
-    shape = common_shape(shapes)
+    whole = common_shape(shapes)
+    shape = whole if ranks is None else smaller_shape(whole, ranks)
     blocks = [
         Block(first[id(p.field)] + b.tensor, p.object_to_world @ b.object_to_field, block_name(p, b, own))
         for p in placed
@@ -46,16 +54,16 @@ def blocks_of(placed: list[Placed], max_bytes: int | None = None, precision: str
     ]
     if len(blocks) > MAX_BLOCKS:
         raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, this scene has {len(blocks)}")
-    if max_bytes is not None:
-        numbers = max_bytes // BYTES_PER_NUMBER[precision]
-        fitting = fitting_resolutions(shape, tensors, blocks, numbers)
-        tensors = [replace(t, resolution=r) for t, r in zip(tensors, fitting, strict=True)]
+    if fits is not None:
+        tensors = fitting_tensors(tensors, blocks, lambda tried: fits(shape, tried))
     params = torch.empty(sum(shape.size(t.resolution) for t in tensors), dtype=dtype)
     at = 0
     for key, streamed in fields.items():  # one after the other: not all of them need to be in memory
-        field = reshaped(opened(streamed), shape)
+        field = reshaped(opened(streamed), whole)
         for t in range(len(field.tensors)):
-            numbers = tensor_params(field, t, tensors[first[key] + t].resolution)
+            numbers = truncated(
+                tensor_field(field, t, tensors[first[key] + t].resolution), shape
+            ).params
             params[at : at + len(numbers)] = numbers
             at += len(numbers)
     return VMField.assembled(shape, tuple(tensors), tuple(blocks), params)
@@ -117,48 +125,41 @@ def reshaped(field: VMField, shape: VMShape) -> VMField:
     return wide
 
 
-def fitting_resolutions(
-    shape: VMShape, tensors: list[VMTensor], blocks: list[Block], numbers: int
-) -> list[tuple[int, int, int]]:
-    """Of every tensor its own resolution, or that of the finest common voxel (in the blocks' frame) at which
-    all numbers together are at most `numbers`, where that is less.
+def fitting_tensors(
+    tensors: list[VMTensor], blocks: list[Block], fits: Callable[[list[VMTensor]], bool]
+) -> list[VMTensor]:
+    """The tensors at their own resolution, or at that of the finest common voxel (in the blocks' frame) at
+    which they fit, where that is less.
     """
+    if fits(tensors):
+        return tensors
     sizes = [np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False) for b in blocks]
     stretch = [
         max(s[0] for b, s in zip(blocks, sizes, strict=True) if b.tensor == t) for t in range(len(tensors))
     ]
 
-    def resolutions(voxel: float) -> list[tuple[int, int, int]]:
+    def at_voxel(voxel: float) -> list[VMTensor]:
         found = []
         for tensor, scale in zip(tensors, stretch, strict=True):
             wanted = np.ceil((tensor.aabb[3:] - tensor.aabb[:3]) * scale / voxel).astype(int) + 1
-            found.append(tuple(int(n) for n in np.clip(wanted, 2, tensor.resolution)))
+            texels = tuple(int(n) for n in np.clip(wanted, 2, tensor.resolution))
+            found.append(replace(tensor, resolution=texels))
         return found
 
-    def count(voxel: float) -> int:
-        return sum(shape.size(r) for r in resolutions(voxel))
-
-    if sum(shape.size(t.resolution) for t in tensors) <= numbers:
-        return [t.resolution for t in tensors]
-    fine = min(tensors[b.tensor].voxel_size.min() * s[-1] for b, s in zip(blocks, sizes, strict=True)) / 8
+    fine = FINER * min(tensors[b.tensor].voxel_size.min() * s[-1] for b, s in zip(blocks, sizes, strict=True))
     coarse = max(float((t.aabb[3:] - t.aabb[:3]).max() * s) for t, s in zip(tensors, stretch, strict=True))
-    for _ in range(40):
+    while coarse > TOLERANCE * fine:
         middle = (fine * coarse) ** 0.5
-        fine, coarse = (fine, middle) if count(middle) <= numbers else (middle, coarse)
-    return resolutions(coarse)
+        fine, coarse = (fine, middle) if fits(at_voxel(middle)) else (middle, coarse)
+    return at_voxel(coarse)
 
 
-def tensor_params(field: VMField, t: int, resolution: tuple[int, int, int]) -> torch.Tensor:
-    """(P,) numbers of one tensor of a field, resampled where the resolution is another."""
-    single = tensor_field(field, t)
-    if resolution == single.tensors[0].resolution:
-        return single.params
-    return single.resampled(single.tensors[0].aabb, resolution).params
-
-
-def tensor_field(field: VMField, t: int) -> VMField:
-    """One tensor of a field as a field of its own, in its object's frame."""
+def tensor_field(field: VMField, t: int, resolution: tuple[int, int, int] | None = None) -> VMField:
+    """One tensor of a field as a field of its own, in its object's frame, resampled where another resolution
+    is given."""
     tensor: VMTensor = field.tensors[t]
     start = int(field.layout[t, 0])
     params = field.params[start : start + field.shape.size(tensor.resolution)].clone()
-    return VMField(field.shape, (tensor,), (Block(0, np.eye(4), ""),), params, tensor.occupancy)
+    alone = VMField(field.shape, (tensor,), (Block(0, np.eye(4), ""),), params, tensor.occupancy)
+    same = resolution is None or resolution == tensor.resolution
+    return alone if same else alone.resampled(tensor.aabb, resolution)

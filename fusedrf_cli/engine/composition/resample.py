@@ -51,9 +51,13 @@ CORRECTIONS = 3
 
 
 
+class TooFewNumbers(ValueError):
+    """Not even the widest voxels fit."""
+
+
 def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
     """The teacher as a sparse field in its frame with at most so many numbers. Raises EmptyField where the teacher
-    shows nothing, ValueError where not even the widest voxels fit.
+    shows nothing, TooFewNumbers where not even the widest voxels fit.
     """
     lattice, known = fitted(teacher, shape, max_numbers)
     field = SparseField(shape, lattice, density_scale(lattice.tree))
@@ -79,7 +83,7 @@ def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tupl
         wanted = tried[-1][0] + (np.log(0.97 * max_numbers) - tried[-1][1]) / slope
         common = float(np.exp(np.clip(wanted, np.log(min(own)), tried[-1][0] + 2)))
     if best is None:
-        raise ValueError(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
+        raise TooFewNumbers(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
     return best[1]
 
 

@@ -1,9 +1,8 @@
 """Distil any radiance field into a VM student (FusedRF; PVD for one teacher).
 
 Three phases: ask the teacher on rays through it, fit the student's σ and colour at the points of those rays
-(3D losses), then a
-few passes over the rays themselves (RGB loss) at a tenth of the rate, kept only if the student got better on
-views of its own.
+(3D losses), at half the resolution first, then pass over the rays themselves (RGB loss) at a far lower rate,
+kept only if the student got better on views of its own.
 """
 
 import time
@@ -37,7 +36,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 
 RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
-RGB_RATE = 0.01
+RGB_RATE = 0.003
 OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
 COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
@@ -58,8 +57,8 @@ class DistillSettings:
     max_numbers: int = 12_000_000
     """Numbers the student may have; its resolution follows."""
     rays: int = 400_000
-    steps: int = 1200
-    rgb_steps: int = 1500
+    steps: int = 1000
+    rgb_steps: int = 600
     rgb_samples: int = 1 << 15
     time_budget: float | None = None
     """Seconds of learning, half for points and half for rays where there is an RGB phase. None: the steps
@@ -253,7 +252,8 @@ class DistillRun:
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth."""
         self.teacher, self.boxes, self.rgb = teacher, boxes, rgb
         self.settings, self.recipe, self.step = settings, recipe, 0.5 * student.voxel_size
-        self.student, self.refined = (halved(student), student) if recipe.coarse(student) else (student, None)
+        coarse = settings.steps > 0 and recipe.coarse(student)
+        self.student, self.refined = (halved(student), student) if coarse else (student, None)
         """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
         self.report = DistillReport()
@@ -375,7 +375,7 @@ class DistillRun:
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given."""
         if self.settings.time_budget is None:
-            return self.steps / steps
+            return self.steps / steps if steps else 1.0
         return seconds / (self.settings.time_budget / (2 if self.rgb else 1))
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:

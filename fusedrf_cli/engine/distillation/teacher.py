@@ -119,8 +119,11 @@ def ask(
         part = slice(start, start + at_once)
         parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
     pixels, *columns = (torch.cat(column) for column in zip(*parts, strict=True))
+    parts.clear()  # hundreds of megabytes
     order = torch.randperm(len(columns[0]), generator=generator)
-    return TeacherPool(rays_o, rays_d, pixels, Points(*(column[order] for column in columns)))
+    for i, column in enumerate(columns):
+        columns[i] = column[order]
+    return TeacherPool(rays_o, rays_d, pixels, Points(*columns))
 
 
 def _ask_part(

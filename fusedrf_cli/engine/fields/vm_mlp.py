@@ -155,6 +155,10 @@ class VMMLPField:
         """(1, 13) int64 offsets of the sections in params."""
         return self.factors.layout
 
+    def parameter_groups(self) -> list[tuple[int, int, bool]]:
+        """(low, high, whether it is a colour basis) of every group of `params`, in order."""
+        return self.factors.parameter_groups()
+
     @property
     def kernel_shape(self) -> tuple[tuple[int, ...], ...]:
         """Ranks as the kernels take them."""

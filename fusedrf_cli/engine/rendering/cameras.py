@@ -130,7 +130,12 @@ def orbit(aabb: np.ndarray, count: int, width: int, height: int, elevation: floa
 
 
 def scattered(
-    aabb: np.ndarray, count: int, width: int, height: int, seed: int, lowest: float = 0.05
+    aabb: np.ndarray,
+    count: int,
+    width: int,
+    height: int,
+    seed: int | tuple[int, ...],
+    lowest: float = 0.05,
 ) -> list[Camera]:
     """`count` cameras at seeded random azimuths and elevations above `lowest` radians: the views nothing is
     trained on."""

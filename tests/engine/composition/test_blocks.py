@@ -119,19 +119,23 @@ def test_a_tensor_stays_while_one_copy_does():
     assert torch.equal(left.params, chair.params) and left.blocks[0].name == "two"
 
 
+def at_most(numbers):
+    return lambda shape, tensors: sum(shape.size(t.resolution) for t in tensors) <= numbers
+
+
 def test_shrunk_fits_and_resembles():
     smooth = random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32).resampled(BOX, (30, 33, 33))
     placed = [Placed("a", smooth, affine(turn(20))), Placed("b", small(2), affine(0.5, (3, 0, 0)))]
     field = blocks_of(placed)
     whole = field.params.numel()
     for numbers in (whole // 2, whole // 4):
-        less = blocks_of(placed, max_bytes=4 * numbers, precision="float32")
+        less = blocks_of(placed, at_most(numbers))
         assert 0.5 * numbers < less.params.numel() <= numbers
         assert all(min(t.resolution) >= 2 for t in less.tensors)
         wanted, found = asked(field, field.aabb)[0], asked(less, field.aabb)[0]
         assert (found - wanted).abs().mean() < 0.1 * wanted.mean()
-    assert torch.equal(blocks_of(placed, max_bytes=4 * whole, precision="float32").params, field.params)
-    limit = blocks_of([Placed("a", smooth, np.eye(4))], max_bytes=whole, precision="float32")
+    assert torch.equal(blocks_of(placed, at_most(whole)).params, field.params)
+    limit = blocks_of([Placed("a", smooth, np.eye(4))], at_most(whole // 4))
     assert 4 * limit.params.numel() <= whole
 
 

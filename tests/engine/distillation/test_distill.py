@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import (
@@ -187,6 +188,32 @@ def test_the_curve_rises_and_is_of_rays_of_its_own(monkeypatch):
     seconds, steps, values = zip(*report.curve, strict=True)
     assert steps == tuple(range(10, 91, 10)) and values[5] > values[0] + 3
     assert list(seconds) == sorted(seconds) and report.steps == {"points": 60, "pictures": 30}
+
+
+def test_pictures_alone_go_on_from_the_student_that_is_there(monkeypatch):
+    """Without steps on points a student keeps what it knows, and its resolution, until the pictures."""
+    monkeypatch.setattr(module, "COARSE_FROM", 16)
+    known = taught(SETTINGS, rgb=False)[0]
+    start = known.params.clone()
+    settings = replace(SETTINGS, steps=0, rgb_steps=0)
+    run = DistillRun(TEACHER, known, [TEACHER.occupancy.tight_aabb(0)], settings)
+    student, report = run.finish()
+    assert torch.equal(student.params, start) and report.psnr_before_rgb == report.psnr_after_rgb > 20
+
+
+def test_several_blocks_are_finished_on_pictures():
+    """Two placed tensors learn together; their cells stay as they are."""
+    one, two = (random_vm(THIRTY_TWO, (16, 16, 16), torch.float32, seed=s, cells=8) for s in (1, 2))
+    matrices = np.eye(4), affine(turn(30), (0.5, 0, 0))
+    placed = [Placed(n, f, m) for n, f, m in zip("ab", (one, two), matrices, strict=True)]
+    student, teacher = blocks_of(placed), blocks_of(placed)
+    student.params.mul_(0.9)
+    settings = replace(SETTINGS, steps=0, rgb_steps=40)
+    run = DistillRun(teacher, student, [teacher.occupancy.tight_aabb(0)], settings)
+    cells = student.occupancy.occupied
+    finished, report = run.finish()
+    assert report.psnr_after_rgb > report.psnr_before_rgb + 1 and report.rgb_kept
+    assert len(finished.blocks) == 2 and np.array_equal(finished.occupancy.occupied, cells)
 
 
 def test_half_the_resolution_first_ends_at_all_of_it(monkeypatch):

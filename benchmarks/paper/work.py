@@ -1,0 +1,81 @@
+"""What every experiment uses: commands run in this process, views to hold fields to, memory, and files."""
+
+import contextlib
+import csv
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fusedrf_cli.bridge.chart import Course
+from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.commands.chart import fuse_words
+from fusedrf_cli.main import cli
+
+MOST_BYTES = 25_000_000
+"""The paper's size of a fused field."""
+KINDS = tuple(kind for kind in ("blocks", "sparse", "vm") if fuse_words(("--kind", kind)) is not None)
+
+
+@dataclass(frozen=True)
+class Work:
+    """Where an experiment reads and writes."""
+
+    folder: Path
+    """Sources and scenes, which are kept between runs."""
+    out: Path
+    """Tables and plots."""
+    data: Path | None
+    """Captures: chair/ and fuze/fuze.obj; None: scenes that are made here alone."""
+
+
+def fusedrf(folder: Path, *words: str) -> dict:
+    """The JSON report of a command in a folder. It runs in this process, so that kernels are loaded once.
+    RuntimeError with its sentence where it fails; a missed quality is a report.
+    """
+    line = [*words, "--json"] if words[0] == "eval" else [*words, "--json", "-w"]
+    said, wrong = io.StringIO(), io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(said), contextlib.redirect_stderr(wrong):
+        try:
+            cli.main(line)
+        except SystemExit as end:
+            code = end.code
+    if code not in (0, 7):
+        raise RuntimeError(f"fusedrf {' '.join(line)}: {wrong.getvalue().strip()}")
+    return json.loads(said.getvalue())
+
+
+def course(scene: Path, size: int, box=None) -> Course:
+    """Views of a scene that nothing was trained or chosen on; box (6,) is what they frame."""
+    return Course.lay(str(scene), Memory(), (size, size), box=box)
+
+
+def frame_times(held: Course, bundles: Sequence[Path]) -> list[float]:
+    """Median ms of a frame of the scene as composed and of each bundle, all taking turns."""
+    return held.frame_times(bundles, lambda done: None)
+
+
+def peak_of(scene: Path, size: int) -> int:
+    """Bytes that a process of its own holds at most, which reads a scene and renders one frame of it."""
+    picture = str(scene.with_suffix(".peak.png"))
+    words = ["render", str(scene), "-o", picture, "--size", f"{size}x{size}", "-w", "--json"]
+    line = [sys.executable, "-m", "fusedrf_cli", *words]
+    done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=True)
+    return json.loads(done.stdout)["memory"]["peak_bytes"]
+
+
+def write_csv(path: Path, rows: Iterable[dict]) -> None:
+    """Rows with the same keys, which are the columns."""
+    rows = list(rows)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+        table.writeheader()
+        table.writerows({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows)
+
+
+def tell(text: str) -> None:
+    """A line of progress."""
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,183 @@
+"""Arrays in 8 or 4 bits: a code for every number, and a scale for every block of neighbours.
+
+An array of three dimensions (na, nb, R) is cut into blocks of 8 x 8 x 1, one of two (V, C) into blocks of
+64 x 1, from index 0, smaller at the far edges. With L = 127 in 8 bits and 7 in 4, a number is
+
+    value = scale * code / L        scale a float16 >= 0 of its block, code an integer from -L to L
+
+computed in float32, the product first: it is exact, so that code L gives back the scale itself. A block whose
+scale is 0 is all zero and stores no codes. Encoding what was decoded gives the same scales and codes, because
+every other block has a number of code L or -L, which tells its scale.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from formats.errors import BadArray, NotFinite
+
+BLOCKS = {2: (64, 1), 3: (8, 8, 1)}  # by an array's dimensions
+LEAST = {2: 65536, 3: 4096}  # numbers of an array that a writer codes; smaller ones stay float16
+LEVELS = {8: 127, 4: 7}  # the largest code, by bits
+# Of a block's largest number: the scales that are tried for the least squared error. Eight bits have no use
+# for cutting the largest off; none may be above 1, or no code would reach L.
+FACTORS = {8: (1.0,), 4: (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.65)}
+NUMBERS_AT_ONCE = 1 << 17  # of an array, so that what is made of them stays in the cache
+
+
+def is_coded(shape: tuple[int, ...]) -> bool:
+    """Whether a writer codes an array of that shape."""
+    return len(shape) in LEAST and math.prod(shape) >= LEAST[len(shape)]
+
+
+def scales_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Blocks per axis of an array of two or three dimensions."""
+    return tuple(-(-n // b) for n, b in zip(shape, BLOCKS[len(shape)], strict=True))
+
+
+def code_bytes(numbers: int, bits: int) -> int:
+    """Bytes of so many codes."""
+    return -(-numbers * bits // 8)
+
+
+def quantised(array: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Scales, float16 of `scales_shape`, and codes, flat uint8, of a float array of two or three dimensions.
+
+    An error is at most scale / (2 L), or 2^-24 where that is more, in 8 bits; in 4 the largest numbers of a
+    block may be cut off where the others gain by it. Magnitudes have to be at most 65504.
+    """
+    levels = LEVELS[bits]
+    scales, codes = np.empty(scales_shape(array.shape), np.float16), []
+    for rows, blocks in _slabs(array.shape):
+        values = np.asarray(array[rows], np.float32)
+        scales[blocks] = _best_scales(values, bits)
+        spread = _spread(scales[blocks], values.shape)
+        codes.append((_codes(values, spread, levels) + np.float32(levels + 1)).astype(np.uint8)[spread > 0])
+    found = np.concatenate(codes) if codes else np.zeros(0, np.uint8)
+    return scales, found if bits == 8 else _paired(found)
+
+
+def dequantised(
+    scales: np.ndarray, codes: np.ndarray, bits: int, shape: tuple[int, ...], where: str
+) -> np.ndarray:
+    """float32 numbers of `shape` from what `quantised` gave; `scales` have the shape that `shape` asks for.
+
+    `where` leads error sentences. Before the numbers are allocated, raises NotFinite (scales) and BadArray
+    (negative scales, codes that are none, too many or too few of them).
+    """
+    levels, kept_numbers = LEVELS[bits], check_scales(scales, shape, where)
+    if codes.size != code_bytes(kept_numbers, bits):
+        raise BadArray(
+            f"{where}: {codes.size:,} bytes of codes where its scales ask for "
+            f"{code_bytes(kept_numbers, bits):,}; make the file again"
+        )
+    if bits == 4:
+        codes = _single(codes)
+        if codes[kept_numbers:].any():
+            raise BadArray(f"{where}: its last half byte should be 0; make the file again")
+        codes = codes[:kept_numbers]
+    if kept_numbers and not codes.min():
+        raise BadArray(f"{where}: has a code 0, expected 1 to {2 * levels + 1}; make the file again")
+    array, at = np.zeros(shape, np.float32), 0
+    for rows, blocks in _slabs(shape):
+        if not scales[blocks].any():
+            continue  # pages of zeros are never touched
+        spread = _spread(scales[blocks], array[rows].shape)
+        kept = spread > 0
+        count = np.count_nonzero(kept)
+        signed = np.zeros(kept.shape, np.float32)
+        signed[kept] = codes[at : at + count].astype(np.float32) - (levels + 1)
+        array[rows] = spread * signed / np.float32(levels)
+        at += count
+    return array
+
+
+def check_scales(scales: np.ndarray, shape: tuple[int, ...], where: str) -> int:
+    """How many numbers of an array of `shape` have codes. Raises NotFinite and BadArray for scales that are
+    none."""
+    if not np.isfinite(scales).all():
+        raise NotFinite(f"{where}: has scales NaN or infinite; make the file again")
+    if np.signbit(scales).any():
+        raise BadArray(f"{where}: has negative scales; make the file again")
+    return _numbers_kept(scales > 0, shape)
+
+
+def exact_code_bytes(array: np.ndarray, bits: int) -> int:
+    """Bytes that the codes of an array take, without making them."""
+    kept = np.empty(scales_shape(array.shape), bool)
+    for rows, blocks in _slabs(array.shape):
+        kept[blocks] = _floored(_by_block(np.maximum, np.abs(array[rows]))) > 0
+    return code_bytes(_numbers_kept(kept, array.shape), bits)
+
+
+def _numbers_kept(kept: np.ndarray, shape: tuple[int, ...]) -> int:
+    """Numbers in those blocks."""
+    counts = kept.astype(np.int64)
+    for axis, (n, b) in enumerate(zip(shape, BLOCKS[len(shape)], strict=True)):
+        lengths = np.minimum(b, n - b * np.arange(kept.shape[axis]))
+        counts *= lengths.reshape([-1 if a == axis else 1 for a in range(len(shape))])
+    return int(counts.sum())
+
+
+def _slabs(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice]]:
+    """Slices of an array's first axis, and of its scales', that cut no block."""
+    block = BLOCKS[len(shape)][0]
+    step = max(1, NUMBERS_AT_ONCE // (block * max(1, math.prod(shape[1:]))))
+    for first in range(0, -(-shape[0] // block), step):
+        yield slice(block * first, block * (first + step)), slice(first, first + step)
+
+
+def _spread(scales: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """float32 of `shape`: the scale of every number's block."""
+    spread = scales.astype(np.float32)
+    for axis, (n, b) in enumerate(zip(shape, BLOCKS[len(shape)], strict=True)):
+        if b > 1:
+            spread = np.repeat(spread, b, axis)[(slice(None),) * axis + (slice(n),)]
+    return spread
+
+
+def _by_block(reduce: np.ufunc, values: np.ndarray) -> np.ndarray:
+    """The largest of every block, or its sum."""
+    for axis, b in enumerate(BLOCKS[values.ndim]):
+        if b > 1:
+            values = reduce.reduceat(values, np.arange(0, values.shape[axis], b), axis)
+    return values
+
+
+def _floored(peaks: np.ndarray) -> np.ndarray:
+    """float16, rounded towards zero: the largest number of a block then always gets the largest code, below
+    the smallest normal float16 too."""
+    near = peaks.astype(np.float16)
+    return np.where(near > peaks, np.nextafter(near, np.float16(0)), near)
+
+
+def _best_scales(values: np.ndarray, bits: int) -> np.ndarray:
+    """float16 scales of the blocks of a slab, of the least squared error among those tried."""
+    levels, peaks = LEVELS[bits], _by_block(np.maximum, np.abs(values))
+    tried, errors = [_floored(np.float32(factor) * peaks) for factor in FACTORS[bits]], []
+    if len(tried) == 1:
+        return tried[0]
+    for scales in tried:
+        spread = _spread(scales, values.shape)
+        off = values - spread * _codes(values, spread, levels) / np.float32(levels)
+        errors.append(_by_block(np.add, np.square(off, dtype=np.float64)))
+    first = np.argmin(errors, 0)  # of equal ones the largest scale, so that what was coded stays
+    return np.take_along_axis(np.stack(tried), first[None], 0)[0]
+
+
+def _codes(values: np.ndarray, spread: np.ndarray, levels: int) -> np.ndarray:
+    """Signed codes of values under their blocks' scales, as float32; 0 where the scale is."""
+    by = np.divide(np.float32(levels), spread, out=np.zeros_like(spread), where=spread > 0)
+    return np.clip(np.rint(values * by), -levels, levels)
+
+
+def _paired(codes: np.ndarray) -> np.ndarray:
+    """Two codes a byte, the first in the lower half; the last byte is filled with 0."""
+    even = np.append(codes, np.uint8(0)) if codes.size % 2 else codes
+    return even[0::2] | even[1::2] << 4
+
+
+def _single(codes: np.ndarray) -> np.ndarray:
+    """Inverse of `_paired`, with what filled the last byte."""
+    return np.stack([codes & 15, codes >> 4], 1).ravel()

@@ -1,0 +1,329 @@
+"""`chart`: a scene fused in the ways that are worth it, each measured against the scene as composed."""
+
+import contextlib
+import csv
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from formats.atomic import atomic_folder, hidden_sibling
+from fusedrf_cli import plots
+from fusedrf_cli.bridge.fuse import fuse, source_bytes
+from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
+from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
+from fusedrf_cli.bridge.render import renderable
+from fusedrf_cli.bridge.running import checkpoint_path, engine
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.bridge.shelf import Shelf
+from fusedrf_cli.bridge.train import WHITE
+from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
+from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
+from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.errors import FusedRFError, Interrupted, InvalidInput, UsageProblem
+from fusedrf_cli.progress import NullProgress
+
+VIEWS = 8
+HELD_OUT = (JUDGED_SEED, 2)  # a pair seeds a stream that no single number, such as a person's --seed, does
+ROUNDS = 5  # of frames, all fields taking turns
+PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
+COSTS = ("seconds", "bytes", "ms")
+NOISE = 0.05
+BEHIND = 0.5  # dB
+NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
+
+
+@dataclass
+class Point:
+    """One way to fuse the scene, and what it gave."""
+
+    flags: str
+    kind: str
+    psnr: float
+    """dB against the scene as composed, mean of VIEWS views over white that nothing was trained on."""
+    ssim: float
+    seconds: float
+    """Of fusing, once the kernels are loaded."""
+    bytes: int
+    ms: float = float("nan")
+    """Median time of a frame."""
+    frontier: list[str] = field(default_factory=list)
+    """The COSTS at which no other point is as good for less."""
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What all fused fields of a scene are held to."""
+
+    scene: str
+    memory: Memory
+    size: tuple[int, int]
+    allow_outside: bool
+    place: str
+    box: np.ndarray
+    """(6,) of the world, which the views frame."""
+    truth: list[np.ndarray]
+    """(H, W, 3) float32 over white, of every camera."""
+    source_bytes: int
+
+    @classmethod
+    def lay(
+        cls,
+        scene: str,
+        memory: Memory,
+        size: tuple[int, int],
+        allow_outside: bool = False,
+        place: str = "cpu",
+        box: np.ndarray | None = None,
+    ):
+        """Render the scene as composed; the views frame a box (6,) of the world, by default all matter."""
+        loaded = load_scene(scene, allow_outside, memory, place)
+        composed = loaded.composed()
+        needed = sources(loaded.sizes) | picture(*size, composed=True) | measured(*size)
+        needed["the pictures to compare with"] = VIEWS * size[0] * size[1] * PER_PIXEL_KEPT
+        memory.expect(needed, advice="give a smaller --size")
+        if box is None:
+            box = composed.occupancy.tight_aabb(0) + np.tile(composed.origin, 2)
+        cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
+        truth = [render_image(composed, c, origin=composed.origin).over(WHITE) for c in cameras]
+        return cls(scene, memory, size, allow_outside, place, box, truth, source_bytes(loaded))
+
+    def quality(self, bundle: Path) -> tuple[float, float]:
+        """Mean PSNR and SSIM of a fused bundle."""
+        render, origin = renderable(load_scene(str(bundle), budget=self.memory, place=self.place))
+        cameras = scattered(self.box, VIEWS, *self.size, seed=HELD_OUT)
+        shots = [render_image(render, c, origin=origin).over(WHITE) for c in cameras]
+        pairs = list(zip(shots, self.truth, strict=True))
+        return float(np.mean([psnr(*p) for p in pairs])), float(np.mean([ssim(*p) for p in pairs]))
+
+    def frame_times(self, bundles: Sequence[Path], advance: Callable[[int], None]) -> list[float]:
+        """Median milliseconds of a frame of the scene as composed, and of every fused bundle: all take
+        turns, so that what else the machine does meets them alike.
+        """
+        shelf = Shelf(self.memory.room(picture(*self.size, composed=True)))
+        camera = framing_camera(self.box, 0.9, 0.45, *self.size)
+        loaded = load_scene(self.scene, self.allow_outside, self.memory, self.place)
+        composed = loaded.composed()
+        sizes = [sum(load_scene(str(path), budget=self.memory).sizes) for path in bundles]
+        seconds = [[] for _ in range(1 + len(bundles))]
+        for done in range(1 + ROUNDS):  # the first warms up
+            seconds[0].append(frame_seconds(composed, camera, composed.origin))
+            for i, (path, size) in enumerate(zip(bundles, sizes, strict=True), 1):
+                found = shelf.take(
+                    str(path), size, lambda path=path: renderable(load_scene(str(path), place=self.place))
+                )
+                seconds[i].append(frame_seconds(found[0], camera, found[1]))
+            advance(done + 1)
+        return [1000 * statistics.median(taken[1:]) for taken in seconds]
+
+
+def frame_seconds(render, camera, origin: np.ndarray) -> float:
+    """Time of one frame."""
+    started = time.perf_counter()
+    render_image(render, camera, origin=origin)
+    return time.perf_counter() - started
+
+
+def chart(
+    scene: str,
+    output: str,
+    *,
+    budget: float,
+    kinds: Sequence[str],
+    least_psnr: float,
+    size: tuple[int, int],
+    memory: int | None,
+    allow_outside: bool,
+    overwrite: bool,
+    seed: int,
+    device: str,
+    threads: int | None,
+    fuse_words: Callable[[Flags], dict | None],
+    progress,
+) -> dict:
+    """Fuse a scene in the ways that are worth it, measure each, and draw them in a folder.
+
+    `fuse_words` makes of a command line's flags what `fuse` takes, None where it has no such flags: so every
+    label is the flags that gave the point. Raises the error of fusing where no way can be gone.
+    """
+    plots.check()
+    where = {"memory": memory, "allow_outside": allow_outside, "seed": seed, "device": device}
+    where |= {"threads": threads, "overwrite": True}
+    with engine(device, threads, progress) as place, scratch(output) as paths:
+        progress.phase("the scene as composed", None)
+        course = Course.lay(scene, Memory(memory), size, allow_outside, place)
+        run = Charting(course, paths, fuse_words, where, progress)
+        progress.phase("fusing", budget)
+        left = run.climb({kind: ladders(kind, least_psnr) for kind in kinds}, budget)
+        progress.phase("frames", 1 + ROUNDS)
+        composed_ms, *ms = course.frame_times(run.bundles, progress.advance)
+    for point, value in zip(run.points, ms, strict=True):
+        point.ms = value
+    mark_frontiers(run.points)
+    best = sorted((p for p in run.points if p.frontier), key=lambda p: (-p.psnr, p.bytes))
+    composed = {"ms": composed_ms, "bytes": course.source_bytes}
+    with atomic_folder(output, overwrite=overwrite) as folder:
+        write_csv(folder / "chart.csv", run.points, composed)
+        for suffix in ("png", "svg"):
+            plots.chart(run.points, best, composed, Path(scene).name, folder / f"chart.{suffix}")
+    if left:
+        progress.warn(f"{left} ladders were left off where --budget {budget:g} ended; give more to go on")
+    columns = ("flags", "psnr", "ssim", "bytes", "seconds", "ms")
+    return {
+        "output": output,
+        "views": f"{VIEWS} of {size[0]}x{size[1]}, which nothing was trained or chosen on",
+        "composed": composed,
+        "tried": len(run.points),
+        "frontier": [{"no": i} | {c: getattr(p, c) for c in columns} for i, p in enumerate(best, 1)],
+        "points": [asdict(p) for p in run.points],
+    }
+
+
+@contextlib.contextmanager
+def scratch(output: str) -> Iterator[Iterator[Path]]:
+    """Names for bundles beside the output, which are removed at the end: sources are found from there by the
+    same paths as from a bundle that a person puts there, so that the bytes are the same.
+    """
+    target, made = Path(os.path.realpath(output)), []
+
+    def names() -> Iterator[Path]:
+        for number in count():
+            made.append(hidden_sibling(target, f"{number}.rfpack"))
+            yield made[-1]
+
+    try:
+        yield names()
+    except Interrupted as interrupt:
+        interrupt.sentence = "interrupted; nothing was written"  # and no checkpoint is left to go on from
+        raise
+    finally:
+        for path in made:
+            path.unlink(missing_ok=True)
+            checkpoint_path(str(path)).unlink(missing_ok=True)
+
+
+@dataclass(eq=False)
+class Climber:
+    """How far one ladder was climbed."""
+
+    ladder: Ladder
+    flags: Flags
+    """Of the next rung."""
+    points: list[Point] = field(default_factory=list)
+
+    def climb(self, point: Point | None) -> bool:
+        """Take what the rung gave, if anything; whether there is another one."""
+        self.points += [point] if point is not None else []
+        with contextlib.suppress(StopIteration):
+            self.flags = self.ladder.send(point and (point.bytes, point.psnr))
+            return True
+        return False
+
+    def behind(self, others: list["Climber"]) -> bool:
+        """Whether its last point is well surpassed by another ladder's with no more bytes. It may overtake at
+        smaller sizes, so that it only waits.
+        """
+        if not self.points:
+            return False
+        last, found = self.points[-1], [p for other in others for p in other.points]
+        return any(p.bytes <= last.bytes and p.psnr >= last.psnr + BEHIND for p in found)
+
+
+class Charting:
+    """The points found so far, and the bundles they were measured on."""
+
+    def __init__(self, course: Course, paths: Iterator[Path], fuse_words, where: dict, progress):
+        self.course, self.paths, self.fuse_words, self.where = course, paths, fuse_words, where
+        self.progress = progress
+        self.points: list[Point] = []
+        self.bundles: list[Path] = []
+        self.refused: dict[str, FusedRFError] = {}
+        self.warm: set[tuple[str, str]] = set()
+
+    def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
+        """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
+        next comes the group that has had the least time, and of its ladders one that is not behind, with the
+        fewest rungs. Returns how many ladders were left off.
+        """
+        climbers = {(k, g): self.known(found) for k, groups in waiting.items() for g, found in groups.items()}
+        started, spent = time.monotonic(), dict.fromkeys(climbers, 0.0)
+        while any(climbers.values()) and (now := time.monotonic() - started) < budget:
+            self.progress.advance(now)
+            group = min((g for g in climbers if climbers[g]), key=spent.get)
+            climber = min(climbers[group], key=lambda c: (c.behind(climbers[group]), len(c.points)))
+            point = self.try_flags(group, climber.flags)
+            if not climber.climb(point):
+                climbers[group].remove(climber)
+            spent[group] += time.monotonic() - started - now
+            climbers = {g: found for g, found in climbers.items() if g[0] not in self.refused}
+        if not self.points:
+            raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
+        return sum(map(len, climbers.values()))
+
+    def known(self, found: list[Ladder]) -> list["Climber"]:
+        """Climbers of the ladders whose flags `fuse` has, on their first rungs."""
+        first = [Climber(ladder, next(ladder)) for ladder in found]
+        return [climber for climber in first if self.fuse_words(climber.flags) is not None]
+
+    def try_flags(self, group: tuple[str, str], flags: Flags) -> Point | None:
+        """The point of some flags, or None and a warning where the scene cannot be fused so; group is the
+        kind, and a name of what loads the same kernels.
+        """
+        kind, _ = group
+        if self.where["seed"]:
+            flags = (*flags, "--seed", str(self.where["seed"]))
+        words, path = self.fuse_words(flags), next(self.paths)
+        try:
+            if group not in self.warm:  # the first of a group also loads kernels, so the second one counts
+                self.fuse(path, words)
+                self.warm.add(group)
+            report, warnings = self.fuse(path, words)
+        except FusedRFError as error:
+            if isinstance(error, InvalidInput):  # this scene never becomes that kind
+                self.refused[kind] = error
+            self.progress.warn(f"left out {' '.join(flags)}: {error}")
+            return None
+        quality = self.course.quality(path)
+        point = Point(" ".join(flags), kind, *quality, report["total_seconds"], report["bytes"])
+        point.warnings = warnings
+        self.points.append(point)
+        self.bundles.append(path)
+        self.progress.note(f"{point.flags}: {point.psnr:.2f} dB, {point.bytes:,} bytes")
+        return point
+
+    def fuse(self, path: Path, words: dict) -> tuple[dict, list[str]]:
+        """A fuse's report, and what it warned of."""
+        heard = NullProgress()
+        report = fuse(self.course.scene, str(path), **words | self.where, progress=heard)
+        return report, heard.warnings
+
+
+def mark_frontiers(points: list[Point]) -> None:
+    """Note at every point for which COSTS no other one is at least as good for less. Times that differ by
+    less than NOISE are taken as equal.
+    """
+    for cost in COSTS:
+        margin, least = 1 if cost == "bytes" else 1 + NOISE, np.inf
+        for point in sorted(points, key=lambda p: (-p.psnr, getattr(p, cost), p.seconds)):
+            if getattr(point, cost) * margin < least:
+                least = getattr(point, cost)
+                point.frontier.append(cost)
+
+
+def write_csv(path: Path, points: list[Point], composed: dict) -> None:
+    """All points, and the scene as composed, one per line."""
+    columns = ("flags", "kind", "psnr", "ssim", "seconds", "bytes", "ms")
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow([*columns, "frontier"])
+        table.writerow(["", "composed", "", "", "", composed["bytes"], f"{composed['ms']:.3f}"])
+        for p in points:
+            values = (p.flags, p.kind, f"{p.psnr:.3f}", f"{p.ssim:.5f}", f"{p.seconds:.3f}")
+            table.writerow([*values, p.bytes, f"{p.ms:.3f}", " ".join(p.frontier)])

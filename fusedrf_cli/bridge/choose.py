@@ -1,0 +1,155 @@
+"""No more than a scene needs: which of many ways to store a field is the best under a size, or the smallest
+that reaches a PSNR.
+
+What is tried is made, stored and read back, and its pictures are measured: nothing here is predicted.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+
+from fusedrf_cli.report import readable_size
+
+DB_PER_E_FOLD = 8.0  # that PSNR gains about when the bytes grow by e: only the next guess rests on it
+CLOSE = 1.08  # between the smallest size that reaches the target and the largest that does not
+MOST_GROWTH = 3.0  # from one size that is tried to the next
+OVERSHOOT = 0.1  # dB aimed above a target, so that the next try is likely to reach it
+NEIGHBOUR = 1.3  # ratio of bytes at which the next larger and smaller choice is looked at
+TRIES = 8  # sizes of one way
+FINALISTS = 3  # ways that are finished where a size is given; the others are judged as they are
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to store a field, but for its size."""
+
+    precision: str
+    ranks: tuple[int, int] | None = None
+    """Density and colour components per mode at most; None: as many as the sources have."""
+    sh_degree: int | None = None
+
+    def flags(self, kind: str, limit: int) -> str:
+        """The flags of `fuse` that take this way to a size (bytes)."""
+        words = [f"--kind {kind}", f"--precision {self.precision}"]
+        words += [f"--ranks {self.ranks[0]},{self.ranks[1]}"] if self.ranks is not None else []
+        words += [f"--sh-degree {self.sh_degree}"] if self.sh_degree is not None else []
+        return " ".join([*words, f"--max-size {limit}"])
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What a way gave at a size."""
+
+    way: Way
+    limit: int
+    """Bytes that were allowed."""
+    bytes: int
+    psnr: float
+    before: float
+    """PSNR before finishing on rays."""
+    whole: bool
+    """Whether more bytes would change nothing."""
+
+    def told(self, kind: str) -> dict:
+        """For a report."""
+        return {"flags": self.way.flags(kind, self.limit), "bytes": self.bytes, "psnr": self.psnr}
+
+
+Make = Callable[[Way, int, bool], Tried | None]
+"""(way, bytes, finished) -> what it gave; None where not even the coarsest fits."""
+
+
+class Choosing:
+    """One search: remembers what it tried."""
+
+    def __init__(self, make: Make, kind: str, tell: Callable[[str], None]):
+        self.kind, self.tell, self.tried = kind, tell, []
+        self.make = cache(lambda way, limit, finished: self._made(make, way, limit, finished))
+
+    def _made(self, make: Make, way: Way, limit: int, finished: bool) -> Tried | None:
+        found = make(way, limit, finished)
+        if found is not None and finished:
+            self.tried.append(found)
+            self.tell(f"{way.flags(self.kind, limit)}: {found.psnr:.2f} dB, {readable_size(found.bytes)}")
+        return found
+
+    def best_within(self, ways: Iterable[Way], limit: int) -> Tried | None:
+        """The highest PSNR under a size, None where nothing fits."""
+        plain = [t for way in ways if (t := self.make(way, limit, False)) is not None]
+        plain.sort(key=lambda t: -t.psnr)
+        finished = [self.make(t.way, limit, True) for t in plain[:FINALISTS]]
+        return max(finished, key=lambda t: t.psnr, default=None)
+
+    def smallest_reaching(self, ways: list[list[Way]], target: float, limit: int, gain: float):
+        """The fewest bytes at a PSNR of at least target (dB) under a size, None where nothing reaches it.
+
+        ways come in groups, the cheapest first; the first group in which one reaches the target decides.
+        gain (dB): what finishing may add at most, to leave out a way that is further away at its largest.
+        """
+        for group in ways:
+            best = None
+            for way in group:
+                most = limit if best is None else int(best.bytes / CLOSE)
+                top = self.make(way, most, False)
+                if top is None or top.psnr + gain < target:
+                    continue
+                found = self._smallest_of(way, target, most, min(top.bytes, most), best is not None)
+                best = found if found is not None else best
+            if best is not None:
+                return best
+        return None
+
+    def _smallest_of(self, way: Way, target: float, most: int, top: int, contested: bool) -> Tried | None:
+        """The smallest size of one way that reaches the target. `contested`: another way reaches it at `most`
+        already, so that this one has to show at once that it does too.
+        """
+        size = most if contested else max(top // 4, 1)
+        low, high = None, None
+        for _ in range(TRIES):
+            found = self.make(way, size, True)
+            if found is None:  # not even the coarsest fits
+                low = low or size
+                size = min(most, int(size * MOST_GROWTH))
+                continue
+            if found.psnr >= target:
+                high = found
+            else:
+                if size >= most or found.whole:
+                    break
+                low = max(low or 0, size)
+            if high is not None and low is not None and high.limit <= CLOSE * low:
+                break
+            size = self._next_size(found, target, low, high, most)
+        return high
+
+    def _next_size(self, found: Tried, target: float, low: int | None, high: Tried | None, most: int) -> int:
+        """By the slope that PSNR usually has, between what is too small and what is enough."""
+        step = math.exp((target + OVERSHOOT - found.psnr) / DB_PER_E_FOLD)
+        start = min(found.limit, found.bytes) if found.whole else found.limit
+        size = start * min(max(step, 1 / MOST_GROWTH), MOST_GROWTH)
+        if low is not None and high is not None:
+            size = min(max(size, low * CLOSE**0.5), min(high.limit, high.bytes) / CLOSE**0.5)
+        elif high is not None:
+            size = min(size, min(high.limit, high.bytes) / CLOSE**0.5)
+        elif low is not None:
+            size = max(size, low * CLOSE)
+        return min(most, max(1, round(size)))
+
+    def neighbours(self, chosen: Tried) -> dict[str, dict]:
+        """The next larger choice that shows more and the next smaller one, with what they give."""
+        found = {}
+        for name, side in (("smaller", -1), ("larger", 1)):
+            near = [
+                t
+                for t in self.tried
+                if CLOSE**0.5 < (t.bytes / chosen.bytes) ** side < NEIGHBOUR * CLOSE
+                and (t.psnr - chosen.psnr) * side > 0
+            ]
+            if not near and not (chosen.whole and side > 0):
+                made = self.make(chosen.way, round(chosen.bytes * NEIGHBOUR**side), True)
+                near = [made] if made is not None else []
+            if near:
+                best = max(near, key=lambda t: (t.psnr - chosen.psnr) / abs(math.log(t.bytes / chosen.bytes)))
+                found[f"next_{name}"] = best.told(self.kind)
+        return found

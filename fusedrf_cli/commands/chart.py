@@ -1,0 +1,84 @@
+"""`fusedrf chart`: what fusing a scene costs in each way that is worth it, and what it gives."""
+
+import click
+
+from fusedrf_cli import options
+
+KINDS = ("blocks", "vm", "sparse")
+NOT_OF_FUSING = ("scene", "output", "overwrite", "as_json", "quiet", "verbose")
+
+
+class KindsType(click.ParamType):
+    """'blocks,vm' -> those kinds of fused fields, in the order of KINDS."""
+
+    name = "KINDS"
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):  # the default
+            return value
+        asked = value.split(",")
+        if unknown := [kind for kind in asked if kind not in KINDS]:
+            self.fail(f"{unknown[0]!r} is not one of {', '.join(KINDS)}", param, ctx)
+        return tuple(kind for kind in KINDS if kind in asked)
+
+
+def fuse_words(flags: tuple[str, ...]) -> dict | None:
+    """What `fusedrf fuse` makes of flags, as bridge.fuse takes it; None where this version has no such flag
+    or choice."""
+    from fusedrf_cli.commands.fuse import command as fuse
+
+    line = [options.STDIO, "-o", options.STDIO, *flags]
+    try:
+        words = fuse.make_context("fuse", line).params
+    except click.UsageError:
+        return None
+    return {name: value for name, value in words.items() if name not in NOT_OF_FUSING}
+
+
+def shown(report: dict) -> dict:
+    """The frontier, without the points that another one surpasses."""
+    return {name: value for name, value in report.items() if name not in ("points", "warnings")}
+
+
+@click.command("chart")
+@click.argument("scene", type=options.INPUT)
+@options.writing("The folder for chart.png, chart.svg and chart.csv.", folders=True)
+@click.option(
+    "--budget",
+    type=options.POSITIVE,
+    metavar="S",
+    default=300.0,
+    show_default=True,
+    help="Start no new point after S seconds.",
+)
+@click.option(
+    "--kinds", type=KindsType(), default=KINDS, help=f"Kinds to try; default: {','.join(KINDS)}."
+)
+@click.option(
+    "--least-psnr",
+    type=options.POSITIVE,
+    metavar="DB",
+    default=30.0,
+    show_default=True,
+    help="Go no smaller once a point falls below it.",
+)
+@click.option(
+    "--size", type=options.SIZE, default=(400, 400), help="Size of the pictures compared; default: 400x400."
+)
+@options.memory
+@options.allow_outside
+@options.seeded
+@options.reporting(brief=shown)
+def command(scene, output, **words):
+    """Chart PSNR against seconds, bytes and time per frame.
+
+    SCENE, a scene.json or a bundle, is fused in many ways; each is compared with the scene as composed, on
+    views that no fusing uses. Every point of the frontier is labelled with the flags of fuse that give it.
+
+    \b
+    Example:
+      fusedrf chart scene.json -o chart --budget 120
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.chart(scene, output, fuse_words=fuse_words, **words)

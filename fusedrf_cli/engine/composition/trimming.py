@@ -1,0 +1,135 @@
+"""Leaving out of a VM field what its pictures do not need: texels that nothing reads, and ranks of little
+energy.
+"""
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.vm import MODES, VMField, VMShape, VMTensor
+
+REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
+
+
+def read_texels(tensor: VMTensor, mode: int) -> np.ndarray:
+    """(na, nb) bool: the plane texels of a mode that some point of an occupied cell reads."""
+    a, b, c = MODES[mode]
+    held = tensor.occupancy.occupied.any(axis=c)
+    sums = np.zeros(np.array(held.shape) + 1, np.int64)
+    sums[1:, 1:] = held.cumsum(0).cumsum(1)
+    (a0, a1), (b0, b1) = (
+        reading_cells(n, cells)
+        for n, cells in zip((tensor.resolution[a], tensor.resolution[b]), held.shape, strict=True)
+    )
+    return (
+        sums[a1[:, None], b1] - sums[a0[:, None], b1] - sums[a1[:, None], b0] + sums[a0[:, None], b0]
+    ) > 0
+
+
+def reading_cells(texels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two (texels,) int64: the first of the cells along an axis whose points read a texel, and the one after
+    the last. A texel is read from less than one spacing on either side of it.
+    """
+    at, spacing = np.arange(texels) * cells / (texels - 1), cells / (texels - 1)
+    first = np.floor(at - spacing + 1e-9)
+    after = np.ceil(at + spacing - 1e-9)
+    return first.clip(0, cells).astype(np.int64), after.clip(0, cells).astype(np.int64)
+
+
+def without_unread(field: VMField) -> VMField:
+    """The same field with 0 in all plane texels that no occupied cell reads: it answers the same, and such
+    texels cost next to nothing where blocks of numbers share a scale.
+    """
+    trimmed = VMField(
+        field.shape, field.tensors, field.blocks, field.params.clone(), field.occupancy, field.owners
+    )
+    for t, tensor in enumerate(trimmed.tensors):
+        sections = trimmed.sections(t)
+        for mode in range(3):
+            unread = torch.from_numpy(~read_texels(tensor, mode))
+            for what in ("density", "colour"):
+                sections[f"{what}_plane_{mode}"][unread] = 0
+    return trimmed
+
+
+def smaller_shape(a: VMShape, b: VMShape) -> VMShape:
+    """The largest shape that both of two hold."""
+    return VMShape(*(min(getattr(a, name), getattr(b, name)) for name in vars(a)))
+
+
+def truncated(field: VMField, shape: VMShape) -> VMField:
+    """The field with at most a shape's ranks and SH bands, what it drops chosen by energy over the box.
+
+    Density: a mode's Σ P_r ⊗ L_r is a matrix of plane by line texels, and its first singular vectors are the
+    nearest of lower rank (Eckart and Young 1936). Colour: L_r comes with a row B_r of the basis, so that a
+    truncated SVD could not be told as line times basis; components are kept one by one, each time the one
+    that leaves least, and the planes fitted anew to those kept by least squares.
+    """
+    least = smaller_shape(field.shape, shape)
+    if least == field.shape:
+        return field
+    params = torch.zeros(sum(least.size(t.resolution) for t in field.tensors), dtype=field.params.dtype)
+    small = VMField(least, field.tensors, field.blocks, params, field.occupancy, field.owners)
+    for t in range(len(field.tensors)):
+        old = {name: view.double().numpy() for name, view in field.sections(t).items()}
+        old["colour_basis"] = old["colour_basis"][:, : least.coefficients]
+        for name, values in truncated_tensor(old, least).items():
+            small.sections(t)[name].copy_(torch.from_numpy(values))
+    return small
+
+
+def truncated_tensor(old: dict[str, np.ndarray], shape: VMShape) -> dict[str, np.ndarray]:
+    """The 13 sections of one tensor at lower ranks, from those it has (float64)."""
+    new, rank = {}, old["colour_line_0"].shape[1]
+    basis = old["colour_basis"]
+    kept_basis = np.zeros((*basis.shape[:2], 3 * shape.colour_rank))
+    for m in range(3):
+        plane, line = old[f"density_plane_{m}"], old[f"density_line_{m}"]
+        new[f"density_plane_{m}"], new[f"density_line_{m}"] = leading(plane, line, shape.density_rank)
+        plane, line = old[f"colour_plane_{m}"], old[f"colour_line_{m}"]
+        rows = basis[..., m * rank : (m + 1) * rank]
+        kept, mixed = fewer_components(plane, line, rows.reshape(-1, rank), shape.colour_rank)
+        new[f"colour_plane_{m}"], new[f"colour_line_{m}"] = mixed, line[:, kept]
+        kept_basis[..., m * shape.colour_rank : (m + 1) * shape.colour_rank] = rows[..., kept]
+    return new | {"colour_basis": kept_basis}
+
+
+def leading(plane: np.ndarray, line: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """Plane (na, nb, rank) and line (nc, rank) of the nearest product sum of that rank to (na, nb, R) and
+    (nc, R).
+    """
+    if plane.shape[-1] <= rank:
+        return plane, line
+    q, r = np.linalg.qr(plane.reshape(-1, plane.shape[-1]))
+    left, values, right = np.linalg.svd(r @ line.T, full_matrices=False)
+    found = min(rank, len(values))
+    root = np.sqrt(values[:found])
+    lines, planes = np.zeros((len(line), rank)), np.zeros((*plane.shape[:2], rank))
+    lines[:, :found] = right[:found].T * root
+    planes[..., :found] = (q @ (left[:, :found] * root)).reshape(*plane.shape[:2], found)
+    return planes, lines
+
+
+def fewer_components(
+    plane: np.ndarray, line: np.ndarray, basis: np.ndarray, count: int
+) -> tuple[list[int], np.ndarray]:
+    """Which `count` of R colour components to keep, in order of choice, and the planes (na, nb, count) that
+    with them come nearest to plane (na, nb, R) ⊗ line (nc, R) ⊗ basis (K, R).
+    """
+    rank = plane.shape[-1]
+    if rank <= count:
+        return list(range(rank)), plane
+    flat = plane.reshape(-1, rank)
+    of_planes, of_rest = flat.T @ flat, (line.T @ line) * (basis.T @ basis)
+    of_rest = of_rest + REGULAR * of_rest.max() * np.eye(rank)
+    kept: list[int] = []
+    for _ in range(count):
+        others = [r for r in range(rank) if r not in kept]
+        kept.append(max(others, key=lambda r: energy_of([*kept, r], of_planes, of_rest)))
+    mix = np.linalg.solve(of_rest[np.ix_(kept, kept)], of_rest[kept])
+    return kept, plane @ mix.T
+
+
+def energy_of(kept: list[int], of_planes: np.ndarray, of_rest: np.ndarray) -> float:
+    """Squared norm of what the kept components can say of all of them, from their Gram matrices (R, R)."""
+    mix = np.linalg.solve(of_rest[np.ix_(kept, kept)], of_rest[kept])
+    return float(np.einsum("rs,kr,ks->", of_planes, of_rest[kept], mix))

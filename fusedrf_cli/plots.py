@@ -1,0 +1,143 @@
+"""Charts as PNG and SVG; matplotlib, of the extra `charts`, is imported only here and only to draw."""
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+from fusedrf_cli.errors import FusedRFError
+from fusedrf_cli.report import readable_size
+
+LOOKS = {"blocks": ("#0072B2", "o"), "vm": ("#D55E00", "s"), "sparse": ("#009E73", "^")}
+AXES = {"seconds": "seconds to fuse", "bytes": "bytes", "ms": "milliseconds per frame"}
+PALE = 0.25
+ROW_INCHES = 0.19
+FONT = 8  # points
+FEW_TICKS = 20  # times the smallest value, from which on an axis is marked at 1, 2 and 5 alone
+FAR = 3  # times the largest point, from which on a reference is off the scale
+AROUND = [(dx, dy) for r in (9, 15, 22) for dx, dy in ((-r, r), (0, r), (r, r), (r, 0), (r, -r), (0, -r))]
+
+
+def check() -> None:
+    """FusedRFError where matplotlib is missing: found before any work that ends in a chart."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise FusedRFError("matplotlib, which draws charts, is missing; pip install 'fusedrf[charts]'")
+
+
+def pyplot():
+    """matplotlib's pyplot, without a display; equal figures give equal bytes, and text stays text in an
+    SVG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    matplotlib.rcParams.update({"svg.hashsalt": "fusedrf", "svg.fonttype": "none", "font.size": 9})
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def save(figure, path: Path) -> None:
+    """Write a figure as its name's ending says, and let it go."""
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=130)
+    pyplot().close(figure)
+
+
+def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: str, path: Path) -> None:
+    """PSNR against seconds, bytes and milliseconds of points (bridge.chart.Point), those on a frontier
+    numbered as in the list of `best` below; `composed` has the scene's own bytes and ms.
+    """
+    height = 4.4 + ROW_INCHES * (len(best) + 2)
+    figure = pyplot().figure(figsize=(13, height), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(4.4, height - 4.4))
+    panels = above.subplots(1, 3, sharey=True)
+    for panel, cost in zip(panels, AXES, strict=True):
+        draw_panel(panel, cost, points)
+        if cost in composed:
+            draw_composed(panel, cost, composed[cost], max(getattr(p, cost) for p in points))
+    panels[0].set_ylabel("PSNR against the scene as composed, dB")
+    above.suptitle(title, parse_math=False)
+    above.legend(handles=kind_handles(points), loc="outside upper right", ncols=len(LOOKS), fontsize=FONT)
+    write_list(below, best)
+    figure.draw_without_rendering()  # places are final from here on
+    for panel, cost in zip(panels, AXES, strict=True):
+        number(panel, cost, points, best)
+    save(figure, path)
+
+
+def draw_panel(panel, cost: str, points: Sequence) -> None:
+    """The points over one cost, the surpassed ones pale, and the frontier as a line."""
+    from matplotlib import ticker
+
+    for point in points:
+        colour, marker = LOOKS[point.kind]
+        alpha = 1 if cost in point.frontier else PALE
+        look = {"color": colour, "alpha": alpha, "markersize": 6, "markeredgewidth": 0}
+        panel.plot(getattr(point, cost), point.psnr, marker, **look)
+    line = sorted((getattr(p, cost), p.psnr) for p in points if cost in p.frontier)
+    panel.plot(*zip(*line, strict=True), color="0.4", linewidth=1, zorder=0)
+    values = [getattr(p, cost) for p in points]
+    panel.set_xscale("log")
+    panel.set_xlim(min(values) / 1.2, max(values) * 1.2)
+    panel.set_xlabel(AXES[cost])
+    panel.margins(y=0.1)
+    panel.grid(alpha=0.3)
+    tell = (lambda x, _: readable_size(x)) if cost == "bytes" else (lambda x, _: f"{x:g}")
+    few = max(values) > FEW_TICKS * min(values)
+    panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if few else (1, 1.5, 2, 3, 4, 5, 6, 8)))
+    panel.xaxis.set_major_formatter(tell)
+    panel.xaxis.set_minor_locator(ticker.NullLocator())
+    panel.tick_params(labelsize=FONT)
+
+
+def draw_composed(panel, cost: str, value: float, largest: float) -> None:
+    """A line where the scene stands as composed: at the panel's end where it is far beyond all points."""
+    left, right = panel.get_xlim()
+    text = "all sources" if cost == "bytes" else "as composed"
+    if value > FAR * largest:
+        text += f": {readable_size(value) if cost == 'bytes' else f'{value:,.0f} ms'}, off the scale"
+    else:
+        panel.set_xlim(min(left, value / 1.2), max(right, value * 1.2))
+    at = min(value, 0.985 * panel.get_xlim()[1])
+    panel.axvline(at, color="black", linewidth=1, linestyle=":")
+    where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": FONT}
+    panel.annotate(text, (at, 0.02), (-4, 0), rotation=90, ha="right", va="bottom", **where)
+
+
+def kind_handles(points: Sequence) -> list:
+    """A legend's marks for the kinds that are there."""
+    from matplotlib.lines import Line2D
+
+    found = [kind for kind in LOOKS if kind in {p.kind for p in points}]
+    return [Line2D([], [], color=LOOKS[k][0], marker=LOOKS[k][1], linestyle="", label=k) for k in found]
+
+
+def number(panel, cost: str, points: Sequence, best: Sequence) -> None:
+    """Write its number beside every point of a panel's frontier, where nothing else is."""
+    to_pixels, per_point = panel.transData.transform, panel.figure.dpi / 72
+    taken = [tuple(to_pixels((getattr(p, cost), p.psnr)) / per_point) for p in points]
+    for i, point in enumerate(best, 1):
+        if cost not in point.frontier:
+            continue
+        x, y = to_pixels((getattr(point, cost), point.psnr)) / per_point
+        dx, dy = max(AROUND, key=lambda d: (clear((x + d[0], y + d[1]), taken), -abs(d[0]) - abs(d[1])))
+        taken.append((x + dx, y + dy))
+        where = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": FONT}
+        panel.annotate(str(i), (getattr(point, cost), point.psnr), (dx, dy), **where)
+
+
+def clear(place: tuple[float, float], taken: Sequence[tuple[float, float]], enough: float = 9.0) -> float:
+    """Distance in points to the nearest of the places taken; beyond enough it is all the same."""
+    return min(enough, min(((place[0] - x) ** 2 + (place[1] - y) ** 2) ** 0.5 for x, y in taken))
+
+
+def write_list(figure, best: Sequence) -> None:
+    """What the numbers stand for: the flags, and what they give."""
+    longest = max(len(p.flags) for p in best)
+    head = f"{'':4}{'fusedrf fuse …':{longest}}{'dB':>8}{'SSIM':>8}{'size':>9}{'fuse, s':>9}{'frame, ms':>11}"
+    rows = [
+        f"{i:<4}{p.flags:{longest}}{p.psnr:8.2f}{p.ssim:8.4f}{readable_size(p.bytes):>9}{p.seconds:9.2f}{p.ms:11.1f}"
+        for i, p in enumerate(best, 1)
+    ]
+    colours = ["black", *(LOOKS[p.kind][0] for p in best)]
+    for row, (text, colour) in enumerate(zip([head, *rows], colours, strict=True)):
+        y = 1 - (row + 0.5) / (len(rows) + 1.5)
+        figure.text(0.05, y, text, family="monospace", fontsize=FONT + 0.5, color=colour, va="center")

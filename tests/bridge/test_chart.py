@@ -1,0 +1,272 @@
+"""`chart` for real: labels that are true, frontiers, ladders, and what is refused."""
+
+import csv
+import itertools
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fusedrf_cli import plots
+from fusedrf_cli.bridge.ladders import distilled, in_words, ladders, readable_floor, shrinking
+from fusedrf_cli.commands.chart import fuse_words
+from fusedrf_cli.errors import InvalidInput, ResourceProblem
+from fusedrf_cli.main import _interrupt
+from fusedrf_cli.options import BYTES
+from fusedrf_cli.progress import NullProgress
+from tests.bridge.conftest import done, part, write_scene_of
+
+CHART = ("chart", "scene.json", "-o", "chart", "--size", "24x24")
+
+
+@pytest.fixture(scope="module")
+def charted(shop, tmp_path_factory):
+    """(folder, the report of a chart of blocks there, the bundles that were made for it)."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("charted") / "shop")
+    module, made = part("chart"), []
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("PRECISIONS", "FINISHED"):
+            patch.setattr(part("ladders"), name, ("float16",))
+        patch.setattr(part("ladders"), "RANKS", ((),))
+
+        def noted(scene, output, **words):
+            report = fuse(scene, output, **words)
+            made.append(Path(output).read_bytes())
+            return report
+
+        fuse = module.fuse
+        patch.setattr(module, "fuse", noted)
+        said = done(folder, *CHART, "--kinds", "blocks", "--budget", "600", "--least-psnr", "65")
+    return folder, said, made
+
+
+def test_a_label_is_the_flags_that_give_the_point(charted, report, folder):
+    """All of them, to the byte."""
+    _, said, made = charted
+    assert 3 <= len(said["points"]) == said["tried"]
+    assert {"--no-rgb" in p["flags"] for p in said["points"]} == {True, False}
+    for point in said["points"]:
+        report("fuse", "scene.json", "-o", "again.rfpack", "-w", *point["flags"].split())
+        assert (folder / "again.rfpack").read_bytes() in made
+        assert (folder / "again.rfpack").stat().st_size == point["bytes"]
+
+
+def test_the_folder_holds_the_chart_twice_and_its_numbers(charted):
+    folder, said, _ = charted
+    assert sorted(p.name for p in (folder / "chart").iterdir()) == ["chart.csv", "chart.png", "chart.svg"]
+    assert (folder / "chart" / "chart.png").read_bytes().startswith(b"\x89PNG")
+    drawn = (folder / "chart" / "chart.svg").read_text()
+    with open(folder / "chart" / "chart.csv", newline="") as file:
+        composed, *rows = csv.DictReader(file)
+    assert composed["kind"] == "composed" and float(composed["ms"]) > 0
+    for row, point in zip(rows, said["points"], strict=True):
+        assert row["flags"] == point["flags"] and int(row["bytes"]) == point["bytes"]
+        assert float(row["psnr"]) == pytest.approx(point["psnr"], abs=1e-3)
+        assert row["frontier"].split() == point["frontier"]
+        assert not point["frontier"] or point["flags"] in drawn
+    assert {r["flags"] for r in said["frontier"]} == {p["flags"] for p in said["points"] if p["frontier"]}
+
+
+def test_nothing_else_is_left(charted):
+    folder, _, _ = charted
+    before = {"floor", "red", "blue", "scene", "pair", "photos", "chart"}
+    assert {p.name.split(".")[0] for p in folder.iterdir()} == before
+
+
+def test_people_see_the_frontier(run):
+    result = run(*CHART, "--kinds", "blocks", "--budget", "0.05")
+    assert result.exit_code == 0 and "--kind blocks --precision" in result.stdout
+    assert "were left off where --budget 0.05 ended" in result.stderr
+
+
+def test_a_seed_is_part_of_the_label(report):
+    said = report(*CHART, "--kinds", "blocks", "--budget", "0.05", "--seed", "7")
+    assert said["frontier"][0]["flags"].endswith("--seed 7")
+
+
+def test_what_cannot_be_charted(run, folder, monkeypatch):
+    write_scene_of(folder, "floor", "red", file="fog.json", composition="add")
+    wrong = run("chart", "fog.json", "-o", "chart", "--size", "24x24", "--kinds", "blocks")
+    assert wrong.exit_code == 3 and "blocks need vm sources" in wrong.stderr
+    assert run(*CHART, "--kinds", "blocks,voxels").exit_code == 2
+    little = run(*CHART, "--memory", "20MB")
+    assert little.exit_code == 5 and "needs about" in little.stderr
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    bare = run(*CHART)
+    assert bare.exit_code == 1 and bare.stderr.count("\n") == 1 and "fusedrf[charts]" in bare.stderr
+    assert not (folder / "chart").exists() and not list(folder.glob(".*.rfpack*"))
+
+
+def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
+    before = sorted(folder.iterdir())
+
+    def interrupted(scene, output, **words):
+        Path(output).touch()
+        Path(f"{output}.checkpoint").touch()
+        _interrupt(signal.SIGINT, None)
+
+    monkeypatch.setattr(part("chart"), "fuse", interrupted)
+    result = run(*CHART)
+    assert result.exit_code == 130 and "nothing was written" in result.stderr
+    assert sorted(folder.iterdir()) == before
+
+
+# --- frontiers ----------------------------------------------------------------------------------------------
+
+
+def point(**values):
+    return part("chart").Point(**{"flags": "", "kind": "vm", "ssim": 1.0, "ms": 1.0} | values)
+
+
+def test_a_frontier_is_what_no_other_point_surpasses():
+    rng = np.random.default_rng(0)
+    sizes, psnrs = rng.integers(1, 20, 60), rng.integers(20, 40, 60).astype(float)
+    points = [point(psnr=q, bytes=int(b), seconds=1.0) for q, b in zip(psnrs, sizes, strict=True)]
+    part("chart").mark_frontiers(points)
+
+    def surpassed(p):
+        return any(
+            q.psnr >= p.psnr and q.bytes <= p.bytes and (q.psnr, -q.bytes) > (p.psnr, -p.bytes)
+            for q in points
+        )
+
+    chosen = {(p.psnr, p.bytes) for p in points if "bytes" in p.frontier}
+    assert chosen == {(p.psnr, p.bytes) for p in points if not surpassed(p)}
+
+
+def test_times_within_the_noise_are_equal():
+    times = [(50, 1.0), (49, 0.97), (48, 0.94), (47, 0.5)]
+    points = [point(psnr=q, bytes=1, seconds=s) for q, s in times]
+    part("chart").mark_frontiers(points)
+    assert ["seconds" in p.frontier for p in points] == [True, False, True, True]
+
+
+# --- the order of work --------------------------------------------------------------------------------------
+
+
+def climbing(monkeypatch, seconds: dict[str, float], refused: dict[str, Exception]):
+    """(what Charting.climb left, its points, its warnings) where a fuse of a kind takes so many seconds of a
+    clock of its own, or is refused; the PSNR falls by 5 dB per rung."""
+    module, clock, heard = part("chart"), [0.0], NullProgress()
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    course = SimpleNamespace(scene="scene.json", quality=lambda path: (50.0 - 5 * len(run.points), 1.0))
+    paths = iter(map(Path, "abcdefghijklmnop"))
+    run = module.Charting(course, paths, lambda flags: {"flags": flags}, {"seed": 0}, heard)
+
+    def fuse(scene, output, *, flags, **words):
+        kind = flags[flags.index("--kind") + 1]
+        clock[0] += seconds[kind] / 2  # the first of a kind is done twice
+        if kind in refused:
+            raise refused[kind]
+        return {"bytes": 1_000_000, "total_seconds": seconds[kind]}
+
+    monkeypatch.setattr(module, "fuse", fuse)
+    waiting = {k: {k: [shrinking(("--kind", k), 0)]} for k in seconds}
+    return lambda budget: (run.climb(waiting, budget), run.points, heard.warnings)
+
+
+def test_the_kind_that_had_least_time_is_next(monkeypatch):
+    left, points, _ = climbing(monkeypatch, {"vm": 20.0, "blocks": 8.0}, {})(60.0)
+    assert [p.kind for p in points] == ["vm", *4 * ["blocks"], "vm", *3 * ["blocks"]]
+    assert left == 2
+
+
+def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
+    """The second one's first rung shows 2 dB less than the other in more bytes, its next ones are as good."""
+    chart = part("chart")
+    ahead, slow = chart.Climber(shrinking(("a",), 30), ("a",)), chart.Climber(shrinking(("b",), 30), ("b",))
+    for climber, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
+        climber.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
+    assert slow.behind([ahead, slow]) and not ahead.behind([ahead, slow])
+    slow.points.append(point(psnr=46.9, bytes=6, seconds=1.0))
+    assert not slow.behind([ahead, slow])
+    assert not chart.Climber(shrinking((), 30), ()).behind([ahead, slow])
+
+
+def test_a_kind_that_does_not_fit_leaves_the_others(monkeypatch):
+    refusals = {"blocks": InvalidInput("no blocks"), "vm": ResourceProblem("no room")}
+    seconds = dict.fromkeys(("blocks", "vm", "sparse"), 2.0)
+    left, points, warnings = climbing(monkeypatch, seconds, refusals)(9)
+    assert {p.kind for p in points} == {"sparse"} and left == 1
+    assert warnings == ["left out --kind blocks: no blocks", "left out --kind vm: no room"]
+
+
+def test_where_nothing_fits_the_reason_is_told(monkeypatch):
+    with pytest.raises(InvalidInput, match="no blocks"):
+        climbing(monkeypatch, {"blocks": 1.0}, {"blocks": InvalidInput("no blocks")})(9)
+
+
+# --- ladders ------------------------------------------------------------------------------------------------
+
+
+def climbed(ladder, give) -> list[tuple[str, ...]]:
+    """All flags of a ladder, where give(flags) is (bytes, PSNR) or None."""
+    rungs = [next(ladder)]
+    while True:
+        try:
+            rungs.append(ladder.send(give(rungs[-1])))
+        except StopIteration:
+            return rungs
+
+
+def test_a_ladder_shrinks_until_quality_is_lost():
+    psnrs = iter((50.0, 45.0, 40.0, 29.0))
+    rungs = climbed(shrinking(("--kind", "blocks"), 30), lambda flags: (18_400_000, next(psnrs)))
+    assert rungs[0] == ("--kind", "blocks")
+    assert [r[-1] for r in rungs[1:]] == ["12MB", "8MB", "5.3MB"]
+    assert climbed(shrinking((), 30), lambda flags: None) == [()]
+    smallest = climbed(shrinking((), 30), lambda flags: (400_000, 99.0))[-1]
+    assert smallest[-1] == "48kB"
+
+
+def test_a_distilled_ladder_goes_on_past_what_does_not_fit():
+    rungs = climbed(distilled(), lambda flags: None)
+    assert len(rungs) == len(set(rungs)) == 24
+    assert all("--time-budget" not in r for r in rungs[-6:])
+
+
+@pytest.mark.parametrize("size", [1, 9, 10, 99, 100, 51_234, 949_999, 999_999, 1_000_000, 12_345_678.9])
+def test_sizes_are_rounded_down_to_what_the_flag_reads_back(size):
+    floor = readable_floor(size)
+    assert 0.9 * size < floor <= size or size < 10
+    assert BYTES.parse(in_words(floor)) == floor
+
+
+@pytest.mark.parametrize("kind", ["blocks", "vm"])
+def test_fuse_takes_what_a_ladder_begins_with(kind):
+    found = [ladder for group in ladders(kind, 30).values() for ladder in group]
+    assert any(fuse_words(next(ladder)) for ladder in found)
+    assert fuse_words(("--no-such-flag",)) is None
+
+
+# --- the drawing --------------------------------------------------------------------------------------------
+
+
+def test_numbers_in_a_panel_do_not_overlap():
+    rng = np.random.default_rng(2)
+    points = [point(psnr=30 + i, bytes=int(1e6 * 1.3**i), seconds=1.0) for i in range(20)]
+    points += [point(psnr=25 + 10 * v, bytes=int(1e6 + 4e7 * v), seconds=1.0) for v in rng.random(40)]
+    part("chart").mark_frontiers(points)
+    figure = plots.pyplot().figure(figsize=(4.3, 4.4))
+    panel = figure.subplots()
+    plots.draw_panel(panel, "bytes", points)
+    figure.draw_without_rendering()
+    best = sorted((p for p in points if "bytes" in p.frontier), key=lambda p: -p.psnr)
+    plots.number(panel, "bytes", points, best)
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in panel.texts]
+    assert len(boxes) >= 20
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    plots.pyplot().close(figure)
+
+
+def test_matplotlib_is_loaded_by_drawing_alone(folder):
+    """A command that draws nothing does not wait for it."""
+    code = "import sys, fusedrf_cli.bridge; print('matplotlib' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"

@@ -1,0 +1,82 @@
+"""The search for a way to store a field, against a made-up law of PSNR and bytes."""
+
+import math
+
+import pytest
+
+from fusedrf_cli.bridge.choose import CLOSE, Choosing, Tried, Way
+
+INT4 = [Way("int4", (8, 16)), Way("int4", (8, 24)), Way("int4")]
+INT8 = [Way("int8", (8, 16)), Way("int8")]
+
+
+class Law:
+    """PSNR = at + slope ln(bytes) up to a way's whole size; counts what is asked."""
+
+    def __init__(self, at: dict[Way, float], whole: dict[Way, int], slope: float = 9.0, least: int = 1000):
+        self.at, self.whole, self.slope, self.least, self.asked = at, whole, slope, least, []
+
+    def psnr(self, way: Way, size: int) -> float:
+        return self.at[way] + self.slope * math.log(size / 1e6)
+
+    def __call__(self, way: Way, limit: int, finished: bool) -> Tried | None:
+        self.asked.append((way, limit, finished))
+        size = min(limit, self.whole[way])
+        if size < self.least:
+            return None
+        found = self.psnr(way, size)
+        return Tried(way, limit, size, found if finished else found - 2, found - 2, limit >= self.whole[way])
+
+
+def search(law: Law) -> Choosing:
+    return Choosing(law, "blocks", lambda sentence: None)
+
+
+@pytest.mark.parametrize("target", [25.0, 33.0, 40.0, 41.5])
+def test_the_smallest_is_found_to_within_the_tolerance(target):
+    law = Law(dict.fromkeys(INT4, 39.0) | {INT4[1]: 40.0}, dict.fromkeys(INT4, 2_000_000))
+    chosen = search(law).smallest_reaching([INT4], target, 25_000_000, gain=3)
+    exact = 1e6 * math.exp((target - 40.0) / 9)
+    assert chosen.way == INT4[1] and chosen.psnr >= target
+    assert exact <= chosen.bytes <= 1.06 * CLOSE * exact
+    assert len([a for a in law.asked if a[2]]) <= 12
+
+
+def test_a_dearer_precision_is_only_tried_where_the_cheap_ones_fail():
+    at = dict.fromkeys(INT4, 38.0) | dict.fromkeys(INT8, 36.0)
+    law = Law(at, dict.fromkeys(INT4, 2_000_000) | dict.fromkeys(INT8, 9_000_000))
+    assert search(law).smallest_reaching([INT4, INT8], 40, 25_000_000, 3).way.precision == "int4"
+    assert not any(way in INT8 for way, _, _ in law.asked)
+    assert search(law).smallest_reaching([INT4, INT8], 50, 25_000_000, 3).way.precision == "int8"
+
+
+def test_nothing_reaches_what_nothing_can():
+    law = Law(dict.fromkeys(INT4, 38.0), dict.fromkeys(INT4, 2_000_000))
+    assert search(law).smallest_reaching([INT4], 60, 25_000_000, 3) is None
+    assert search(law).smallest_reaching([INT4], 40, 900_000, 3) is None
+
+
+def test_the_best_under_a_size():
+    law = Law({INT4[0]: 37.0, INT4[1]: 39.0, INT4[2]: 38.0}, dict.fromkeys(INT4, 2_000_000))
+    chosen = search(law).best_within(INT4, 500_000)
+    assert chosen.way == INT4[1] and chosen.bytes <= 500_000
+    assert search(law).best_within(INT4, 10) is None
+
+
+def test_the_next_larger_and_smaller_are_told_with_what_they_give():
+    law = Law(dict.fromkeys(INT4, 39.0), dict.fromkeys(INT4, 2_000_000))
+    choosing = search(law)
+    chosen = choosing.best_within(INT4, 500_000)
+    near = choosing.neighbours(chosen)
+    assert near["next_smaller"]["bytes"] < chosen.bytes < near["next_larger"]["bytes"]
+    assert near["next_smaller"]["psnr"] < chosen.psnr < near["next_larger"]["psnr"]
+    assert f"--max-size {near['next_larger']['bytes']}" in near["next_larger"]["flags"]
+    whole = choosing.make(INT4[0], 3_000_000, True)
+    assert "next_larger" not in choosing.neighbours(whole)
+
+
+def test_flags_name_what_is_fixed():
+    assert Way("int4", (8, 16), 1).flags("blocks", 9) == (
+        "--kind blocks --precision int4 --ranks 8,16 --sh-degree 1 --max-size 9"
+    )
+    assert Way("float16").flags("blocks", 9) == "--kind blocks --precision float16 --max-size 9"

@@ -1,0 +1,146 @@
+"""`make bench-paper`, made small: every part runs, what it writes can be read, and the table shows it."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.paper import capacity, quality, smallest, sources, table, times
+from benchmarks.paper.__main__ import EXPERIMENTS
+from benchmarks.paper.work import Work, fusedrf
+from tests.bridge.conftest import write_scene_of
+
+SMALL_VM = {"KINDS": ("blocks", "vm"), "MOST_BYTES": 300_000}
+
+
+@pytest.fixture
+def work(folder, tmp_path, monkeypatch) -> Work:
+    """The shop's scene in place of all others, and tiny pictures."""
+    for module in (quality, times, smallest):
+        monkeypatch.setattr(module, "four_objects", lambda work: folder / "scene.json")
+    for module, name in ((quality, "SIZE"), (smallest, "SIZE"), (times, "COMPARED"), (times, "SIZE")):
+        monkeypatch.setattr(module, name, 24)
+    for module in (quality, times):
+        for name, value in SMALL_VM.items():
+            monkeypatch.setattr(module, name, value)
+    (tmp_path / "out").mkdir()
+    return Work(folder, tmp_path / "out", None)
+
+
+def rows_of(work: Work, name: str) -> list[dict]:
+    with (work.out / f"{name}.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_kinds_and_seeds(work, monkeypatch):
+    monkeypatch.setattr(quality, "KINDS", ("blocks",))
+    monkeypatch.setattr(quality, "SEEDS", 2)
+    seen = quality.kinds(work) | quality.seeds(work)
+    plain, finished = rows_of(work, "kinds")
+    assert (plain["rgb"], finished["rgb"]) == ("False", "True")
+    assert seen["points"] == f"blocks {float(plain['psnr']):.1f} dB" and float(plain["psnr"]) > 30
+    assert [row["seed"] for row in rows_of(work, "seeds")] == ["0", "1"]
+
+
+def test_a_close_up_frames_the_object_alone(work, folder, monkeypatch):
+    box = np.array([-0.8, -0.3, -0.3, -0.2, 0.3, 0.3])  # of red
+    monkeypatch.setattr(quality, "with_a_tiny_one", lambda work: (folder / "scene.json", box))
+    monkeypatch.setattr(quality, "KINDS", ("blocks",))
+    quality.closeup(work)
+    (row,) = rows_of(work, "closeup")
+    assert float(row["psnr"]) > 30 and row["psnr"] != row["psnr of the whole"]
+
+
+@pytest.mark.slow
+def test_times(work, monkeypatch):
+    for name, value in {"FUSING": (1,), "TRAINING": (1,), "VIEWS": 4, "WANTED": 5.0}.items():
+        monkeypatch.setattr(times, name, value)
+    seen = times.times(work)
+    rows = rows_of(work, "times")
+    assert [row["way"] for row in rows] == ["blocks", "background", "scratch", "retraining"]
+    assert all(float(row["seconds"]) > 0 for row in rows) and "blocks" in seen["time"]
+    assert (work.out / "times.svg").stat().st_size < 200_000
+
+
+@pytest.mark.slow
+def test_capacity(work, folder, monkeypatch):
+    def places(work, count):
+        write_scene_of(folder, *("floor", "red", "blue")[: count + 1], file=f"things_{count:02d}.json")
+        return folder / f"things_{count:02d}.json"
+
+    monkeypatch.setattr(capacity, "things_on_ground", places)
+    limits = {"25MB": 25_000_000, "150kB": 150_000}
+    for name, value in {"COUNTS": (1, 2), "LIMITS": limits, "MEASURED_AT": 2}.items():
+        monkeypatch.setattr(capacity, name, value)
+    monkeypatch.setattr(capacity, "COMPARED", 24)
+    monkeypatch.setattr(capacity, "FRAME", 24)
+    seen = capacity.capacity(work)
+    rows = rows_of(work, "capacity")
+    assert [(row["n"], row["limit"]) for row in rows] == [(n, s) for n in "12" for s in limits]
+    assert all(int(row["bytes"]) <= limits[row["limit"]] for row in rows)
+    assert all(int(row["fused peak bytes"]) > 1e8 for row in rows)  # of a process of its own
+    assert float(seen["flat"]) > 0 and seen["naive over fused"].endswith("×")
+    assert (work.out / "capacity.svg").stat().st_size < 200_000
+
+
+@dataclass(frozen=True)
+class Reports:
+    """Commands that report what they are told to."""
+
+    points: list[dict]
+
+    def __call__(self, folder: Path, command: str, *words: str) -> dict:
+        if command == "chart":
+            for name in ("chart.csv", "chart.svg"):
+                (folder / "chart").mkdir(exist_ok=True)
+                (folder / "chart" / name).write_text("")
+            return {"points": self.points}
+        return {"bytes": 1_100_000, "total_seconds": 3.0}
+
+
+def test_smallest_is_the_least_of_those_that_reach_the_psnr(work, monkeypatch):
+    sizes = ((40.5, 2_000_000), (41.0, 1_000_000), (39.9, 500_000))
+    points = [{"flags": "", "psnr": q, "bytes": b, "seconds": 1.0} for q, b in sizes]
+    held = SimpleNamespace(quality=lambda path: (40.2, 1.0))
+    monkeypatch.setattr(smallest, "course", lambda scene, size: held)
+    monkeypatch.setattr(smallest, "fusedrf", Reports(points))
+    seen = smallest.smallest(work)
+    assert seen == {"picked": "1.10 (40.2 dB)", "smallest": "1 MB (41.0 dB)"}
+    monkeypatch.setattr(smallest, "fusedrf", Reports(points[2:]))
+    assert smallest.smallest(work)["smallest"] == "none"
+
+
+def test_the_table_keeps_what_other_parts_saw(work):
+    table.update(work.out, {"flat": "1.01"})
+    table.update(work.out, {"seeds": "blocks 0.1 dB"})
+    page = (work.out / "table.md").read_text()
+    assert "| fused frame time at N = 8 over N = 1 | 1.00 | ≤ 1.10 | ≤ 1.02 | 1.01 |" in page
+    assert "| blocks 0.1 dB |" in page
+
+
+def test_seconds_to_a_psnr_lie_between_its_points(monkeypatch):
+    monkeypatch.setattr(times, "WANTED", 35.0)
+    rows = [{"way": "a", "seconds": s, "psnr": q} for s, q in ((40, 40.0), (10, 30.0), (2, 20.0))]
+    assert times.seconds_to(rows, "a") == pytest.approx(20)  # half way, in logarithms
+    assert times.seconds_to(rows[1:], "a") is None and times.seconds_to(rows[:1], "a") == 40
+
+
+def test_thirty_two_things_find_places_on_the_ground():
+    found = sources.places(32)
+    apart = np.linalg.norm(found[:, None] - found[None], axis=-1) + 9 * np.eye(32)
+    widest = 0.4 * sources.SHRUNK  # the radius of a thing
+    assert apart.min() > 2 * widest and np.linalg.norm(found, axis=1).max() + widest < 2
+    np.testing.assert_array_equal(sources.places(8), found[:8])
+
+
+def test_a_command_that_fails_says_why(folder):
+    with pytest.raises(RuntimeError, match="blocks need vm sources"):
+        write_scene_of(folder, "floor", "red", file="fog.json", composition="add")
+        fusedrf(folder, "fuse", "fog.json", "-o", "fog.rfpack", "--kind", "blocks")
+
+
+def test_every_measure_is_somebodys():
+    assert set(table.PARTS) == set(EXPERIMENTS)

@@ -1,0 +1,60 @@
+"""Finishing: what was made smaller comes nearer to its teacher on rays it never saw; the same seed, the same
+numbers."""
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.blocks import blocks_of
+from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.rendering.volume import render_rays
+from tests.analytic.rays import affine, turn
+from tests.engine.conftest import BOX, THIRTY_TWO, random_vm
+
+
+@pytest.fixture
+def pair(monkeypatch):
+    """Two blocks over two tensors, and the same at less than half their resolution."""
+    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 32)
+    one, two = (
+        random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32, seed=s).resampled(BOX, (20, 21, 22))
+        for s in (1, 2)
+    )
+    placed = [Placed("a", one, affine(turn(20))), Placed("b", two, affine(0.5, (2.5, 0, 0)))]
+    whole = blocks_of(placed)
+    few = blocks_of(placed, lambda shape, tensors: max(t.resolution[0] for t in tensors) < 5)
+    few.params += 0.3 * torch.randn(few.params.shape, generator=torch.Generator().manual_seed(3))
+    return whole, few
+
+
+def test_a_student_comes_nearer_on_rays_it_never_saw(pair):
+    whole, few = pair
+    lesson = RayLesson(whole, [whole.aabb], seed=0, rays=4000)
+    rays = random_rays([whole.aabb], 1000, torch.Generator().manual_seed(99))
+    wanted = render_rays(whole, *rays)[:, :4]
+
+    def error() -> float:
+        return float(((render_rays(few, *rays)[:, :4] - wanted) ** 2).mean())
+
+    before, shares = error(), []
+    lesson.teach(few, steps=60, advance=shares.append)
+    assert error() < 0.6 * before and shares[-1] == 1
+
+
+def test_the_same_seed_teaches_the_same(pair):
+    whole, few = pair
+    start, ends = few.params.clone(), []
+    for seed in (0, 0, 1):
+        few.params.copy_(start)
+        RayLesson(whole, [whole.aabb], seed, rays=1000).teach(few, steps=5)
+        ends.append(few.params.clone())
+    assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
+
+
+def test_what_the_teacher_shows_is_over_white(pair):
+    whole, _ = pair
+    lesson = RayLesson(whole, [whole.aabb], seed=0, rays=500)
+    empty = lesson.target[:, 3] == 0
+    assert empty.any() and np.array_equal(lesson.target[empty, :3], np.ones((empty.sum(), 3)))
