@@ -5,7 +5,8 @@ voxels, or split into eight nodes. Vertices are counted in *units*, voxel sides 
 neighbours know each other's vertices whatever their levels.
 """
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -211,6 +212,13 @@ class Lattice:
         """(V, 3) int64 in units of the tree, free ones first."""
         self.vertices[rank] = vertices
         self.spread = self._spread(keys, rank, hanging, parents)
+
+    def moved(self, origin: np.ndarray) -> "Lattice":
+        """The same lattice in a frame whose origin is at `origin` (3,) of its own."""
+        other = copy(self)
+        other.tree = replace(self.tree, lo=self.tree.lo - origin)
+        other.__dict__.pop("places", None)  # as they were, if they were asked for
+        return other
 
     @property
     def width(self) -> np.ndarray:

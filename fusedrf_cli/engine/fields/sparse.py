@@ -77,6 +77,13 @@ class SparseField:
         """The same field with its numbers on a device: there it is asked, rendered and trained."""
         return self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
 
+    def moved(self, origin: np.ndarray) -> "SparseField":
+        """The same field in a frame whose origin is at `origin` (3,) of its own."""
+        other = self.with_params(self.params)
+        other.fine = self.fine.moved(origin)
+        other.coarse = self.coarse.moved(origin) if self.coarse else None
+        return other
+
     # -- reading ---------------------------------------------------------------------------------------------
 
     @property
