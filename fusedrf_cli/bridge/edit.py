@@ -13,6 +13,7 @@ import torch
 from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
 from formats.scene import Leaf, Matrix4, SceneGraph
+from fusedrf_cli.bridge.fuse_sparse import read_back
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
@@ -21,10 +22,12 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import RESTORED, ClippedField, cleared, region_of
+from fusedrf_cli.engine.composition.sparse_edit import added, emptied
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.fields.sparse import SparseField
+from fusedrf_cli.engine.fields.vm import Block, VMField
 from fusedrf_cli.errors import InvalidInput
 
 REGION_SETTINGS = DistillSettings(
@@ -79,10 +82,13 @@ def add(
         ]
         settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
         progress.phase("adding", 1.0)
-        originals, objects = objects, [as_vm(p, settings, rgb, progress) for p in objects]
-        base = Placed("", field, np.eye(4))
+        originals, base = objects, Placed("", field, np.eye(4))
         try:
-            result = blocks_of([base, *objects])
+            if type(field) is SparseField:
+                result = with_objects(field, objects)
+            else:
+                objects = [as_vm(p, settings, rgb, progress) for p in objects]
+                result = blocks_of([base, *objects])
         except ValueError as error:
             raise InvalidInput(f"{fused}: {error}") from error
         box = enclosing(
@@ -91,7 +97,7 @@ def add(
         progress.phase("measuring", None)
         truth = ComposedField([base, *originals])
         reached = Judge(truth, settings.views, settings.view_size, seed)(
-            moved_frame(stored(result, precision), truth.origin)
+            as_read(result, precision, truth.origin)
         )
         entry = {
             "event": "added",
@@ -156,22 +162,16 @@ def delete(
                     f"{', '.join(sorted(known)) or 'nothing that has a name'}"
                 )
         if set(names) == known:
-            raise InvalidInput(
-                f"{fused}: deleting {', '.join(sorted(names))} would leave nothing; keep one object, or "
-                "delete the file"
-            )
+            raise nothing_left(fused, tuple(sorted(names)))
         origin = node.object_to_world[:3, 3]
-        dropped = [b for b in field.blocks if named(b, set(names))]
+        dropped = [b for b in blocks_in(field) if named(b, set(names))]
         boxes = [
             transformed_aabb(field.tensors[b.tensor].occupancy.tight_aabb(0), b.object_to_field)
             for b in dropped
         ]
         result = without(field, set(names)) if dropped else field
         if result is None:
-            raise InvalidInput(
-                f"{fused}: deleting {', '.join(names)} would leave nothing; keep one object, or "
-                "delete the file"
-            )
+            raise nothing_left(fused, names)
         figures = {"restored": True, "seconds": {}}
         inside = [
             entry
@@ -183,9 +183,14 @@ def delete(
             box = np.asarray(entry["aabb"], np.float64) - np.tile(origin, 2)
             boxes.append(box)
             rest = remaining(scene, members, Path(fused), names, origin, allow_outside, progress)
+            figures["restored"] &= rest is not None
+            if type(result) is SparseField:
+                result = emptied(result, box, rest or [])
+                if result is None:
+                    raise nothing_left(fused, names)
+                continue
             settings = replace(REGION_SETTINGS, seed=seed, time_budget=time_budget)
             result, learned = cut(result, box, rest, settings, rgb, progress)
-            figures["restored"] &= rest is not None
             figures |= learned
         history = (
             *scene.history,
@@ -207,7 +212,14 @@ def delete(
     )
 
 
-def addition_memory(field: VMField, new: LoadedScene) -> list[dict[str, float]]:
+def nothing_left(fused: str, names: tuple[str, ...]) -> InvalidInput:
+    """The refusal of a deletion that would empty the field."""
+    return InvalidInput(
+        f"{fused}: deleting {', '.join(names)} would leave nothing; keep one object, or delete the file"
+    )
+
+
+def addition_memory(field: VMField | SparseField, new: LoadedScene) -> list[dict[str, float]]:
     """The stages of adding a scene's fields to a field: putting together, measuring."""
     view, old = REGION_SETTINGS.view_size, field.params.numel() * FLOAT
     sizes, numbers = [old, *new.sizes], (old + sum(new.sizes)) // FLOAT
@@ -235,7 +247,7 @@ def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, lis
             sources([headers[leaves[0].field].decoded_size], copies=READING), advice="edit a smaller field"
         )
     field = make_field(read_field(path, leaves[0].field), path)
-    if type(field) is not VMField or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
+    if type(field) not in (VMField, SparseField) or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
     own = headers[leaves[0].field].precision
     return scene, [m for m in headers if m != leaves[0].field], leaves[0], field, own
@@ -267,14 +279,19 @@ def graph_nodes(scene: SceneGraph) -> list[dict]:
     return list(nodes.values())
 
 
-def names_in(scene: SceneGraph, field: VMField, whole: str) -> set[str]:
+def names_in(scene: SceneGraph, field: VMField | SparseField, whole: str) -> set[str]:
     """Names that can be deleted: of the history and of the blocks."""
-    return {n["name"] for n in graph_nodes(scene)} | {b.name for b in field.blocks} - {
+    return {n["name"] for n in graph_nodes(scene)} | {b.name for b in blocks_in(field)} - {
         whole,
         "",
         "fused",
         RESTORED,
     }
+
+
+def blocks_in(field: VMField | SparseField) -> tuple[Block, ...]:
+    """The blocks of a field; one of bricks has none."""
+    return field.blocks if type(field) is VMField else ()
 
 
 def as_vm(placed: Placed, settings: DistillSettings, rgb: bool, progress) -> Placed:
@@ -296,6 +313,21 @@ def as_vm(placed: Placed, settings: DistillSettings, rgb: bool, progress) -> Pla
     back = placed.object_to_world.copy()
     back[:3, 3] += back[:3, :3] @ teacher.origin
     return Placed(placed.name, student, back)
+
+
+def with_objects(field: SparseField, objects: list[Placed]) -> SparseField:
+    """A sparse field with placed objects put in, one after the other."""
+    for placed in objects:
+        field = added(field, placed)
+    return field
+
+
+def as_read(field: VMField | SparseField, precision: str, origin: np.ndarray) -> VMField | SparseField:
+    """A field as it will be read from a bundle of that precision, in a frame whose origin is at `origin` (3,) of its
+    own."""
+    if type(field) is SparseField:
+        return read_back(field, precision)[0].moved(origin)
+    return moved_frame(stored(field, precision), origin)
 
 
 def moved_frame(field: VMField, origin: np.ndarray) -> VMField:
@@ -421,7 +453,7 @@ def edit_report(
     before: str,
     names: str,
     box: np.ndarray,
-    field: VMField,
+    field: VMField | SparseField,
     figures: dict,
     started: float,
 ) -> dict:
@@ -435,7 +467,7 @@ def edit_report(
         "touched": {
             "names": names,
             "aabb": box.tolist(),
-            "blocks": len(field.blocks),
+            **({"bricks": len(field.tree.level)} if type(field) is SparseField else {"blocks": len(field.blocks)}),
             "share_of_box": float(min(1.0, np.prod(extent / whole))),
         },
         **figures,

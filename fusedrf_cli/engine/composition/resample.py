@@ -5,16 +5,15 @@ much, all is coarser by one factor.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy import sparse
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.bricks import (
+    MAX_LEVEL,
     MAX_TOP_CELLS,
     OCTANTS,
     BrickTree,
@@ -28,61 +27,50 @@ from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
+FINER = 0.6  # of a teacher's voxel: a lattice that lies across the teacher's own needs finer ones to hold as much
 DEEPEST = 6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
-FAINT = 1e-5  # optical depth of a voxel under which there is nothing
+FAINT = 1e-4  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
 COLOURED = 1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
-LEAST, MOST = -8.0, 60.0  # of the density feature
+LEAST, MOST = -12.0, 60.0  # of the density feature
 REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these
-DIRECTIONS = 32
+LOOKED_FROM, DIRECTIONS = 20, 32  # directions along which voxels are sought, and colours asked
 ONE_SIDED = 0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
 LOOKS = 9  # places along a look through the voxels before and behind a vertex
 RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
 LOGITS = 8.0  # colours are told apart up to sigmoid(8)
 AT_ONCE = 1 << 18
-ATTEMPTS = 5
+ATTEMPTS = 4
 FULL_ENOUGH = 0.93  # of the numbers allowed
 DILATIONS = 3
-SEEING_RAYS = 1_000_000
-SEEN = 1e-8  # weight of a voxel in a picture of the scene, at least, to be held
+CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which a voxel has to be seen
+BLOCKED = 0.05  # transmittance under which nothing is seen
+MOST_LOST = 0.05  # optical depth of a voxel that is always held
+ODD_LINES = 20
 CORRECTIONS = 3
+
 
 
 class TooFewNumbers(ValueError):
     """Not even the widest voxels fit."""
 
 
-class Known(NamedTuple):
-    """What was asked of a teacher at vertices, by ascending keys of their places in units."""
-
-    keys: np.ndarray  # (M,) int64
-    sigma: np.ndarray  # (M,) float64
-    facing: np.ndarray  # (M, 3) mean direction along which a vertex is seen
-
-    def of(self, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-        """σ (V,) and facing (V, 3) of a lattice's vertices, all of them among the known."""
-        at = np.searchsorted(self.keys, node_keys(lattice.vertices))
-        return self.sigma[at], self.facing[at]
-
-
 def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
-    """The teacher as a sparse field in its frame with at most so many numbers. Raises ValueError where the teacher
+    """The teacher as a sparse field in its frame with at most so many numbers. Raises EmptyField where the teacher
     shows nothing, TooFewNumbers where not even the widest voxels fit.
     """
-    tree, known = fitted(teacher, shape, max_numbers)
-    field = SparseField(shape, Lattice(tree, SIDE), density_scale(tree))
-    fill(field, teacher, known)
+    lattice, known = fitted(teacher, shape, max_numbers)
+    field = SparseField(shape, lattice, density_scale(lattice.tree))
+    fill(field, teacher, *known)
     return field
 
 
-def fitted(
-    teacher: RadianceField, shape: SparseShape, max_numbers: int
-) -> tuple[BrickTree, Known]:
-    """The finest tree found with at most so many numbers, and what is known of its vertices."""
+def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tuple[Lattice, list[np.ndarray]]:
+    """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
     own = [p.voxel_size for p in placed_in(teacher)]
     common, best, tried = 2 * max(own), None, []
     for _ in range(ATTEMPTS):
-        found = occupied_tree(teacher, common)
+        found = occupied(teacher, common)
         count = number_count(found[0], shape)
         tried.append((np.log(common), np.log(count)))
         if count <= max_numbers and (best is None or common < best[0]):
@@ -99,10 +87,10 @@ def fitted(
     return best[1]
 
 
-def number_count(tree: BrickTree, shape: SparseShape) -> int:
-    """Numbers of a sparse field over a tree."""
-    count = 4 * Lattice(tree, SIDE).free
-    return count + (shape.band_numbers * Lattice(tree, COARSE).free if shape.sh_degree else 0)
+def number_count(lattice: Lattice, shape: SparseShape) -> int:
+    """Numbers of a sparse field over a lattice."""
+    count = 4 * lattice.free
+    return count + (shape.band_numbers * Lattice(lattice.tree, COARSE).free if shape.sh_degree else 0)
 
 
 # -- where ---------------------------------------------------------------------------------------------------
@@ -121,22 +109,22 @@ def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, 
     the mean is what gives the least error for the numbers.
     """
     own = np.array([p.voxel_size for p in placed_in(teacher)])
-    needs = np.sqrt(own * np.maximum(own, common))
+    needs = FINER * np.sqrt(own * np.maximum(own, common))
     depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
     top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
     box = teacher.occupancy.tight_aabb(0)
     while True:
         counts = np.maximum(np.ceil((box[3:] - box[:3]) / top + 0.5), 1).astype(int)
-        if np.prod(counts) <= MAX_TOP_CELLS // 4 or depth == DEEPEST + 1:
+        if np.prod(counts.astype(float)) <= MAX_TOP_CELLS // 4:
             break
-        depth, top = depth + 1, 2 * top
+        depth, top = min(depth + 1, MAX_LEVEL), 2 * top
     lo = (box[:3] + box[3:] - top * counts) / 2
     levels = np.clip(np.round(np.log2(top / (SIDE * needs))), 0, depth).astype(int)
     return lo, float(top), tuple(counts), [int(level) for level in levels]
 
 
-def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, Known]:
-    """The tree whose active voxels hold all matter that shows, and what is known of its vertices."""
+def occupied(teacher: RadianceField, common: float) -> tuple[Lattice, list[np.ndarray]]:
+    """The lattice whose active voxels hold all matter that shows, and σ (V,) and facing (V, 3) of its vertices."""
     lo, top, counts, levels = frame_of(teacher, common)
     wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
     for placed, level in zip(placed_in(teacher), levels, strict=True):
@@ -145,35 +133,54 @@ def occupied_tree(teacher: RadianceField, common: float) -> tuple[BrickTree, Kno
     whole = BrickTree.of(lo, top, counts, level, at, np.ones((len(level), SIDE, SIDE, SIDE), bool))
     lattice = Lattice(whole, SIDE)
     sigma = density(teacher, lattice.places)
-    depth = sigma * lattice.finest_voxel
-    matter = depth > harmless(depth, lattice)
-    if not matter.any():
-        raise ValueError("the scene shows nothing")
-    weight, facing = looked_at(lattice, sigma, teacher)
-    mask = matter[lattice.corners].any(1).reshape(-1, SIDE**3) & (weight > SEEN * SEEING_RAYS)
-    kept = mask.any(1)
-    tree = BrickTree.of(lo, top, counts, whole.level[kept], whole.at[kept], mask[kept].reshape(-1, SIDE, SIDE, SIDE))
-    keys = node_keys(lattice.vertices >> (whole.depth - tree.depth))
-    order = np.argsort(keys)
-    return tree, Known(keys[order], sigma[order], around(lattice, facing, weight)[order])
-
-
-def looked_at(
-    lattice: Lattice, sigma: np.ndarray, teacher: RadianceField
-) -> tuple[np.ndarray, np.ndarray]:
-    """`SparseField.seen` of densities (V,) for rays from outside at the whole and at the placed fields."""
+    dense = (sigma * lattice.finest_voxel > FAINT)[lattice.corners].any(1)
+    lattice, (sigma,) = thinned(lattice, dense, sigma)
     field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree))
     set_density(field, sigma)
-    boxes = [teacher.occupancy.tight_aabb(0), *sorted((p.aabb for p in placed_in(teacher)), key=list)]
-    return field.seen(*random_rays(boxes, SEEING_RAYS, torch.Generator().manual_seed(0)))
+    kept, facing = shown(field)
+    return thinned(lattice, kept, sigma, facing)
 
 
-def around(lattice: Lattice, facing: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(V, 3) mean direction, by weight, along which the voxels around each vertex are seen: of length 1 where it
-    is seen from one side alone, 0 where from all or never."""
-    told = np.concatenate([facing.reshape(-1, 3), weight.reshape(-1, 1)], 1)[lattice.active.ravel()]
-    summed = touching(lattice).T @ told
-    return summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
+class EmptyField(ValueError):
+    """Nothing is there to be held."""
+
+
+def thinned(lattice: Lattice, kept: np.ndarray, *values: np.ndarray) -> tuple[Lattice, list[np.ndarray]]:
+    """The lattice of those active voxels of another that are kept (K,), and the values (V, ...) of its vertices.
+    Raises EmptyField where there are none."""
+    if not kept.any():
+        raise EmptyField("the scene shows nothing")
+    whole = lattice.tree
+    mask = np.zeros(lattice.active.shape, bool)
+    mask[lattice.active] = kept
+    own = mask.any(1)
+    mask = mask[own].reshape(-1, SIDE, SIDE, SIDE)
+    tree = BrickTree.of(whole.lo, whole.top, whole.counts, whole.level[own], whole.at[own], mask)
+    smaller = Lattice(tree, SIDE)
+    at = lattice.find(smaller.keys)[0]
+    return smaller, [v[at] for v in values]
+
+
+def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Which active voxels (K,) a camera sees anything of that is not closer than CAMERA_FAR times the box; and the
+    mean direction (V, 3) along which each vertex is seen, of length 1 where from one side alone. With `which` (K,)
+    bool only those voxels are looked at, and all others shown.
+
+    What is hidden in solids is not held, and of haze as much is left out as no line of sight misses.
+    """
+    lattice = field.fine
+    which = np.ones(len(lattice.corners), bool) if which is None else which
+    corners, box, feature = lattice.corners[which], field.aabb, field.rows[:, 0].numpy()
+    far = CAMERA_FAR * float(np.linalg.norm(box[3:] - box[:3]))
+    low, high = lattice.places[corners[:, 0]], lattice.places[corners[:, 7]]
+    clearest, facing = field.exposed(low, high, even_directions(LOOKED_FROM), far, BLOCKED)
+    sigma = np.where(feature > LEAST, field.scale * np.logaddexp(0, feature), 0)
+    depth = sigma[corners].max(1) * (high - low)[:, 0] * clearest
+    kept = which.copy()
+    kept[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
+    told = np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * kept[which])[:, None]
+    summed = touching(lattice)[which].T @ told
+    return kept | ~which, summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
 
 
 def touching(lattice: Lattice) -> sparse.csr_matrix:
@@ -251,16 +258,17 @@ def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(levels), np.concatenate(places)
 
 
-def harmless(depth: np.ndarray, lattice: Lattice) -> float:
-    """The largest optical depth of a voxel up to which vertices may be left out without any axis-parallel line of
-    them losing more than LOST_DEPTH: thin fog is no emptiness."""
+def harmless(depth: np.ndarray, places: np.ndarray) -> float:
+    """The largest optical depth of a voxel up to which voxels (K,) at places (K, 3) may be left out, when one in
+    ODD_LINES of the axis-parallel lines through them may lose more than LOST_DEPTH: thin fog is no emptiness."""
+    if not len(depth):
+        return 0.0
     lines = []
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        line = lattice.vertices[:, a] << 21 | lattice.vertices[:, b]
-        lines.append(np.unique(line, return_inverse=True)[1])
-    for threshold in LOST_DEPTH * 0.25 ** np.arange(12):
+        lines.append(np.unique(places[:, a] << 21 | places[:, b], return_inverse=True)[1])
+    for threshold in MOST_LOST * 0.5 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)
-        if max(np.bincount(line, lost).max() for line in lines) <= LOST_DEPTH:
+        if max(np.quantile(np.bincount(line, lost), 1 - 1 / ODD_LINES) for line in lines) <= LOST_DEPTH:
             return float(threshold)
     return 0.0
 
@@ -288,14 +296,14 @@ def density(source, places: np.ndarray) -> np.ndarray:
     return found
 
 
-def fill(field: SparseField, teacher: RadianceField, known: Known) -> None:
-    """Give the vertices the numbers that show what the teacher does.
+def fill(field: SparseField, teacher: RadianceField, sigma: np.ndarray, facing: np.ndarray) -> None:
+    """Give the vertices the numbers that show what the teacher does, whose σ there is known (V,), and the directions
+    along which they are seen (V, 3), as of `shown`.
 
     What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour from
     where a look along its facing ends.
     """
     fine, degree = field.fine, field.shape.sh_degree
-    sigma, facing = known.of(fine)
     fit_density(field, teacher, sigma)
     places, opacity = look(teacher, fine, sigma, facing)
     coefficients = np.zeros((len(sigma), 3, field.shape.coefficients), np.float32)
@@ -335,9 +343,9 @@ def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -
     """Density features that, interpolated, come nearest to the teacher's in the squares of their differences at
     eight points of every active voxel; sigma (V,) is what the teacher says at the vertices.
 
-    Features are told apart up to REACH on either side of the one at which a voxel is half opaque: so a surface
-    comes to lie where it is between vertices of which one knows only that there is much and the other that there
-    is nothing.
+    In a voxel that a surface runs through, features are told apart up to REACH on either side of the one at which
+    it is half opaque: so the surface comes to lie where it is, between vertices of which one knows only that there
+    is much and the other that there is nothing.
     """
     lattice = field.fine
     corners = lattice.corners
@@ -346,8 +354,10 @@ def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -
     spots = 0.25 + 0.5 * OCTANTS
     weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
     answers = np.stack([density(teacher, first + side[:, None] * spot) for spot in spots], 1)
-    wanted = between(answers, field.scale, side[:, None])
-    found = between(sigma, field.scale, lattice.finest_voxel)
+    half, own = (half_opaque(field.scale, size) for size in (side[:, None], lattice.finest_voxel))
+    wanted = np.clip(inverse_softplus(answers / field.scale), LEAST, half + REACH)
+    wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - REACH), wanted)
+    found = np.clip(inverse_softplus(sigma / field.scale), own - REACH, own + REACH)
     scatter = sparse.csr_matrix(
         (np.ones(corners.size), (corners.ravel(), np.arange(corners.size))), (len(found), corners.size)
     )
@@ -358,9 +368,8 @@ def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -
     found = conjugate_gradients(
         lambda x: x[corners] @ weights.T, adjoint, scatter @ np.tile((weights**2).sum(0), len(corners)), wanted, found
     )
-    full = half_opaque(field.scale, lattice.finest_voxel) + 0.9 * REACH
     most = np.clip(inverse_softplus(sigma / field.scale), None, MOST)
-    field.rows[:, 0] = torch.from_numpy(np.where(found > full, np.maximum(found, most), found))
+    field.rows[:, 0] = torch.from_numpy(np.where(found > own + 0.9 * REACH, np.maximum(found, most), found))
     field.settle()
 
 
@@ -380,12 +389,6 @@ def conjugate_gradients(apply, adjoint, diagonal: np.ndarray, wanted: np.ndarray
         new = rest @ (rest / diagonal)
         along, size = rest / diagonal + new / size * along, new
     return x
-
-
-def between(sigma: np.ndarray, scale: float, side: np.ndarray) -> np.ndarray:
-    """Features of densities, within REACH of the one at which a voxel of a side is half opaque."""
-    half = half_opaque(scale, side)
-    return np.clip(inverse_softplus(sigma / scale), half - REACH, half + REACH)
 
 
 def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:

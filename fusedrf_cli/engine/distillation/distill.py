@@ -290,7 +290,7 @@ class DistillRun:
         clock.lap("teachers")
         if self.phase == "points":
             phase("points")
-            if len(pool.points):
+            if len(pool.points) and settings.steps:
                 self._learn(PointPass(pool, self), settings.steps, held_out, advance, whole)
             with whole():
                 self._begin_pictures()

@@ -5,7 +5,8 @@ voxels, or split into eight nodes. Vertices are counted in *units*, voxel sides 
 neighbours know each other's vertices whatever their levels.
 """
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -212,6 +213,13 @@ class Lattice:
         self.vertices[rank] = vertices
         self.spread = self._spread(keys, rank, hanging, parents)
 
+    def moved(self, origin: np.ndarray) -> "Lattice":
+        """The same lattice in a frame whose origin is at `origin` (3,) of its own."""
+        other = copy(self)
+        other.tree = replace(self.tree, lo=self.tree.lo - origin)
+        other.__dict__.pop("places", None)  # as they were, if they were asked for
+        return other
+
     @property
     def width(self) -> np.ndarray:
         """(N,) int64 side of the bricks' voxels, in units."""
@@ -221,6 +229,17 @@ class Lattice:
     def places(self) -> np.ndarray:
         """(V, 3) float64 vertices in the frame of the tree."""
         return self.tree.lo + self.vertices * self.tree.unit
+
+    @cached_property
+    def keys(self) -> np.ndarray:
+        """(V,) int64, one for each vertex, that stays the same whatever else the box holds."""
+        return node_keys(self.vertices << (MAX_LEVEL - self.tree.depth))
+
+    def find(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) rows of the vertices of those keys, and whether there is such a vertex."""
+        order = np.argsort(self.keys)
+        row = order[np.minimum(np.searchsorted(self.keys, keys, sorter=order), len(order) - 1)]
+        return row, self.keys[row] == keys
 
     @cached_property
     def corners(self) -> np.ndarray:

@@ -77,6 +77,13 @@ class SparseField:
         """The same field with its numbers on a device: there it is asked, rendered and trained."""
         return self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
 
+    def moved(self, origin: np.ndarray) -> "SparseField":
+        """The same field in a frame whose origin is at `origin` (3,) of its own."""
+        other = self.with_params(self.params)
+        other.fine = self.fine.moved(origin)
+        other.coarse = self.coarse.moved(origin) if self.coarse else None
+        return other
+
     # -- reading ---------------------------------------------------------------------------------------------
 
     @property
@@ -195,13 +202,16 @@ class SparseField:
         read = *self.kernel_shape, self.arrays, self.grid
         self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
-    def seen(self, rays_o: np.ndarray, rays_d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How much each voxel weighs in the pictures of rays (R, 3), summed over them, (N, 64) float32, and the
-        sum of the directions it is seen along by that weight, (N, 64, 3)."""
-        weights = np.zeros((torch.get_num_threads(), len(self.tree.mask) * SIDE**3 * 4), np.float32)
-        self.loops.see(self.arrays, self.grid, rays_o, rays_d, 0.5 * self.voxel_size, 1e-3, weights)
-        found = weights.sum(0).reshape(-1, SIDE**3, 4)
-        return found[..., 0], found[..., 1:]
+    def exposed(
+        self, low: np.ndarray, high: np.ndarray, directions: np.ndarray, far: float, blocked: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions (D, 3),
+        (K,), from `far` away or from outside the box, and the mean direction along which each is seen (K, 3), of
+        length 1 where from one side alone. Light of less than `blocked` counts as none."""
+        clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
+        sides = np.ascontiguousarray((high - low)[:, 0])
+        self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
+        return clearest, facing
 
     # -- learning --------------------------------------------------------------------------------------------
 

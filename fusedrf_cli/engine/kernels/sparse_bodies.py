@@ -237,16 +237,22 @@ def query_sparse_point_backward(
 
 
 @body
-def beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k):
-    """First sample index beyond the node of a level around the point of sample k."""
+def node_exit(sparse, level, x, y, z, dx, dy, dz):
+    """Distance from a point to where a ray leaves the node of a level around it."""
     side = sparse.top / (1 << level)
     i = math.floor((x - sparse.lo[0]) / side)
     j = math.floor((y - sparse.lo[1]) / side)
     m = math.floor((z - sparse.lo[2]) / side)
-    away = min(
+    return min(
         exit_distance(x, dx, sparse.lo[0], side, i, 1),
         min(exit_distance(y, dy, sparse.lo[1], side, j, 1), exit_distance(z, dz, sparse.lo[2], side, m, 1)),
     )
+
+
+@body
+def beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k):
+    """First sample index beyond the node of a level around the point of sample k."""
+    away = node_exit(sparse, level, x, y, z, dx, dy, dz)
     return max(k + 1, int(math.ceil((t + away - t0) / step - FACE_TOLERANCE)))
 
 
@@ -308,39 +314,48 @@ def render_sparse_ray(
 
 
 @body
-def see_sparse_ray(sparse, grid, rays_o, rays_d, step, early_stop, i, seen):
-    """Adds the weight of every sample of ray i, and that times the ray's direction, to its voxel's place in seen
-    (64 N * 4,)."""
-    ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
-    dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
-    t0, t1 = hit_box(ox, oy, oz, dx, dy, dz, grid.lo, grid.hi)
-    t0 = t0 + 0.5 * step
-    trans = 1.0
-    k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, 0)
-    while k >= 0 and trans > early_stop:
-        t = t0 + k * step
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        brick, level = brick_at(sparse, x, y, z)
-        steps = 1 << (sparse.finest - level)
-        if brick < 0:
-            k = beyond_node(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k)
-        elif k & (steps - 1) != 0:
-            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
-        else:
-            first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
-            if first >= 0:
-                s = sparse.scale * softplus(feature_at(sparse, brick, first, u, v, w))
-                weight = trans * (1.0 - math.exp(-s * steps * step))
-                trans -= weight
-                n = SIDE + 1
-                voxel = (first // n**2 * SIDE + first // n % n) * SIDE + first % n
-                at = 4 * (brick * SIDE**3 + voxel)
-                accumulate(seen, at, weight)
-                accumulate(seen, at + 1, weight * dx)
-                accumulate(seen, at + 2, weight * dy)
-                accumulate(seen, at + 3, weight * dz)
-            k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
-        k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k)
+def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, facing):
+    """How much light reaches voxel i, a cube of sides[i] around places[i], from `far` away or from outside the box:
+    the most along one of the directions (D, 3) into clearest[i], and the mean of their opposites, by that light,
+    into facing[i]. What lets through less than `blocked` counts as opaque.
+    """
+    clearest[i] = 0
+    facing[i, 0], facing[i, 1], facing[i, 2] = 0, 0, 0
+    total = 0.0
+    for q in range(directions.shape[0]):
+        dx, dy, dz = directions[q, 0], directions[q, 1], directions[q, 2]
+        trans = 1.0
+        t = sides[i]
+        while t < far and trans > blocked:
+            x, y, z = places[i, 0] + t * dx, places[i, 1] + t * dy, places[i, 2] + t * dz
+            brick, level = brick_at(sparse, x, y, z)
+            if brick < 0:
+                if not in_box(sparse, x, y, z):
+                    break
+                t += max(node_exit(sparse, level, x, y, z, dx, dy, dz), 0.0) + 1e-3 * sides[i]
+            else:
+                span = sparse.top / (SIDE << level)
+                first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
+                if first >= 0:
+                    s = sparse.scale * softplus(feature_at(sparse, brick, first, u, v, w))
+                    trans *= math.exp(-s * span)
+                t += span
+        if trans > blocked:
+            clearest[i] = max(clearest[i], trans)
+            facing[i, 0] -= trans * dx
+            facing[i, 1] -= trans * dy
+            facing[i, 2] -= trans * dz
+            total += trans
+    if total > 0:
+        facing[i, 0], facing[i, 1], facing[i, 2] = facing[i, 0] / total, facing[i, 1] / total, facing[i, 2] / total
+
+
+@body
+def in_box(sparse, x, y, z):
+    """Whether a point lies in the field's box."""
+    nx, ny, nz = sparse.offset.shape
+    u, v, w = (x - sparse.lo[0]) / sparse.top, (y - sparse.lo[1]) / sparse.top, (z - sparse.lo[2]) / sparse.top
+    return u >= 0 and v >= 0 and w >= 0 and u < nx and v < ny and w < nz
 
 
 @body

@@ -14,16 +14,16 @@ from fusedrf_cli.engine.kernels.cpu import (
     task,
 )
 from fusedrf_cli.engine.kernels.sparse_bodies import (
+    expose_voxel,
     query_sparse_point,
     query_sparse_point_backward,
     render_sparse_ray,
-    see_sparse_ray,
     sum_of_rows,
     train_sparse_ray,
 )
 
 __all__ = [
-    "adam", "on_device", "query", "query_backward", "render", "see", "shared", "sums_of_rows", "train_rays",
+    "adam", "expose", "on_device", "query", "query_backward", "render", "shared", "sums_of_rows", "train_rays",
 ]  # fmt: skip
 
 
@@ -103,20 +103,20 @@ def render(widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early
 
 
 @task
-def see_task(sparse, grid, rays_o, rays_d, step, early_stop, low, high, seen):
-    """`see` for rays low..high, into one row."""
+def expose_task(sparse, places, sides, directions, far, blocked, low, high, clearest, facing):
+    """`expose` for voxels low..high."""
     for i in range(low, high):
-        see_sparse_ray(sparse, grid, rays_o, rays_d, step, early_stop, i, seen)
+        expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, facing)
 
 
 @loop
-def see(sparse, grid, rays_o, rays_d, step, early_stop, seen):
-    """Which voxels rays see: adds to row p of seen (parts, 64 N * 4) what part p's samples weigh, and that times
-    their directions."""
-    n = rays_o.shape[0]
-    parts = seen.shape[0]
-    for p in prange(parts):
-        see_task(sparse, grid, rays_o, rays_d, step, early_stop, p * n // parts, (p + 1) * n // parts, seen[p])
+def expose(sparse, places, sides, directions, far, blocked, clearest, facing):
+    """How much light reaches voxels of sides (K,) around places (K, 3): clearest (K,) and facing (K, 3) as of
+    `expose_voxel`."""
+    n = places.shape[0]
+    for part in prange((n + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        low, high = part * POINTS_PER_TASK, min(n, (part + 1) * POINTS_PER_TASK)
+        expose_task(sparse, places, sides, directions, far, blocked, low, high, clearest, facing)
 
 
 @task
