@@ -25,8 +25,8 @@ from fusedrf_cli.engine.composition.region import RESTORED, ClippedField, cleare
 from fusedrf_cli.engine.composition.sparse_edit import added, emptied
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
-from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.sparse import SparseField
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import Block, VMField
 from fusedrf_cli.errors import InvalidInput
 

@@ -22,6 +22,7 @@ from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.finish import RAYS, RayLesson
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kernels import working_time
 
 # Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md).
 RANKS = ((8, 16), (8, 24), None)
@@ -52,7 +53,7 @@ class BlocksMaker:
         views = VIEWS_TO_CHOOSE_BY if asked.target is not None else DistillSettings.views
         self.judge = Judge(composed, views, DistillSettings.view_size, asked.seed)
         self.views, self.whole_in_memory, self._lesson = views, whole_in_memory, None
-        self.started = time.monotonic()
+        self.started = working_time()
         self.last: tuple[Tried, VMField] | None = None
 
     def try_way(self, way: Way, limit: int, finished: bool) -> Tried | None:
@@ -73,7 +74,7 @@ class BlocksMaker:
     def learns(self) -> bool:
         """Whether finishing was asked for and there is time left for it."""
         budget = self.asked.time_budget
-        return self.asked.rgb and (budget is None or time.monotonic() - self.started < budget)
+        return self.asked.rgb and (budget is None or working_time() - self.started < budget)
 
     def field_of(self, tried: Tried) -> VMField:
         """The field of an earlier try; made again where another was tried since."""

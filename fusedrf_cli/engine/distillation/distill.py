@@ -5,7 +5,6 @@ Three phases: ask the teacher on rays through it, fit the student's σ and colou
 kept only if the student got better on views of its own.
 """
 
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -31,6 +30,7 @@ from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, ma
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, harmless_depth
 from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
@@ -261,7 +261,7 @@ class DistillRun:
         self.guard = Guard(lambda: self.optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.schedule = recipe.schedule()
-        self.began = time.monotonic()
+        self.began = working_time()
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
         self.epochs, self.count = Epochs(settings.rays, self.generator), RAYS_AT_FIRST
@@ -276,7 +276,7 @@ class DistillRun:
     ) -> tuple[VMField, DistillReport]:
         """Run to the end. Every step happens inside a `whole()`, which may hold an interrupt back."""
         report, settings = self.report, self.settings
-        self.began = time.monotonic() - (report.curve[-1][0] if report.curve else 0.0)
+        self.began = working_time() - (report.curve[-1][0] if report.curve else 0.0)
         clock = _Clock(report.seconds)
         phase("asking the teachers")
         self.generator.manual_seed(settings.seed + 1)
@@ -347,8 +347,8 @@ class DistillRun:
         whole: Callable,
     ) -> None:
         """The steps of one phase."""
-        started = time.monotonic() - self.elapsed
-        while (share := self._share(steps, time.monotonic() - started)) < self.schedule.end:
+        started = working_time() - self.elapsed
+        while (share := self._share(steps, working_time() - started)) < self.schedule.end:
             with whole():
                 if self.refined is not None and share >= COARSE_UNTIL:
                     self._refine()
@@ -359,7 +359,7 @@ class DistillRun:
                 self.steps += 1
                 if self.steps % LOOK_EVERY == 0:
                     self._look(held_out, share)
-                self.elapsed = time.monotonic() - started
+                self.elapsed = working_time() - started
             if self.steps % 20 == 1:
                 advance(share / self.schedule.end, figures)
         self.guard.check()
@@ -370,7 +370,7 @@ class DistillRun:
         if self.refined is None:
             self.schedule.look(share, found)
         made = self.steps + self.report.steps.get("points", 0)
-        self.report.curve.append((time.monotonic() - self.began, made, found))
+        self.report.curve.append((working_time() - self.began, made, found))
 
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given."""
@@ -428,10 +428,10 @@ class _Clock:
     """Seconds per phase."""
 
     def __init__(self, seconds: dict[str, float]):
-        self.seconds, self.last = seconds, time.monotonic()
+        self.seconds, self.last = seconds, working_time()
 
     def lap(self, name: str) -> None:
-        now = time.monotonic()
+        now = working_time()
         self.seconds[name], self.last = now - self.last, now
 
 

@@ -1,7 +1,6 @@
 """Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy
 grid is set."""
 
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from fusedrf_cli.engine.distillation.passes import PASSES, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.fields.vm import PROBES, VMField, VMShape
 from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
+from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.rendering.cameras import Camera
 
 RATE = 0.02
@@ -118,7 +118,7 @@ class FitRun:
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.optimiser = Adam.of(field)
         self.rays_pass = PASSES[field.kind](field)
-        self.started, self.steps = time.monotonic(), 0
+        self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
         self.found_matter, self.found_nothing = False, 0
@@ -152,10 +152,6 @@ class FitRun:
             with whole():
                 self.refresh(share)
                 self.step(share)
-            if self.steps == 1:
-                self.started = (
-                    time.monotonic()
-                )  # a first run compiles in its first step; that is not the budget's
             if self.steps % 20 == 0:
                 advance(share, {"psnr": self.psnr})
         with whole():
@@ -185,7 +181,7 @@ class FitRun:
             "command": "train",
             "field": metadata,
             "steps": self.steps,
-            "elapsed": time.monotonic() - self.started,
+            "elapsed": working_time() - self.started,
             "adam_steps": self.optimiser.steps,
             "stages": len(self.stages),
             "refreshes": self.refreshes,
@@ -210,7 +206,7 @@ class FitRun:
         self.refreshes = state["refreshes"]
         self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
-        self.started = time.monotonic() - state["elapsed"]
+        self.started = working_time() - state["elapsed"]
         self.guard.restore(state["guard"])
         self.pool.epochs.restore(arrays, state)
         self.generator.set_state(torch.from_numpy(arrays["random"]))
@@ -223,7 +219,7 @@ class FitRun:
     def share(self) -> float:
         """How much of the run is done, in [0, 1]."""
         if self.settings.time_budget is not None:
-            return (time.monotonic() - self.started) / self.settings.time_budget
+            return (working_time() - self.started) / self.settings.time_budget
         return self.steps / self.settings.steps
 
     def refresh(self, share: float) -> None:

@@ -8,6 +8,7 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -112,6 +113,17 @@ def telling_of_compilation(tell: Callable[[], None]) -> AbstractContextManager:
     return event.install_listener("numba:compile", _First(tell))
 
 
+_compiling = event.TimingListener()
+event.register("numba:compile", _compiling)
+
+
+def working_time() -> float:
+    """A monotonic clock (s) that stands still while kernels are compiled: a first use takes its time from
+    nobody's budget.
+    """
+    return time.monotonic() - (_compiling.duration if _compiling.done else 0.0)
+
+
 __all__ = [
     "NO_BLOCK",
     "GridArrays",
@@ -122,4 +134,5 @@ __all__ = [
     "set_threads",
     "sparse_loops",
     "telling_of_compilation",
+    "working_time",
 ]

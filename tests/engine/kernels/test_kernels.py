@@ -5,8 +5,10 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numba
 import pytest
 
 from fusedrf_cli.engine import kernels
@@ -94,3 +96,16 @@ def test_a_users_cache_that_others_may_write_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     kernels.kernel_cache().chmod(0o777)
     assert kernels.kernel_cache().parent == tmp_path
+
+
+def test_the_working_clock_stands_still_while_something_is_compiled():
+    started, worked = time.monotonic(), kernels.working_time()
+
+    @numba.njit
+    def cube(x):
+        return x**3
+
+    assert cube(2.0) == 8
+    compiled = kernels._compiling.duration
+    passed = time.monotonic() - started
+    assert 0 < compiled and kernels.working_time() - worked < passed - 0.5 * min(compiled, passed)
