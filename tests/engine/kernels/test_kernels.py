@@ -18,7 +18,7 @@ def test_cache_is_the_users_and_named_for_the_bodies(tmp_path, monkeypatch):
     """numba does not notice that an inlined function of another file changed: new bodies need another
     folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    files = ("bodies.py", "prefetch.py", "items.py")
+    files = ("bodies.py", "prefetch.py", "items.py", "sparse_bodies.py")
     inlined = [Path(kernels.__file__).with_name(name).read_bytes() for name in files]
     folder = kernels.kernel_cache()
     assert folder.is_dir() and folder.is_relative_to(tmp_path / "fusedrf")
