@@ -10,7 +10,17 @@ import torch
 from formats.records import BYTES_PER_NUMBER
 from fusedrf_cli.bridge.choose import Choosing, Tried, Way
 from fusedrf_cli.bridge.fusing import Asked, Fused, make_room
-from fusedrf_cli.bridge.memory import FLOAT, RESAMPLING, Memory, judged, learning, lesson, ownership, result
+from fusedrf_cli.bridge.memory import (
+    FLOAT,
+    RESAMPLING,
+    TRUNCATING,
+    Memory,
+    judged,
+    learning,
+    lesson,
+    ownership,
+    result,
+)
 from fusedrf_cli.bridge.scene import LoadedScene, stored
 from fusedrf_cli.bridge.sizes import vm_bytes
 from fusedrf_cli.bridge.train import check_size
@@ -215,12 +225,14 @@ def blocks_memory(
     numbers, grids = min(int(asked.limit / BYTES_PER_NUMBER["int4"]), own), ownership(composed.aabb)
     if asked.target is None and asked.precision is None:  # then either nothing learns or it is much smaller
         numbers = min(numbers, max(asked.limit // 2, own // 2))
+    chosen = asked.target is not None or sum(loaded.sizes) // 2 > asked.limit
+    copies = TRUNCATING if chosen else RESAMPLING
     threads = torch.get_num_threads()
     learnt = learning(numbers, threads) | lesson(RAYS) | grids if asked.rgb else {}
     make_room(
         budget,
         loaded,
-        (RESAMPLING, result(numbers, measured=False) | grids),
+        (copies, result(numbers, measured=False) | grids),
         (0.0, result(numbers) | grids | judged()),
         (0.0, learnt),
     )

@@ -26,6 +26,7 @@ FLOAT = 4
 COMPILED = 130 << 20  # kernels, once they are loaded, and the libraries that come with them
 READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
 RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
+TRUNCATING = RESAMPLING + 6  # and while its ranks are truncated: sections in float64 before and after
 PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
 PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
