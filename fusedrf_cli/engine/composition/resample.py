@@ -22,6 +22,7 @@ from fusedrf_cli.engine.fields.bricks import (
     corner_offsets,
     key_places,
     node_keys,
+    sides,
 )
 from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kernels.reference import sh_basis
@@ -101,7 +102,7 @@ def placed_in(teacher: RadianceField) -> list[Placed]:
     return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
 
 
-def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, tuple, list[int]]:
+def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
     """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should be no
     finer than each placed field's own, nor than the geometric mean of that and a common one.
 
@@ -120,7 +121,7 @@ def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, 
         depth, top = min(depth + 1, MAX_LEVEL), 2 * top
     lo = (box[:3] + box[3:] - top * counts) / 2
     levels = np.clip(np.round(np.log2(top / (SIDE * needs))), 0, depth).astype(int)
-    return lo, float(top), tuple(counts), [int(level) for level in levels]
+    return lo, sides(top), tuple(counts), [int(level) for level in levels]
 
 
 def occupied(teacher: RadianceField, common: float) -> tuple[Lattice, list[np.ndarray]]:
@@ -175,7 +176,7 @@ def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarr
     low, high = lattice.places[corners[:, 0]], lattice.places[corners[:, 7]]
     clearest, facing = field.exposed(low, high, even_directions(LOOKED_FROM), far, BLOCKED)
     sigma = np.where(feature > LEAST, field.scale * np.logaddexp(0, feature), 0)
-    depth = sigma[corners].max(1) * (high - low)[:, 0] * clearest
+    depth = sigma[corners].max(1) * (high - low).min(1) * clearest
     kept = which.copy()
     kept[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
     told = np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * kept[which])[:, None]
@@ -193,7 +194,7 @@ def touching(lattice: Lattice) -> sparse.csr_matrix:
 
 
 def demanded(
-    teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: float, counts: tuple
+    teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: np.ndarray, counts: tuple
 ) -> np.ndarray:
     """Keys of the bricks of a level at one of whose vertices the placed field is the densest there is."""
     side = top / 2**level
@@ -203,7 +204,7 @@ def demanded(
     keys, inverse = np.unique(node_keys((bricks[:, None] * SIDE + inner).reshape(-1, 3)), return_inverse=True)
     places = lo + key_places(keys) * (side / SIDE)
     own = density(placed, places)
-    dense = own * side / SIDE > FAINT
+    dense = own * np.min(side) / SIDE > FAINT
     for other in placed_in(teacher):
         beside = dense & (places >= other.aabb[:3]).all(1) & (places <= other.aabb[3:]).all(1)
         if other is not placed and beside.any():
@@ -212,12 +213,12 @@ def demanded(
     return node_keys(bricks[kept])
 
 
-def touched(placed: Placed, side: float, lo: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def touched(placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """(M, 3) the bricks of a side that the occupied cells of a placed field reach, and a voxel around them."""
     grid, matrix = placed.field.occupancy, placed.object_to_world
     stretch = np.linalg.norm(matrix[:3, :3], axis=0)
-    margin = side / SIDE / np.maximum(stretch, 1e-30)
-    steps = np.ceil((grid.cell + 2 * margin) * stretch / (0.7 * side)).astype(int) + 1
+    margin = np.max(side) / SIDE / np.maximum(stretch, 1e-30)
+    steps = np.ceil((grid.cell + 2 * margin) * stretch / (0.7 * np.min(side))).astype(int) + 1
     spots = [np.linspace(-m, c + m, s) for m, c, s in zip(margin, grid.cell, steps, strict=True)]
     inner = np.stack(np.meshgrid(*spots, indexing="ij"), -1).reshape(-1, 3) @ matrix[:3, :3].T
     corners = (grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -350,11 +351,11 @@ def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -
     lattice = field.fine
     corners = lattice.corners
     first = lattice.places[corners[:, 0]]
-    side = lattice.places[corners[:, 7], 0] - first[:, 0]
+    extent = lattice.places[corners[:, 7]] - first
     spots = 0.25 + 0.5 * OCTANTS
     weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
-    answers = np.stack([density(teacher, first + side[:, None] * spot) for spot in spots], 1)
-    half, own = (half_opaque(field.scale, size) for size in (side[:, None], lattice.finest_voxel))
+    answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
+    half, own = (half_opaque(field.scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
     wanted = np.clip(inverse_softplus(answers / field.scale), LEAST, half + REACH)
     wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - REACH), wanted)
     found = np.clip(inverse_softplus(sigma / field.scale), own - REACH, own + REACH)
@@ -398,7 +399,7 @@ def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:
 
 def density_scale(tree: BrickTree) -> float:
     """σ of a feature of 1, about: an optical depth of 1 in a voxel between the widest and the finest."""
-    return float(1 / np.sqrt(tree.unit * tree.top / (SIDE << int(tree.level.min()))))
+    return float(1 / np.sqrt(tree.unit.min() * tree.top.min() / (SIDE << int(tree.level.min()))))
 
 
 def set_density(field: SparseField, sigma: np.ndarray) -> None:

@@ -94,9 +94,9 @@ def meets(low: np.ndarray, high: np.ndarray, box: np.ndarray) -> np.ndarray:
     return (low <= box[3:]).all(-1) & (box[:3] <= high).all(-1)
 
 
-def level_for(voxel: float, top: float) -> int:
+def level_for(voxel: float, top: np.ndarray) -> int:
     """The level whose voxels are nearest to a size."""
-    return int(np.clip(np.round(np.log2(top / (SIDE * voxel))), 0, MAX_LEVEL))
+    return int(np.clip(np.round(np.log2(top.min() / (SIDE * voxel))), 0, MAX_LEVEL))
 
 
 def refilled(

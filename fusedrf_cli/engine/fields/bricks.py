@@ -1,6 +1,6 @@
 """Where a sparse field's numbers are: a tree of bricks, and lattices of vertices over it.
 
-The box is cut into cubic *top cells*. A node of level l is 2^-l top cells wide; it is empty, a brick of 4 x 4 x 4
+The box is cut into *top cells*, cubic ones where a field was resampled. A node of level l is 2^-l top cells wide; it is empty, a brick of 4 x 4 x 4
 voxels, or split into eight nodes. Vertices are counted in *units*, voxel sides of the finest level, so that
 neighbours know each other's vertices whatever their levels.
 """
@@ -30,8 +30,8 @@ class BrickTree:
 
     lo: np.ndarray
     """(3,) float64 lower corner of the box."""
-    top: float
-    """Side of a top cell, in units of the frame."""
+    top: np.ndarray
+    """(3,) float64 sides of a top cell, in units of the frame."""
     counts: tuple[int, int, int]
     """Top cells per axis."""
     level: np.ndarray
@@ -42,11 +42,12 @@ class BrickTree:
     """(N, 4, 4, 4) bool, the voxels that are active."""
 
     @classmethod
-    def of(cls, lo, top: float, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
-        """The tree of bricks in any order, none inside another. Raises ValueError where there are too many."""
+    def of(cls, lo, top, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
+        """The tree of bricks in any order, none inside another; top (3,), or one number for a cube."""
         key = walk_order(level, at, counts)
         order = np.lexsort((key, level))
-        return cls(np.asarray(lo, np.float64), float(top), tuple(int(n) for n in counts), level[order], at[order], mask[order])
+        counts = tuple(int(n) for n in counts)
+        return cls(np.asarray(lo, np.float64), sides(top), counts, level[order], at[order], mask[order])
 
     @property
     def depth(self) -> int:
@@ -59,8 +60,8 @@ class BrickTree:
         return np.concatenate([self.lo, self.lo + self.top * np.asarray(self.counts)])
 
     @property
-    def unit(self) -> float:
-        """Side of a voxel of the finest level."""
+    def unit(self) -> np.ndarray:
+        """(3,) sides of a voxel of the finest level."""
         return self.top / (SIDE << self.depth)
 
     @cached_property
@@ -88,7 +89,7 @@ class BrickTree:
         return np.packbits(bits), np.packbits(self.mask.reshape(-1, SIDE**3), axis=1).ravel()
 
     @classmethod
-    def unpacked(cls, lo, top: float, counts, nodes: np.ndarray, masks: np.ndarray) -> "BrickTree":
+    def unpacked(cls, lo, top, counts, nodes: np.ndarray, masks: np.ndarray) -> "BrickTree":
         """Inverse of `packed`. Whatever the bytes, nothing is made that is not in proportion to them; ValueError
         where they are no tree."""
         if 4 * len(nodes) < np.prod(counts):
@@ -112,7 +113,7 @@ class BrickTree:
         if masks.shape != (8 * len(level),):
             raise ValueError(f"array 'masks' should have shape {[8 * len(level)]}, found {list(masks.shape)}")
         mask = np.unpackbits(masks).reshape(-1, SIDE, SIDE, SIDE).astype(bool)
-        return cls(np.asarray(lo, np.float64), float(top), tuple(counts), level, at, mask)
+        return cls(np.asarray(lo, np.float64), sides(top), tuple(counts), level, at, mask)
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -252,11 +253,11 @@ class Lattice:
 
     @cached_property
     def finest_voxel(self) -> np.ndarray:
-        """(V,) float64 side of the smallest voxel around each vertex, in the tree's frame."""
+        """(V,) float64 shortest side of the smallest voxel around each vertex, in the tree's frame."""
         brick = np.broadcast_to(self.width[:, None], self.used.shape)[self.used]
         found = np.full(len(self.vertices), np.iinfo(np.int64).max)
         np.minimum.at(found, self.rows[self.used], brick)
-        return found * self.tree.unit
+        return found * self.tree.unit.min()
 
     @cached_property
     def spreading(self) -> tuple[np.ndarray, ...]:
@@ -333,6 +334,11 @@ class Lattice:
         while (step := through @ step).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
             total = total + step
         return total.tocsr()
+
+
+def sides(top) -> np.ndarray:
+    """(3,) float64 of three sides, or of one for all."""
+    return np.broadcast_to(np.asarray(top, np.float64), 3).copy()
 
 
 def check_counts(counts) -> None:

@@ -128,8 +128,8 @@ class SparseField:
 
     @property
     def voxel_size(self) -> float:
-        """Side of the finest voxel."""
-        return self.tree.unit
+        """Shortest side of the finest voxel."""
+        return float(self.tree.unit.min())
 
     @cached_property
     def occupancy(self) -> OccupancyGrid:
@@ -209,7 +209,7 @@ class SparseField:
         (K,), from `far` away or from outside the box, and the mean direction along which each is seen (K, 3), of
         length 1 where from one side alone. Light of less than `blocked` counts as none."""
         clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
-        sides = np.ascontiguousarray((high - low)[:, 0])
+        sides = (high - low).min(1)
         self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
         return clearest, facing
 
@@ -287,7 +287,7 @@ class SparseField:
         metadata = {
             "aabb": self.aabb.tolist(),
             "counts": list(self.tree.counts),
-            "top": self.tree.top,
+            "top": self.tree.top.tolist(),
             "scale": self.scale,
             "sh_degree": self.shape.sh_degree,
         }
@@ -320,8 +320,13 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
         raise ValueError(f"counts should be three whole numbers, found {counts}")
     counts = tuple(whole(n, "counts", 1, MAX_TOP_CELLS) for n in counts)
     check_counts(counts)
-    top, aabb = positive(metadata["top"], "top"), np.asarray(metadata["aabb"], np.float64)
-    if aabb.shape != (6,) or not np.isfinite(aabb).all() or not np.allclose(aabb[3:] - aabb[:3], top * np.array(counts)):
+    if not isinstance(metadata["top"], list) or len(metadata["top"]) != 3:
+        raise ValueError(f"top should be three numbers, found {metadata['top']}")
+    top = np.array([positive(side, "top") for side in metadata["top"]])
+    aabb = np.asarray(metadata["aabb"], np.float64)
+    if aabb.shape != (6,) or not np.isfinite(aabb).all():
+        raise ValueError("aabb should be six finite numbers")
+    if not np.allclose(aabb[3:] - aabb[:3], top * counts, rtol=1e-6):
         raise ValueError("aabb should be as many top cells wide as counts says")
     for name in ("nodes", "masks"):
         found = arrays.get(name)

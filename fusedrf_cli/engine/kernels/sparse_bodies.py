@@ -46,7 +46,7 @@ class SparseArrays(NamedTuple):
     bands_at: int  # where the bands begin in params
     scale: float  # σ = scale softplus(f), 1/length
     lo: object  # (3,) float, lower corner of the box
-    top: float  # side of a top cell
+    top: object  # (3,) float, sides of a top cell
     offset: object  # (X, Y, Z) int64, where a top cell's table begins, or -1
     depth: object  # (X, Y, Z) uint8, the level of its finest brick: the table has 2^depth entries a side
     table: object  # (E,) int32, the brick that holds an entry's cube, or -1 - level of the empty node
@@ -64,9 +64,9 @@ def brick_at(sparse, x, y, z):
 
     Outside the box the answer is an empty node of level 0.
     """
-    u = (x - sparse.lo[0]) / sparse.top
-    v = (y - sparse.lo[1]) / sparse.top
-    w = (z - sparse.lo[2]) / sparse.top
+    u = (x - sparse.lo[0]) / sparse.top[0]
+    v = (y - sparse.lo[1]) / sparse.top[1]
+    w = (z - sparse.lo[2]) / sparse.top[2]
     nx, ny, nz = sparse.offset.shape
     i, j, m = int(math.floor(u)), int(math.floor(v)), int(math.floor(w))
     if i < 0 or j < 0 or m < 0 or i >= nx or j >= ny or m >= nz:
@@ -85,7 +85,7 @@ def brick_at(sparse, x, y, z):
 @body
 def in_brick(sparse, level, coordinate, axis, n):
     """Voxel of a brick's n along an axis that a coordinate lies in, and the fraction inside it."""
-    u = (coordinate - sparse.lo[axis]) / sparse.top * (1 << level)
+    u = (coordinate - sparse.lo[axis]) / sparse.top[axis] * (1 << level)
     f = (u - math.floor(u)) * n
     i = min(int(f), n - 1)
     return i, f - i
@@ -239,13 +239,14 @@ def query_sparse_point_backward(
 @body
 def node_exit(sparse, level, x, y, z, dx, dy, dz):
     """Distance from a point to where a ray leaves the node of a level around it."""
-    side = sparse.top / (1 << level)
-    i = math.floor((x - sparse.lo[0]) / side)
-    j = math.floor((y - sparse.lo[1]) / side)
-    m = math.floor((z - sparse.lo[2]) / side)
+    n = 1.0 / (1 << level)
+    a, b, c = n * sparse.top[0], n * sparse.top[1], n * sparse.top[2]
+    i = math.floor((x - sparse.lo[0]) / a)
+    j = math.floor((y - sparse.lo[1]) / b)
+    m = math.floor((z - sparse.lo[2]) / c)
     return min(
-        exit_distance(x, dx, sparse.lo[0], side, i, 1),
-        min(exit_distance(y, dy, sparse.lo[1], side, j, 1), exit_distance(z, dz, sparse.lo[2], side, m, 1)),
+        exit_distance(x, dx, sparse.lo[0], a, i, 1),
+        min(exit_distance(y, dy, sparse.lo[1], b, j, 1), exit_distance(z, dz, sparse.lo[2], c, m, 1)),
     )
 
 
@@ -334,7 +335,7 @@ def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, f
                     break
                 t += max(node_exit(sparse, level, x, y, z, dx, dy, dz), 0.0) + 1e-3 * sides[i]
             else:
-                span = sparse.top / (SIDE << level)
+                span = min(sparse.top[0], min(sparse.top[1], sparse.top[2])) / (SIDE << level)
                 first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
                 if first >= 0:
                     s = sparse.scale * softplus(feature_at(sparse, brick, first, u, v, w))
@@ -354,7 +355,8 @@ def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, f
 def in_box(sparse, x, y, z):
     """Whether a point lies in the field's box."""
     nx, ny, nz = sparse.offset.shape
-    u, v, w = (x - sparse.lo[0]) / sparse.top, (y - sparse.lo[1]) / sparse.top, (z - sparse.lo[2]) / sparse.top
+    u, v = (x - sparse.lo[0]) / sparse.top[0], (y - sparse.lo[1]) / sparse.top[1]
+    w = (z - sparse.lo[2]) / sparse.top[2]
     return u >= 0 and v >= 0 and w >= 0 and u < nx and v < ny and w < nz
 
 
