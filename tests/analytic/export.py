@@ -99,11 +99,9 @@ def vm_mlp_field(
     return VMMLPField(vm, network)
 
 
-def sparse_field(
-    field: AnalyticField, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3
-) -> SparseField:
-    """A sparse field of one level over the box of the field's matter, `resolution` vertices along each axis: as exact
-    as the `vm` field is."""
+def sparse_field(field: AnalyticField, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3) -> SparseField:
+    """A sparse field of one level over the box of the field's matter, `resolution` vertices along each axis:
+    as exact as the `vm` field is."""
     told, tint = field.activation, field.tint or Tint()
     if told is None:
         raise NotExportable(f"the density of {type(field).__name__} is no sum of products of axes")
@@ -117,7 +115,7 @@ def sparse_field(
     degree = {0: 1, 5: 2, 12: 3}[tint.bands.shape[1]]
     sparse = SparseField(SparseShape(degree), Lattice(tree, SIDE), told.scale)
     x, y, z = sparse.fine.places.T
-    sparse.rows[:, 0] = torch.from_numpy(SHIFT + sum(a(x) * b(y) * c(z) for a, b, c in told.terms))
+    sparse.rows[:, 0] = torch.from_numpy(SHIFT + sum((a(x) * b(y) * c(z) for a, b, c in told.terms), 0 * x))
     level = np.asarray(tint.level) + sparse.fine.places @ tint.slope.T
     sparse.rows[:, 1:] = torch.from_numpy(level / Y0)
     bands = np.concatenate([tint.facing[:, [1, 2, 0]] / (np.array([-1, 1, -1]) * Y1), tint.bands], 1)

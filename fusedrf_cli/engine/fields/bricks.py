@@ -1,8 +1,8 @@
 """Where a sparse field's numbers are: a tree of bricks, and lattices of vertices over it.
 
-The box is cut into *top cells*, cubic ones where a field was resampled. A node of level l is 2^-l top cells wide; it is empty, a brick of 4 x 4 x 4
-voxels, or split into eight nodes. Vertices are counted in *units*, voxel sides of the finest level, so that
-neighbours know each other's vertices whatever their levels.
+The box is cut into *top cells*, cubic ones where a field was resampled. A node of level l is 2^-l top cells
+wide; it is empty, a brick of 4 x 4 x 4 voxels, or split into eight nodes. Vertices are counted in *units*,
+voxel sides of the finest level, so that neighbours know each other's vertices whatever their levels.
 """
 
 from copy import copy
@@ -66,13 +66,14 @@ class BrickTree:
 
     @cached_property
     def codes(self) -> tuple[np.ndarray, ...]:
-        """By level: EMPTY, BRICK or SPLIT of every node, (M,) uint8, in the order of the walk, and where it is,
-        (M, 3) int64."""
+        """By level: EMPTY, BRICK or SPLIT of every node, (M,) uint8, in the order of the walk, and where it
+        is, (M, 3) int64."""
         found, nodes = [], np.argwhere(np.ones(self.counts, bool))
         for level in range(self.depth + 1):
             own = node_keys(self.at[self.level == level])
             finer = [
-                node_keys(self.at[self.level == deep] >> (deep - level)) for deep in range(level + 1, self.depth + 1)
+                node_keys(self.at[self.level == deep] >> (deep - level))
+                for deep in range(level + 1, self.depth + 1)
             ]
             keys = node_keys(nodes)
             code = np.where(np.isin(keys, own), BRICK, EMPTY)
@@ -90,10 +91,12 @@ class BrickTree:
 
     @classmethod
     def unpacked(cls, lo, top, counts, nodes: np.ndarray, masks: np.ndarray) -> "BrickTree":
-        """Inverse of `packed`. Whatever the bytes, nothing is made that is not in proportion to them; ValueError
-        where they are no tree."""
+        """Inverse of `packed`. Whatever the bytes, nothing is made that is not in proportion to them;
+        ValueError where they are no tree."""
         if 4 * len(nodes) < np.prod(counts):
-            raise ValueError(f"array 'nodes' should tell of {np.prod(counts)} top cells, found {len(nodes)} bytes")
+            raise ValueError(
+                f"array 'nodes' should tell of {np.prod(counts)} top cells, found {len(nodes)} bytes"
+            )
         code = np.unpackbits(nodes).reshape(-1, 4, 2)
         code = (code[..., 0] * 2 + code[..., 1]).ravel()
         here, start, levels, places = np.argwhere(np.ones(counts, bool)), 0, [], []
@@ -126,7 +129,9 @@ class BrickTree:
             depth[cell], held[cell] = level, True
         sizes = np.where(held, 1 << (3 * depth.astype(np.int64)), 0)
         if sizes.sum() > MAX_ENTRIES:
-            raise ValueError(f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {MAX_ENTRIES:,}")
+            raise ValueError(
+                f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {MAX_ENTRIES:,}"
+            )
         offset = np.where(held, (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape), -1)
         table = np.empty(int(sizes.sum()), np.int32)
         for level, (code, nodes) in enumerate(self.codes):
@@ -139,8 +144,9 @@ class BrickTree:
     def voxels_at(
         self, halves: np.ndarray, n: int, active: np.ndarray, finest: int | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3) int64
-        given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own depth."""
+        """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3)
+        int64 given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own
+        depth."""
         offset, depth, table = self.tables
         span = 2 * SIDE << (self.depth if finest is None else finest)
         cell = halves // span
@@ -160,8 +166,8 @@ class BrickTree:
         return np.where(held, brick, -1), voxel, held & active[safe, voxel]
 
     def extended(self, aabb: np.ndarray) -> "BrickTree":
-        """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where those
-        would be too many."""
+        """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where
+        those would be too many."""
         before = np.maximum(np.ceil((self.lo - aabb[:3]) / self.top), 0).astype(np.int64)
         behind = np.maximum(np.ceil((aabb[3:] - self.aabb[3:]) / self.top), 0).astype(np.int64)
         counts = before + np.asarray(self.counts) + behind
@@ -170,8 +176,8 @@ class BrickTree:
         return BrickTree.of(self.lo - before * self.top, self.top, counts, self.level, at, self.mask)
 
     def occupancy(self, longest: int) -> OccupancyGrid:
-        """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of them
-        lie along an axis."""
+        """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of
+        them lie along an axis."""
         fine = max(s for s in range(3) if s == 0 or max(self.counts) << s <= longest)
         occupied = np.zeros(tuple(n << fine for n in self.counts), bool)
         for level in range(self.depth + 1):
@@ -280,7 +286,8 @@ class Lattice:
         return node_keys((self.tree.at[brick] * self.n + inner) * width)
 
     def _constraints(self, vertices: np.ndarray) -> tuple[np.ndarray, tuple]:
-        """(V,) bool which vertices hang, and of those (rows' keys (H, 8), weights (H, 8)) of what they hang on."""
+        """(V,) bool which vertices hang, and of those (rows' keys (H, 8), weights (H, 8)) of what they hang
+        on."""
         tree, n = self.tree, self.n
         hanging = np.zeros(len(vertices), bool)
         nothing = np.zeros((0, 8), np.int64), np.zeros((0, 8))
@@ -319,7 +326,9 @@ class Lattice:
         keys = self._keys()[np.repeat(found, self.used.sum(1))]
         return np.isin(node_keys(vertices), keys)
 
-    def _spread(self, known: np.ndarray, rank: np.ndarray, hanging: np.ndarray, parents: tuple) -> sparse.csr_matrix:
+    def _spread(
+        self, known: np.ndarray, rank: np.ndarray, hanging: np.ndarray, parents: tuple
+    ) -> sparse.csr_matrix:
         """(H, F) weights by which hanging rows follow from free ones."""
         keys, weights = parents
         count, free = len(rank), self.free
@@ -331,7 +340,9 @@ class Lattice:
         whole = sparse.csr_matrix((weights[weights > 0], (own[kept], found)), shape=(count - free, count))
         direct, through = whole[:, :free], whole[:, free:]
         total, step = direct, direct
-        while (step := through @ step).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
+        while (
+            step := through @ step
+        ).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
             total = total + step
         return total.tocsr()
 
@@ -345,7 +356,8 @@ def check_counts(counts) -> None:
     """Raise ValueError where there are more top cells than a tree may have."""
     if max(counts) > LONGEST or np.prod(np.asarray(counts, np.float64)) > MAX_TOP_CELLS:
         raise ValueError(
-            f"counts should be at most {LONGEST} top cells each and {MAX_TOP_CELLS} in all, found {list(counts)}"
+            f"counts should be at most {LONGEST} top cells each and {MAX_TOP_CELLS} in all, found "
+            f"{list(counts)}"
         )
 
 
@@ -389,7 +401,12 @@ def walk_order(level: np.ndarray, at: np.ndarray, counts) -> np.ndarray:
 
 
 def fill_cubes(
-    table: np.ndarray, offset: np.ndarray, depth: np.ndarray, level: int, nodes: np.ndarray, values: np.ndarray
+    table: np.ndarray,
+    offset: np.ndarray,
+    depth: np.ndarray,
+    level: int,
+    nodes: np.ndarray,
+    values: np.ndarray,
 ) -> None:
     """Write values (M,) into the entries that nodes (M, 3) of a level cover, in those top cells that have a
     table."""

@@ -1,8 +1,9 @@
-"""The `sparse` field: numbers only at the vertices of bricks of voxels, which lie where something is and are as
-fine as it needs there.
+"""The `sparse` field: numbers only at the vertices of bricks of voxels, which lie where something is and are
+as fine as it needs there.
 
-Rows hold the density feature and the colour of degree 0; what changes with the view lies in bands, on a lattice
-of voxels twice as wide. σ = scale softplus(f) and rgb = sigmoid(Σ_k Y_k c_k), interpolated before the activation.
+Rows hold the density feature and the colour of degree 0; what changes with the view lies in bands, on a
+lattice of voxels twice as wide. σ = scale softplus(f) and rgb = sigmoid(Σ_k Y_k c_k), interpolated before the
+activation.
 """
 
 from dataclasses import dataclass
@@ -56,7 +57,8 @@ class SparseShape:
 
 @register
 class SparseField:
-    """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle` afterwards)."""
+    """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle`
+    afterwards)."""
 
     kind = "sparse"
 
@@ -75,7 +77,9 @@ class SparseField:
 
     def to(self, device: str | torch.device) -> "SparseField":
         """The same field with its numbers on a device: there it is asked, rendered and trained."""
-        return self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
+        return (
+            self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
+        )
 
     def moved(self, origin: np.ndarray) -> "SparseField":
         """The same field in a frame whose origin is at `origin` (3,) of its own."""
@@ -205,9 +209,9 @@ class SparseField:
     def exposed(
         self, low: np.ndarray, high: np.ndarray, directions: np.ndarray, far: float, blocked: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions (D, 3),
-        (K,), from `far` away or from outside the box, and the mean direction along which each is seen (K, 3), of
-        length 1 where from one side alone. Light of less than `blocked` counts as none."""
+        """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions
+        (D, 3), (K,), from `far` away or from outside the box, and the mean direction along which each is seen
+        (K, 3), of length 1 where from one side alone. Light of less than `blocked` counts as none."""
         clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
         sides = (high - low).min(1)
         self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
@@ -247,8 +251,8 @@ class SparseField:
         and the losses and samples to those of loss (parts, 3); see cpu.train_rays for the loss."""
         slots = int(np.linalg.norm(self.aabb[3:] - self.aabb[:3]) / step) + 2
         self.loops.train_rays(
-            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-            background, opacity_weight, slots, grads, loss,
+            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop,
+            target, background, opacity_weight, slots, grads, loss,
         )  # fmt: skip
         self._collect(grads)
 
@@ -279,7 +283,8 @@ class SparseField:
     # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Arrays and metadata for a bundle: the free rows, brick by brick, and the tree; all indices follow."""
+        """Arrays and metadata for a bundle: the free rows, brick by brick, and the tree; all indices
+        follow."""
         nodes, masks = self.tree.packed()
         arrays = {"rows": self.rows[: self.fine.free].detach().cpu().numpy(), "nodes": nodes, "masks": masks}
         if self.coarse:
@@ -299,7 +304,9 @@ class SparseField:
         tree = stored_tree(arrays, metadata)
         shape = SparseShape(whole(metadata["sh_degree"], "sh_degree", 0, 3))
         field = cls(shape, Lattice(tree, SIDE), positive(metadata["scale"], "scale"))
-        held = {"rows": (field.rows, field.fine)} | ({"bands": (field.bands, field.coarse)} if field.coarse else {})
+        held = {"rows": (field.rows, field.fine)} | (
+            {"bands": (field.bands, field.coarse)} if field.coarse else {}
+        )
         for name, (view, lattice) in held.items():
             found = arrays.get(name)
             expected = (lattice.free, view.shape[1])

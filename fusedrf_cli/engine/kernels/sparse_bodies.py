@@ -2,8 +2,8 @@
 (`sparse_cuda.py`).
 
 Notation for the whole file.
-    brick        a cube of 4 x 4 x 4 voxels, a leaf of a tree whose roots are the *top cells* of the box; a brick
-                 of level l is 2^-l top cells wide
+    brick        4 x 4 x 4 voxels, a leaf of a tree whose roots are the *top cells* of the box; a brick of
+                 level l is 2^-l top cells wide
     rows         (V, 4) floats from params[0] on: density feature and the degree-0 coefficients of the three
                  colour logits, one row per vertex of the brick's voxels
     bands        (W, width) floats from params[bands_at] on: the coefficients of degree 1 and more, channel by
@@ -93,7 +93,8 @@ def in_brick(sparse, level, coordinate, axis, n):
 
 @body
 def voxel_at(sparse, brick, level, x, y, z):
-    """(first vertex of the voxel around a point, fractions u, v, w); the vertex is -1 where it is inactive."""
+    """(first vertex of the voxel around a point, fractions u, v, w); the vertex is -1 where it is
+    inactive."""
     i, u = in_brick(sparse, level, x, 0, SIDE)
     j, v = in_brick(sparse, level, y, 1, SIDE)
     m, w = in_brick(sparse, level, z, 2, SIDE)
@@ -158,7 +159,8 @@ def logits_at(widths, coefficients, sparse, brick, level, first, u, v, w, x, y, 
 
 @body
 def scatter_point(
-    widths, coefficients, sparse, grads, brick, level, first, u, v, w, x, y, z, d_f, shaded, d_logits, sh, bands
+    widths, coefficients, sparse, grads, brick, level, first, u, v, w, x, y, z, d_f, shaded, d_logits, sh,
+    bands
 ):  # fmt: skip
     """Adjoint of `feature_at`, for d_f, and, where shaded, of `logits_at` for d_logits (3,)."""
     real = sparse.params.dtype.type
@@ -232,7 +234,8 @@ def query_sparse_point_backward(
     f = feature_at(sparse, brick, first, u, v, w)
     d_f = d_sigma[i] * sparse.scale * sigmoid(f)
     scatter_point(
-        widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits, sh, bands
+        widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits, sh,
+        bands
     )  # fmt: skip
 
 
@@ -272,8 +275,8 @@ def render_sparse_ray(
 ):
     """Marches, shades and composites ray i in one pass: out[i] is premultiplied rgb, opacity, Σ w t.
 
-    In a brick of level l one step in 2^(finest - l), counted from the ray's first, is a sample, and stands for as
-    many: which they are does not depend on what was skipped before.
+    In a brick of level l one step in 2^(finest - l), counted from the ray's first, is a sample, and stands
+    for as many: which they are does not depend on what was skipped before.
     """
     ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
     dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
@@ -316,9 +319,9 @@ def render_sparse_ray(
 
 @body
 def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, facing):
-    """How much light reaches voxel i, a cube of sides[i] around places[i], from `far` away or from outside the box:
-    the most along one of the directions (D, 3) into clearest[i], and the mean of their opposites, by that light,
-    into facing[i]. What lets through less than `blocked` counts as opaque.
+    """How much light reaches voxel i, a cube of sides[i] around places[i], from `far` away or from outside
+    the box: the most along one of the directions (D, 3) into clearest[i], and the mean of their opposites, by
+    that light, into facing[i]. What lets through less than `blocked` counts as opaque.
     """
     clearest[i] = 0
     facing[i, 0], facing[i, 1], facing[i, 2] = 0, 0, 0
@@ -348,7 +351,11 @@ def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, f
             facing[i, 2] -= trans * dz
             total += trans
     if total > 0:
-        facing[i, 0], facing[i, 1], facing[i, 2] = facing[i, 0] / total, facing[i, 1] / total, facing[i, 2] / total
+        facing[i, 0], facing[i, 1], facing[i, 2] = (
+            facing[i, 0] / total,
+            facing[i, 1] / total,
+            facing[i, 2] / total,
+        )
 
 
 @body
@@ -446,8 +453,8 @@ def train_sparse_ray(
         brick, level = brick_at(sparse, x, y, z)
         first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
         scatter_point(
-            widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits, sh,
-            bands,
+            widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits,
+            sh, bands,
         )  # fmt: skip
 
 

@@ -1,5 +1,5 @@
-"""CUDA loops over the bodies of sparse_bodies.py, after the pattern of `cuda.py`: one thread per item of work; the
-functions and their arguments are those of `sparse_cpu.py`."""
+"""CUDA loops over the bodies of sparse_bodies.py, after the pattern of `cuda.py`: one thread per item of
+work; the functions and their arguments are those of `sparse_cpu.py`."""
 
 from functools import lru_cache
 from types import FunctionType, SimpleNamespace
@@ -22,7 +22,17 @@ from fusedrf_cli.engine.kernels.cuda import (
     training_scratch,
 )
 
-__all__ = ["adam", "expose", "on_device", "query", "query_backward", "render", "shared", "sums_of_rows", "train_rays"]
+__all__ = [
+    "adam",
+    "expose",
+    "on_device",
+    "query",
+    "query_backward",
+    "render",
+    "shared",
+    "sums_of_rows",
+    "train_rays",
+]
 
 
 @lru_cache(maxsize=1)
@@ -46,7 +56,11 @@ def kernels(width: int, kind: np.dtype) -> SimpleNamespace:
     def query(widths, coefficients, sparse, points, dirs, with_colour, sigma, rgb):
         i = cuda.grid(1)
         if i < points.shape[0]:
-            sh, bands, logits = cuda.local.array(16, real), cuda.local.array(room, real), cuda.local.array(3, real)
+            sh, bands, logits = (
+                cuda.local.array(16, real),
+                cuda.local.array(room, real),
+                cuda.local.array(3, real),
+            )
             query_point(
                 widths, coefficients, sparse, points, dirs, with_colour, i, sh, bands, logits, sigma, rgb
             )
@@ -55,7 +69,11 @@ def kernels(width: int, kind: np.dtype) -> SimpleNamespace:
     def query_backward(widths, coefficients, sparse, points, dirs, d_sigma, d_rgb, grads):
         i = cuda.grid(1)
         if i < points.shape[0]:
-            sh, bands, logits = cuda.local.array(16, real), cuda.local.array(room, real), cuda.local.array(3, real)
+            sh, bands, logits = (
+                cuda.local.array(16, real),
+                cuda.local.array(room, real),
+                cuda.local.array(3, real),
+            )
             query_point_backward(
                 widths, coefficients, sparse, points, dirs, d_sigma, d_rgb, i, sh, bands, logits, grads[0]
             )
@@ -64,24 +82,34 @@ def kernels(width: int, kind: np.dtype) -> SimpleNamespace:
     def render(widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, out):
         i = cuda.grid(1)
         if i < rays_o.shape[0]:
-            sh, bands, logits = cuda.local.array(16, real), cuda.local.array(room, real), cuda.local.array(3, real)
+            sh, bands, logits = (
+                cuda.local.array(16, real),
+                cuda.local.array(room, real),
+                cuda.local.array(3, real),
+            )
             render_ray(
-                widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, i, sh, bands, logits,
-                out,
+                widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, i, sh, bands,
+                logits, out,
             )  # fmt: skip
 
     @cuda.jit(fastmath=True)
     def train_rays(
-        widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background,
-        opacity_weight, reals, wholes, grads, loss,
+        widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
+        background, opacity_weight, reals, wholes, grads, loss,
     ):  # fmt: skip
         thread = cuda.grid(1)
-        sh, bands, logits = cuda.local.array(16, real), cuda.local.array(room, real), cuda.local.array(3, real)
+        sh, bands, logits = (
+            cuda.local.array(16, real),
+            cuda.local.array(room, real),
+            cuda.local.array(3, real),
+        )
         if thread < reals.shape[2]:
             for i in range(thread, rays_o.shape[0], reals.shape[2]):
                 train_ray(
-                    widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-                    background, opacity_weight, i, reals[0, :, thread], reals[1, :, thread], reals[2, :, thread],
+                    widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop,
+                    target,
+                    background, opacity_weight, i, reals[0, :, thread], reals[1, :, thread], reals[2, :,
+                    thread],
                     reals[3, :, thread], reals[4:7, :, thread].T, wholes[0, :, thread], sh, bands, logits,
                     grads[0], loss[0],
                 )  # fmt: skip
@@ -110,7 +138,7 @@ def plain_kernels() -> SimpleNamespace:
     return SimpleNamespace(expose=expose, sums_of_rows=sums_of_rows)
 
 
-# -- the functions of sparse_cpu.py ----------------------------------------------------------------------------
+# -- the functions of sparse_cpu.py ------------------------------------------------------------------------
 
 
 def query(widths, coefficients, sparse, points, dirs, with_colour, sigma, rgb):
@@ -138,8 +166,8 @@ def train_rays(
     """See sparse_cpu.train_rays; all is added to row 0 of grads and loss."""
     scratch = training_scratch(max_samples, RAYS_IN_FLIGHT, sparse.params.dtype)
     inputs = (
-        widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop, target, background,
-        opacity_weight, *scratch,
+        widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
+        background, opacity_weight, *scratch,
     )  # fmt: skip
     kernel = kernels(len(widths), sparse.params.dtype).train_rays
     launch(kernel, min(len(rays_o), RAYS_IN_FLIGHT), inputs, (grads, loss))
