@@ -247,7 +247,8 @@ def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, lis
             sources([headers[leaves[0].field].decoded_size], copies=READING), advice="edit a smaller field"
         )
     field = make_field(read_field(path, leaves[0].field), path)
-    if type(field) not in (VMField, SparseField) or not np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3)):
+    upright = np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3))
+    if type(field) not in (VMField, SparseField) or not upright:
         raise InvalidInput(f"{path}: a field of kind '{field.kind}' cannot be edited; fuse it first")
     own = headers[leaves[0].field].precision
     return scene, [m for m in headers if m != leaves[0].field], leaves[0], field, own
@@ -323,8 +324,8 @@ def with_objects(field: SparseField, objects: list[Placed]) -> SparseField:
 
 
 def as_read(field: VMField | SparseField, precision: str, origin: np.ndarray) -> VMField | SparseField:
-    """A field as it will be read from a bundle of that precision, in a frame whose origin is at `origin` (3,) of its
-    own."""
+    """A field as it will be read from a bundle of that precision, in a frame whose origin is at `origin` (3,)
+    of its own."""
     if type(field) is SparseField:
         return read_back(field, precision)[0].moved(origin)
     return moved_frame(stored(field, precision), origin)
@@ -437,6 +438,13 @@ def cut(
     }
 
 
+def parts_of(field: VMField | SparseField) -> dict[str, int]:
+    """What a field is made of, and how many of it."""
+    if type(field) is SparseField:
+        return {"bricks": len(field.tree.level)}
+    return {"blocks": len(field.blocks)}
+
+
 def overlaps(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two boxes (6,) share a volume."""
     return bool((a[:3] < b[3:]).all() and (b[:3] < a[3:]).all())
@@ -467,7 +475,7 @@ def edit_report(
         "touched": {
             "names": names,
             "aabb": box.tolist(),
-            **({"bricks": len(field.tree.level)} if type(field) is SparseField else {"blocks": len(field.blocks)}),
+            **parts_of(field),
             "share_of_box": float(min(1.0, np.prod(extent / whole))),
         },
         **figures,

@@ -10,9 +10,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
 from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.fields.vm_mlp import FEATURE_DEGREE, ColourNetwork, VMMLPField
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
 
 SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's tests too
@@ -96,6 +99,30 @@ def vm_mlp_field(
     return VMMLPField(vm, network)
 
 
+def sparse_field(field: AnalyticField, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3) -> SparseField:
+    """A sparse field of one level over the box of the field's matter, `resolution` vertices along each axis:
+    as exact as the `vm` field is."""
+    told, tint = field.activation, field.tint or Tint()
+    if told is None:
+        raise NotExportable(f"the density of {type(field).__name__} is no sum of products of axes")
+    box, voxels = field.matter, np.asarray(resolution) - 1
+    counts = -(-voxels // SIDE)
+    at = np.argwhere(np.ones(counts, bool))
+    inner = np.argwhere(np.ones((SIDE,) * 3, bool))
+    mask = ((at[:, None] * SIDE + inner) < voxels).all(2).reshape(-1, SIDE, SIDE, SIDE)
+    top = (box[3:] - box[:3]) / voxels * SIDE
+    tree = BrickTree.of(box[:3], top, counts, np.zeros(len(at), np.uint8), at, mask)
+    degree = {0: 1, 5: 2, 12: 3}[tint.bands.shape[1]]
+    sparse = SparseField(SparseShape(degree), Lattice(tree, SIDE), told.scale)
+    x, y, z = sparse.fine.places.T
+    sparse.rows[:, 0] = torch.from_numpy(SHIFT + sum((a(x) * b(y) * c(z) for a, b, c in told.terms), 0 * x))
+    level = np.asarray(tint.level) + sparse.fine.places @ tint.slope.T
+    sparse.rows[:, 1:] = torch.from_numpy(level / Y0)
+    bands = np.concatenate([tint.facing[:, [1, 2, 0]] / (np.array([-1, 1, -1]) * Y1), tint.bands], 1)
+    sparse.bands[:] = torch.from_numpy(bands.ravel())
+    return sparse
+
+
 def bare_field(
     field: AnalyticField, resolution: tuple[int, int, int], shape: VMShape, dtype: torch.dtype, cells: int
 ) -> VMField:
@@ -138,4 +165,4 @@ def write_colour_products(field: VMField, axes: list[np.ndarray]) -> None:
     line[:, 3] = torch.from_numpy(z).to(line.dtype)
 
 
-EXPORTERS: dict[str, Callable] = {"vm": vm_field, "vm-mlp": vm_mlp_field}
+EXPORTERS: dict[str, Callable] = {"vm": vm_field, "vm-mlp": vm_mlp_field, "sparse": sparse_field}

@@ -1,7 +1,7 @@
 """Any field as a sparse one, by asking it at the vertices: no learning.
 
-A place is as fine as the object that is densest there needs in world units, not finer; where all of that is too
-much, all is coarser by one factor.
+A place is as fine as the object that is densest there needs in world units, not finer; where all of that is
+too much, all is coarser by one factor.
 """
 
 from collections.abc import Iterator
@@ -22,20 +22,29 @@ from fusedrf_cli.engine.fields.bricks import (
     corner_offsets,
     key_places,
     node_keys,
+    sides,
 )
 from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
-FINER = 0.6  # of a teacher's voxel: a lattice that lies across the teacher's own needs finer ones to hold as much
-DEEPEST = 6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
+FINER = (
+    0.6  # of a teacher's voxel: a lattice that lies across the teacher's own needs finer ones to hold as much
+)
+DEEPEST = (
+    6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
+)
 FAINT = 1e-4  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
-COLOURED = 1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
+COLOURED = (
+    1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
+)
 LEAST, MOST = -12.0, 60.0  # of the density feature
 REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these
 LOOKED_FROM, DIRECTIONS = 20, 32  # directions along which voxels are sought, and colours asked
-ONE_SIDED = 0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
+ONE_SIDED = (
+    0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
+)
 LOOKS = 9  # places along a look through the voxels before and behind a vertex
 RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
 LOGITS = 8.0  # colours are told apart up to sigmoid(8)
@@ -50,14 +59,13 @@ ODD_LINES = 20
 CORRECTIONS = 3
 
 
-
 class TooFewNumbers(ValueError):
     """Not even the widest voxels fit."""
 
 
 def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
-    """The teacher as a sparse field in its frame with at most so many numbers. Raises EmptyField where the teacher
-    shows nothing, TooFewNumbers where not even the widest voxels fit.
+    """The teacher as a sparse field in its frame with at most so many numbers. Raises EmptyField where the
+    teacher shows nothing, TooFewNumbers where not even the widest voxels fit.
     """
     lattice, known = fitted(teacher, shape, max_numbers)
     field = SparseField(shape, lattice, density_scale(lattice.tree))
@@ -101,12 +109,12 @@ def placed_in(teacher: RadianceField) -> list[Placed]:
     return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
 
 
-def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, tuple, list[int]]:
-    """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should be no
-    finer than each placed field's own, nor than the geometric mean of that and a common one.
+def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
+    """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should
+    be no finer than each placed field's own, nor than the geometric mean of that and a common one.
 
-    With an error that grows as the square of the voxel over a field's own, and numbers that fall with its square,
-    the mean is what gives the least error for the numbers.
+    With an error that grows as the square of the voxel over a field's own, and numbers that fall with its
+    square, the mean is what gives the least error for the numbers.
     """
     own = np.array([p.voxel_size for p in placed_in(teacher)])
     needs = FINER * np.sqrt(own * np.maximum(own, common))
@@ -120,11 +128,12 @@ def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, float, 
         depth, top = min(depth + 1, MAX_LEVEL), 2 * top
     lo = (box[:3] + box[3:] - top * counts) / 2
     levels = np.clip(np.round(np.log2(top / (SIDE * needs))), 0, depth).astype(int)
-    return lo, float(top), tuple(counts), [int(level) for level in levels]
+    return lo, sides(top), tuple(counts), [int(level) for level in levels]
 
 
 def occupied(teacher: RadianceField, common: float) -> tuple[Lattice, list[np.ndarray]]:
-    """The lattice whose active voxels hold all matter that shows, and σ (V,) and facing (V, 3) of its vertices."""
+    """The lattice whose active voxels hold all matter that shows, and σ (V,) and facing (V, 3) of its
+    vertices."""
     lo, top, counts, levels = frame_of(teacher, common)
     wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
     for placed, level in zip(placed_in(teacher), levels, strict=True):
@@ -146,8 +155,8 @@ class EmptyField(ValueError):
 
 
 def thinned(lattice: Lattice, kept: np.ndarray, *values: np.ndarray) -> tuple[Lattice, list[np.ndarray]]:
-    """The lattice of those active voxels of another that are kept (K,), and the values (V, ...) of its vertices.
-    Raises EmptyField where there are none."""
+    """The lattice of those active voxels of another that are kept (K,), and the values (V, ...) of its
+    vertices. Raises EmptyField where there are none."""
     if not kept.any():
         raise EmptyField("the scene shows nothing")
     whole = lattice.tree
@@ -162,9 +171,9 @@ def thinned(lattice: Lattice, kept: np.ndarray, *values: np.ndarray) -> tuple[La
 
 
 def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Which active voxels (K,) a camera sees anything of that is not closer than CAMERA_FAR times the box; and the
-    mean direction (V, 3) along which each vertex is seen, of length 1 where from one side alone. With `which` (K,)
-    bool only those voxels are looked at, and all others shown.
+    """Which active voxels (K,) a camera sees anything of that is not closer than CAMERA_FAR times the box;
+    and the mean direction (V, 3) along which each vertex is seen, of length 1 where from one side alone. With
+    `which` (K,) bool only those voxels are looked at, and all others shown.
 
     What is hidden in solids is not held, and of haze as much is left out as no line of sight misses.
     """
@@ -175,7 +184,7 @@ def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarr
     low, high = lattice.places[corners[:, 0]], lattice.places[corners[:, 7]]
     clearest, facing = field.exposed(low, high, even_directions(LOOKED_FROM), far, BLOCKED)
     sigma = np.where(feature > LEAST, field.scale * np.logaddexp(0, feature), 0)
-    depth = sigma[corners].max(1) * (high - low)[:, 0] * clearest
+    depth = sigma[corners].max(1) * (high - low).min(1) * clearest
     kept = which.copy()
     kept[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
     told = np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * kept[which])[:, None]
@@ -193,7 +202,7 @@ def touching(lattice: Lattice) -> sparse.csr_matrix:
 
 
 def demanded(
-    teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: float, counts: tuple
+    teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: np.ndarray, counts: tuple
 ) -> np.ndarray:
     """Keys of the bricks of a level at one of whose vertices the placed field is the densest there is."""
     side = top / 2**level
@@ -203,7 +212,7 @@ def demanded(
     keys, inverse = np.unique(node_keys((bricks[:, None] * SIDE + inner).reshape(-1, 3)), return_inverse=True)
     places = lo + key_places(keys) * (side / SIDE)
     own = density(placed, places)
-    dense = own * side / SIDE > FAINT
+    dense = own * np.min(side) / SIDE > FAINT
     for other in placed_in(teacher):
         beside = dense & (places >= other.aabb[:3]).all(1) & (places <= other.aabb[3:]).all(1)
         if other is not placed and beside.any():
@@ -212,12 +221,13 @@ def demanded(
     return node_keys(bricks[kept])
 
 
-def touched(placed: Placed, side: float, lo: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(M, 3) the bricks of a side that the occupied cells of a placed field reach, and a voxel around them."""
+def touched(placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(M, 3) the bricks of a side that the occupied cells of a placed field reach, and a voxel around
+    them."""
     grid, matrix = placed.field.occupancy, placed.object_to_world
     stretch = np.linalg.norm(matrix[:3, :3], axis=0)
-    margin = side / SIDE / np.maximum(stretch, 1e-30)
-    steps = np.ceil((grid.cell + 2 * margin) * stretch / (0.7 * side)).astype(int) + 1
+    margin = np.max(side) / SIDE / np.maximum(stretch, 1e-30)
+    steps = np.ceil((grid.cell + 2 * margin) * stretch / (0.7 * np.min(side))).astype(int) + 1
     spots = [np.linspace(-m, c + m, s) for m, c, s in zip(margin, grid.cell, steps, strict=True)]
     inner = np.stack(np.meshgrid(*spots, indexing="ij"), -1).reshape(-1, 3) @ matrix[:3, :3].T
     corners = (grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -234,13 +244,18 @@ def touched(placed: Placed, side: float, lo: np.ndarray, counts: np.ndarray) -> 
 
 
 def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """(level (N,), place (N, 3)) of the leaves of the tree in which every wanted brick (keys by level) is held at
-    its level or a finer one: where a finer brick lies inside, the rest of the wanted one is split around it."""
+    """(level (N,), place (N, 3)) of the leaves of the tree in which every wanted brick (keys by level) is
+    held at its level or a finer one: where a finer brick lies inside, the rest of the wanted one is split
+    around it."""
     finer = [
         np.unique(
             np.concatenate(
                 [np.zeros(0, np.int64)]
-                + [node_keys(key_places(keys) >> (deep - level)) for deep, keys in enumerate(wanted) if deep > level]
+                + [
+                    node_keys(key_places(keys) >> (deep - level))
+                    for deep, keys in enumerate(wanted)
+                    if deep > level
+                ]
             )
         )
         for level in range(len(wanted))
@@ -259,8 +274,9 @@ def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def harmless(depth: np.ndarray, places: np.ndarray) -> float:
-    """The largest optical depth of a voxel up to which voxels (K,) at places (K, 3) may be left out, when one in
-    ODD_LINES of the axis-parallel lines through them may lose more than LOST_DEPTH: thin fog is no emptiness."""
+    """The largest optical depth of a voxel up to which voxels (K,) at places (K, 3) may be left out, when one
+    in ODD_LINES of the axis-parallel lines through them may lose more than LOST_DEPTH: thin fog is no
+    emptiness."""
     if not len(depth):
         return 0.0
     lines = []
@@ -277,8 +293,8 @@ def harmless(depth: np.ndarray, places: np.ndarray) -> float:
 
 
 def density(source, places: np.ndarray) -> np.ndarray:
-    """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends on
-    the direction."""
+    """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends
+    on the direction."""
     parts = [source] if isinstance(source, Placed) else placed_in(source)
     stretched = any(p.condition > 1 + 1e-6 for p in parts)
     found = np.zeros(len(places))
@@ -297,11 +313,11 @@ def density(source, places: np.ndarray) -> np.ndarray:
 
 
 def fill(field: SparseField, teacher: RadianceField, sigma: np.ndarray, facing: np.ndarray) -> None:
-    """Give the vertices the numbers that show what the teacher does, whose σ there is known (V,), and the directions
-    along which they are seen (V, 3), as of `shown`.
+    """Give the vertices the numbers that show what the teacher does, whose σ there is known (V,), and the
+    directions along which they are seen (V, 3), as of `shown`.
 
-    What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour from
-    where a look along its facing ends.
+    What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour
+    from where a look along its facing ends.
     """
     fine, degree = field.fine, field.shape.sh_degree
     fit_density(field, teacher, sigma)
@@ -320,8 +336,9 @@ def fill(field: SparseField, teacher: RadianceField, sigma: np.ndarray, facing: 
 def look(
     teacher: RadianceField, lattice: Lattice, sigma: np.ndarray, facing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is seen from a voxel before a vertex to a voxel behind, along its facing: where most of that is (V, 3),
-    and the opacity (V,) of it all. A vertex that is seen from all sides, or never, is all that it sees."""
+    """What is seen from a voxel before a vertex to a voxel behind, along its facing: where most of that is
+    (V, 3), and the opacity (V,) of it all. A vertex that is seen from all sides, or never, is all that it
+    sees."""
     size, places = lattice.finest_voxel, lattice.places.copy()
     opacity = -np.expm1(-sigma * size)
     length = np.linalg.norm(facing, axis=1)
@@ -340,21 +357,21 @@ def look(
 
 
 def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -> None:
-    """Density features that, interpolated, come nearest to the teacher's in the squares of their differences at
-    eight points of every active voxel; sigma (V,) is what the teacher says at the vertices.
+    """Density features that, interpolated, come nearest to the teacher's in the squares of their differences
+    at eight points of every active voxel; sigma (V,) is what the teacher says at the vertices.
 
-    In a voxel that a surface runs through, features are told apart up to REACH on either side of the one at which
-    it is half opaque: so the surface comes to lie where it is, between vertices of which one knows only that there
-    is much and the other that there is nothing.
+    In a voxel that a surface runs through, features are told apart up to REACH on either side of the one at
+    which it is half opaque: so the surface comes to lie where it is, between vertices of which one knows only
+    that there is much and the other that there is nothing.
     """
     lattice = field.fine
     corners = lattice.corners
     first = lattice.places[corners[:, 0]]
-    side = lattice.places[corners[:, 7], 0] - first[:, 0]
+    extent = lattice.places[corners[:, 7]] - first
     spots = 0.25 + 0.5 * OCTANTS
     weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
-    answers = np.stack([density(teacher, first + side[:, None] * spot) for spot in spots], 1)
-    half, own = (half_opaque(field.scale, size) for size in (side[:, None], lattice.finest_voxel))
+    answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
+    half, own = (half_opaque(field.scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
     wanted = np.clip(inverse_softplus(answers / field.scale), LEAST, half + REACH)
     wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - REACH), wanted)
     found = np.clip(inverse_softplus(sigma / field.scale), own - REACH, own + REACH)
@@ -366,16 +383,22 @@ def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -
         return scatter @ (rest @ weights).ravel()
 
     found = conjugate_gradients(
-        lambda x: x[corners] @ weights.T, adjoint, scatter @ np.tile((weights**2).sum(0), len(corners)), wanted, found
+        lambda x: x[corners] @ weights.T,
+        adjoint,
+        scatter @ np.tile((weights**2).sum(0), len(corners)),
+        wanted,
+        found,
     )
     most = np.clip(inverse_softplus(sigma / field.scale), None, MOST)
     field.rows[:, 0] = torch.from_numpy(np.where(found > own + 0.9 * REACH, np.maximum(found, most), found))
     field.settle()
 
 
-def conjugate_gradients(apply, adjoint, diagonal: np.ndarray, wanted: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """x that makes the squares of apply(x) - wanted small, in FIT_STEPS steps from a start; the diagonal is that of
-    adjoint(apply(.))."""
+def conjugate_gradients(
+    apply, adjoint, diagonal: np.ndarray, wanted: np.ndarray, start: np.ndarray
+) -> np.ndarray:
+    """x that makes the squares of apply(x) - wanted small, in FIT_STEPS steps from a start; the diagonal is
+    that of adjoint(apply(.))."""
     x, diagonal = start, np.maximum(diagonal, 1e-12)
     rest = adjoint(wanted - apply(x))
     along = rest / diagonal
@@ -398,7 +421,7 @@ def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:
 
 def density_scale(tree: BrickTree) -> float:
     """σ of a feature of 1, about: an optical depth of 1 in a voxel between the widest and the finest."""
-    return float(1 / np.sqrt(tree.unit * tree.top / (SIDE << int(tree.level.min()))))
+    return float(1 / np.sqrt(tree.unit.min() * tree.top.min() / (SIDE << int(tree.level.min()))))
 
 
 def set_density(field: SparseField, sigma: np.ndarray) -> None:
@@ -417,8 +440,8 @@ def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degr
     """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3), by least
     squares over the directions along which they are seen (facing (N, 3), as `around` has it).
 
-    What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit is
-    exact, however the teacher is turned, but for what ONE_SIDED leaves.
+    What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
+    is exact, however the teacher is turned, but for what ONE_SIDED leaves.
     """
     dirs = even_directions(DIRECTIONS)
     basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
@@ -464,10 +487,11 @@ def dilated(lattice: Lattice, values: np.ndarray, weight: np.ndarray) -> tuple[n
     return values, weight
 
 
-def coarser(fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray
+def coarser(
+    fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(W, D) values of the coarse vertices whose interpolation comes near to values (V, D) of the fine ones, where
-    these have a weight (V,), and their own weights (W,)."""
+    """(W, D) values of the coarse vertices whose interpolation comes near to values (V, D) of the fine ones,
+    where these have a weight (V,), and their own weights (W,)."""
     matrix = interpolation(fine, coarse)
     weighted = matrix.T @ sparse.diags(weight.astype(np.float32))
     total = np.asarray(weighted.sum(1)).ravel()

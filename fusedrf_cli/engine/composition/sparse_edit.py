@@ -31,13 +31,13 @@ from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
 Takes = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Which vertices (V,) bool are filled anew, by their places (V, 3), the sides of their voxels (V,), and the σ (V,) of
-the field as it was and of what is put there."""
+"""Which vertices (V,) bool are filled anew, by their places (V, 3), the sides of their voxels (V,), and the σ
+(V,) of the field as it was and of what is put there."""
 
 
 def added(field: SparseField, placed: Placed) -> SparseField:
-    """The field with an object put in, placed in its frame: where that is the densest, at the level that it needs.
-    Raises ValueError where it would be too large."""
+    """The field with an object put in, placed in its frame: where that is the densest, at the level that it
+    needs. Raises ValueError where it would be too large."""
     tree = field.tree.extended(placed.aabb)
     both = Several([Placed("", field, np.eye(4)), placed])
     level = level_for(placed.voxel_size, tree.top)
@@ -51,8 +51,8 @@ def added(field: SparseField, placed: Placed) -> SparseField:
 
 
 def emptied(field: SparseField, region: np.ndarray, rest: list[Placed]) -> SparseField | None:
-    """The field whose vertices in a box (6,) show what the rest, placed in its frame, does there; nothing where there
-    is no rest. None where nothing is left."""
+    """The field whose vertices in a box (6,) show what the rest, placed in its frame, does there; nothing
+    where there is no rest. None where nothing is left."""
     inside = Several([p for p in rest if meets(p.aabb[:3], p.aabb[3:], region)])
     tree, wanted = field.tree, [np.zeros(0, np.int64)] * (MAX_LEVEL + 1)
     for one in inside.placed:
@@ -94,23 +94,32 @@ def meets(low: np.ndarray, high: np.ndarray, box: np.ndarray) -> np.ndarray:
     return (low <= box[3:]).all(-1) & (box[:3] <= high).all(-1)
 
 
-def level_for(voxel: float, top: float) -> int:
+def level_for(voxel: float, top: np.ndarray) -> int:
     """The level whose voxels are nearest to a size."""
-    return int(np.clip(np.round(np.log2(top / (SIDE * voxel))), 0, MAX_LEVEL))
+    return int(np.clip(np.round(np.log2(top.min() / (SIDE * voxel))), 0, MAX_LEVEL))
 
 
 def refilled(
-    field: SparseField, tree: BrickTree, wanted: list[np.ndarray], source, shows, takes: Takes, box: np.ndarray
+    field: SparseField,
+    tree: BrickTree,
+    wanted: list[np.ndarray],
+    source,
+    shows,
+    takes: Takes,
+    box: np.ndarray,
 ) -> SparseField:
-    """A field over the field's bricks, in the box of `tree`, and the wanted ones (keys by level), whose vertices in a
-    box (6,) that `takes` chooses by the σ of a source show what `shows` does. All others keep their bits.
+    """A field over the field's bricks, in the box of `tree`, and the wanted ones (keys by level), whose
+    vertices in a box (6,) that `takes` chooses by the σ of a source show what `shows` does. All others keep
+    their bits.
     """
     old = Carried(field.fine, field.rows.numpy(), tree)
     lattice = Lattice(with_bricks(old, wanted, box), SIDE)
     taken, sigma = chosen(field, old, lattice, source, takes, box)
     new = taken[lattice.corners].any(1)
     dense = (sigma * lattice.finest_voxel > FAINT)[lattice.corners].any(1)
-    middles = (lattice.vertices[lattice.corners[:, 0]] + lattice.vertices[lattice.corners[:, 7]]) << MAX_LEVEL - lattice.tree.depth
+    middles = (
+        lattice.vertices[lattice.corners[:, 0]] + lattice.vertices[lattice.corners[:, 7]]
+    ) << MAX_LEVEL - lattice.tree.depth
     lattice, (taken, sigma) = thinned(lattice, np.where(new, dense, old.covers(middles)), taken, sigma)
 
     probe = SparseField(SparseShape(0), lattice, field.scale)
@@ -145,8 +154,8 @@ class Carried:
         self.order = np.argsort(self.keys)
 
     def at(self, other: Lattice) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (V, D) at another lattice's vertices, NaN where no voxel is active, and which vertices are this
-        lattice's own, whose rows are the same bits."""
+        """Rows (V, D) at another lattice's vertices, NaN where no voxel is active, and which vertices are
+        this lattice's own, whose rows are the same bits."""
         found = np.full((len(other.vertices), self.rows.shape[1]), np.nan, np.float32)
         at = np.minimum(np.searchsorted(self.keys, other.keys, sorter=self.order), len(self.keys) - 1)
         own = self.keys[self.order[at]] == other.keys
@@ -154,7 +163,9 @@ class Carried:
         rest = np.flatnonzero(~own)
         places, n = other.vertices[rest] << MAX_LEVEL - other.tree.depth, self.lattice.n
         for octant in OCTANTS:
-            brick, voxel, active = self.tree.voxels_at(2 * places + 2 * octant - 1, n, self.lattice.active, MAX_LEVEL)
+            brick, voxel, active = self.tree.voxels_at(
+                2 * places + 2 * octant - 1, n, self.lattice.active, MAX_LEVEL
+            )
             active &= np.isnan(found[rest, 0])
             brick, voxel = brick[active], voxel[active]
             i, j, k = voxel // n**2, voxel // n % n, voxel % n
@@ -172,7 +183,8 @@ class Carried:
 
 
 def with_bricks(old: Carried, wanted: list[np.ndarray], box: np.ndarray) -> BrickTree:
-    """The tree of the old bricks and the wanted ones, with all voxels active in those that reach into a box."""
+    """The tree of the old bricks and the wanted ones, with all voxels active in those that reach into a
+    box."""
     tree = old.tree
     keys = []
     for level in range(max(len(wanted), tree.depth + 1)):
@@ -193,7 +205,8 @@ def with_bricks(old: Carried, wanted: list[np.ndarray], box: np.ndarray) -> Bric
 def chosen(
     field: SparseField, old: Carried, lattice: Lattice, source, takes: Takes, box: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which vertices of a lattice (V,) are filled anew, and the σ (V,) that is to be there, taken or carried."""
+    """Which vertices of a lattice (V,) are filled anew, and the σ (V,) that is to be there, taken or
+    carried."""
     rows, places, side = old.at(lattice)[0], lattice.places, lattice.finest_voxel
     feature = np.nan_to_num(rows[:, 0].astype(float), nan=LEAST)
     before = np.where(feature > LEAST, field.scale * np.logaddexp(0, feature), 0)
@@ -205,7 +218,8 @@ def chosen(
 
 
 def local_fill(field: SparseField, shows, fresh: np.ndarray, facing: np.ndarray) -> SparseField:
-    """The bricks of a field that have a fresh vertex (V,), as a field of their own that shows what `shows` does."""
+    """The bricks of a field that have a fresh vertex (V,), as a field of their own that shows what `shows`
+    does."""
     tree = field.tree
     rows = field.fine.rows
     own = (fresh[rows] & (rows >= 0)).any(1)

@@ -1,8 +1,8 @@
 """Where a sparse field's numbers are: a tree of bricks, and lattices of vertices over it.
 
-The box is cut into cubic *top cells*. A node of level l is 2^-l top cells wide; it is empty, a brick of 4 x 4 x 4
-voxels, or split into eight nodes. Vertices are counted in *units*, voxel sides of the finest level, so that
-neighbours know each other's vertices whatever their levels.
+The box is cut into *top cells*, cubic ones where a field was resampled. A node of level l is 2^-l top cells
+wide; it is empty, a brick of 4 x 4 x 4 voxels, or split into eight nodes. Vertices are counted in *units*,
+voxel sides of the finest level, so that neighbours know each other's vertices whatever their levels.
 """
 
 from copy import copy
@@ -30,8 +30,8 @@ class BrickTree:
 
     lo: np.ndarray
     """(3,) float64 lower corner of the box."""
-    top: float
-    """Side of a top cell, in units of the frame."""
+    top: np.ndarray
+    """(3,) float64 sides of a top cell, in units of the frame."""
     counts: tuple[int, int, int]
     """Top cells per axis."""
     level: np.ndarray
@@ -42,11 +42,12 @@ class BrickTree:
     """(N, 4, 4, 4) bool, the voxels that are active."""
 
     @classmethod
-    def of(cls, lo, top: float, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
-        """The tree of bricks in any order, none inside another. Raises ValueError where there are too many."""
+    def of(cls, lo, top, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
+        """The tree of bricks in any order, none inside another; top (3,), or one number for a cube."""
         key = walk_order(level, at, counts)
         order = np.lexsort((key, level))
-        return cls(np.asarray(lo, np.float64), float(top), tuple(int(n) for n in counts), level[order], at[order], mask[order])
+        counts = tuple(int(n) for n in counts)
+        return cls(np.asarray(lo, np.float64), sides(top), counts, level[order], at[order], mask[order])
 
     @property
     def depth(self) -> int:
@@ -59,19 +60,20 @@ class BrickTree:
         return np.concatenate([self.lo, self.lo + self.top * np.asarray(self.counts)])
 
     @property
-    def unit(self) -> float:
-        """Side of a voxel of the finest level."""
+    def unit(self) -> np.ndarray:
+        """(3,) sides of a voxel of the finest level."""
         return self.top / (SIDE << self.depth)
 
     @cached_property
     def codes(self) -> tuple[np.ndarray, ...]:
-        """By level: EMPTY, BRICK or SPLIT of every node, (M,) uint8, in the order of the walk, and where it is,
-        (M, 3) int64."""
+        """By level: EMPTY, BRICK or SPLIT of every node, (M,) uint8, in the order of the walk, and where it
+        is, (M, 3) int64."""
         found, nodes = [], np.argwhere(np.ones(self.counts, bool))
         for level in range(self.depth + 1):
             own = node_keys(self.at[self.level == level])
             finer = [
-                node_keys(self.at[self.level == deep] >> (deep - level)) for deep in range(level + 1, self.depth + 1)
+                node_keys(self.at[self.level == deep] >> (deep - level))
+                for deep in range(level + 1, self.depth + 1)
             ]
             keys = node_keys(nodes)
             code = np.where(np.isin(keys, own), BRICK, EMPTY)
@@ -88,11 +90,13 @@ class BrickTree:
         return np.packbits(bits), np.packbits(self.mask.reshape(-1, SIDE**3), axis=1).ravel()
 
     @classmethod
-    def unpacked(cls, lo, top: float, counts, nodes: np.ndarray, masks: np.ndarray) -> "BrickTree":
-        """Inverse of `packed`. Whatever the bytes, nothing is made that is not in proportion to them; ValueError
-        where they are no tree."""
+    def unpacked(cls, lo, top, counts, nodes: np.ndarray, masks: np.ndarray) -> "BrickTree":
+        """Inverse of `packed`. Whatever the bytes, nothing is made that is not in proportion to them;
+        ValueError where they are no tree."""
         if 4 * len(nodes) < np.prod(counts):
-            raise ValueError(f"array 'nodes' should tell of {np.prod(counts)} top cells, found {len(nodes)} bytes")
+            raise ValueError(
+                f"array 'nodes' should tell of {np.prod(counts)} top cells, found {len(nodes)} bytes"
+            )
         code = np.unpackbits(nodes).reshape(-1, 4, 2)
         code = (code[..., 0] * 2 + code[..., 1]).ravel()
         here, start, levels, places = np.argwhere(np.ones(counts, bool)), 0, [], []
@@ -112,7 +116,7 @@ class BrickTree:
         if masks.shape != (8 * len(level),):
             raise ValueError(f"array 'masks' should have shape {[8 * len(level)]}, found {list(masks.shape)}")
         mask = np.unpackbits(masks).reshape(-1, SIDE, SIDE, SIDE).astype(bool)
-        return cls(np.asarray(lo, np.float64), float(top), tuple(counts), level, at, mask)
+        return cls(np.asarray(lo, np.float64), sides(top), tuple(counts), level, at, mask)
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -125,7 +129,9 @@ class BrickTree:
             depth[cell], held[cell] = level, True
         sizes = np.where(held, 1 << (3 * depth.astype(np.int64)), 0)
         if sizes.sum() > MAX_ENTRIES:
-            raise ValueError(f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {MAX_ENTRIES:,}")
+            raise ValueError(
+                f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {MAX_ENTRIES:,}"
+            )
         offset = np.where(held, (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape), -1)
         table = np.empty(int(sizes.sum()), np.int32)
         for level, (code, nodes) in enumerate(self.codes):
@@ -138,8 +144,9 @@ class BrickTree:
     def voxels_at(
         self, halves: np.ndarray, n: int, active: np.ndarray, finest: int | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3) int64
-        given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own depth."""
+        """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3)
+        int64 given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own
+        depth."""
         offset, depth, table = self.tables
         span = 2 * SIDE << (self.depth if finest is None else finest)
         cell = halves // span
@@ -159,8 +166,8 @@ class BrickTree:
         return np.where(held, brick, -1), voxel, held & active[safe, voxel]
 
     def extended(self, aabb: np.ndarray) -> "BrickTree":
-        """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where those
-        would be too many."""
+        """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where
+        those would be too many."""
         before = np.maximum(np.ceil((self.lo - aabb[:3]) / self.top), 0).astype(np.int64)
         behind = np.maximum(np.ceil((aabb[3:] - self.aabb[3:]) / self.top), 0).astype(np.int64)
         counts = before + np.asarray(self.counts) + behind
@@ -169,8 +176,8 @@ class BrickTree:
         return BrickTree.of(self.lo - before * self.top, self.top, counts, self.level, at, self.mask)
 
     def occupancy(self, longest: int) -> OccupancyGrid:
-        """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of them
-        lie along an axis."""
+        """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of
+        them lie along an axis."""
         fine = max(s for s in range(3) if s == 0 or max(self.counts) << s <= longest)
         occupied = np.zeros(tuple(n << fine for n in self.counts), bool)
         for level in range(self.depth + 1):
@@ -252,11 +259,11 @@ class Lattice:
 
     @cached_property
     def finest_voxel(self) -> np.ndarray:
-        """(V,) float64 side of the smallest voxel around each vertex, in the tree's frame."""
+        """(V,) float64 shortest side of the smallest voxel around each vertex, in the tree's frame."""
         brick = np.broadcast_to(self.width[:, None], self.used.shape)[self.used]
         found = np.full(len(self.vertices), np.iinfo(np.int64).max)
         np.minimum.at(found, self.rows[self.used], brick)
-        return found * self.tree.unit
+        return found * self.tree.unit.min()
 
     @cached_property
     def spreading(self) -> tuple[np.ndarray, ...]:
@@ -279,7 +286,8 @@ class Lattice:
         return node_keys((self.tree.at[brick] * self.n + inner) * width)
 
     def _constraints(self, vertices: np.ndarray) -> tuple[np.ndarray, tuple]:
-        """(V,) bool which vertices hang, and of those (rows' keys (H, 8), weights (H, 8)) of what they hang on."""
+        """(V,) bool which vertices hang, and of those (rows' keys (H, 8), weights (H, 8)) of what they hang
+        on."""
         tree, n = self.tree, self.n
         hanging = np.zeros(len(vertices), bool)
         nothing = np.zeros((0, 8), np.int64), np.zeros((0, 8))
@@ -318,7 +326,9 @@ class Lattice:
         keys = self._keys()[np.repeat(found, self.used.sum(1))]
         return np.isin(node_keys(vertices), keys)
 
-    def _spread(self, known: np.ndarray, rank: np.ndarray, hanging: np.ndarray, parents: tuple) -> sparse.csr_matrix:
+    def _spread(
+        self, known: np.ndarray, rank: np.ndarray, hanging: np.ndarray, parents: tuple
+    ) -> sparse.csr_matrix:
         """(H, F) weights by which hanging rows follow from free ones."""
         keys, weights = parents
         count, free = len(rank), self.free
@@ -330,16 +340,24 @@ class Lattice:
         whole = sparse.csr_matrix((weights[weights > 0], (own[kept], found)), shape=(count - free, count))
         direct, through = whole[:, :free], whole[:, free:]
         total, step = direct, direct
-        while (step := through @ step).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
+        while (
+            step := through @ step
+        ).nnz:  # a parent may hang on a wider voxel still: as often as there are levels
             total = total + step
         return total.tocsr()
+
+
+def sides(top) -> np.ndarray:
+    """(3,) float64 of three sides, or of one for all."""
+    return np.broadcast_to(np.asarray(top, np.float64), 3).copy()
 
 
 def check_counts(counts) -> None:
     """Raise ValueError where there are more top cells than a tree may have."""
     if max(counts) > LONGEST or np.prod(np.asarray(counts, np.float64)) > MAX_TOP_CELLS:
         raise ValueError(
-            f"counts should be at most {LONGEST} top cells each and {MAX_TOP_CELLS} in all, found {list(counts)}"
+            f"counts should be at most {LONGEST} top cells each and {MAX_TOP_CELLS} in all, found "
+            f"{list(counts)}"
         )
 
 
@@ -383,7 +401,12 @@ def walk_order(level: np.ndarray, at: np.ndarray, counts) -> np.ndarray:
 
 
 def fill_cubes(
-    table: np.ndarray, offset: np.ndarray, depth: np.ndarray, level: int, nodes: np.ndarray, values: np.ndarray
+    table: np.ndarray,
+    offset: np.ndarray,
+    depth: np.ndarray,
+    level: int,
+    nodes: np.ndarray,
+    values: np.ndarray,
 ) -> None:
     """Write values (M,) into the entries that nodes (M, 3) of a level cover, in those top cells that have a
     table."""

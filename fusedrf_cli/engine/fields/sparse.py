@@ -1,8 +1,9 @@
-"""The `sparse` field: numbers only at the vertices of bricks of voxels, which lie where something is and are as
-fine as it needs there.
+"""The `sparse` field: numbers only at the vertices of bricks of voxels, which lie where something is and are
+as fine as it needs there.
 
-Rows hold the density feature and the colour of degree 0; what changes with the view lies in bands, on a lattice
-of voxels twice as wide. σ = scale softplus(f) and rgb = sigmoid(Σ_k Y_k c_k), interpolated before the activation.
+Rows hold the density feature and the colour of degree 0; what changes with the view lies in bands, on a
+lattice of voxels twice as wide. σ = scale softplus(f) and rgb = sigmoid(Σ_k Y_k c_k), interpolated before the
+activation.
 """
 
 from dataclasses import dataclass
@@ -56,7 +57,8 @@ class SparseShape:
 
 @register
 class SparseField:
-    """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle` afterwards)."""
+    """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle`
+    afterwards)."""
 
     kind = "sparse"
 
@@ -75,7 +77,9 @@ class SparseField:
 
     def to(self, device: str | torch.device) -> "SparseField":
         """The same field with its numbers on a device: there it is asked, rendered and trained."""
-        return self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
+        return (
+            self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
+        )
 
     def moved(self, origin: np.ndarray) -> "SparseField":
         """The same field in a frame whose origin is at `origin` (3,) of its own."""
@@ -128,8 +132,8 @@ class SparseField:
 
     @property
     def voxel_size(self) -> float:
-        """Side of the finest voxel."""
-        return self.tree.unit
+        """Shortest side of the finest voxel."""
+        return float(self.tree.unit.min())
 
     @cached_property
     def occupancy(self) -> OccupancyGrid:
@@ -205,11 +209,11 @@ class SparseField:
     def exposed(
         self, low: np.ndarray, high: np.ndarray, directions: np.ndarray, far: float, blocked: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions (D, 3),
-        (K,), from `far` away or from outside the box, and the mean direction along which each is seen (K, 3), of
-        length 1 where from one side alone. Light of less than `blocked` counts as none."""
+        """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions
+        (D, 3), (K,), from `far` away or from outside the box, and the mean direction along which each is seen
+        (K, 3), of length 1 where from one side alone. Light of less than `blocked` counts as none."""
         clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
-        sides = np.ascontiguousarray((high - low)[:, 0])
+        sides = (high - low).min(1)
         self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
         return clearest, facing
 
@@ -247,8 +251,8 @@ class SparseField:
         and the losses and samples to those of loss (parts, 3); see cpu.train_rays for the loss."""
         slots = int(np.linalg.norm(self.aabb[3:] - self.aabb[:3]) / step) + 2
         self.loops.train_rays(
-            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-            background, opacity_weight, slots, grads, loss,
+            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop,
+            target, background, opacity_weight, slots, grads, loss,
         )  # fmt: skip
         self._collect(grads)
 
@@ -279,7 +283,8 @@ class SparseField:
     # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Arrays and metadata for a bundle: the free rows, brick by brick, and the tree; all indices follow."""
+        """Arrays and metadata for a bundle: the free rows, brick by brick, and the tree; all indices
+        follow."""
         nodes, masks = self.tree.packed()
         arrays = {"rows": self.rows[: self.fine.free].detach().cpu().numpy(), "nodes": nodes, "masks": masks}
         if self.coarse:
@@ -287,7 +292,7 @@ class SparseField:
         metadata = {
             "aabb": self.aabb.tolist(),
             "counts": list(self.tree.counts),
-            "top": self.tree.top,
+            "top": self.tree.top.tolist(),
             "scale": self.scale,
             "sh_degree": self.shape.sh_degree,
         }
@@ -299,7 +304,9 @@ class SparseField:
         tree = stored_tree(arrays, metadata)
         shape = SparseShape(whole(metadata["sh_degree"], "sh_degree", 0, 3))
         field = cls(shape, Lattice(tree, SIDE), positive(metadata["scale"], "scale"))
-        held = {"rows": (field.rows, field.fine)} | ({"bands": (field.bands, field.coarse)} if field.coarse else {})
+        held = {"rows": (field.rows, field.fine)} | (
+            {"bands": (field.bands, field.coarse)} if field.coarse else {}
+        )
         for name, (view, lattice) in held.items():
             found = arrays.get(name)
             expected = (lattice.free, view.shape[1])
@@ -320,8 +327,13 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
         raise ValueError(f"counts should be three whole numbers, found {counts}")
     counts = tuple(whole(n, "counts", 1, MAX_TOP_CELLS) for n in counts)
     check_counts(counts)
-    top, aabb = positive(metadata["top"], "top"), np.asarray(metadata["aabb"], np.float64)
-    if aabb.shape != (6,) or not np.isfinite(aabb).all() or not np.allclose(aabb[3:] - aabb[:3], top * np.array(counts)):
+    if not isinstance(metadata["top"], list) or len(metadata["top"]) != 3:
+        raise ValueError(f"top should be three numbers, found {metadata['top']}")
+    top = np.array([positive(side, "top") for side in metadata["top"]])
+    aabb = np.asarray(metadata["aabb"], np.float64)
+    if aabb.shape != (6,) or not np.isfinite(aabb).all():
+        raise ValueError("aabb should be six finite numbers")
+    if not np.allclose(aabb[3:] - aabb[:3], top * counts, rtol=1e-6):
         raise ValueError("aabb should be as many top cells wide as counts says")
     for name in ("nodes", "masks"):
         found = arrays.get(name)

@@ -24,7 +24,8 @@ def kernel_cache() -> Path:
 
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
-    inlined = [Path(__file__).with_name(f"{name}.py") for name in ("bodies", "prefetch", "items", "sparse_bodies")]
+    names = "bodies", "prefetch", "items", "sparse_bodies"
+    inlined = [Path(__file__).with_name(f"{name}.py") for name in names]
     bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined)).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = Path(home) / "fusedrf" / "kernels" / bodies

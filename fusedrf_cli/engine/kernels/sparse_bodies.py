@@ -2,8 +2,8 @@
 (`sparse_cuda.py`).
 
 Notation for the whole file.
-    brick        a cube of 4 x 4 x 4 voxels, a leaf of a tree whose roots are the *top cells* of the box; a brick
-                 of level l is 2^-l top cells wide
+    brick        4 x 4 x 4 voxels, a leaf of a tree whose roots are the *top cells* of the box; a brick of
+                 level l is 2^-l top cells wide
     rows         (V, 4) floats from params[0] on: density feature and the degree-0 coefficients of the three
                  colour logits, one row per vertex of the brick's voxels
     bands        (W, width) floats from params[bands_at] on: the coefficients of degree 1 and more, channel by
@@ -46,7 +46,7 @@ class SparseArrays(NamedTuple):
     bands_at: int  # where the bands begin in params
     scale: float  # σ = scale softplus(f), 1/length
     lo: object  # (3,) float, lower corner of the box
-    top: float  # side of a top cell
+    top: object  # (3,) float, sides of a top cell
     offset: object  # (X, Y, Z) int64, where a top cell's table begins, or -1
     depth: object  # (X, Y, Z) uint8, the level of its finest brick: the table has 2^depth entries a side
     table: object  # (E,) int32, the brick that holds an entry's cube, or -1 - level of the empty node
@@ -64,9 +64,9 @@ def brick_at(sparse, x, y, z):
 
     Outside the box the answer is an empty node of level 0.
     """
-    u = (x - sparse.lo[0]) / sparse.top
-    v = (y - sparse.lo[1]) / sparse.top
-    w = (z - sparse.lo[2]) / sparse.top
+    u = (x - sparse.lo[0]) / sparse.top[0]
+    v = (y - sparse.lo[1]) / sparse.top[1]
+    w = (z - sparse.lo[2]) / sparse.top[2]
     nx, ny, nz = sparse.offset.shape
     i, j, m = int(math.floor(u)), int(math.floor(v)), int(math.floor(w))
     if i < 0 or j < 0 or m < 0 or i >= nx or j >= ny or m >= nz:
@@ -85,7 +85,7 @@ def brick_at(sparse, x, y, z):
 @body
 def in_brick(sparse, level, coordinate, axis, n):
     """Voxel of a brick's n along an axis that a coordinate lies in, and the fraction inside it."""
-    u = (coordinate - sparse.lo[axis]) / sparse.top * (1 << level)
+    u = (coordinate - sparse.lo[axis]) / sparse.top[axis] * (1 << level)
     f = (u - math.floor(u)) * n
     i = min(int(f), n - 1)
     return i, f - i
@@ -93,7 +93,8 @@ def in_brick(sparse, level, coordinate, axis, n):
 
 @body
 def voxel_at(sparse, brick, level, x, y, z):
-    """(first vertex of the voxel around a point, fractions u, v, w); the vertex is -1 where it is inactive."""
+    """(first vertex of the voxel around a point, fractions u, v, w); the vertex is -1 where it is
+    inactive."""
     i, u = in_brick(sparse, level, x, 0, SIDE)
     j, v = in_brick(sparse, level, y, 1, SIDE)
     m, w = in_brick(sparse, level, z, 2, SIDE)
@@ -158,7 +159,8 @@ def logits_at(widths, coefficients, sparse, brick, level, first, u, v, w, x, y, 
 
 @body
 def scatter_point(
-    widths, coefficients, sparse, grads, brick, level, first, u, v, w, x, y, z, d_f, shaded, d_logits, sh, bands
+    widths, coefficients, sparse, grads, brick, level, first, u, v, w, x, y, z, d_f, shaded, d_logits, sh,
+    bands
 ):  # fmt: skip
     """Adjoint of `feature_at`, for d_f, and, where shaded, of `logits_at` for d_logits (3,)."""
     real = sparse.params.dtype.type
@@ -232,20 +234,22 @@ def query_sparse_point_backward(
     f = feature_at(sparse, brick, first, u, v, w)
     d_f = d_sigma[i] * sparse.scale * sigmoid(f)
     scatter_point(
-        widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits, sh, bands
+        widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits, sh,
+        bands
     )  # fmt: skip
 
 
 @body
 def node_exit(sparse, level, x, y, z, dx, dy, dz):
     """Distance from a point to where a ray leaves the node of a level around it."""
-    side = sparse.top / (1 << level)
-    i = math.floor((x - sparse.lo[0]) / side)
-    j = math.floor((y - sparse.lo[1]) / side)
-    m = math.floor((z - sparse.lo[2]) / side)
+    n = 1.0 / (1 << level)
+    a, b, c = n * sparse.top[0], n * sparse.top[1], n * sparse.top[2]
+    i = math.floor((x - sparse.lo[0]) / a)
+    j = math.floor((y - sparse.lo[1]) / b)
+    m = math.floor((z - sparse.lo[2]) / c)
     return min(
-        exit_distance(x, dx, sparse.lo[0], side, i, 1),
-        min(exit_distance(y, dy, sparse.lo[1], side, j, 1), exit_distance(z, dz, sparse.lo[2], side, m, 1)),
+        exit_distance(x, dx, sparse.lo[0], a, i, 1),
+        min(exit_distance(y, dy, sparse.lo[1], b, j, 1), exit_distance(z, dz, sparse.lo[2], c, m, 1)),
     )
 
 
@@ -271,8 +275,8 @@ def render_sparse_ray(
 ):
     """Marches, shades and composites ray i in one pass: out[i] is premultiplied rgb, opacity, Σ w t.
 
-    In a brick of level l one step in 2^(finest - l), counted from the ray's first, is a sample, and stands for as
-    many: which they are does not depend on what was skipped before.
+    In a brick of level l one step in 2^(finest - l), counted from the ray's first, is a sample, and stands
+    for as many: which they are does not depend on what was skipped before.
     """
     ox, oy, oz = rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]
     dx, dy, dz = rays_d[i, 0], rays_d[i, 1], rays_d[i, 2]
@@ -315,9 +319,9 @@ def render_sparse_ray(
 
 @body
 def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, facing):
-    """How much light reaches voxel i, a cube of sides[i] around places[i], from `far` away or from outside the box:
-    the most along one of the directions (D, 3) into clearest[i], and the mean of their opposites, by that light,
-    into facing[i]. What lets through less than `blocked` counts as opaque.
+    """How much light reaches voxel i, a cube of sides[i] around places[i], from `far` away or from outside
+    the box: the most along one of the directions (D, 3) into clearest[i], and the mean of their opposites, by
+    that light, into facing[i]. What lets through less than `blocked` counts as opaque.
     """
     clearest[i] = 0
     facing[i, 0], facing[i, 1], facing[i, 2] = 0, 0, 0
@@ -334,7 +338,7 @@ def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, f
                     break
                 t += max(node_exit(sparse, level, x, y, z, dx, dy, dz), 0.0) + 1e-3 * sides[i]
             else:
-                span = sparse.top / (SIDE << level)
+                span = min(sparse.top[0], min(sparse.top[1], sparse.top[2])) / (SIDE << level)
                 first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
                 if first >= 0:
                     s = sparse.scale * softplus(feature_at(sparse, brick, first, u, v, w))
@@ -347,14 +351,19 @@ def expose_voxel(sparse, places, sides, directions, far, blocked, i, clearest, f
             facing[i, 2] -= trans * dz
             total += trans
     if total > 0:
-        facing[i, 0], facing[i, 1], facing[i, 2] = facing[i, 0] / total, facing[i, 1] / total, facing[i, 2] / total
+        facing[i, 0], facing[i, 1], facing[i, 2] = (
+            facing[i, 0] / total,
+            facing[i, 1] / total,
+            facing[i, 2] / total,
+        )
 
 
 @body
 def in_box(sparse, x, y, z):
     """Whether a point lies in the field's box."""
     nx, ny, nz = sparse.offset.shape
-    u, v, w = (x - sparse.lo[0]) / sparse.top, (y - sparse.lo[1]) / sparse.top, (z - sparse.lo[2]) / sparse.top
+    u, v = (x - sparse.lo[0]) / sparse.top[0], (y - sparse.lo[1]) / sparse.top[1]
+    w = (z - sparse.lo[2]) / sparse.top[2]
     return u >= 0 and v >= 0 and w >= 0 and u < nx and v < ny and w < nz
 
 
@@ -444,8 +453,8 @@ def train_sparse_ray(
         brick, level = brick_at(sparse, x, y, z)
         first, u, v, w = voxel_at(sparse, brick, level, x, y, z)
         scatter_point(
-            widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits, sh,
-            bands,
+            widths, coefficients, sparse, grad, brick, level, first, u, v, w, x, y, z, d_f, shaded, logits,
+            sh, bands,
         )  # fmt: skip
 
 

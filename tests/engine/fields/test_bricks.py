@@ -35,7 +35,12 @@ def test_bricks_of_any_order_make_the_same_tree(rng):
 def test_bytes_that_are_no_tree_are_refused(what):
     tree = random_tree(2)
     nodes, masks = tree.packed()
-    for bad in (nodes[:-1], np.append(nodes, 0).astype(np.uint8), np.full_like(nodes, 255), np.full_like(nodes, 170)):
+    for bad in (
+        nodes[:-1],
+        np.append(nodes, 0).astype(np.uint8),
+        np.full_like(nodes, 255),
+        np.full_like(nodes, 170),
+    ):
         with pytest.raises(ValueError, match="nodes"):
             BrickTree.unpacked(tree.lo, tree.top, tree.counts, bad, masks)
     with pytest.raises(ValueError, match="masks"):
@@ -62,7 +67,8 @@ def test_points_find_their_voxel(n, rng):
 
 @pytest.mark.parametrize("n", [4, 2])
 def test_every_place_is_one_vertex(n):
-    """Free and hanging rows are different places; corners of active voxels have one, in ascending order of need."""
+    """Free and hanging rows are different places; corners of active voxels have one, in ascending order of
+    need."""
     tree = random_tree(2)
     lattice = Lattice(tree, n)
     assert len(np.unique(node_keys(lattice.vertices))) == len(lattice.vertices)

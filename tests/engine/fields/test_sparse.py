@@ -1,5 +1,5 @@
-"""The sparse field: answers against a slow loop, no cracks between levels, gradients against finite differences,
-pictures against the general renderer, storage."""
+"""The sparse field: answers against a slow loop, no cracks between levels, gradients against finite
+differences, pictures against the general renderer, storage."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
-from fusedrf_cli.engine.fields.bricks import OCTANTS, Lattice
+from fusedrf_cli.engine.fields.bricks import OCTANTS, BrickTree, Lattice
 from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE
@@ -18,34 +18,35 @@ from tests.engine.fields.sparse_cases import random_sparse, random_tree
 
 
 def slowly(field: SparseField, point: np.ndarray, direction: np.ndarray):
-    """σ and rgb at one point by a loop over all bricks, and the place in the brick's voxel; None where inactive."""
-    tree, fine = field.tree, field.fine
+    """σ and rgb at one point by a loop over all bricks; None where no voxel is active."""
+    tree = field.tree
     for b in range(len(tree.level)):
-        side = tree.top / 2 ** int(tree.level[b])
-        inside = (point - tree.lo) / side - tree.at[b]
+        inside = (point - tree.lo) / (tree.top / 2 ** int(tree.level[b])) - tree.at[b]
         if not ((inside >= 0) & (inside < 1)).all():
             continue
         if not tree.mask[b][tuple((inside * SIDE).astype(int))]:
             return None
-
-        def mixed(lattice: Lattice, rows: torch.Tensor) -> np.ndarray:
-            n = lattice.n
-            at = inside * n
-            voxel = at.astype(int)
-            total = 0.0
-            for corner in OCTANTS:
-                i, j, k = voxel + corner
-                row = lattice.rows[b, (i * (n + 1) + j) * (n + 1) + k]
-                total = total + np.prod(np.where(corner, at - voxel, 1 - at + voxel)) * rows[row].numpy()
-            return total
-
-        own = mixed(fine, field.rows)
+        own = mixed(field.fine, field.rows, b, inside)
         logits = own[1:, None]
         if field.coarse:
-            logits = np.concatenate([logits, mixed(field.coarse, field.bands).reshape(3, -1)], 1)
+            more = mixed(field.coarse, field.bands, b, inside)
+            logits = np.concatenate([logits, more.reshape(3, -1)], 1)
         basis = sh_basis(field.shape.coefficients, torch.from_numpy(direction[None])).numpy()[0]
         return field.scale * np.log1p(np.exp(own[0])), 1 / (1 + np.exp(-(logits @ basis)))
     return None
+
+
+def mixed(lattice: Lattice, rows: torch.Tensor, brick: int, inside: np.ndarray) -> np.ndarray:
+    """Rows interpolated at a point (3,) in [0, 1) of a brick."""
+    n = lattice.n
+    at = inside * n
+    voxel = at.astype(int)
+    total = 0.0
+    for corner in OCTANTS:
+        i, j, k = voxel + corner
+        row = lattice.rows[brick, (i * (n + 1) + j) * (n + 1) + k]
+        total = total + np.prod(np.where(corner, at - voxel, 1 - at + voxel)) * rows[row].numpy()
+    return total
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -66,7 +67,8 @@ def test_answers_are_those_of_a_loop(degree, rng):
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_levels_join_without_a_crack(degree, rng):
-    """Both sides of every face between active voxels of different bricks say the same, whatever the levels."""
+    """Both sides of every face between active voxels of different bricks say the same, whatever the
+    levels."""
     tree = random_tree(3)
     tree.mask[:] = True
     bare = SparseField(SparseShape(degree), Lattice(tree, SIDE), 4.0)
@@ -206,9 +208,10 @@ def test_what_does_not_fit_is_refused_by_name():
         ("counts", [2048, 2048, 2048]),
         ("counts", [3, 2]),
         ("counts", [3, 2.0, 3]),
-        ("top", 0.0),
-        ("top", float("inf")),
-        ("top", "far"),
+        ("top", [0.6, 0.6, 0.0]),
+        ("top", [0.6, 0.6, float("inf")]),
+        ("top", [0.6, 0.6, "far"]),
+        ("top", 0.6),
         ("scale", -1.0),
         ("sh_degree", 4),
         ("sh_degree", True),
@@ -235,18 +238,33 @@ def test_a_step_of_adam_leaves_hanging_vertices_on_their_voxels(rng):
     optimiser.step(0.1)
     assert (field.params != before).float().mean() > 0.1
     np.testing.assert_allclose(
-        field.rows[field.fine.free :].numpy(), field.fine.spread @ field.rows[: field.fine.free].numpy(), atol=1e-5
+        field.rows[field.fine.free :].numpy(),
+        field.fine.spread @ field.rows[: field.fine.free].numpy(),
+        atol=1e-5,
     )
 
 
-def test_seen_weighs_every_ray_by_its_opacity(rng):
-    field = random_sparse(0)
-    rays_o, rays_d = rays_at(field.aabb, 50)
-    weight, facing = field.seen(rays_o, rays_d)
-    opacity = render_rays(field, rays_o, rays_d, step=0.5 * field.voxel_size)[:, 3]
-    assert weight.sum() == pytest.approx(opacity.sum(), rel=1e-4)
-    np.testing.assert_allclose(facing.sum((0, 1)), opacity @ rays_d, rtol=1e-3)
-    assert not weight[~field.tree.mask.reshape(weight.shape)].any()
+def test_what_light_reaches():
+    """In an even cube it falls with the exponential of the optical depth to the nearest face; what is opaque
+    is seen from that face alone, unless a camera may be inside."""
+    tree = BrickTree.of(
+        [0, 0, 0], 1.0, (2, 2, 2), np.zeros(8, np.uint8), OCTANTS, np.ones((8, 4, 4, 4), bool)
+    )
+    field = SparseField(SparseShape(0), Lattice(tree, SIDE), 1.0)
+    dirs = np.concatenate([np.eye(3), -np.eye(3)])
+    low, high = (field.fine.places[field.fine.corners[:, q]] for q in (0, 7))
+    for sigma in (0.3, 30.0):
+        field.rows[:, 0] = float(np.log(np.expm1(sigma)))
+        clearest, facing = field.exposed(low, high, dirs, 10.0, 1e-9)
+        away = np.minimum(low, 2 - high).min(1)
+        np.testing.assert_allclose(clearest, np.exp(-sigma * away), rtol=0.3 if sigma < 1 else 5)
+        outer = (low[:, 0] == 0) & (low[:, 1:] > 0.2).all(1) & (high[:, 1:] < 1.8).all(1)
+        if sigma > 1:
+            np.testing.assert_allclose(facing[outer], np.tile([1.0, 0, 0], (outer.sum(), 1)), atol=0.1)
+    clearest, _ = field.exposed(low, high, dirs, 0.2, 1e-9)  # so near that a camera would be inside
+    assert (clearest[away > 0.1] > np.exp(-30 * 0.5)).all()
+    clearest, facing = field.exposed(low, high, dirs, 10.0, 0.5)
+    assert (clearest[away > 0.1] == 0).all() and (facing[away > 0.1] == 0).all()
 
 
 def test_bands_lie_on_a_lattice_of_wider_voxels():
