@@ -341,7 +341,11 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
             raise ValueError(f"array '{name}' should be bytes in one dimension")
     if len(arrays["masks"]) > 8 * MAX_BRICKS:
         raise ValueError(f"there should be at most {MAX_BRICKS} bricks, found {len(arrays['masks']) // 8}")
-    return BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
+    tree = BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
+    if not tree.mask.any():
+        raise ValueError("array 'masks' should have an active voxel")
+    tree.tables  # noqa: B018  (made now, so that what is too large is refused here)
+    return tree
 
 
 def whole(value: object, what: str, least: int, most: int) -> int:
