@@ -21,6 +21,7 @@ from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
 
 COARSE = 2  # voxels of the bands' lattice along a brick's side
+PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
 LINE = 16  # floats: the bands begin on a cache line, and a row of them is a whole number of half ones
 MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
