@@ -17,12 +17,20 @@ from fusedrf_cli.bridge.fuse_sparse import read_back
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, make_field, stored, write_field
+from fusedrf_cli.bridge.scene import (
+    LoadedScene,
+    held_size,
+    history_nodes,
+    load_scene,
+    make_field,
+    stored,
+    write_field,
+)
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import RESTORED, ClippedField, cleared, region_of
-from fusedrf_cli.engine.composition.sparse_edit import added, emptied
+from fusedrf_cli.engine.composition.sparse_edit import added, emptied, with_fringe
 from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.sparse import SparseField
@@ -185,6 +193,8 @@ def delete(
             rest = remaining(scene, members, Path(fused), names, origin, allow_outside, progress)
             figures["restored"] &= rest is not None
             if type(result) is SparseField:
+                if rest is not None:
+                    box = boxes[-1] = with_fringe(result, box)
                 result = emptied(result, box, rest or [])
                 if result is None:
                     raise nothing_left(fused, names)
@@ -244,7 +254,7 @@ def read_fused(path: str, budget: Memory | None = None) -> tuple[SceneGraph, lis
         )
     if budget is not None:
         budget.expect(
-            sources([headers[leaves[0].field].decoded_size], copies=READING), advice="edit a smaller field"
+            sources([held_size(headers[leaves[0].field])], copies=READING), advice="edit a smaller field"
         )
     field = make_field(read_field(path, leaves[0].field), path)
     upright = np.array_equal(leaves[0].object_to_world[:3, :3], np.eye(3))

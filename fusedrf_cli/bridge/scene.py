@@ -1,5 +1,6 @@
 """Files to placed engine fields, and back."""
 
+import math
 import os
 import sys
 from collections.abc import Container
@@ -18,6 +19,7 @@ from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import field_kinds
+from fusedrf_cli.engine.fields.sparse import PER_BRICK, SparseField
 from fusedrf_cli.engine.fields.streamed import StreamedField
 from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.errors import InvalidInput
@@ -80,6 +82,12 @@ def make_field(record: FieldRecord, where: str):
         ) from error
 
 
+def held_size(header: FieldHeader) -> int:
+    """Bytes of a field in memory: its arrays, and of bricks the indices that follow from them."""
+    masks = header.specs.get("masks") if header.kind == SparseField.kind else None
+    return header.decoded_size + (PER_BRICK * math.prod(masks.shape) // 8 if masks is not None else 0)
+
+
 def placed_on(field, place: str):
     """A field on the device where it is to be asked; what is no vm field stays on the CPU."""
     return field.to(place) if type(field) is VMField else field
@@ -127,7 +135,7 @@ class _Loader:
         if not found:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
         if self.budget is not None:
-            sizes = list({member: header.decoded_size for *_, member, header in found}.values())
+            sizes = list({member: held_size(header) for *_, member, header in found}.values())
             self.shelf.resize(self.budget.room({}))
             self.budget.expect(sources(sizes, self.shelf.room, READING), advice="use smaller sources")
         fields = tuple(self.source(*where) for where in found)
@@ -171,7 +179,7 @@ class _Loader:
         member: str,
         header: FieldHeader,
     ) -> SourceField:
-        size = header.decoded_size
+        size = held_size(header)
 
         def read():
             return placed_on(make_field(read_field(path, member), f"{path}: node '{name}'"), self.place)

@@ -71,6 +71,13 @@ def emptied(field: SparseField, region: np.ndarray, rest: list[Placed]) -> Spars
         return None
 
 
+def with_fringe(field: SparseField, box: np.ndarray) -> np.ndarray:
+    """(6,) the box grown by the widest voxel around its vertices: one beyond its face, where there is
+    nothing, has its share in where a surface on that face lies."""
+    inside = meets(field.fine.places, field.fine.places, box)
+    return box + np.repeat([-1, 1], 3) * field.fine.finest_voxel[inside].max(initial=0)
+
+
 class Several:
     """Placed fields as one that says what the densest of them says; of none, that there is nothing."""
 

@@ -21,6 +21,7 @@ from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
 
 COARSE = 2  # voxels of the bands' lattice along a brick's side
+PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
 LINE = 16  # floats: the bands begin on a cache line, and a row of them is a whole number of half ones
 MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
@@ -341,7 +342,11 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
             raise ValueError(f"array '{name}' should be bytes in one dimension")
     if len(arrays["masks"]) > 8 * MAX_BRICKS:
         raise ValueError(f"there should be at most {MAX_BRICKS} bricks, found {len(arrays['masks']) // 8}")
-    return BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
+    tree = BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
+    if not tree.mask.any():
+        raise ValueError("array 'masks' should have an active voxel")
+    tree.tables  # noqa: B018  (made now, so that what is too large is refused here)
+    return tree
 
 
 def whole(value: object, what: str, least: int, most: int) -> int:

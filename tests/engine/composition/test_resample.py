@@ -20,7 +20,7 @@ from fusedrf_cli.engine.fields.sparse import SparseShape
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
-from tests.analytic.fields import Ball, Gaussian, Tint
+from tests.analytic.fields import Ball, Box, Gaussian, Tint
 from tests.analytic.rays import unit
 
 RED = Tint.of(0.8, 0.2, 0.1)
@@ -164,3 +164,16 @@ def test_an_occupancy_of_few_wide_cells_is_searched_too():
     teacher = ball()
     teacher.occupancy = OccupancyGrid.full(teacher.aabb, 2)
     assert likeness(resampled(teacher, SparseShape(0), 60_000), ball()) > 28
+
+
+@pytest.mark.slow
+def test_an_object_at_a_twentieth_of_the_scene_keeps_its_detail():
+    """Seen close, against the composed scene."""
+    ground = Box(80.0, (1.2, 1.2, 0.1), tint=None)
+    ground.voxel_size = 0.03
+    marble = placed(ball(density=150.0, voxel=0.03, tint=None), 0.05, (0.2, 0.1, 0.125))
+    teacher = ComposedField([placed(ground), marble])
+    field = resampled(teacher, SparseShape(1), 2_000_000)
+    cameras = scattered(teacher.placed[1].aabb, 4, 96, 96, seed=2)
+    shots = [np.stack([render_image(f, c).over((1, 1, 1)) for c in cameras]) for f in (field, teacher)]
+    assert psnr(*shots) > 33

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.fields.bricks import BrickTree, Lattice, children, key_places, node_keys
+from fusedrf_cli.engine.fields.bricks import (
+    MAX_LEVEL,
+    BrickTree,
+    Lattice,
+    children,
+    key_places,
+    node_keys,
+)
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 from tests.engine.fields.sparse_cases import random_tree
 
@@ -105,3 +112,34 @@ def test_children_fill_their_parent():
     kids = children(np.array([[1, 2, 3]]))
     assert len(np.unique(node_keys(kids))) == 8
     np.testing.assert_array_equal(kids >> 1, np.tile([1, 2, 3], (8, 1)))
+
+
+def test_tables_that_a_few_bytes_would_make_huge_are_refused():
+    """One finest brick in each of many top cells: two million entries for each."""
+    at = np.argwhere(np.ones((4, 4, 4), bool)) << MAX_LEVEL
+    tree = BrickTree.of(
+        np.zeros(3), 1.0, (4, 4, 4), np.full(64, MAX_LEVEL, np.uint8), at, np.ones((64, 4, 4, 4), bool)
+    )
+    assert len(tree.packed()[0]) < 2000
+    with pytest.raises(ValueError, match="entries"):
+        tree.tables  # noqa: B018
+
+
+def test_too_many_top_cells_are_refused_before_they_are_made():
+    with pytest.raises(ValueError, match="nodes"):
+        BrickTree.unpacked(np.zeros(3), 1.0, (2048, 1024, 2), np.zeros(10, np.uint8), np.zeros(0, np.uint8))
+    tree = random_tree(0)
+    with pytest.raises(ValueError, match="counts"):
+        tree.extended(np.array([0, 0, 0, 1e6, 1e6, 1e6]))
+
+
+def test_a_larger_box_moves_no_brick():
+    tree = random_tree(2)
+    wide = tree.extended(tree.aabb + np.array([-0.1, 0, -2.0, 0, 0.1, 0.7]))
+    np.testing.assert_allclose(
+        wide.lo + wide.at * (wide.top / 2.0 ** wide.level[:, None]),
+        tree.lo + tree.at * (tree.top / 2.0 ** tree.level[:, None]),
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(wide.mask, tree.mask)
+    assert (wide.aabb[:3] <= tree.aabb[:3] - [0.1, 0, 2.0]).all() and (wide.aabb[3:] >= tree.aabb[3:]).all()

@@ -1,0 +1,93 @@
+"""`fuse --kind sparse`, and edits of what it makes, as whole commands."""
+
+import numpy as np
+import pytest
+
+from formats.bundle import read_bundle
+from fusedrf_cli.bridge.scene import make_field
+from fusedrf_cli.engine.rendering.metrics import psnr
+from tests.bridge.conftest import PLACES, TinySettings, done, part
+from tests.bridge.test_edit import AT, blues, covered
+
+SPARSE = ("--kind", "sparse", "--max-size", "600kB", "--precision", "float16")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short(tiny):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(part("fuse_sparse"), "FINISH", TinySettings(steps=0, rgb_steps=10))
+        yield
+
+
+@pytest.fixture
+def fused(report):
+    """What fusing floor and red to bricks says, sources inside."""
+    return report("fuse", "pair.json", "-o", "sparse.rfpack", *SPARSE, "--keep-sources")
+
+
+def field_of(folder, name: str):
+    bundle = read_bundle(folder / name)
+    (leaf,) = bundle.scene.leaves()
+    return make_field(bundle.fields[leaf.field], name), leaf.object_to_world[:3, 3]
+
+
+def rows_by_place(folder, name: str) -> dict:
+    """Bytes of every free row by its place in the world."""
+    field, origin = field_of(folder, name)
+    places = np.round(field.fine.places[: field.fine.free] + origin, 5)
+    return {tuple(p): r.tobytes() for p, r in zip(places, field.rows.numpy(), strict=False)}
+
+
+def test_a_scene_becomes_bricks(fused, folder, picture):
+    assert fused["kind"] == "sparse" and fused["bytes"] <= 600_000
+    chosen = fused["chosen"]
+    assert chosen["vertices"] > 1000 and sum(level["bricks"] for level in chosen["levels"]) > 50
+    assert "needs" in chosen["why"] and chosen["sh_degree"] in (0, 1, 2)
+    assert psnr(picture("sparse.rfpack"), picture("pair.json")) > 25
+    assert fused["psnr"]["before_rgb"] > 22
+
+
+def test_equal_seeds_give_equal_bytes(report, folder):
+    for name in ("one", "two"):
+        report("fuse", "pair.json", "-o", f"{name}.rfpack", *SPARSE)
+    assert (folder / "one.rfpack").read_bytes() == (folder / "two.rfpack").read_bytes()
+
+
+def test_added_and_deleted_it_is_as_before(fused, report, folder, picture):
+    """Numbers outside the new object's box are the same bits all along."""
+    before = picture("sparse.rfpack")
+    said = report("add", "sparse.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
+    assert said["touched"]["bricks"] > 10
+    more = picture("more.rfpack")
+    assert blues(more) > 20 and blues(before) == 0
+    away = ~covered("blue")
+    assert psnr(more[away], before[away]) >= 45
+    box = np.asarray(said["touched"]["aabb"])
+    touched = report("delete", "more.rfpack", "blue", "-o", "less.rfpack")["touched"]["aabb"]
+    assert np.abs(np.asarray(touched) - box).max() < 0.1
+    rows = [rows_by_place(folder, f"{name}.rfpack") for name in ("sparse", "more", "less")]
+    for other, aabb in zip(rows[1:], (box, np.asarray(touched)), strict=True):
+        low, high = aabb[:3] - 1e-4, aabb[3:] + 1e-4
+        outside = [p for p in rows[0] if (p < low).any() or (p > high).any()]
+        assert all(other[p] == rows[0][p] for p in outside if p in other)
+        assert sum(p in other for p in outside) > 0.98 * len(outside)
+    assert blues(picture("less.rfpack")) == 0 and psnr(picture("less.rfpack"), before) > 30
+
+
+def test_what_a_deleted_object_hid_comes_back_from_its_source(fused, report, picture):
+    """The red box, which stands on the floor, taken out where the floor's source is kept inside."""
+    said = report("delete", "sparse.rfpack", "red", "-o", "less.rfpack")
+    assert said["restored"]
+    report("compose", "floor.rfpack", "-t", ",".join(map(str, PLACES["floor"])), "-o", "floor.json")
+    assert psnr(picture("less.rfpack"), picture("floor.json")) > 22
+
+
+def test_the_last_object_cannot_be_deleted(fused, run):
+    result = run("delete", "sparse.rfpack", "red", "floor", "-o", "less.rfpack")
+    assert result.exit_code == 3 and "would leave nothing" in result.stderr
+
+
+def test_a_sparse_field_can_be_fused_again(fused, folder, report, picture):
+    report("compose", "sparse.rfpack", "blue.rfpack", "-t", "0.7,0,0", "-o", "again.json")
+    said = done(folder, "fuse", "again.json", "-o", "again.rfpack", *SPARSE, "--no-rgb")
+    assert said["kind"] == "sparse" and blues(picture("again.rfpack")) > 20
