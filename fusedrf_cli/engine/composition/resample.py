@@ -1,62 +1,51 @@
-"""Any field as a sparse one, by asking it at the vertices: no learning.
+"""Any field as a sparse one, by asking it: where bricks are needed, and of which level.
 
-A place is as fine as the object that is densest there needs in world units, not finer; where all of that is
-too much, all is coarser by one factor.
+A place is about as fine as the object that is densest there needs in world units; where all of that is too
+much, what is finest gives way most. What no camera sees is not held. filling.py says what the vertices get.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
-import torch
-from scipy import sparse
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.filling import (
+    AT_ONCE,
+    LEAST,
+    density,
+    density_scale,
+    even_directions,
+    fill,
+    pieces,
+    placed_in,
+    set_density,
+    touching,
+)
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,
-    OCTANTS,
     BrickTree,
     Lattice,
     children,
-    corner_offsets,
     key_places,
     node_keys,
     sides,
 )
 from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
-from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
-FINER = (
-    0.6  # of a teacher's voxel: a lattice that lies across the teacher's own needs finer ones to hold as much
-)
-DEEPEST = (
-    6  # levels below the coarsest; a ratio of voxels beyond 2^6 makes the coarse object's finer than it needs
-)
+FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
+YIELD = 1 / 3  # by which share, in logarithms, what is finer than the common voxel comes to meet it
+DEEPEST = 6  # levels under the coarsest: where voxels differ by more, the widest are finer than needed
 FAINT = 1e-4  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
-COLOURED = (
-    1e-2  # optical depth of a voxel from which a vertex's colour is the teacher's and not its neighbours'
-)
-LEAST, MOST = -12.0, 60.0  # of the density feature
-REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these
-LOOKED_FROM, DIRECTIONS = 20, 32  # directions along which voxels are sought, and colours asked
-ONE_SIDED = (
-    0.4  # length of the mean direction along which a vertex is seen, from which only that side is asked
-)
-LOOKS = 9  # places along a look through the voxels before and behind a vertex
-RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
-LOGITS = 8.0  # colours are told apart up to sigmoid(8)
-AT_ONCE = 1 << 18
-ATTEMPTS = 4
-FULL_ENOUGH = 0.93  # of the numbers allowed
-DILATIONS = 3
+MOST_LOST = 0.05  # optical depth of a voxel that is always held
+ODD_LINES = 20  # one line of voxels in so many may lose more: haze is no fog
+LOOKED_FROM = 20  # directions from which voxels are sought
 CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which a voxel has to be seen
 BLOCKED = 0.05  # transmittance under which nothing is seen
-MOST_LOST = 0.05  # optical depth of a voxel that is always held
-ODD_LINES = 20
-CORRECTIONS = 3
+MOST_TRIED = 1 << 31  # bricks in a placed field's box
+ATTEMPTS = 4
+FULL_ENOUGH = 0.93  # of the numbers allowed
 
 
 class TooFewNumbers(ValueError):
@@ -101,23 +90,16 @@ def number_count(lattice: Lattice, shape: SparseShape) -> int:
     return count + (shape.band_numbers * Lattice(lattice.tree, COARSE).free if shape.sh_degree else 0)
 
 
-# -- where ---------------------------------------------------------------------------------------------------
-
-
-def placed_in(teacher: RadianceField) -> list[Placed]:
-    """The placed fields of a composed one; any other field by itself."""
-    return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
-
-
 def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
     """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should
-    be no finer than each placed field's own, nor than the geometric mean of that and a common one.
+    be no finer than FINER times each placed field's own, nor than a mean of that and a common one.
 
-    With an error that grows as the square of the voxel over a field's own, and numbers that fall with its
-    square, the mean is what gives the least error for the numbers.
+    A mean is what gives the least error for the numbers: one of equal weights for views of the whole, where
+    the squared error grows with the square of the voxel over a field's own; here the own weighs more, since
+    cameras come close to what is small.
     """
     own = np.array([p.voxel_size for p in placed_in(teacher)])
-    needs = FINER * np.sqrt(own * np.maximum(own, common))
+    needs = FINER * own ** (1 - YIELD) * np.maximum(own, common) ** YIELD
     depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
     top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
     box = teacher.occupancy.tight_aabb(0)
@@ -192,15 +174,6 @@ def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarr
     return kept | ~which, summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
 
 
-def touching(lattice: Lattice) -> sparse.csr_matrix:
-    """(K, V) ones where an active voxel has a vertex as a corner."""
-    count = len(lattice.corners)
-    start = np.arange(0, 8 * count + 1, 8)
-    return sparse.csr_matrix(
-        (np.ones(8 * count, np.float32), lattice.corners.ravel(), start), (count, len(lattice.vertices))
-    )
-
-
 def demanded(
     teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: np.ndarray, counts: tuple
 ) -> np.ndarray:
@@ -233,6 +206,8 @@ def touched(placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray
     corners = (grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell) @ matrix[:3, :3].T + matrix[:3, 3]
     first = np.clip(np.floor((placed.aabb[:3] - lo) / side).astype(int) - 1, 0, counts - 1)
     last = np.clip(np.floor((placed.aabb[3:] - lo) / side).astype(int) + 1, 0, counts - 1)
+    if np.prod((last - first + 1.0)) > MOST_TRIED:
+        raise ValueError(f"'{placed.name}' is too large for voxels so fine")
     found = np.zeros(last - first + 1, bool)
     start = ((corners - lo) / side - first).astype(np.float32)
     fewer, more = sorted((start, (inner / side).astype(np.float32)), key=len)
@@ -287,243 +262,3 @@ def harmless(depth: np.ndarray, places: np.ndarray) -> float:
         if max(np.quantile(np.bincount(line, lost), 1 - 1 / ODD_LINES) for line in lines) <= LOST_DEPTH:
             return float(threshold)
     return 0.0
-
-
-# -- what ----------------------------------------------------------------------------------------------------
-
-
-def density(source, places: np.ndarray) -> np.ndarray:
-    """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends
-    on the direction."""
-    parts = [source] if isinstance(source, Placed) else placed_in(source)
-    stretched = any(p.condition > 1 + 1e-6 for p in parts)
-    found = np.zeros(len(places))
-    axes = np.eye(3)[: 3 if stretched else 1]
-    for part in pieces(len(places), AT_ONCE):
-        points = torch.from_numpy(places[part])
-        for axis in axes:
-            dirs = torch.from_numpy(np.broadcast_to(axis, points.shape).copy())
-            if isinstance(source, Placed):
-                x, d, stretch = source.to_object(points, dirs)
-                sigma = source.field.query(x, d, False)[0].double() * stretch
-            else:
-                sigma = source.query(points, dirs, False)[0].double()
-            found[part] += sigma.numpy() / len(axes)
-    return found
-
-
-def fill(field: SparseField, teacher: RadianceField, sigma: np.ndarray, facing: np.ndarray) -> None:
-    """Give the vertices the numbers that show what the teacher does, whose σ there is known (V,), and the
-    directions along which they are seen (V, 3), as of `shown`.
-
-    What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour
-    from where a look along its facing ends.
-    """
-    fine, degree = field.fine, field.shape.sh_degree
-    fit_density(field, teacher, sigma)
-    places, opacity = look(teacher, fine, sigma, facing)
-    coefficients = np.zeros((len(sigma), 3, field.shape.coefficients), np.float32)
-    asked = np.flatnonzero(opacity > COLOURED)
-    coefficients[asked] = colours(teacher, places[asked], facing[asked], degree)
-    weight = np.where(opacity > COLOURED, opacity, 0)
-    field.rows[:, 1:] = torch.from_numpy(dilated(fine, coefficients[..., 0], weight)[0])
-    if field.coarse:
-        bands, held = coarser(fine, field.coarse, coefficients[..., 1:].reshape(len(sigma), -1), weight)
-        field.bands[:] = torch.from_numpy(dilated(field.coarse, bands, held)[0])
-    field.settle()
-
-
-def look(
-    teacher: RadianceField, lattice: Lattice, sigma: np.ndarray, facing: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """What is seen from a voxel before a vertex to a voxel behind, along its facing: where most of that is
-    (V, 3), and the opacity (V,) of it all. A vertex that is seen from all sides, or never, is all that it
-    sees."""
-    size, places = lattice.finest_voxel, lattice.places.copy()
-    opacity = -np.expm1(-sigma * size)
-    length = np.linalg.norm(facing, axis=1)
-    which = np.flatnonzero(length > ONE_SIDED)
-    along = facing[which] / length[which, None] * size[which, None]
-    spots = np.linspace(-1, 1, LOOKS)
-    trans, heaviest, end = np.ones(len(which)), np.zeros(len(which)), np.zeros(len(which))
-    for spot in spots:
-        depth = density(teacher, lattice.places[which] + spot * along) * size[which] * (spots[1] - spots[0])
-        weight = -trans * np.expm1(-depth)
-        end, heaviest = np.where(weight > heaviest, spot, end), np.maximum(weight, heaviest)
-        trans = trans - weight
-    places[which] += end[:, None] * along
-    opacity[which] = 1 - trans
-    return places, opacity
-
-
-def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -> None:
-    """Density features that, interpolated, come nearest to the teacher's in the squares of their differences
-    at eight points of every active voxel; sigma (V,) is what the teacher says at the vertices.
-
-    In a voxel that a surface runs through, features are told apart up to REACH on either side of the one at
-    which it is half opaque: so the surface comes to lie where it is, between vertices of which one knows only
-    that there is much and the other that there is nothing.
-    """
-    lattice = field.fine
-    corners = lattice.corners
-    first = lattice.places[corners[:, 0]]
-    extent = lattice.places[corners[:, 7]] - first
-    spots = 0.25 + 0.5 * OCTANTS
-    weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
-    answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
-    half, own = (half_opaque(field.scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
-    wanted = np.clip(inverse_softplus(answers / field.scale), LEAST, half + REACH)
-    wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - REACH), wanted)
-    found = np.clip(inverse_softplus(sigma / field.scale), own - REACH, own + REACH)
-    scatter = sparse.csr_matrix(
-        (np.ones(corners.size), (corners.ravel(), np.arange(corners.size))), (len(found), corners.size)
-    )
-
-    def adjoint(rest: np.ndarray) -> np.ndarray:
-        return scatter @ (rest @ weights).ravel()
-
-    found = conjugate_gradients(
-        lambda x: x[corners] @ weights.T,
-        adjoint,
-        scatter @ np.tile((weights**2).sum(0), len(corners)),
-        wanted,
-        found,
-    )
-    most = np.clip(inverse_softplus(sigma / field.scale), None, MOST)
-    field.rows[:, 0] = torch.from_numpy(np.where(found > own + 0.9 * REACH, np.maximum(found, most), found))
-    field.settle()
-
-
-def conjugate_gradients(
-    apply, adjoint, diagonal: np.ndarray, wanted: np.ndarray, start: np.ndarray
-) -> np.ndarray:
-    """x that makes the squares of apply(x) - wanted small, in FIT_STEPS steps from a start; the diagonal is
-    that of adjoint(apply(.))."""
-    x, diagonal = start, np.maximum(diagonal, 1e-12)
-    rest = adjoint(wanted - apply(x))
-    along = rest / diagonal
-    size = rest @ along
-    for _ in range(FIT_STEPS):
-        if size <= 0:
-            break
-        curved = adjoint(apply(along))
-        length = size / (along @ curved)
-        x, rest = x + length * along, rest - length * curved
-        new = rest @ (rest / diagonal)
-        along, size = rest / diagonal + new / size * along, new
-    return x
-
-
-def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:
-    """The feature at which light falls to HALF on its way through a voxel of a side."""
-    return inverse_softplus(-np.log(HALF) / (scale * side))
-
-
-def density_scale(tree: BrickTree) -> float:
-    """σ of a feature of 1, about: an optical depth of 1 in a voxel between the widest and the finest."""
-    return float(1 / np.sqrt(tree.unit.min() * tree.top.min() / (SIDE << int(tree.level.min()))))
-
-
-def set_density(field: SparseField, sigma: np.ndarray) -> None:
-    """Give the vertices densities (V,), as far as the feature's range goes."""
-    field.rows[:, 0] = torch.from_numpy(np.clip(inverse_softplus(sigma / field.scale), LEAST, MOST))
-    field.settle()
-
-
-def inverse_softplus(y: np.ndarray) -> np.ndarray:
-    """f with log(1 + e^f) = y; -inf at 0."""
-    with np.errstate(divide="ignore"):
-        return np.where(y > 15, y, np.log(np.expm1(np.minimum(y, 15))))
-
-
-def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
-    """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3), by least
-    squares over the directions along which they are seen (facing (N, 3), as `around` has it).
-
-    What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
-    is exact, however the teacher is turned, but for what ONE_SIDED leaves.
-    """
-    dirs = even_directions(DIRECTIONS)
-    basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
-    found = np.empty((len(places), 3, len(basis[0])), np.float32)
-    one_sided = np.linalg.norm(facing, axis=1) > ONE_SIDED
-    side = np.where(one_sided, (facing @ dirs.T).argmax(1), len(dirs))
-    for group in np.unique(side):
-        counts = np.ones(len(dirs)) if group == len(dirs) else np.maximum(dirs @ dirs[group], 0)
-        asked = np.flatnonzero(counts > 0.1)
-        weighted = basis[asked] * counts[asked, None]
-        ridge = RIDGE * np.diag([0.0] + [1.0] * (len(basis[0]) - 1))
-        solve = np.linalg.solve(weighted.T @ basis[asked] + ridge, weighted.T)
-        own = np.flatnonzero(side == group)
-        for part in pieces(len(own), AT_ONCE // len(asked)):
-            points = np.repeat(places[own[part]], len(asked), 0)
-            along = np.tile(dirs[asked], (len(points) // len(asked), 1))
-            rgb = teacher.query(torch.from_numpy(points), torch.from_numpy(along))[1].double().numpy()
-            edge = 1 / (1 + np.exp(LOGITS))
-            rgb = np.clip(rgb, edge, 1 - edge)
-            logits = np.log(rgb / (1 - rgb)).reshape(-1, len(asked), 3)
-            found[own[part]] = np.einsum("kd,ndc->nck", solve, logits)
-    return found
-
-
-def even_directions(count: int) -> np.ndarray:
-    """(count, 3) unit directions, evenly spread along a spiral."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.arange(count) * np.pi * (3 - 5**0.5)
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
-
-
-def dilated(lattice: Lattice, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (V, D) where their weight (V,) is 0 from the vertices around, step by step; and the weights
-    (V,) then."""
-    touches = touching(lattice)
-    values, weight = values.astype(np.float32).copy(), weight.astype(np.float32)
-    for _ in range(DILATIONS):
-        gathered = touches.T @ (touches @ np.concatenate([values * weight[:, None], weight[:, None]], 1))
-        new = (weight == 0) & (gathered[:, -1] > 0)
-        values[new] = gathered[new, :-1] / gathered[new, -1:]
-        weight[new] = 1e-3
-    return values, weight
-
-
-def coarser(
-    fine: Lattice, coarse: Lattice, values: np.ndarray, weight: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(W, D) values of the coarse vertices whose interpolation comes near to values (V, D) of the fine ones,
-    where these have a weight (V,), and their own weights (W,)."""
-    matrix = interpolation(fine, coarse)
-    weighted = matrix.T @ sparse.diags(weight.astype(np.float32))
-    total = np.asarray(weighted.sum(1)).ravel()
-    values = values.astype(np.float32)
-    share = (1 / np.maximum(total, 1e-12))[:, None].astype(np.float32)
-    found = share * (weighted @ values)
-    for _ in range(CORRECTIONS):
-        found += share * (weighted @ (values - matrix @ found))
-    return found, total
-
-
-def interpolation(fine: Lattice, coarse: Lattice) -> sparse.csr_matrix:
-    """(V, W) weights of the coarse vertices at the fine ones, both over one tree."""
-    n, m = SIDE + 1, COARSE
-    at = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3) * m / SIDE
-    voxel = np.minimum(at.astype(int), m - 1)
-    share = at - voxel
-    weights = np.where(OCTANTS == 1, share[:, None], 1 - share[:, None]).prod(2)
-    first = (voxel[:, 0] * (m + 1) + voxel[:, 1]) * (m + 1) + voxel[:, 2]
-    inner = first[:, None] + corner_offsets(m)
-    row, first = np.unique(fine.rows, return_index=True)  # every vertex by the first brick that has it
-    row, first = row[row >= 0], first[row >= 0]
-    brick, vertex = np.divmod(first, n**3)
-    columns, data = coarse.rows[brick[:, None], inner[vertex]], weights[vertex]
-    kept = (columns >= 0) & (data > 0)
-    return sparse.csr_matrix(
-        (data[kept].astype(np.float32), (np.broadcast_to(row[:, None], kept.shape)[kept], columns[kept])),
-        (len(fine.vertices), len(coarse.vertices)),
-    )
-
-
-def pieces(count: int, size: int) -> Iterator[slice]:
-    """Slices of at most a size that cover 0 to count."""
-    for start in range(0, count, size):
-        yield slice(start, min(count, start + size))

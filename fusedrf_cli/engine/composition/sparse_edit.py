@@ -6,18 +6,8 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.resample import (
-    FAINT,
-    LEAST,
-    EmptyField,
-    demanded,
-    density,
-    fill,
-    leaves,
-    set_density,
-    shown,
-    thinned,
-)
+from fusedrf_cli.engine.composition.filling import LEAST, density, fill, set_density
+from fusedrf_cli.engine.composition.resample import FAINT, EmptyField, demanded, leaves, shown, thinned
 from fusedrf_cli.engine.fields.bricks import (
     MAX_LEVEL,
     OCTANTS,

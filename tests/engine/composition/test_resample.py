@@ -7,13 +7,8 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.resample import (
-    colours,
-    even_directions,
-    frame_of,
-    leaves,
-    resampled,
-)
+from fusedrf_cli.engine.composition.filling import colours, even_directions
+from fusedrf_cli.engine.composition.resample import frame_of, leaves, resampled
 from fusedrf_cli.engine.fields.bricks import MAX_LEVEL, key_places, node_keys
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.sparse import SparseShape
@@ -171,9 +166,9 @@ def test_an_object_at_a_twentieth_of_the_scene_keeps_its_detail():
     """Seen close, against the composed scene."""
     ground = Box(80.0, (1.2, 1.2, 0.1), tint=None)
     ground.voxel_size = 0.03
-    marble = placed(ball(density=150.0, voxel=0.03, tint=None), 0.05, (0.2, 0.1, 0.125))
+    marble = placed(ball(density=150.0, voxel=0.012, tint=None), 0.05, (0.2, 0.1, 0.125))
     teacher = ComposedField([placed(ground), marble])
-    field = resampled(teacher, SparseShape(1), 2_000_000)
+    field = resampled(teacher, SparseShape(1), 4_000_000)
     cameras = scattered(teacher.placed[1].aabb, 4, 96, 96, seed=2)
     shots = [np.stack([render_image(f, c).over((1, 1, 1)) for c in cameras]) for f in (field, teacher)]
     assert psnr(*shots) > 33
