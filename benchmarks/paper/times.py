@@ -18,9 +18,9 @@ from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.volume import render_image
 
 WANTED = 37.0  # dB
-FUSING = (8, 20, 40)  # seconds of learning
-TRAINING = (20, 50, 110)
-VIEWS, SIZE, SEED = 100, 300, 31  # of the pictures that retraining learns from
+FUSING = (8, 25)  # seconds of learning
+TRAINING = (20, 70)
+VIEWS, SIZE, SEED = 60, 300, 31  # of the pictures that retraining learns from
 COMPARED = 400
 DISTILLED = {"background": (), "scratch": ("--from-scratch", "--no-rgb")}
 

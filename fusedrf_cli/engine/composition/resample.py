@@ -206,7 +206,7 @@ def touched(placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray
     corners = (grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell) @ matrix[:3, :3].T + matrix[:3, 3]
     first = np.clip(np.floor((placed.aabb[:3] - lo) / side).astype(int) - 1, 0, counts - 1)
     last = np.clip(np.floor((placed.aabb[3:] - lo) / side).astype(int) + 1, 0, counts - 1)
-    if np.prod((last - first + 1.0)) > MOST_TRIED:
+    if np.prod(last - first + 1.0) > MOST_TRIED:
         raise ValueError(f"'{placed.name}' is too large for voxels so fine")
     found = np.zeros(last - first + 1, bool)
     start = ((corners - lo) / side - first).astype(np.float32)
