@@ -44,7 +44,7 @@ LOOKED_FROM = 20  # directions from which voxels are sought
 CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which a voxel has to be seen
 BLOCKED = 0.05  # transmittance under which nothing is seen
 MOST_TRIED = 1 << 31  # bricks in a placed field's box
-ATTEMPTS = 4
+ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has fitted yet
 FULL_ENOUGH = 0.93  # of the numbers allowed
 
 
@@ -66,7 +66,9 @@ def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tupl
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
     own = [p.voxel_size for p in placed_in(teacher)]
     common, best, tried = 2 * max(own), None, []
-    for _ in range(ATTEMPTS):
+    for attempt in range(MOST_ATTEMPTS):
+        if attempt >= ATTEMPTS and best is not None:
+            break
         found = occupied(teacher, common)
         count = number_count(found[0], shape)
         tried.append((np.log(common), np.log(count)))
