@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.paper import figures
 from benchmarks.paper.sources import four_objects
-from benchmarks.paper.work import KINDS, MOST_BYTES, Work, course, fusedrf, tell, write_csv
+from benchmarks.paper.work import KINDS, MOST_BYTES, SIZES, Work, course, fusedrf, tell, write_csv
 from formats.captures import write_capture
 from formats.views import View
 from fusedrf_cli.bridge.render import to_pixels
@@ -54,7 +54,8 @@ def times(work: Work) -> dict[str, str]:
 def fusings(scene: Path):
     """(way, bundle, seconds) of fused fields."""
     for kind in KINDS:  # the first of a kind loads kernels
-        fuse(scene, "--kind", kind, *(("--time-budget", "1") if kind == "vm" else ()))
+        if kind not in SIZES:
+            fuse(scene, "--kind", kind, *(("--time-budget", "1") if kind == "vm" else ()))
     for kind in KINDS:
         if kind != "vm":
             yield kind, *fuse(scene, "--kind", kind)
@@ -66,7 +67,8 @@ def fusings(scene: Path):
 def fuse(scene: Path, *words: str) -> tuple[Path, float]:
     """A fused bundle, and the seconds that it took."""
     tell(f"times: {' '.join(words)}")
-    line = ("-o", "times.rfpack", "--max-size", str(MOST_BYTES), *words)
+    size = SIZES.get(words[words.index("--kind") + 1], MOST_BYTES)
+    line = ("-o", "times.rfpack", "--max-size", str(size), *words)
     report = fusedrf(scene.parent, "fuse", scene.name, *line)
     return scene.with_name("times.rfpack"), report["total_seconds"]
 
