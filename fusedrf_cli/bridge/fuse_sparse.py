@@ -22,6 +22,7 @@ from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 POINTS = 3_000_000  # that are kept of the teacher's answers, about
 PADDED = 1.6  # floats in memory for each number that is stored: rows are padded, hanging vertices too
 WHOLE_BELOW = 0.8  # of the numbers allowed: less are taken where no object needs more
+PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squares of a vertex
 BYTES_PER_BRICK = 10  # masks and nodes
 VERTICES_PER_BRICK = 25  # at least, in scenes of surfaces
 FINISH = DistillSettings(rays=150_000, steps=0, rgb_steps=400)  # what was asked needs no learning from points
@@ -189,7 +190,9 @@ def sparse_memory(composed: ComposedField, asked: Asked) -> list[tuple[float, di
     """The stages of resampling a scene to bricks: asking, measuring, learning."""
     numbers = numbers_within(asked.limit, asked.precision or FAITHFUL)
     grids = ownership(composed.aabb) | judged()
+    filling = {"vertices while they are found and filled": PER_NUMBER_FILLED * numbers}
     return [
+        (0.0, filling | grids),
         (0.0, result(int(PADDED * numbers)) | grids),
         (0.0, learning(int(PADDED * numbers), torch.get_num_threads()) | teaching(FINISH, POINTS) | grids),
     ]
