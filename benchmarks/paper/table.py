@@ -23,7 +23,8 @@ PARTS = {  # CSVs that the page shows whole, and what it says of them
     "(a sunflower's seeds); the camera frames the ground and is the same for all N. "
     "`ms at n = 1` is the fused scene of one thing, whose frames take turns with the others of the row. "
     "Peak memory is that of a process that reads the scene and renders one frame of 400 × 400.",
-    "kinds": "Four objects, at most 25 MB (bricks 6 MB, since more take minutes to fill), on 8 views of 400 × 400.",
+    "kinds": "Four objects, at most 25 MB (bricks 6 MB, since more take minutes to fill), on 8 views of "
+    "400 × 400.",
     "times": "Seconds of the whole command once kernels are loaded. Retraining first renders 60 views of "
     "300 × 300 of the scene as composed, which counts, and is told the scene's box.",
     "closeup": "Views that frame the small object alone.",
