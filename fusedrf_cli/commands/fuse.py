@@ -5,6 +5,11 @@ import click
 from fusedrf_cli import options
 
 
+def brief(report: dict) -> dict:
+    """What people see: all but the learning curve."""
+    return {key: value for key, value in report.items() if key != "curve"}
+
+
 @click.command("fuse")
 @click.argument("scene", type=options.SCENE)
 @options.writing("The fused field to write, OUT.rfpack.")
@@ -31,7 +36,7 @@ from fusedrf_cli import options
 @options.resume
 @options.allow_outside
 @options.seeded
-@options.reporting
+@options.reporting(brief=brief)
 def command(scene, output, **words):
     """Turn a whole scene into one field.
 
