@@ -12,7 +12,7 @@ from benchmarks.paper.work import Work, fusedrf, tell
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MOST_THINGS = 32
-DRAFT = ("--quality", "draft", "--views", "30", "--size", "160", "--max-size", "1500kB")
+DRAFT = ("--quality", "draft", "--views", "20", "--size", "128", "--max-size", "800kB")
 NORMAL = ("--quality", "draft", "--views", "60", "--size", "300")
 LEAST_TRAINED = 22.0  # dB, below which a field is no object to experiment with
 STAND = 0.06  # height of the ground's top
