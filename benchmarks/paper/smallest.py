@@ -7,7 +7,7 @@ from benchmarks.paper.work import Work, course, fusedrf, tell, write_csv
 from fusedrf_cli.report import readable_size
 
 WANTED = 40.0  # dB
-BUDGET = 150
+BUDGET = 60
 SIZE = 400
 
 
