@@ -12,7 +12,8 @@ SHRINK = 1.5  # a rung's --max-size over the next one's
 SMALLEST = 50_000  # bytes, below which a bundle is mostly headers
 PRECISIONS = ("int8", "float16", "int4")
 RANKS = ((), ("--ranks", "8,24"), ("--ranks", "8,16"))
-DEGREES = ((), ("--sh-degree", "1"), ("--sh-degree", "0"))
+DEGREES = ("1", "0")
+SPARSE_SIZES = ("1MB", "3MB", "8MB")
 FINISHED = ("int8", "int4")  # what was finished at 16 bits is surpassed by twice the numbers at 8
 VM_SIZES = ("25MB", "12MB", "6MB")
 VM_BUDGETS = (("--time-budget", "5"), ("--time-budget", "15"), ("--time-budget", "45"), ())
@@ -22,9 +23,10 @@ def ladders(kind: str, least_psnr: float) -> dict[str, list[Ladder]]:
     """The ladders of a kind, in groups that take about as long; those that learn nothing come first."""
     if kind == "vm":
         return {"vm": [distilled()]}
-    more = RANKS if kind == "blocks" else DEGREES
-    plain = [("--precision", p, *m, "--no-rgb") for m, p in itertools.product(more, PRECISIONS)]
-    finished = [("--precision", p, *m) for m, p in itertools.product(more, FINISHED)]
+    if kind == "sparse":
+        return {"sparse": [bricks()]}
+    plain = [("--precision", p, *m, "--no-rgb") for m, p in itertools.product(RANKS, PRECISIONS)]
+    finished = [("--precision", p, *m) for m, p in itertools.product(RANKS, FINISHED)]
     groups = {kind: plain, f"{kind}, finished": finished}
     return {
         name: [shrinking(("--kind", kind, *flags), least_psnr) for flags in found]
@@ -44,6 +46,12 @@ def distilled() -> Ladder:
     """One tensor over the scene: the steps decide last, since that takes longest."""
     for budget, size, rgb in itertools.product(VM_BUDGETS, VM_SIZES, (("--no-rgb",), ())):
         yield ("--kind", "vm", "--max-size", size, *rgb, *budget)
+
+
+def bricks() -> Ladder:
+    """From few bricks to more, since many take minutes."""
+    for rgb, size, degree in itertools.product((("--no-rgb",), ()), SPARSE_SIZES, DEGREES):
+        yield ("--kind", "sparse", "--precision", "int8", "--sh-degree", degree, "--max-size", size, *rgb)
 
 
 def readable_floor(size: float) -> int:
