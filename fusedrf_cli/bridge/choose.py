@@ -81,7 +81,9 @@ class Choosing:
         finished = [self.make(t.way, limit, True) for t in plain[:FINALISTS]]
         return max(finished, key=lambda t: t.psnr, default=None)
 
-    def smallest_reaching(self, ways: list[list[Way]], target: float, limit: int, gain: float):
+    def smallest_reaching(
+        self, ways: list[list[Way]], target: float, limit: int, gain: float
+    ) -> Tried | None:
         """The fewest bytes at a PSNR of at least target (dB) under a size, None where nothing reaches it.
 
         ways come in groups, the cheapest first; the first group in which one reaches the target decides.
@@ -108,16 +110,15 @@ class Choosing:
         low, high = None, None
         for _ in range(TRIES):
             found = self.make(way, size, True)
+            if found is not None and found.psnr >= target:
+                high = found
+            elif size >= most or (found is not None and found.whole):
+                break
+            else:
+                low = max(low or 0, size)
             if found is None:  # not even the coarsest fits
-                low = low or size
                 size = min(most, int(size * MOST_GROWTH))
                 continue
-            if found.psnr >= target:
-                high = found
-            else:
-                if size >= most or found.whole:
-                    break
-                low = max(low or 0, size)
             if high is not None and low is not None and high.limit <= CLOSE * low:
                 break
             size = self._next_size(found, target, low, high, most)

@@ -64,6 +64,8 @@ class BlocksMaker:
         self.judge = Judge(composed, views, DistillSettings.view_size, asked.seed)
         self.views, self.whole_in_memory, self._lesson = views, whole_in_memory, None
         self.started = working_time()
+        # once, since a source that memory does not hold is read again whenever it is opened
+        self.blocks = sum(len(opened(p.field).blocks) for p in composed.placed)
         self.last: tuple[Tried, VMField] | None = None
 
     def try_way(self, way: Way, limit: int, finished: bool) -> Tried | None:
@@ -73,7 +75,7 @@ class BlocksMaker:
             return None
         before = psnr = self.measured(field, way)
         if finished and self.learns() and not (whole and way.ranks is None):
-            learnt = replace_params(field)
+            learnt = field.with_params(field.params.clone())
             self.lesson().teach(learnt)
             psnr = self.measured(learnt, way)
             field, psnr = (learnt, psnr) if psnr > before else (field, before)
@@ -108,8 +110,7 @@ class BlocksMaker:
 
     def bytes_of(self, shape: VMShape, tensors: Sequence[VMTensor], way: Way) -> int:
         """Bytes of the file with blocks over such tensors."""
-        blocks = sum(len(opened(p.field).blocks) for p in self.composed.placed)
-        return self.asked.overhead + vm_bytes(shape, tensors, blocks, way.precision)
+        return self.asked.overhead + vm_bytes(shape, tensors, self.blocks, way.precision)
 
     def shape_of(self, way: Way) -> VMShape | None:
         """The most ranks and bands that a way keeps, None for all."""
@@ -132,13 +133,6 @@ class BlocksMaker:
             boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
             self._lesson = RayLesson(teacher, boxes, self.asked.seed)
         return self._lesson
-
-
-def replace_params(field: VMField) -> VMField:
-    """The same field with a copy of its numbers."""
-    return VMField(
-        field.shape, field.tensors, field.blocks, field.params.clone(), field.occupancy, field.owners
-    )
 
 
 def fuse_blocks(
@@ -210,9 +204,9 @@ def why(composed: ComposedField, field: VMField, chosen: Tried, asked: Asked, tr
     own = len({id(p.field) for p in composed.placed})
     blocks = f"{len(field.blocks)} blocks over {own} fields, each in its object's own axes"
     if asked.target is not None and chosen.psnr >= asked.target:
-        return f"{blocks}: the smallest of {tried} choices that reach {asked.target:g} dB"
+        return f"{blocks}: the smallest that reaches {asked.target:g} dB, of {tried} choices tried"
     if tried:
-        return f"{blocks}: the best of {tried} choices under {asked.limit} bytes"
+        return f"{blocks}: the best under {asked.limit} bytes, of {tried} choices tried"
     return f"{blocks}, as the sources have them"
 
 
@@ -222,10 +216,10 @@ def blocks_memory(
     """Make room for compiling a scene to blocks: putting together, measuring, learning. Whether all sources
     together may be in memory as a teacher."""
     own = sum(loaded.sizes) // FLOAT
-    numbers, grids = min(int(asked.limit / BYTES_PER_NUMBER["int4"]), own), ownership(composed.aabb)
-    if asked.target is None and asked.precision is None:  # then either nothing learns or it is much smaller
-        numbers = min(numbers, max(asked.limit // 2, own // 2))
-    chosen = asked.target is not None or sum(loaded.sizes) // 2 > asked.limit
+    grids = ownership(composed.aabb)
+    chosen = asked.target is not None or own * BYTES_PER_NUMBER[asked.precision or PRECISE] > asked.limit
+    cheapest = asked.precision or (CHEAP_FIRST[0] if chosen else PRECISE)
+    numbers = min(own, int(asked.limit / BYTES_PER_NUMBER[cheapest]))
     copies = TRUNCATING if chosen else RESAMPLING
     threads = torch.get_num_threads()
     learnt = learning(numbers, threads) | lesson(RAYS) | grids if asked.rgb else {}

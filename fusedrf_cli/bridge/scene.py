@@ -227,8 +227,7 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
 
 def stored(field: VMField, precision: str) -> VMField:
     """The field as it will come back from a bundle of that precision."""
-    params = torch.zeros_like(field.params)
-    back = VMField(field.shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
+    back = field.with_params(torch.zeros_like(field.params))
     for t in range(len(field.tensors)):
         target = back.sections(t)
         for name, view in field.sections(t).items():

@@ -10,7 +10,6 @@ import torch
 from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_images, read_capture
 from formats.meshes import mesh_capture
-from formats.records import BYTES_PER_NUMBER as BYTES_PER_NUMBER
 from formats.records import coded_bytes
 from formats.views import Capture, View
 from fusedrf_cli.bridge.memory import Memory, fitting, photos

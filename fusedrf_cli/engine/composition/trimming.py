@@ -39,9 +39,7 @@ def without_unread(field: VMField) -> VMField:
     """The same field with 0 in all plane texels that no occupied cell reads: it answers the same, and such
     texels cost next to nothing where blocks of numbers share a scale.
     """
-    trimmed = VMField(
-        field.shape, field.tensors, field.blocks, field.params.clone(), field.occupancy, field.owners
-    )
+    trimmed = field.with_params(field.params.clone())
     for t, tensor in enumerate(trimmed.tensors):
         sections = trimmed.sections(t)
         for mode in range(3):

@@ -184,6 +184,10 @@ class VMField:
         settle_crowded(unsettled, np.argwhere(count > 2), first, second)
         return unsettled
 
+    def with_params(self, params: torch.Tensor) -> "VMField":
+        """The same tensors and blocks with other numbers."""
+        return VMField(self.shape, self.tensors, self.blocks, params, self.occupancy, self.owners)
+
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
         """A one-block field on another box and resolution: planes and lines are interpolated, outside the old
         box they are 0."""
@@ -215,8 +219,7 @@ class VMField:
         """The same field with its numbers on a device: there it is asked, rendered and trained."""
         if self.params.device == torch.device(device):
             return self
-        params = self.params.to(device)
-        return VMField(self.shape, self.tensors, self.blocks, params, self.occupancy, self.owners)
+        return self.with_params(self.params.to(device))
 
     # -- reading ---------------------------------------------------------------------------------------------
 
