@@ -21,16 +21,11 @@ from fusedrf_cli.bridge.fuse import DEFAULT_MAX_SIZE
 from fusedrf_cli.bridge.scene import background_of, load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.distill import (
-    DistillReport,
-    DistillRun,
-    DistillSettings,
-    Recipe,
-    empty_student,
-    student_from,
-)
+from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.losses import OPAQUE
 from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
+from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.distillation.student import empty_student, student_from
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField
 

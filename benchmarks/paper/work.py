@@ -12,14 +12,13 @@ from pathlib import Path
 
 from fusedrf_cli.bridge.chart import Course
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.commands.chart import fuse_words
 from fusedrf_cli.main import cli
 
 MOST_BYTES = 25_000_000
 """The paper's size of a fused field."""
 SIZES = {"sparse": 6_000_000}
 """Bytes of a kind of which less is taken: bricks of the paper's size take minutes to fill."""
-KINDS = tuple(kind for kind in ("blocks", "sparse", "vm") if fuse_words(("--kind", kind)) is not None)
+KINDS = ("blocks", "sparse", "vm")
 
 
 @dataclass(frozen=True)

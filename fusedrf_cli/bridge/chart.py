@@ -22,7 +22,7 @@ from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.bridge.train import WHITE
-from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
+from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
 from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -145,13 +145,13 @@ def chart(
     seed: int,
     device: str,
     threads: int | None,
-    fuse_words: Callable[[Flags], dict | None],
+    fuse_words: Callable[[Flags], dict],
     progress,
 ) -> dict:
     """Fuse a scene in the ways that are worth it, measure each, and draw them in a folder.
 
-    `fuse_words` makes of a command line's flags what `fuse` takes, None where it has no such flags: so every
-    label is the flags that gave the point. Raises the error of fusing where no way can be gone.
+    `fuse_words` makes of a command line's flags what `fuse` takes: so every label is the flags that gave the
+    point. Raises the error of fusing where no way can be gone.
     """
     plots.check()
     where = {"memory": memory, "allow_outside": allow_outside, "seed": seed, "device": device}
@@ -252,7 +252,11 @@ class Charting:
         next comes the group that has had the least time, and of its ladders one that is not behind, with the
         fewest rungs. Returns how many ladders were left off.
         """
-        climbers = {(k, g): self.known(found) for k, groups in waiting.items() for g, found in groups.items()}
+        climbers = {
+            (kind, name): [Climber(ladder, next(ladder)) for ladder in found]
+            for kind, groups in waiting.items()
+            for name, found in groups.items()
+        }
         started, spent = time.monotonic(), dict.fromkeys(climbers, 0.0)
         while any(climbers.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
@@ -266,11 +270,6 @@ class Charting:
         if not self.points:
             raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
         return sum(map(len, climbers.values()))
-
-    def known(self, found: list[Ladder]) -> list["Climber"]:
-        """Climbers of the ladders whose flags `fuse` has, on their first rungs."""
-        first = [Climber(ladder, next(ladder)) for ladder in found]
-        return [climber for climber in first if self.fuse_words(climber.flags) is not None]
 
     def try_flags(self, group: tuple[str, str], flags: Flags) -> Point | None:
         """The point of some flags, or None and a warning where the scene cannot be fused so; group is the

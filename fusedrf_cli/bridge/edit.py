@@ -13,7 +13,7 @@ import torch
 from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
 from formats.scene import Leaf, Matrix4, SceneGraph
-from fusedrf_cli.bridge.fuse_sparse import read_back
+from fusedrf_cli.bridge.fuse_sparse import stored_sparse
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.running import engine
@@ -31,7 +31,10 @@ from fusedrf_cli.engine.composition.blocks import blocks_of, named, without
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import RESTORED, ClippedField, cleared, region_of
 from fusedrf_cli.engine.composition.sparse_edit import added, emptied, with_fringe
-from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge, distill, empty_student
+from fusedrf_cli.engine.distillation.distill import distill
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.sparse import SparseField
 from fusedrf_cli.engine.fields.streamed import opened
@@ -337,7 +340,7 @@ def as_read(field: VMField | SparseField, precision: str, origin: np.ndarray) ->
     """A field as it will be read from a bundle of that precision, in a frame whose origin is at `origin` (3,)
     of its own."""
     if type(field) is SparseField:
-        return read_back(field, precision)[0].moved(origin)
+        return stored_sparse(field, precision).moved(origin)
     return moved_frame(stored(field, precision), origin)
 
 

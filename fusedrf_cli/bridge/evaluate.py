@@ -10,7 +10,7 @@ from fusedrf_cli.bridge.render import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.train import WHITE, camera_of, over_white
-from fusedrf_cli.engine.distillation.distill import JUDGED_SEED
+from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image

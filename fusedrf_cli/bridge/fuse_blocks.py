@@ -28,8 +28,9 @@ from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import block_details
 from fusedrf_cli.engine.composition.trimming import without_unread
-from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.finish import RAYS, RayLesson
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import working_time
@@ -135,9 +136,7 @@ class BlocksMaker:
         return self._lesson
 
 
-def fuse_blocks(
-    composed: ComposedField, asked: Asked, whole_in_memory: bool, place: str, progress
-) -> Fused:
+def fuse_blocks(composed: ComposedField, asked: Asked, whole_in_memory: bool, place: str, progress) -> Fused:
     """The scene as blocks, in the way that was asked for or found.
 
     UsageProblem where not even the coarsest blocks fit the limit.
@@ -210,9 +209,7 @@ def why(composed: ComposedField, field: VMField, chosen: Tried, asked: Asked, tr
     return f"{blocks}, as the sources have them"
 
 
-def blocks_memory(
-    budget: Memory, loaded: LoadedScene, composed: ComposedField, asked: Asked
-) -> bool:
+def blocks_memory(budget: Memory, loaded: LoadedScene, composed: ComposedField, asked: Asked) -> bool:
     """Make room for compiling a scene to blocks: putting together, measuring, learning. Whether all sources
     together may be in memory as a teacher."""
     own = sum(loaded.sizes) // FLOAT

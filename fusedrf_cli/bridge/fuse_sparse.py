@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from formats.records import BYTES_PER_NUMBER, FieldRecord, decode_field, encode_field
+from formats.records import BYTES_PER_NUMBER, FieldRecord, as_stored, encode_field
 from fusedrf_cli.bridge.choose import Choosing, Tried, Way
 from fusedrf_cli.bridge.fusing import Asked, Fused
 from fusedrf_cli.bridge.memory import judged, learning, ownership, result, teaching
@@ -15,7 +15,9 @@ from fusedrf_cli.bridge.train import check_size
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
 from fusedrf_cli.engine.composition.resample import TooFewNumbers, resampled
-from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, DistillSettings, Judge, Recipe
+from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
@@ -51,21 +53,23 @@ class SparseMaker:
             field = resampled(self.composed, SparseShape(way.sh_degree), numbers).to(self.place)
         except TooFewNumbers:
             return None
-        read, size = read_back(field, way.precision)
-        if size + self.asked.overhead > limit:
+        size = self.asked.overhead + file_bytes(field, way.precision)
+        if size > limit:
             return None
-        before = psnr = self.judge(read.to(self.place))
+        before = psnr = self.judge(stored_sparse(field, way.precision))
         did = None
         if finished and self.asked.rgb:
             kept = field.params.clone()
             did = self.learn(field)
-            read, size = read_back(field, way.precision)
-            psnr = self.judge(read.to(self.place))
-            if psnr <= before:
+            psnr = self.judge(stored_sparse(field, way.precision))
+            learnt_size = self.asked.overhead + file_bytes(field, way.precision)
+            if psnr > before and learnt_size <= limit:
+                size = learnt_size
+            else:
                 field.params.copy_(kept)
                 psnr = before
         whole = field.numbers < WHOLE_BELOW * numbers
-        tried = Tried(way, limit, size + self.asked.overhead, psnr, before, whole)
+        tried = Tried(way, limit, size, psnr, before, whole)
         self.last = tried, field, did
         return tried
 
@@ -74,7 +78,7 @@ class SparseMaker:
         composed = self.composed
         # in an order that does not depend on the nodes', so that equal scenes draw equal rays
         boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
-        run = DistillRun(composed, field, boxes, self.settings, True, RECIPE)
+        run = DistillRun(composed, field, boxes, self.settings, True, RECIPE, self.judge)
         tell = self.progress
         return run.finish(lambda name: tell.phase(name, 1.0), lambda s, f: tell.advance(s, **f))[1]
 
@@ -85,11 +89,20 @@ class SparseMaker:
         return self.last[1:]
 
 
-def read_back(field: SparseField, precision: str) -> tuple[SparseField, int]:
-    """The field as it will be read from a bundle of that precision, and its bytes there."""
-    data = encode_field(FieldRecord(field.kind, *field.state()), precision)
-    record = decode_field(data, "the field as it is stored")
-    return SparseField.from_state(record.arrays, record.metadata), len(data)
+def stored_sparse(field: SparseField, precision: str) -> SparseField:
+    """The field as it will come back from a bundle of that precision."""
+    back = field.with_params(field.params.clone())
+    held = {"rows": (back.rows, back.fine)} | ({"bands": (back.bands, back.coarse)} if back.coarse else {})
+    for name, (view, lattice) in held.items():
+        free = view[: lattice.free]
+        free.copy_(torch.from_numpy(as_stored(free.cpu().numpy(), precision, name)))
+    back.settle()
+    return back
+
+
+def file_bytes(field: SparseField, precision: str) -> int:
+    """Bytes of the field in a bundle."""
+    return len(encode_field(FieldRecord(field.kind, *field.state()), precision))
 
 
 def numbers_within(limit: int, precision: str) -> int:

@@ -19,15 +19,10 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import tensor_details
 from fusedrf_cli.engine.composition.trimming import truncated
-from fusedrf_cli.engine.distillation.distill import (
-    DistillReport,
-    DistillRun,
-    DistillSettings,
-    Judge,
-    empty_student,
-    resolution_for,
-    student_from,
-)
+from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.distillation.student import empty_student, resolution_for, student_from
 from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
@@ -56,17 +51,18 @@ def fuse_vm(
     With a target the tensor starts small and grows, from what it has learnt, until it reaches it.
     """
     saved = load_checkpoint(output, "fuse") if resume else None
-    judge, student, tried = None, None, []
+    student, tried = None, []
+    progress.phase("measuring", None)
+    judge = Judge(composed, DistillSettings.views, DistillSettings.view_size, asked.seed)
     for settings in sizes(composed, asked):
         begun, start = beginning(loaded, composed, settings, asked, from_scratch, student, progress)
         if saved is not None and asked.target and saved[1].get("numbers") != begun.params.numel():
             continue  # the run that was interrupted had grown further
-        run, made_with = prepared(composed, begun.to(place), settings, asked, start)
+        run, made_with = prepared(composed, begun.to(place), settings, asked, start, judge)
         if saved is not None:
             take_up(run, made_with, output, *saved)
             saved = None
         student, did = finished(run, made_with, output, progress)
-        judge = judge or Judge(composed, settings.views, settings.view_size, settings.seed)
         for precision in precisions(asked):
             reached = judge(stored(student, precision).to(place))
             tried.append((precision, settings.max_numbers, reached))
@@ -101,9 +97,7 @@ def largest(composed: ComposedField, asked: Asked) -> DistillSettings:
     numbers = max(1, int(room / each))
     while needed(composed, shape, numbers, precisions(asked)[-1]) > room:  # small planes are not coded
         numbers = int(SMALLER * numbers)
-    return DistillSettings(
-        shape=shape, max_numbers=numbers, seed=asked.seed, time_budget=asked.time_budget
-    )
+    return DistillSettings(shape=shape, max_numbers=numbers, seed=asked.seed, time_budget=asked.time_budget)
 
 
 def needed(composed: ComposedField, shape: VMShape, numbers: int, precision: str) -> int:
@@ -156,7 +150,12 @@ def beginning(
 
 
 def prepared(
-    composed: ComposedField, student: VMField, settings: DistillSettings, asked: Asked, start: str
+    composed: ComposedField,
+    student: VMField,
+    settings: DistillSettings,
+    asked: Asked,
+    start: str,
+    judge: Judge,
 ) -> tuple[DistillRun, dict]:
     """A run, and what its saved numbers depend on: with other words they would go on to something else."""
     # in an order that does not depend on the nodes', so that equal scenes draw equal rays
@@ -169,7 +168,7 @@ def prepared(
         "seed": settings.seed,
         "boxes": [box.tolist() for box in boxes],
     }
-    return DistillRun(composed, student, boxes, settings, asked.rgb), made_with
+    return DistillRun(composed, student, boxes, settings, asked.rgb, judge=judge), made_with
 
 
 def take_up(run: DistillRun, made_with: dict, output: str, arrays: dict, state: dict) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fusedrf_cli.engine.distillation.distill import DistillSettings
 from fusedrf_cli.engine.distillation.fit import FitSettings, texels
+from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE

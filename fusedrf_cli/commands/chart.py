@@ -22,16 +22,12 @@ class KindsType(click.ParamType):
         return tuple(kind for kind in KINDS if kind in asked)
 
 
-def fuse_words(flags: tuple[str, ...]) -> dict | None:
-    """What `fusedrf fuse` makes of flags, as bridge.fuse takes it; None where this version has no such flag
-    or choice."""
+def fuse_words(flags: tuple[str, ...]) -> dict:
+    """What `fusedrf fuse` makes of flags, as bridge.fuse takes it."""
     from fusedrf_cli.commands.fuse import command as fuse
 
     line = [options.STDIO, "-o", options.STDIO, *flags]
-    try:
-        words = fuse.make_context("fuse", line).params
-    except click.UsageError:
-        return None
+    words = fuse.make_context("fuse", line).params
     return {name: value for name, value in words.items() if name not in NOT_OF_FUSING}
 
 

@@ -20,9 +20,10 @@ from formats.views import View
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.distillation import distill, finish
-from fusedrf_cli.engine.distillation.distill import DistillSettings, Judge
 from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields import vm
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.rendering.cameras import orbit

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fusedrf_cli.engine.distillation.distill import Judge
+from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.fields.base import field_kinds
 from tests.analytic.export import NotExportable
 from tests.bridge.conftest import TinySettings, part

@@ -18,7 +18,8 @@ from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.distill import distill, empty_student
+from fusedrf_cli.engine.distillation.distill import distill
+from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.fields.base import field_kinds
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField

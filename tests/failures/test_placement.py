@@ -15,7 +15,9 @@ from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.detail import block_details, opacity_off
-from fusedrf_cli.engine.distillation.distill import DistillSettings, distill, empty_student
+from fusedrf_cli.engine.distillation.distill import distill
+from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField

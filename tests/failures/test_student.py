@@ -17,7 +17,8 @@ from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of, without
-from fusedrf_cli.engine.distillation.distill import distill, empty_student
+from fusedrf_cli.engine.distillation.distill import distill
+from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.main import cli

@@ -34,7 +34,7 @@ from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
-YIELD = 1 / 3  # by which share, in logarithms, what is finer than the common voxel comes to meet it
+YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way
 DEEPEST = 6  # levels under the coarsest: where voxels differ by more, the widest are finer than needed
 FAINT = 1e-4  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
@@ -45,7 +45,9 @@ CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which
 BLOCKED = 0.05  # transmittance under which nothing is seen
 MOST_TRIED = 1 << 31  # bricks in a placed field's box
 ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has fitted yet
-FULL_ENOUGH = 0.93  # of the numbers allowed
+AIMED, FULL_ENOUGH = 0.98, 0.88  # of the numbers allowed
+FIRST_WIDENING = 2.0  # what is tried first is cheap
+USUAL_SLOPE = -2.7  # of the logarithm of numbers over that of the widening, as seen
 
 
 class TooFewNumbers(ValueError):
@@ -65,22 +67,23 @@ def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> S
 def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tuple[Lattice, list[np.ndarray]]:
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
     own = [p.voxel_size for p in placed_in(teacher)]
-    common, best, tried = 2 * max(own), None, []
+    least = (min(own) / max(own)) ** YIELD  # no voxel is wider than needed then
+    widening, best, tried = max(FIRST_WIDENING, least), None, []
     for attempt in range(MOST_ATTEMPTS):
         if attempt >= ATTEMPTS and best is not None:
             break
-        found = occupied(teacher, common)
+        found = occupied(teacher, widening)
         count = number_count(found[0], shape)
-        tried.append((np.log(common), np.log(count)))
-        if count <= max_numbers and (best is None or common < best[0]):
-            best = common, found
-        if count <= max_numbers and (common <= min(own) or count >= FULL_ENOUGH * max_numbers):
+        tried.append((np.log(widening), np.log(count)))
+        if count <= max_numbers and (best is None or widening < best[0]):
+            best = widening, found
+        if count <= max_numbers and (widening <= least or count >= FULL_ENOUGH * max_numbers):
             break
-        slope = -1.5
+        slope = USUAL_SLOPE
         if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
-            slope = min(-0.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
-        wanted = tried[-1][0] + (np.log(0.97 * max_numbers) - tried[-1][1]) / slope
-        common = float(np.exp(np.clip(wanted, np.log(min(own)), tried[-1][0] + 2)))
+            slope = min(-1.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
+        wanted = tried[-1][0] + (np.log(AIMED * max_numbers) - tried[-1][1]) / slope
+        widening = float(np.exp(np.clip(wanted, np.log(least), tried[-1][0] + 1)))
     if best is None:
         raise TooFewNumbers(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
     return best[1]
@@ -92,16 +95,14 @@ def number_count(lattice: Lattice, shape: SparseShape) -> int:
     return count + (shape.band_numbers * Lattice(lattice.tree, COARSE).free if shape.sh_degree else 0)
 
 
-def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
-    """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels should
-    be no finer than FINER times each placed field's own, nor than a mean of that and a common one.
+def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
+    """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels are
+    FINER times each placed field's own, or as much wider than that as a widening says.
 
-    A mean is what gives the least error for the numbers: one of equal weights for views of the whole, where
-    the squared error grows with the square of the voxel over a field's own; here the own weighs more, since
-    cameras come close to what is small.
+    What is finer than the widest own voxel gives way a little more: by YIELD of the distance, in logarithms.
     """
     own = np.array([p.voxel_size for p in placed_in(teacher)])
-    needs = FINER * own ** (1 - YIELD) * np.maximum(own, common) ** YIELD
+    needs = FINER * np.maximum(own, widening * own ** (1 - YIELD) * own.max() ** YIELD)
     depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
     top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
     box = teacher.occupancy.tight_aabb(0)
@@ -115,10 +116,10 @@ def frame_of(teacher: RadianceField, common: float) -> tuple[np.ndarray, np.ndar
     return lo, sides(top), tuple(counts), [int(level) for level in levels]
 
 
-def occupied(teacher: RadianceField, common: float) -> tuple[Lattice, list[np.ndarray]]:
+def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.ndarray]]:
     """The lattice whose active voxels hold all matter that shows, and σ (V,) and facing (V, 3) of its
     vertices."""
-    lo, top, counts, levels = frame_of(teacher, common)
+    lo, top, counts, levels = frame_of(teacher, widening)
     wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
     for placed, level in zip(placed_in(teacher), levels, strict=True):
         wanted[level].append(demanded(teacher, placed, level, lo, top, counts))

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import reshaped
 from fusedrf_cli.engine.distillation.epochs import Epochs
-from fusedrf_cli.engine.distillation.fit import EARLY_STOP, EMPTY_BELOW, texels
+from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
+from fusedrf_cli.engine.distillation.judging import HeldOut, Judge
 from fusedrf_cli.engine.distillation.losses import (
     DensityLoss,
     Visibility,
@@ -26,53 +25,19 @@ from fusedrf_cli.engine.distillation.losses import (
 )
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
+from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, matter_first, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, harmless_depth
-from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.rendering.cameras import scattered
-from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 
 RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
 RGB_RATE = 0.003
 OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
 COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
-COARSE_FROM = 64  # texels along a student's longest axis from which it starts at half of them
 RAYS_AT_FIRST = 1024
-HELD_OUT = 1 << 12  # rays whose PSNR is the learning curve
-HELD_OUT_SEED = 9_000_001
-LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
-WHITE = np.ones(3)
-JUDGED_SEED = 7_000_001  # views the student is judged on are drawn from a stream of their own
-
-
-@dataclass(frozen=True)
-class DistillSettings:
-    """What a distillation is asked for."""
-
-    shape: VMShape = VMShape(16, 24, 2)
-    max_numbers: int = 12_000_000
-    """Numbers the student may have; its resolution follows."""
-    rays: int = 400_000
-    steps: int = 1000
-    rgb_steps: int = 600
-    rgb_samples: int = 1 << 15
-    time_budget: float | None = None
-    """Seconds of learning, half for points and half for rays where there is an RGB phase. None: the steps
-    decide, and equal seeds give equal bytes.
-    """
-    seed: int = 0
-    views: int = 4
-    view_size: int = 160
-
-
-def starts_coarse(student: RadianceField) -> bool:
-    """Whether a student is one VM tensor large enough to have half its resolution first."""
-    single = type(student) is VMField and len(student.blocks) == 1
-    return single and max(student.tensors[0].resolution) >= COARSE_FROM
 
 
 @dataclass(frozen=True)
@@ -110,113 +75,6 @@ class DistillReport:
     """Steps skipped and returns to a good state, where there were any (guard.py)."""
 
 
-class Judge:
-    """PSNR of a student against its teacher on seeded views that nothing was trained on."""
-
-    def __init__(self, teacher: RadianceField, views: int, size: int, seed: int):
-        box = teacher.occupancy.tight_aabb(0)
-        self.cameras = scattered(box, views, size, size, seed=JUDGED_SEED + seed)
-        self.truth = [render_image(teacher, c).over(WHITE) for c in self.cameras]
-
-    def __call__(self, student: RadianceField) -> float:
-        """PSNR in dB of all pixels of all views together, over white."""
-        return psnr(
-            np.stack([render_image(student, c).over(WHITE) for c in self.cameras]), np.stack(self.truth)
-        )
-
-
-class HeldOut:
-    """PSNR of a student on a few rays that nothing is trained on: quick to ask, for curves and schedules."""
-
-    def __init__(self, teacher: RadianceField, boxes: list[np.ndarray], step: float, seed: int):
-        generator = torch.Generator().manual_seed(HELD_OUT_SEED + seed)
-        self.rays, self.step = random_rays(boxes, HELD_OUT, generator), step
-        self.truth = over_white(ask(teacher, *self.rays, step, generator).pixels.numpy())
-
-    def __call__(self, student: RadianceField) -> float:
-        """PSNR in dB of all rays together, over white."""
-        return psnr(over_white(render_rays(student, *self.rays, step=self.step)), self.truth)
-
-
-def over_white(pixels: np.ndarray) -> np.ndarray:
-    """(N, 3) of pixels (N, 4 or more): rgb premultiplied by opacity, opacity."""
-    return pixels[:, :3] + 1 - pixels[:, 3:4]
-
-
-def resolution_for(aabb: np.ndarray, finest: float, shape: VMShape, max_numbers: int) -> tuple[int, int, int]:
-    """Texels per axis: voxels no finer than the teachers' own, and no more numbers than allowed."""
-    longest = int(np.ceil((aabb[3:] - aabb[:3]).max() / finest)) + 1
-    while longest > 16 and shape.size(texels(aabb, longest)) > max_numbers:
-        longest -= max(1, longest // 100)
-    return texels(aabb, longest)
-
-
-def empty_student(
-    teacher: RadianceField, settings: DistillSettings, generator: torch.Generator, name: str
-) -> VMField:
-    """An untrained student over the teacher's box, whose occupancy is the teacher's."""
-    box = teacher.occupancy.aabb
-    resolution = resolution_for(box, teacher.voxel_size, settings.shape, settings.max_numbers)
-    student = VMField.create(box, resolution, settings.shape, generator, name)
-    return student.with_occupancy(teacher.occupancy)
-
-
-def student_from(
-    background: Placed, teacher: RadianceField, settings: DistillSettings, generator: torch.Generator
-) -> VMField | None:
-    """A student over the teacher's box that starts as the background (FusedRF §3), or None where that cannot
-    be taken over.
-
-    A VM decomposition follows its axes, so the background must be placed upright: moved and uniformly scaled
-    only.
-    """
-    linear = background.object_to_world[:3, :3]
-    scale = linear[0, 0]
-    if type(background.field) is not VMField or len(background.field.blocks) != 1 or scale <= 0:
-        return None
-    if not np.allclose(linear, scale * np.eye(3), atol=1e-9 * scale):
-        return None
-    source = background.field.tensors[0]
-    placed_box = source.aabb * scale + np.tile(background.object_to_world[:3, 3], 2)
-    tensor = VMTensor(source.resolution, placed_box, source.scale / scale, source.shift)
-    moved = VMField(
-        background.field.shape,
-        (tensor,),
-        (Block(0, np.eye(4), "fused"),),
-        background.field.params,
-        OccupancyGrid.full(placed_box),
-    )
-    shape = VMShape(
-        *(max(a, b) for a, b in zip(vars(moved.shape).values(), vars(settings.shape).values(), strict=True))
-    )
-    box = teacher.occupancy.aabb
-    resolution = resolution_for(box, teacher.voxel_size, shape, settings.max_numbers)
-    student = reshaped(moved, shape).resampled(box, resolution).with_occupancy(teacher.occupancy)
-    wake(student, generator)
-    return student
-
-
-def halved(student: VMField) -> VMField:
-    """A one-block student at half its resolution, over the same occupancy."""
-    resolution = tuple((n + 1) // 2 for n in student.tensors[0].resolution)
-    return student.resampled(student.tensors[0].aabb, resolution).with_occupancy(student.occupancy)
-
-
-def resampled_like(student: VMField, other: VMField) -> VMField:
-    """A one-block student's numbers at the resolution of another over the same box."""
-    tensor = other.tensors[0]
-    return student.resampled(tensor.aabb, tensor.resolution).with_occupancy(student.occupancy)
-
-
-def wake(student: VMField, generator: torch.Generator) -> None:
-    """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for
-    ever.
-    """
-    for name, section in student.sections(0).items():
-        if name != "colour_basis":
-            section += 0.03 * torch.randn(section.shape, generator=generator)
-
-
 def distill(
     teacher: RadianceField,
     student: VMField,
@@ -248,16 +106,19 @@ class DistillRun:
         settings: DistillSettings,
         rgb: bool = True,
         recipe: Recipe = DEFAULT_RECIPE,
+        judge: Judge | None = None,
     ):
-        """The arguments are those of `distill`; the recipe is for measuring what its parts are worth."""
-        self.teacher, self.boxes, self.rgb = teacher, boxes, rgb
+        """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge
+        of the same teacher and settings is taken where there is one.
+        """
+        self.teacher, self.boxes, self.rgb, self.judge = teacher, boxes, rgb, judge
         self.settings, self.recipe, self.step = settings, recipe, 0.5 * student.voxel_size
         coarse = settings.steps > 0 and recipe.coarse(student)
         self.student, self.refined = (halved(student), student) if coarse else (student, None)
         """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
         self.report = DistillReport()
-        self.optimiser = Adam.of(student)
+        self.optimiser = Adam.of(self.student)
         self.guard = Guard(lambda: self.optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.schedule = recipe.schedule()
@@ -280,7 +141,7 @@ class DistillRun:
         clock = _Clock(report.seconds)
         phase("asking the teachers")
         self.generator.manual_seed(settings.seed + 1)
-        judge = Judge(self.teacher, settings.views, settings.view_size, settings.seed)
+        judge = self.judge or Judge(self.teacher, settings.views, settings.view_size, settings.seed)
         rays_o, rays_d = random_rays(self.boxes, settings.rays, self.generator)
         pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)
         held_out = HeldOut(self.teacher, self.boxes, self.step, settings.seed)
@@ -472,19 +333,3 @@ class RayPass:
         wanted = run.settings.rgb_samples * len(chosen) / max(sums[2], 1)
         run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))
         return sums, {"psnr": float(-10 * np.log10(max(sums[0] / len(chosen), 1e-10)))}
-
-
-def pruned(student: VMField) -> OccupancyGrid:
-    """The student's occupancy without the cells in which it turned out to hold nothing."""
-    grid = student.occupancy
-    cells = np.argwhere(grid.occupied)
-
-    sigma = np.zeros(len(cells), np.float32)
-    student.loops.density_at_cells(
-        student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma
-    )
-    depth = np.zeros(grid.occupied.shape, np.float32)
-    depth[tuple(cells.T)] = sigma * grid.cell.min()
-    occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)
-    kept = OccupancyGrid(grid.aabb, occupied).dilated().occupied & grid.occupied
-    return OccupancyGrid(grid.aabb, kept)

@@ -210,6 +210,25 @@ def accumulate(out, i, value):
 
 
 @body
+def compared(red, green, blue, trans, target, background, opacity_weight, i, count, loss):
+    """Gradients of the loss of `train_rays` (cpu.py) in ray i's colour and in the transmittance behind it;
+    its colour error, opacity error and samples are added to `loss`.
+    """
+    e_r = red + trans * background[i, 0] - target[i, 0]
+    e_g = green + trans * background[i, 1] - target[i, 1]
+    e_b = blue + trans * background[i, 2] - target[i, 2]
+    e_a = (1.0 - trans) - target[i, 3]
+    accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
+    accumulate(loss, 1, e_a * e_a)
+    accumulate(loss, 2, count)
+    n = target.shape[0]
+    scale = 2.0 / (3.0 * n)
+    g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
+    behind = g_r * background[i, 0] + g_g * background[i, 1] + g_b * background[i, 2]
+    return g_r, g_g, g_b, behind - 2.0 / n * opacity_weight * e_a
+
+
+@body
 def add_scaled_8(out, o, weight, values, v):
     """out[o : o + 8] += weight * values[v : v + 8].
 

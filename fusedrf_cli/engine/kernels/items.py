@@ -13,11 +13,11 @@ import numpy as np
 
 from fusedrf_cli.engine.kernels.bodies import (
     COLOUR_FROM,
-    accumulate,
     add_scaled,
     block_density,
     body,
     colour_features,
+    compared,
     directional_basis,
     dot_row,
     hit_box,
@@ -213,21 +213,8 @@ def train_ray(
         count += 1
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k + steps)
 
-    e_r = red + trans * background[i, 0] - target[i, 0]
-    e_g = green + trans * background[i, 1] - target[i, 1]
-    e_b = blue + trans * background[i, 2] - target[i, 2]
-    e_a = (1.0 - trans) - target[i, 3]
-    accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
-    accumulate(loss, 1, e_a * e_a)
-    accumulate(loss, 2, count)
-    n = rays_o.shape[0]
-    scale = 2.0 / (3.0 * n)
-    g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
-    g_t = (
-        g_r * background[i, 0]
-        + g_g * background[i, 1]
-        + g_b * background[i, 2]
-        - 2.0 / n * opacity_weight * e_a
+    g_r, g_g, g_b, g_t = compared(
+        red, green, blue, trans, target, background, opacity_weight, i, count, loss
     )
     if count > 0:
         train_ray_backward(

@@ -25,6 +25,7 @@ from fusedrf_cli.engine.kernels.bodies import (
     accumulate,
     add_scaled,
     body,
+    compared,
     exit_distance,
     hit_box,
     next_sample,
@@ -420,22 +421,10 @@ def train_sparse_ray(
             k = next_in_brick(sparse, level, x, y, z, dx, dy, dz, t, t0, step, k, steps)
         k = next_sample(grid, ox, oy, oz, dx, dy, dz, t0, t1, step, k)
 
-    e_r = red + trans * background[i, 0] - target[i, 0]
-    e_g = green + trans * background[i, 1] - target[i, 1]
-    e_b = blue + trans * background[i, 2] - target[i, 2]
-    e_a = (1.0 - trans) - target[i, 3]
-    accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
-    accumulate(loss, 1, e_a * e_a)
-    accumulate(loss, 2, count)
-    n = rays_o.shape[0]
-    scale = 2.0 / (3.0 * n)
-    g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
-    behind = trans * (
-        g_r * background[i, 0]
-        + g_g * background[i, 1]
-        + g_b * background[i, 2]
-        - 2.0 / n * opacity_weight * e_a
+    g_r, g_g, g_b, g_t = compared(
+        red, green, blue, trans, target, background, opacity_weight, i, count, loss
     )
+    behind = trans * g_t
     after = trans
     own = 0.0
     for q in range(count - 1, -1, -1):

@@ -145,7 +145,7 @@ def test_leaves_hold_every_wanted_brick_once(rng):
 
 def test_levels_stay_within_what_a_tree_can_be():
     tiny = ComposedField([placed(ball(), 1e-3), placed(ball(), 3.0)])
-    _, top, counts, levels = frame_of(tiny, 1e-9)
+    _, top, counts, levels = frame_of(tiny, 1e-6)
     assert max(levels) <= MAX_LEVEL and np.prod(counts) <= 1 << 20 and (top > 0).all()
 
 

@@ -12,17 +12,11 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
-from fusedrf_cli.engine.distillation.distill import (
-    DistillRun,
-    DistillSettings,
-    Judge,
-    distill,
-    empty_student,
-    pruned,
-    resolution_for,
-    student_from,
-)
+from fusedrf_cli.engine.distillation.distill import DistillRun, distill
 from fusedrf_cli.engine.distillation.fit import texels
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.distillation.student import empty_student, pruned, resolution_for, student_from
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
@@ -141,7 +135,7 @@ def test_a_student_that_holds_nothing_yet_keeps_its_cells(monkeypatch):
 def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
     """Stopped before the first step, in the points (20 steps, of which the first six may be coarse), in the
     pictures (10) and after the last; the schedule looks every fourth step."""
-    monkeypatch.setattr(module, "COARSE_FROM", coarse_from)
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", coarse_from)
     monkeypatch.setattr(module, "LOOK_EVERY", 4)
     brief = replace(SETTINGS, rays=1000, steps=20, rgb_steps=10)
     straight, told = taught(brief)
@@ -192,7 +186,7 @@ def test_the_curve_rises_and_is_of_rays_of_its_own(monkeypatch):
 
 def test_pictures_alone_go_on_from_the_student_that_is_there(monkeypatch):
     """Without steps on points a student keeps what it knows, and its resolution, until the pictures."""
-    monkeypatch.setattr(module, "COARSE_FROM", 16)
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", 16)
     known = taught(SETTINGS, rgb=False)[0]
     start = known.params.clone()
     settings = replace(SETTINGS, steps=0, rgb_steps=0)
@@ -219,11 +213,19 @@ def test_several_blocks_are_finished_on_pictures():
 def test_half_the_resolution_first_ends_at_all_of_it(monkeypatch):
     """What comes out has the resolution that was asked, and is no worse."""
     straight, told = taught(SETTINGS, rgb=False)
-    monkeypatch.setattr(module, "COARSE_FROM", 16)
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", 16)
     student, report = taught(SETTINGS, rgb=False)
     assert student.tensors[0].resolution == straight.tensors[0].resolution
     assert student.params.shape == straight.params.shape
     assert report.psnr_before_rgb > told.psnr_before_rgb - 0.5
+
+
+def test_the_coarse_student_learns_too(monkeypatch):
+    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", 16)
+    monkeypatch.setattr(module, "LOOK_EVERY", 1)
+    brief = replace(SETTINGS, rays=2000, steps=60)
+    curve = [psnr for _, _, psnr in taught(brief, rgb=False)[1].curve]
+    assert curve[16] > curve[0] + 3  # of the 18 steps that are made at half the resolution
 
 
 def a_run(settings: DistillSettings) -> module.DistillRun:

@@ -3,11 +3,6 @@
 The simulator runs the bodies as plain Python, so the cases are few and small.
 """
 
-import os
-import subprocess
-import sys
-
-import numba
 import numpy as np
 import pytest
 import torch
@@ -19,25 +14,24 @@ from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, tile_order
 from fusedrf_cli.engine.rendering.volume import render_image
 from tests.engine.conftest import BOX, SIXTY_FOUR, points_in, random_vm, rays_at, unit
+from tests.engine.kernels.simulated import (
+    EXACT,
+    HERE,
+    SIMULATED,
+    beside_the_simulator,
+    both,
+    on_a_device,
+    run_simulated,
+)
 from tests.engine.kernels.test_cpu import two_blocks
 
-SIMULATED = bool(numba.config.ENABLE_CUDASIM)
-on_a_device = pytest.mark.skipif(
-    not SIMULATED and not torch.cuda.is_available(), reason="needs a GPU, or the simulator's own process"
-)
-if SIMULATED or torch.cuda.is_available():
+if HERE:
     from fusedrf_cli.engine.kernels import cuda
-EXACT = dict(rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.skipif(SIMULATED, reason="this is the simulator's process")
+@beside_the_simulator
 def test_the_simulator_agrees():
-    """All cases below once more, in a process of their own where numba simulates the GPU."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__]
-    done = subprocess.run(
-        command, env=os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}, capture_output=True, text=True
-    )
-    assert done.returncode == 0 and " passed" in done.stdout and "1 skipped" in done.stdout, done.stdout
+    run_simulated(__file__)
 
 
 def fields():
@@ -46,14 +40,9 @@ def fields():
     return [random_vm(cells=3), two_blocks(turned)]
 
 
-def both(name: str, field, inputs: tuple, outputs: tuple[tuple[int, ...], ...]):
-    """What the CPU's and the GPU's function of a name leave in zeroed outputs of the given shapes."""
-    found = []
-    for loops in (cpu, cuda):
-        arrays = [np.zeros(shape) for shape in outputs]
-        getattr(loops, name)(*field.kernel_shape, field.arrays, field.grid, *inputs, *arrays)
-        found.append(arrays)
-    return zip(*found, strict=True)
+def both_of(name: str, field, inputs: tuple, outputs: tuple[tuple[int, ...], ...]):
+    """`both` of a function that reads a VM field."""
+    return both((cpu, cuda), name, (*field.kernel_shape, field.arrays, field.grid, *inputs), outputs)
 
 
 @on_a_device
@@ -63,12 +52,12 @@ def test_query_and_its_gradient(case, count):
     field = fields()[case]
     points = points_in(field.aabb, count, margin=0.1)
     dirs = unit(np.random.default_rng(1).normal(size=(count, 3)))
-    for wanted, found in both("query", field, (points, dirs, True), ((count,), (count, 3))):
+    for wanted, found in both_of("query", field, (points, dirs, True), ((count,), (count, 3))):
         np.testing.assert_allclose(found, wanted, **EXACT)
         assert count < 2 or wanted.any()
     d_sigma, d_rgb = np.linspace(-1, 1, count), np.linspace(1, -1, 3 * count).reshape(count, 3)
     size = field.params.numel()
-    for wanted, found in both("query_backward", field, (points, dirs, d_sigma, d_rgb), ((1, size),)):
+    for wanted, found in both_of("query_backward", field, (points, dirs, d_sigma, d_rgb), ((1, size),)):
         np.testing.assert_allclose(found, wanted, **EXACT)
 
 
@@ -79,7 +68,7 @@ def test_render(case):
     rays_o, rays_d = rays_at(field.aabb, 4)
     rays_d[0] = [0.0, 0.0, -1.0]  # along an axis
     inputs = rays_o, rays_d, 0.0, 0.2, 1e-3
-    for wanted, found in both("render", field, inputs, ((4, 5),)):
+    for wanted, found in both_of("render", field, inputs, ((4, 5),)):
         np.testing.assert_allclose(found, wanted, **EXACT)
         assert wanted[:, 3].max() > 0.1
 
@@ -95,7 +84,7 @@ def test_train_rays(case, monkeypatch):
     target, background = rng.random((n, 4)), rng.random((n, 3))
     inputs = rays_o, rays_d, 0.0, rng.random(n), 0.4, 1e-3, target, background, 0.3, 40
     monkeypatch.setattr(cuda, "RAYS_IN_FLIGHT", 2)
-    for wanted, found in both("train_rays", field, inputs, ((1, field.params.numel()), (1, 3))):
+    for wanted, found in both_of("train_rays", field, inputs, ((1, field.params.numel()), (1, 3))):
         np.testing.assert_allclose(found, wanted, **EXACT)
     assert wanted[0, 2] > n  # samples
 

@@ -1,45 +1,27 @@
 """The sparse field's CUDA loops against the CPU's, as test_cuda.py has it: always in numba's simulator."""
 
-import os
-import subprocess
-import sys
-
-import numba
 import numpy as np
 import pytest
-import torch
 
 from fusedrf_cli.engine.kernels import sparse_cpu
 from tests.analytic.rays import points_in, rays_at, unit
 from tests.engine.fields.sparse_cases import random_sparse
-
-SIMULATED = bool(numba.config.ENABLE_CUDASIM)
-on_a_device = pytest.mark.skipif(
-    not SIMULATED and not torch.cuda.is_available(), reason="needs a GPU, or the simulator's own process"
+from tests.engine.kernels.simulated import (
+    EXACT,
+    HERE,
+    beside_the_simulator,
+    both,
+    on_a_device,
+    run_simulated,
 )
-if SIMULATED or torch.cuda.is_available():
+
+if HERE:
     from fusedrf_cli.engine.kernels import sparse_cuda
-EXACT = dict(rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.skipif(SIMULATED, reason="this is the simulator's process")
+@beside_the_simulator
 def test_the_simulator_agrees():
-    """All cases below once more, in a process of their own where numba simulates the GPU."""
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__]
-    done = subprocess.run(
-        command, env=os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}, capture_output=True, text=True
-    )
-    assert done.returncode == 0 and " passed" in done.stdout and "1 skipped" in done.stdout, done.stdout
-
-
-def both(name: str, inputs: tuple, outputs: tuple[tuple[int, ...], ...]):
-    """What the CPU's and the GPU's function of a name leave in zeroed outputs of the given shapes."""
-    found = []
-    for loops in (sparse_cpu, sparse_cuda):
-        arrays = [np.zeros(shape) for shape in outputs]
-        getattr(loops, name)(*inputs, *arrays)
-        found.append(arrays)
-    return zip(*found, strict=True)
+    run_simulated(__file__)
 
 
 @on_a_device
@@ -50,11 +32,13 @@ def test_query_and_its_gradient(degree, count):
     points = points_in(field.aabb, count, margin=0.1)
     dirs = unit(np.random.default_rng(1).normal(size=(count, 3)))
     read = *field.kernel_shape, field.arrays, points, dirs
-    for wanted, found in both("query", (*read, True), ((count,), (count, 3))):
+    for wanted, found in both((sparse_cpu, sparse_cuda), "query", (*read, True), ((count,), (count, 3))):
         np.testing.assert_allclose(found, wanted, **EXACT)
         assert count < 2 or wanted.any()
     d_sigma, d_rgb = np.linspace(-1, 1, count), np.linspace(1, -1, 3 * count).reshape(count, 3)
-    for wanted, found in both("query_backward", (*read, d_sigma, d_rgb), ((1, field.size),)):
+    for wanted, found in both(
+        (sparse_cpu, sparse_cuda), "query_backward", (*read, d_sigma, d_rgb), ((1, field.size),)
+    ):
         np.testing.assert_allclose(found, wanted, **EXACT)
 
 
@@ -65,7 +49,7 @@ def test_render(degree):
     rays_o, rays_d = rays_at(field.aabb, 4)
     rays_d[0] = [0.0, 0.0, -1.0]  # along an axis
     inputs = *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, 0.0, 0.05, 1e-3
-    for wanted, found in both("render", inputs, ((4, 5),)):
+    for wanted, found in both((sparse_cpu, sparse_cuda), "render", inputs, ((4, 5),)):
         np.testing.assert_allclose(found, wanted, **EXACT)
         assert wanted[:, 3].max() > 0.1
 
@@ -82,7 +66,7 @@ def test_train_rays(monkeypatch):
         background, 0.3, 200,
     )  # fmt: skip
     monkeypatch.setattr(sparse_cuda, "RAYS_IN_FLIGHT", 2)
-    for wanted, found in both("train_rays", inputs, ((1, field.size), (1, 3))):
+    for wanted, found in both((sparse_cpu, sparse_cuda), "train_rays", inputs, ((1, field.size), (1, 3))):
         np.testing.assert_allclose(found, wanted, **EXACT)
     assert wanted[0, 2] > n  # samples
 
@@ -92,7 +76,7 @@ def test_expose():
     field = random_sparse(0, depth=1)
     low, high = (field.fine.places[field.fine.corners[:12, q]] for q in (0, 7))
     inputs = field.arrays, (low + high) / 2, (high - low).min(1), np.eye(3), 3.0, 0.01
-    for wanted, found in both("expose", inputs, ((12,), (12, 3))):
+    for wanted, found in both((sparse_cpu, sparse_cuda), "expose", inputs, ((12,), (12, 3))):
         np.testing.assert_allclose(found, wanted, **EXACT)
         assert wanted.any()
 
