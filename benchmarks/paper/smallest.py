@@ -7,7 +7,7 @@ from benchmarks.paper.work import Work, course, fusedrf, tell, write_csv
 from fusedrf_cli.report import readable_size
 
 WANTED = 40.0  # dB
-BUDGET = 60
+BUDGET = 600
 SIZE = 400
 
 

@@ -19,8 +19,8 @@ from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.volume import render_image
 
 WANTED = 37.0  # dB
-FUSING = (10, 30)  # seconds of learning
-TRAINING = (20, 70)
+FUSING = (5, 15, 45)  # seconds of learning
+TRAINING = (10, 30, 90, 240)
 VIEWS, SIZE, SEED = 60, 300, 31  # of the pictures that retraining learns from
 COMPARED = 400
 DISTILLED = {"background": (), "scratch": ("--from-scratch", "--no-rgb")}

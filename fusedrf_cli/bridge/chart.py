@@ -5,7 +5,7 @@ import csv
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
@@ -36,6 +36,7 @@ PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
 COSTS = ("seconds", "bytes", "ms")
 NOISE = 0.05
 BEHIND = 0.5  # dB
+LAGGING = 3  # how many times longer a group waits that is behind others
 NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
 
 
@@ -226,14 +227,12 @@ class Climber:
             return True
         return False
 
-    def behind(self, others: list["Climber"]) -> bool:
-        """Whether its last point is well surpassed by another ladder's with no more bytes. It may overtake at
+    def behind(self, found: Iterable[Point]) -> bool:
+        """Whether its last point is well surpassed by another one with no more bytes. It may overtake at
         smaller sizes, so that it only waits.
         """
-        if not self.points:
-            return False
-        last, found = self.points[-1], [p for other in others for p in other.points]
-        return any(p.bytes <= last.bytes and p.psnr >= last.psnr + BEHIND for p in found)
+        last = self.points[-1] if self.points else None
+        return last is not None and any(p.bytes <= last.bytes and p.psnr >= last.psnr + BEHIND for p in found)
 
 
 class Charting:
@@ -249,8 +248,9 @@ class Charting:
 
     def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
         """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
-        next comes the group that has had the least time, and of its ladders one that is not behind, with the
-        fewest rungs. Returns how many ladders were left off.
+        next comes the group that has had the least time, of which one counts for LAGGING where other groups
+        surpass all of it, and of its ladders one that is not behind, with the fewest rungs. Returns how many
+        ladders were left off.
         """
         climbers = {
             (kind, name): [Climber(ladder, next(ladder)) for ladder in found]
@@ -260,8 +260,14 @@ class Charting:
         started, spent = time.monotonic(), dict.fromkeys(climbers, 0.0)
         while any(climbers.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
-            group = min((g for g in climbers if climbers[g]), key=spent.get)
-            climber = min(climbers[group], key=lambda c: (c.behind(climbers[group]), len(c.points)))
+            due = {
+                g: LAGGING * spent[g] if self.lags(found) else spent[g]
+                for g, found in climbers.items()
+                if found
+            }
+            group = min(due, key=due.get)
+            own = [p for c in climbers[group] for p in c.points]
+            climber = min(climbers[group], key=lambda c: (c.behind(own), len(c.points)))
             point = self.try_flags(group, climber.flags)
             if not climber.climb(point):
                 climbers[group].remove(climber)
@@ -270,6 +276,10 @@ class Charting:
         if not self.points:
             raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
         return sum(map(len, climbers.values()))
+
+    def lags(self, climbers: list[Climber]) -> bool:
+        """Whether every ladder of a group is behind the points that there are."""
+        return all(climber.behind(self.points) for climber in climbers)
 
     def try_flags(self, group: tuple[str, str], flags: Flags) -> Point | None:
         """The point of some flags, or None and a warning where the scene cannot be fused so; group is the

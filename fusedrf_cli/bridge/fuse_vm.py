@@ -28,6 +28,7 @@ from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.errors import InvalidInput
 
+RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
 RECKONED_RAYS = 2000  # of which the number of points is reckoned
 SMALLER = 0.98  # steps in which a size is looked for that fits
 GROWTH = 2  # of the numbers, from one size to the next
@@ -97,7 +98,12 @@ def largest(composed: ComposedField, asked: Asked) -> DistillSettings:
     numbers = max(1, int(room / each))
     while needed(composed, shape, numbers, precisions(asked)[-1]) > room:  # small planes are not coded
         numbers = int(SMALLER * numbers)
-    return DistillSettings(shape=shape, max_numbers=numbers, seed=asked.seed, time_budget=asked.time_budget)
+    settings = DistillSettings(
+        shape=shape, max_numbers=numbers, seed=asked.seed, time_budget=asked.time_budget
+    )
+    if asked.time_budget is not None:  # more than there is time to learn from need not be asked
+        settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * asked.time_budget) + 1))
+    return settings
 
 
 def needed(composed: ComposedField, shape: VMShape, numbers: int, precision: str) -> int:

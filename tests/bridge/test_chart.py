@@ -149,9 +149,12 @@ def test_times_within_the_noise_are_equal():
 # --- the order of work --------------------------------------------------------------------------------------
 
 
-def climbing(monkeypatch, seconds: dict[str, float], refused: dict[str, Exception]):
+def climbing(
+    monkeypatch, seconds: dict[str, float], refused: dict[str, Exception], sizes: dict[str, int] | None = None
+):
     """(what Charting.climb left, its points, its warnings) where a fuse of a kind takes so many seconds of a
-    clock of its own, or is refused; the PSNR falls by 5 dB per rung."""
+    clock of its own, or is refused; from one to the next the PSNR falls by 5 dB, and the bytes by a tenth of
+    those of the kind, a million by default."""
     module, clock, heard = part("chart"), [0.0], NullProgress()
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     course = SimpleNamespace(scene="scene.json", quality=lambda path: (50.0 - 5 * len(run.points), 1.0))
@@ -163,7 +166,8 @@ def climbing(monkeypatch, seconds: dict[str, float], refused: dict[str, Exceptio
         clock[0] += seconds[kind] / 2  # the first of a kind is done twice
         if kind in refused:
             raise refused[kind]
-        return {"bytes": 1_000_000, "total_seconds": seconds[kind]}
+        size = (sizes or {}).get(kind, 1_000_000) * 0.9 ** len(run.points)
+        return {"bytes": int(size), "total_seconds": seconds[kind]}
 
     monkeypatch.setattr(module, "fuse", fuse)
     waiting = {k: {k: [shrinking(("--kind", k), 0)]} for k in seconds}
@@ -176,16 +180,24 @@ def test_the_kind_that_had_least_time_is_next(monkeypatch):
     assert left == 2
 
 
+def test_a_kind_that_others_surpass_gets_a_third_of_the_time(monkeypatch):
+    sizes = {"blocks": 1_000_000, "vm": 9_000_000}
+    _, points, _ = climbing(monkeypatch, {"blocks": 2.0, "vm": 2.0}, {}, sizes)(14.5)
+    assert "".join(p.kind[0] for p in points) == "bvbbbbbvbbbv"
+
+
 def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
     """The second one's first rung shows 2 dB less than the other in more bytes, its next ones are as good."""
     chart = part("chart")
     ahead, slow = chart.Climber(shrinking(("a",), 30), ("a",)), chart.Climber(shrinking(("b",), 30), ("b",))
     for climber, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
         climber.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
-    assert slow.behind([ahead, slow]) and not ahead.behind([ahead, slow])
+    found = [*ahead.points, *slow.points]
+    assert slow.behind(found) and not ahead.behind(found)
     slow.points.append(point(psnr=46.9, bytes=6, seconds=1.0))
-    assert not slow.behind([ahead, slow])
-    assert not chart.Climber(shrinking((), 30), ()).behind([ahead, slow])
+    found = [*ahead.points, *slow.points]
+    assert not slow.behind(found)
+    assert not chart.Climber(shrinking((), 30), ()).behind(found)
 
 
 def test_a_kind_that_does_not_fit_leaves_the_others(monkeypatch):
