@@ -47,6 +47,8 @@ class Variant:
     recipe: Recipe = Recipe()
     from_scratch: bool = False
     rgb: bool = True
+    rays: float = 1.0
+    """The share of the rays that are asked."""
     seed: int = 0
 
 
@@ -102,6 +104,8 @@ VARIANTS = (
     *(Variant(f"nothing, seed {seed}", seed=seed) for seed in range(5)),
     Variant("the pictures", rgb=False),
     Variant("the background's weights", from_scratch=True),
+    Variant("the rays: half of them", rays=0.5),
+    Variant("the rays: a quarter", rays=0.25),
     Variant("points where matter is seen: evenly instead", replace(WHOLE, chance=evenly)),
     Variant("points by transmittance: all alike", replace(WHOLE, visibility=all_alike)),
     Variant("log1p of depth: raw depth", replace(WHOLE, density_loss=raw_depth)),
@@ -157,7 +161,8 @@ class Task:
 
     def distilled(self, variant: Variant) -> DistillReport:
         """What distilling by a variant's recipe gives."""
-        settings = replace(self.settings, seed=variant.seed)
+        rays = round(variant.rays * self.settings.rays)
+        settings = replace(self.settings, seed=variant.seed, rays=rays)
         generator, student = torch.Generator().manual_seed(settings.seed), None
         if not variant.from_scratch:
             student = student_from(self.background, self.composed, settings, generator)
