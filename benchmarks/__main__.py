@@ -22,8 +22,8 @@ from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
 from fusedrf_cli.engine.distillation.teacher import Points
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import VMField, VMShape
 from fusedrf_cli.engine.kernels import cpu, reference
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image
 

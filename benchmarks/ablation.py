@@ -27,7 +27,7 @@ from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
 from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import empty_student, student_from
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kinds.vm.field import VMField
 
 BESIDES = 16384  # bytes of a bundle that are no numbers, about
 TRAINED = ("--quality", "draft", "--views", "40", "--size", "200", "--max-size", "4MB")

@@ -36,9 +36,9 @@ from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
-from fusedrf_cli.engine.fields.sparse import SparseField
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import Block, VMField
+from fusedrf_cli.engine.kinds.sparse.field import SparseField
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField
 from fusedrf_cli.errors import InvalidInput
 
 REGION_SETTINGS = DistillSettings(

@@ -12,7 +12,7 @@ from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import LoadedScene, history_nodes, load_scene, write_field
 from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.fields.base import holds_matter
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.errors import InvalidInput, QualityNotReached
 
 DEFAULT_MAX_SIZE = 25_000_000

@@ -32,8 +32,8 @@ from fusedrf_cli.engine.distillation.finish import RAYS, RayLesson
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import working_time
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape, VMTensor
 
 # Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md).
 RANKS = ((8, 16), (8, 24), None)

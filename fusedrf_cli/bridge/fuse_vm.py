@@ -25,7 +25,7 @@ from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import empty_student, resolution_for, student_from
 from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.errors import InvalidInput
 
 RAYS_PER_SECOND = 40_000  # that are asked for each second of learning

@@ -16,7 +16,7 @@ import numpy as np
 from fusedrf_cli.engine.distillation.fit import FitSettings, texels
 from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
-from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
+from fusedrf_cli.engine.kinds.vm.field import OWNERSHIP_CELLS
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
 from fusedrf_cli.errors import ResourceProblem
 from fusedrf_cli.report import readable_size

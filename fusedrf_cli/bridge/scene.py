@@ -18,10 +18,10 @@ from fusedrf_cli.bridge.memory import READING, Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.base import field_kinds
-from fusedrf_cli.engine.fields.sparse import PER_BRICK, SparseField
 from fusedrf_cli.engine.fields.streamed import StreamedField
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.errors import InvalidInput
 
 STDIN_LIMIT = 4 << 20

@@ -9,7 +9,7 @@ from formats.quantised import BLOCKS, code_bytes, is_coded
 from formats.records import BITS, coded_bytes
 from formats.scene import SceneGraph, dump_scene, make_node
 from fusedrf_cli.engine.composition.trimming import read_texels
-from fusedrf_cli.engine.fields.vm import VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import VMShape, VMTensor
 
 HEADER = 512  # of a field: its metadata but for tensors and blocks
 HEADER_PER_TENSOR = 2000  # its shape, and 14 arrays' names and offsets

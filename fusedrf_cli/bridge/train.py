@@ -16,7 +16,7 @@ from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, texels
-from fusedrf_cli.engine.fields.vm import VMShape
+from fusedrf_cli.engine.kinds.vm.field import VMShape
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image

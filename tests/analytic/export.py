@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.fields.vm_mlp import FEATURE_DEGREE, ColourNetwork, VMMLPField
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, ColourNetwork, VMMLPField
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
 
 SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's tests too

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.base import field_kinds
+from fusedrf_cli.engine.kinds.registry import field_kinds
 from tests.analytic import scenes
 from tests.analytic.export import EXPORTERS, NotExportable, exported
 from tests.analytic.fields import Ball, Box, Gaussian, Slab, Tint

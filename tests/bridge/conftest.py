@@ -24,8 +24,8 @@ from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.settings import DistillSettings
-from fusedrf_cli.engine.fields import vm
-from fusedrf_cli.engine.fields.vm import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm import field as vm
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.main import _interrupt, cli

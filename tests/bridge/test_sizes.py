@@ -7,7 +7,7 @@ import torch
 from formats.records import FieldRecord, encode_field
 from fusedrf_cli.bridge.sizes import vm_bytes
 from fusedrf_cli.engine.composition.trimming import without_unread
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 
 
 @pytest.mark.parametrize("precision", ["float16", "float32", "int8", "int4"])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.analytic.export import SHAPE as THIRTY_TWO  # float32's: few shapes, since each is compiled
 from tests.analytic.fields import BOX, AnalyticField, Ball, Gaussian, Slab, Slow, chord_of_box
 from tests.analytic.rays import DIRECTIONS_26, points_in, rays_at, unit

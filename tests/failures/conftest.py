@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from fusedrf_cli.engine.distillation.judging import Judge
-from fusedrf_cli.engine.fields.base import field_kinds
+from fusedrf_cli.engine.kinds.registry import field_kinds
 from tests.analytic.export import NotExportable
 from tests.bridge.conftest import TinySettings, part
 
@@ -73,7 +73,7 @@ def row(request) -> Row:
 def quick(monkeypatch) -> None:
     """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 48)
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 48)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 48)
     monkeypatch.setattr("fusedrf_cli.engine.distillation.distill.POINTS_PER_STEP", 1 << 13)
     monkeypatch.setattr(part("fuse_vm"), "DistillSettings", TinySettings)
     monkeypatch.setattr(part("fuse_blocks"), "RANKS", (None,))  # others would be compiled

@@ -20,9 +20,9 @@ from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.student import empty_student
-from fusedrf_cli.engine.fields.base import field_kinds
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.errors import InvalidInput

@@ -20,7 +20,7 @@ from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.analytic import scenes
 from tests.analytic.export import SHAPE, exported

@@ -12,7 +12,7 @@ from fusedrf_cli.bridge.train import QUALITY
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.fit import fit
-from fusedrf_cli.engine.fields.vm import VMShape
+from fusedrf_cli.engine.kinds.vm.field import VMShape
 from fusedrf_cli.engine.rendering.cameras import orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.analytic.fields import Box, Tint

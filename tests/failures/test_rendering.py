@@ -19,7 +19,7 @@ from click.testing import CliRunner
 from formats.images import read_image
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.fit import FitSettings, fit, occupancy_of
-from fusedrf_cli.engine.fields.vm_mlp import ColourNetwork
+from fusedrf_cli.engine.kinds.vm_mlp.field import ColourNetwork
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
@@ -36,7 +36,7 @@ def coarse_grids():
     """Grids over scenes that are made in no time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 64)
-        patch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 64)
+        patch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 64)
         yield
 
 
@@ -246,7 +246,7 @@ def test_d5_a_shortage_that_does_not_end_is_exit_5(row, tmp_path, monkeypatch):
         tried.append(1)
         raise MemoryError("no more")
 
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.VMField.render_rays", starved)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.VMField.render_rays", starved)
     result = invoke(tmp_path, "render", path, "-o", "a.png", "--size", "16x16")
     assert not (tmp_path / "a.png").exists() and "not enough memory" in result.stderr
     row.check("D5", "exit code where memory never suffices", result.exit_code, 5)

@@ -23,7 +23,7 @@ from click.testing import CliRunner
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge import edit, scene
-from fusedrf_cli.engine.fields import vm
+from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
 from tests.promises.mutations import mutated

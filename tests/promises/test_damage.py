@@ -190,7 +190,7 @@ def test_a_reader_that_stumbles_or_hangs_is_found_out(tmp_path, monkeypatch):
 
 def test_good_packs_are_taken_by_every_verb(monkeypatch):
     """A fuzzer whose verbs refuse all would find nothing."""
-    from fusedrf_cli.engine.fields import vm
+    from fusedrf_cli.engine.kinds.vm import field as vm
 
     monkeypatch.setattr(vm, "OWNERSHIP_CELLS", 16)
     assert all(verb(str(GOLDEN / "pair.rfpack")) for verb in VERBS.values())

@@ -52,7 +52,7 @@ def test_kept_packs_render_as_they_did(name, picture):
 
 def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
     """P1 with its defence removed: a reader that changed its mind about a number misses the picture."""
-    from fusedrf_cli.engine.fields import vm
+    from fusedrf_cli.engine.kinds.vm import field as vm
 
     real = vm.stored_tensor
     monkeypatch.setattr(
@@ -130,7 +130,7 @@ def test_keys_that_this_version_does_not_know_survive_a_round_trip(tmp_path):
 
 def test_an_edit_keeps_what_it_does_not_know_of_the_scene(tmp_path, monkeypatch):
     """P1, through a whole `delete`."""
-    from fusedrf_cli.engine.fields import vm
+    from fusedrf_cli.engine.kinds.vm import field as vm
 
     monkeypatch.setattr(vm, "OWNERSHIP_CELLS", 32)
     words = ["delete", str(GOLDEN / "later.rfpack"), "chair", "-o", str(tmp_path / "a.rfpack"), "--json"]

@@ -16,7 +16,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.trimming import smaller_shape, truncated
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 
 MAX_BLOCKS = 255
 FINER = 1 / 8  # of the finest voxel: with a stretched block a common voxel may lie under it

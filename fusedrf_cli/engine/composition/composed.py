@@ -7,7 +7,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_cells
-from fusedrf_cli.engine.fields.vm import OWNERSHIP_CELLS
+from fusedrf_cli.engine.kinds.vm.field import OWNERSHIP_CELLS
 
 OCCUPANCY_CELLS = OWNERSHIP_CELLS  # so that a scene and what it is fused to are framed alike
 RULES = ("max", "add")

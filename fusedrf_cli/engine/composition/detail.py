@@ -9,7 +9,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.blocks import tensor_field
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.fields.vm import NO_BLOCK, VMField
+from fusedrf_cli.engine.kinds.vm.field import NO_BLOCK, VMField
 
 ENOUGH_VOXELS = 8  # across an object, under which there is no shape left
 LOST_NOTED = 0.01  # share of an object's cells

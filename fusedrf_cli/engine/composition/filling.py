@@ -8,10 +8,10 @@ from scipy import sparse
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.bricks import OCTANTS, BrickTree, Lattice, corner_offsets
-from fusedrf_cli.engine.fields.sparse import COARSE, SparseField
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice, corner_offsets
+from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField
 
 LEAST, MOST = -12.0, 60.0  # of the density feature
 REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these

@@ -8,7 +8,7 @@ import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import VMField, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
 
 RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
 

@@ -20,7 +20,8 @@ from fusedrf_cli.engine.composition.filling import (
     touching,
 )
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.bricks import (
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,
     BrickTree,
@@ -30,8 +31,7 @@ from fusedrf_cli.engine.fields.bricks import (
     node_keys,
     sides,
 )
-from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
 YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way

@@ -8,7 +8,8 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.filling import LEAST, density, fill, set_density
 from fusedrf_cli.engine.composition.resample import FAINT, EmptyField, demanded, leaves, shown, thinned
-from fusedrf_cli.engine.fields.bricks import (
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     OCTANTS,
     BrickTree,
@@ -17,8 +18,7 @@ from fusedrf_cli.engine.fields.bricks import (
     key_places,
     node_keys,
 )
-from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 
 Takes = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Which vertices (V,) bool are filled anew, by their places (V, 3), the sides of their voxels (V,), and the σ

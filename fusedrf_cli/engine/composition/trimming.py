@@ -5,7 +5,7 @@ energy.
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.vm import MODES, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import MODES, VMField, VMShape, VMTensor
 
 REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
 

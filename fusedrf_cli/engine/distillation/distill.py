@@ -29,8 +29,8 @@ from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, matter_first, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.vm import VMField
 from fusedrf_cli.engine.kernels import working_time
+from fusedrf_cli.engine.kinds.vm.field import VMField
 
 RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
 RGB_RATE = 0.003

@@ -13,9 +13,9 @@ from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import PASSES, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
-from fusedrf_cli.engine.fields.vm import PROBES, VMField, VMShape
-from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
 from fusedrf_cli.engine.kernels import working_time
+from fusedrf_cli.engine.kinds.vm.field import PROBES, VMField, VMShape
+from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from fusedrf_cli.engine.rendering.cameras import Camera
 
 RATE = 0.02

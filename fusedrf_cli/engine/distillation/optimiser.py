@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.kinds.vm.field import VMField
 
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15  # TensoRF's; a gradient here can be tiny, so eps must not damp it
 BASIS_RATE_RATIO = 0.05  # TensoRF: 1e-3 for the colour basis where factors learn at 2e-2

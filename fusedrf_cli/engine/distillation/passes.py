@@ -10,9 +10,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.vm import VMField
-from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
 from fusedrf_cli.engine.kernels import autograd, bodies
+from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
 
 NETWORK_RATE = 1e-3  # TensoRF's

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from fusedrf_cli.engine.fields.vm import VMShape
+from fusedrf_cli.engine.kinds.vm.field import VMShape
 
 
 @dataclass(frozen=True)

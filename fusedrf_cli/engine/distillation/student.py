@@ -9,7 +9,7 @@ from fusedrf_cli.engine.distillation.fit import EMPTY_BELOW, texels
 from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, harmless_depth
-from fusedrf_cli.engine.fields.vm import PROBES, Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import PROBES, Block, VMField, VMShape, VMTensor
 
 COARSE_FROM = 64  # texels along a student's longest axis from which it starts at half of them
 LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent

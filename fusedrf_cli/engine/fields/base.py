@@ -1,4 +1,4 @@
-"""The protocol every radiance field keeps, and the registry of field kinds."""
+"""The protocol every radiance field keeps."""
 
 from typing import Protocol, runtime_checkable
 
@@ -63,19 +63,3 @@ def holds_matter(field: RadianceField) -> bool:
             if bool((sigma * through > NOTHING).any()):
                 return True
     return False
-
-
-_KINDS: dict[str, type] = {}
-
-
-def register(cls: type) -> type:
-    """Class decorator: make a field kind known under its `kind`."""
-    _KINDS[cls.kind] = cls
-    return cls
-
-
-def field_kinds() -> dict[str, type]:
-    """All registered kinds by name."""
-    from fusedrf_cli.engine.fields import sparse, vm, vm_mlp  # noqa: F401  (they register themselves)
-
-    return dict(_KINDS)

@@ -14,8 +14,8 @@ from fusedrf_cli.engine.composition.blocks import (
     without,
 )
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.vm import VMShape
 from fusedrf_cli.engine.kernels.reference import vm_query
+from fusedrf_cli.engine.kinds.vm.field import VMShape
 from tests.analytic.rays import SHEAR, affine, turn
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Gaussian, points_in, random_vm, unit
 
@@ -33,7 +33,7 @@ PAIRS = {
 def coarse_ownership(monkeypatch):
     """Grids that are made in no time."""
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 32)
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 32)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 32)
 
 
 def small(seed: int, **options):

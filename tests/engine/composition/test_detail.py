@@ -23,7 +23,7 @@ def test_what_a_stretch_costs_is_the_largest_gap_of_two_exponentials(condition):
 
 
 def test_voxels_across_are_of_the_fused_field(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 24)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 24)
     placed = [Placed("big", BLOCK, np.eye(4)), Placed("flat", BLOCK, affine((0.2, 0.2, 0.1), (2, 0, 0)))]
     big, flat = tensor_details(placed, 0.25)
     assert (big.voxels_across, flat.voxels_across) == (pytest.approx(4), pytest.approx(0.8))
@@ -35,7 +35,7 @@ def test_voxels_across_are_of_the_fused_field(monkeypatch):
 
 def test_the_third_of_three_in_a_cell_is_lost_and_told(monkeypatch):
     """Three slivers side by side in one cell of a grid over a wide scene."""
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 8)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 8)
     spots = ((0.0, 0, 0), (0.03, 0, 0), (0.06, 0, 0), (9.0, 9, 0))
     placed = [Placed(f"n{i}", BLOCK, affine(0.02, at)) for i, at in enumerate(spots)]
     shares = lost_shares(blocks_of(placed))

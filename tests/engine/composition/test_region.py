@@ -16,7 +16,7 @@ HOLE = np.array([-0.2, -0.35, 0.1, 0.5, 0.2, 0.6])
 
 @pytest.fixture(autouse=True)
 def coarse_ownership(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 32)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 32)
 
 
 def field_of(cells: int = 9):

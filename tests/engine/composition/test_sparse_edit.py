@@ -7,7 +7,7 @@ import torch
 from fusedrf_cli.engine.composition.resample import resampled
 from fusedrf_cli.engine.composition.sparse_edit import Several, added, emptied
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image

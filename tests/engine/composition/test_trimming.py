@@ -13,7 +13,7 @@ from fusedrf_cli.engine.composition.trimming import (
     truncated,
     without_unread,
 )
-from fusedrf_cli.engine.fields.vm import MODES, VMShape
+from fusedrf_cli.engine.kinds.vm.field import MODES, VMShape
 from tests.engine.conftest import SIXTY_FOUR, THIRTY_TWO, random_vm, unit
 
 

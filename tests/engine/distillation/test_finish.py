@@ -17,7 +17,7 @@ from tests.engine.conftest import BOX, THIRTY_TWO, random_vm
 @pytest.fixture
 def pair(monkeypatch):
     """Two blocks over two tensors, and the same at less than half their resolution."""
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 32)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 32)
     one, two = (
         random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32, seed=s).resampled(BOX, (20, 21, 22))
         for s in (1, 2)

@@ -6,7 +6,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.guard import ALLOWED, KEPT_EVERY, MOST_ROLL_BACKS, WINDOW, Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.fields.vm_mlp import VMMLPField
+from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from tests.engine.conftest import THIRTY_TWO, random_vm
 
 FINE, BAD = np.array([1.0, 2.0, 3.0]), np.array([1.0, np.nan, 3.0])
@@ -129,7 +129,7 @@ def test_a_restored_guard_counts_on(parts):
 
 def test_a_networks_weights_and_moments_go_back_too():
     from fusedrf_cli.engine.distillation.passes import PackedPass
-    from fusedrf_cli.engine.fields.vm import VMShape
+    from fusedrf_cli.engine.kinds.vm.field import VMShape
     from tests.engine.conftest import BOX
 
     field = VMMLPField.create(BOX, (5, 6, 7), VMShape(16, 8, 2), torch.Generator().manual_seed(0))

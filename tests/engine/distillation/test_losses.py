@@ -9,7 +9,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.losses import OPAQUE, log_depth, mostly_seen, point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
-from fusedrf_cli.engine.fields.vm import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, random_vm, unit
 

@@ -2,8 +2,9 @@
 
 import torch
 
-from fusedrf_cli.engine.fields.base import RadianceField, field_kinds, holds_matter
-from fusedrf_cli.engine.fields.vm import VMField
+from fusedrf_cli.engine.fields.base import RadianceField, holds_matter
+from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Box
 from tests.engine.conftest import BOX, Ball, points_in, random_vm

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.vm import MODES
 from fusedrf_cli.engine.kernels import autograd
+from fusedrf_cli.engine.kinds.vm.field import MODES
 
 from ..conftest import DIRECTIONS_26, points_in, random_vm
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, bodies, cpu, reference
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.engine.conftest import (
     BOX,
     DIRECTIONS_26,

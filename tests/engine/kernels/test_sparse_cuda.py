@@ -5,7 +5,6 @@ import pytest
 
 from fusedrf_cli.engine.kernels import sparse_cpu
 from tests.analytic.rays import points_in, rays_at, unit
-from tests.engine.fields.sparse_cases import random_sparse
 from tests.engine.kernels.simulated import (
     EXACT,
     HERE,
@@ -14,6 +13,7 @@ from tests.engine.kernels.simulated import (
     on_a_device,
     run_simulated,
 )
+from tests.engine.kinds.sparse_cases import random_sparse
 
 if HERE:
     from fusedrf_cli.engine.kernels import sparse_cuda

@@ -14,11 +14,10 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.base import register
-from fusedrf_cli.engine.fields.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 
 COARSE = 2  # voxels of the bands' lattice along a brick's side
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
@@ -56,7 +55,6 @@ class SparseShape:
         return -(-self.band_numbers // 8) * 8
 
 
-@register
 class SparseField:
     """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle`
     afterwards)."""

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.base import register
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_cells, transformed_aabb
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
@@ -117,7 +116,6 @@ def aligned(count: int) -> int:
     return -(-count // SECTION_ALIGN) * SECTION_ALIGN
 
 
-@register
 class VMField:
     """One or more placed VM tensors; see the module's docstring. Immutable but for `params`, which optimisers
     update in place."""

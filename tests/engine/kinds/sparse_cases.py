@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.bricks import BrickTree, Lattice, children, node_keys
-from fusedrf_cli.engine.fields.sparse import SparseField, SparseShape
 from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, children, node_keys
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 
 LO, TOP, COUNTS = np.array([-1.0, -0.7, 0.2]), np.array([0.6, 0.7, 0.55]), (3, 2, 3)
 

@@ -6,15 +6,16 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
-from fusedrf_cli.engine.fields.bricks import OCTANTS, BrickTree, Lattice
-from fusedrf_cli.engine.fields.sparse import COARSE, SparseField, SparseShape
+from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE
+from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.fields import Slow
 from tests.analytic.rays import points_in, rays_at, unit
-from tests.engine.fields.sparse_cases import random_sparse, random_tree
+from tests.engine.kinds.sparse_cases import random_sparse, random_tree
 
 
 def slowly(field: SparseField, point: np.ndarray, direction: np.ndarray):

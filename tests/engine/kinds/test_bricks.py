@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.fields.bricks import (
+from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     BrickTree,
     Lattice,
@@ -11,8 +12,7 @@ from fusedrf_cli.engine.fields.bricks import (
     key_places,
     node_keys,
 )
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
-from tests.engine.fields.sparse_cases import random_tree
+from tests.engine.kinds.sparse_cases import random_tree
 
 
 def test_keys_keep_places_and_their_order(rng):

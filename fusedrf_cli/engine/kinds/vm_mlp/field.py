@@ -10,10 +10,9 @@ from types import ModuleType
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.base import register
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import MAX_ANSWER, Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
+from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, Block, VMField, VMShape, VMTensor
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
@@ -74,7 +73,6 @@ class Encoding(torch.autograd.Function):
         )
 
 
-@register
 class VMMLPField:
     """One VM tensor and a colour network; immutable but for the factors' `params` and the network's weights.
 

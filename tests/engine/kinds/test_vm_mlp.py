@@ -7,10 +7,11 @@ import torch
 from fusedrf_cli.engine.distillation import passes
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, fit
 from fusedrf_cli.engine.distillation.passes import Batch, PackedPass, composite
-from fusedrf_cli.engine.fields.base import RadianceField, field_kinds
+from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm_mlp import ColourNetwork, Encoding, VMMLPField
 from fusedrf_cli.engine.kernels import autograd, bodies
+from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm_mlp.field import ColourNetwork, Encoding, VMMLPField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays

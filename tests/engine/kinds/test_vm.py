@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.fields.vm import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kernels import NO_BLOCK
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
     """Ownership grids small enough to settle in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.fields.vm.OWNERSHIP_CELLS", 30)
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 30)
 
 
 def ask(field, points):

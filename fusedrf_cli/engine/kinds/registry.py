@@ -1,0 +1,83 @@
+"""Finds the kinds of field: each is a folder beside this file, or comes from another package by an entry
+point of the group GROUP, and says what it is in an object named KIND.
+
+Names are found without importing anything, for `--help`; a kind is imported when it is used.
+"""
+
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+from fusedrf_cli.engine.kinds.kind import Kind
+
+GROUP = "fusedrf.kinds"
+
+
+class UnknownKind(ValueError):
+    """No kind of that name is known."""
+
+
+class BrokenKind(ValueError):
+    """A plug-in's kind that cannot be used; the others can."""
+
+
+@cache
+def own_kinds() -> dict[str, str]:
+    """Names of the kinds that come with the package, and the modules that hold them."""
+    folders = sorted(path.parent.name for path in Path(__file__).parent.glob("*/__init__.py"))
+    return {name.replace("_", "-"): f"{__package__}.{name}" for name in folders}
+
+
+def plugged_in() -> dict[str, EntryPoint]:
+    """Names of the kinds of other packages. Where two packages offer the same name the first is taken, and a
+    name of our own is never replaced."""
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=GROUP):
+        if point.name not in own_kinds():
+            found.setdefault(point.name, point)
+    return found
+
+
+def names() -> list[str]:
+    """Names of all kinds, sorted; nothing is imported."""
+    return sorted({*own_kinds(), *plugged_in()})
+
+
+@cache
+def kind(name: str) -> Kind:
+    """The kind of a name. Raises UnknownKind, or BrokenKind for a plug-in that fails to import or is no
+    kind."""
+    if name in own_kinds():
+        return import_module(own_kinds()[name]).KIND
+    point = plugged_in().get(name)
+    if point is None:
+        raise UnknownKind(f"unknown kind '{name}'; this version knows {', '.join(names())}")
+    package = point.dist.name if point.dist else point.value
+    try:
+        found = point.load()
+    except Exception as error:  # whatever a stranger's module raises, the other kinds work
+        raise BrokenKind(
+            f"the kind '{name}' of the package '{package}' does not load "
+            f"({type(error).__name__}: {error}); update or uninstall that package"
+        ) from error
+    found = getattr(found, "KIND", found)
+    if not isinstance(found, Kind) or found.name != name:
+        raise BrokenKind(
+            f"the kind '{name}' of the package '{package}' is no Kind of that name; update or uninstall "
+            "that package"
+        )
+    return found
+
+
+def field_kinds() -> dict[str, type]:
+    """The fields that bundles may hold, by kind; a plug-in that does not load is left out."""
+    found = {}
+    for name in names():
+        try:
+            field = kind(name).field
+        except BrokenKind:
+            continue
+        if field is not None:
+            found[name] = field
+    return found
