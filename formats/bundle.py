@@ -7,10 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from formats.archive import MAGIC, parse_archive, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
+from formats.contents import objects_in, world_aabb
 from formats.errors import BadHeader, ChecksumMismatch, FormatError, MissingMember, UnknownMember
 from formats.inputs import open_input
 from formats.records import FieldHeader, FieldRecord, decode_field, decode_header, encode_field
@@ -133,6 +132,7 @@ def read_summary(path: Path | str) -> dict:
     """What `info` tells of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
 
     Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
+    `objects` are what a fused field was made of (formats/contents.py); a plain scene has nodes alone.
     """
     if _is_json(path):
         summary = _scene_summary(read_scene(path), {})
@@ -241,16 +241,9 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
         "generator": scene.generator,
         "composition": scene.composition,
         "nodes": nodes,
+        "objects": objects_in(scene, headers),
         "history": list(scene.history),
     }
-
-
-def world_aabb(aabb: list[float], object_to_world: np.ndarray) -> list[float]:
-    """(6,) box in the world around the eight corners of a (6,) box in the object's frame."""
-    low, high = np.array(aabb[:3]), np.array(aabb[3:])
-    centre = object_to_world[:3, :3] @ (low + high) / 2 + object_to_world[:3, 3]
-    half = np.abs(object_to_world[:3, :3]) @ (high - low) / 2
-    return [*(centre - half).tolist(), *(centre + half).tolist()]
 
 
 def _field_summary(name: str, header: FieldHeader) -> dict:

@@ -16,8 +16,8 @@ BT709 = (
     "scale=out_color_matrix=bt709:out_range=tv:flags=bicubic+accurate_rnd+full_chroma_int",
     "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv",
 )
-"""ffmpeg's filters that convert RGB to BT.709's YUV and say so in the film. Without them it converts by BT.601
-and says nothing, and most players then take it for BT.709."""
+"""ffmpeg's filters that convert RGB to YUV by BT.709 and say so in the film. Without them it converts by
+BT.601 and says nothing, and most players then take it for BT.709."""
 MP4_OPTIONS = ("-f", "mp4", "-vf", ",".join(BT709), "-movflags", "+faststart")
 """The format is named because the temporary's name does not end in .mp4; `faststart` moves the index to the
 front, so that a browser can play the film while it is still loading."""
