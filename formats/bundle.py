@@ -109,8 +109,8 @@ def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
 
 
 def read_headers(path: Path | str, *, verify: bool = True) -> tuple[SceneGraph, dict[str, FieldHeader]]:
-    """The scene of the bundle at `path` and what each of its fields says of itself, by member; no array is
-    decoded, but with `verify` every byte is checked. Raises as `read_bundle`.
+    """The scene of the bundle at `path` and the headers of its fields, by member; no array is decoded, but
+    with `verify` every byte is checked. Raises as `read_bundle`.
     """
     return _headers(read_archive(path, verify=verify), str(path), verify)
 
@@ -119,7 +119,7 @@ def read_field(path: Path | str, member: str) -> FieldRecord:
     """One field of a bundle whose bytes were checked before. Raises MissingMember, and as `read_bundle`."""
     views = read_archive(path, verify=False)
     if member not in views:
-        raise MissingMember(f"{path}: holds no member {member!r} any more; was it replaced meanwhile?")
+        raise MissingMember(f"{path}: no longer holds {member!r}; was the file replaced meanwhile?")
     return decode_field(views[member], f"{path}: {member}")
 
 
@@ -129,7 +129,7 @@ def parse_bundle(data: bytes | memoryview, where: str) -> Bundle:
 
 
 def read_summary(path: Path | str) -> dict:
-    """What `info` tells of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
+    """What `info` reports of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
 
     Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
     `objects` are what a fused field was made of (formats/contents.py); a plain scene has nodes alone.
@@ -143,7 +143,7 @@ def read_summary(path: Path | str) -> dict:
     return {
         "path": str(path),
         "format": FORMAT,
-        # Of the file that was mapped: another may stand under its name by now.
+        # The size of the file that was mapped: the path may name another file by now.
         "bytes": len(views[SCENE].obj),
         **_scene_summary(scene, headers),
         "fields": fields,
@@ -170,7 +170,9 @@ def check_fields(scene: SceneGraph, members: Iterable[str], where: str) -> None:
     """Every field that a node names is among `members`; MissingMember otherwise."""
     for leaf in scene.leaves():
         if leaf.field is not None and leaf.field not in members:
-            raise MissingMember(f"{where}: node {leaf.name!r} names {leaf.field!r}, no member of this bundle")
+            raise MissingMember(
+                f"{where}: node {leaf.name!r} names {leaf.field!r}, which is not a member of this bundle"
+            )
 
 
 def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
@@ -197,7 +199,7 @@ def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:
 
 
 def _checked_members(views: dict[str, memoryview], where: str, verify: bool) -> dict[str, memoryview]:
-    """The fields among a bundle's members: names of the format, in order, and true to their content."""
+    """A bundle's fields by member; their names are checked, their order and, with `verify`, their SHA-256."""
     names = [name for name in views if name != SCENE]
     for name in names:
         if not re.fullmatch(MEMBER, name):

@@ -26,7 +26,7 @@ front, so that a browser can play the film while it is still loading."""
 def check_film(path: Path | str) -> None:
     """Before any work: can a film of this name be written here? Raises BadImage or MissingExtra."""
     if Path(path).suffix.lower() not in FILMS:
-        raise BadImage(f"{path}: no film is written under this ending; name it .gif or .mp4")
+        raise BadImage(f"{path}: a film is written as .gif or .mp4; choose a name that ends so")
     if Path(path).suffix.lower() == ".mp4":
         _ffmpeg(path)
 

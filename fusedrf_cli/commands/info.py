@@ -25,7 +25,7 @@ def _brief(summary: dict) -> dict:
 
 
 def _inside(summary: dict) -> list[dict]:
-    """The objects of fused fields; nothing where they are the nodes, which are told already."""
+    """The objects of fused fields; nothing where they are just the nodes, which are listed already."""
     if {part["name"] for part in summary["objects"]} <= {node["name"] for node in summary["nodes"]}:
         return []
     return [
@@ -50,7 +50,7 @@ def _scalars(event: dict) -> dict:
 @click.argument("scene", type=options.SCENE)
 @options.reporting(brief=_brief)
 def command(scene, progress):
-    """Tell what a bundle or scene holds.
+    """List what a bundle or scene holds.
 
     SCENE is a bundle, a scene.json, or - for a scene on stdin. Of a fused bundle the objects are listed with
     kind, place, size in the world and bytes; an object that was distilled into one field with others has no
@@ -66,7 +66,7 @@ def command(scene, progress):
 
 
 def _of_stdin() -> dict:
-    """As `formats.bundle.read_summary` tells of a scene.json."""
+    """The same as `formats.bundle.read_summary` gives for a scene.json."""
     scene, data = options.stdin_scene()
     nodes = [
         {

@@ -97,7 +97,7 @@ def test_what_was_distilled_together_has_a_place_but_no_bytes(tmp_path):
     assert (pole["name"], pole["bytes"]) == ("pole", None)
 
 
-def test_a_field_without_blocks_is_told_by_its_history(tmp_path):
+def test_a_field_without_blocks_is_described_by_its_history(tmp_path):
     record = FieldRecord("bricks", {"a": np.ones(3, np.float32)})
     found = objects(tmp_path, record, {"event": "fused", "nodes": [entry("cup"), entry("pole")]})
     assert [(o["name"], o["kind"], o["bytes"]) for o in found] == [
@@ -118,7 +118,7 @@ def test_the_history_is_followed(tmp_path):
     assert [(o["name"], o["bytes"]) for o in found] == [("pole", None), ("jug", TENSOR_BYTES[1])]
 
 
-def test_a_group_is_told_by_its_blocks(tmp_path):
+def test_a_group_is_described_by_its_blocks(tmp_path):
     """Once they are all deleted, the group is gone though no entry names it."""
     history = {"event": "fused", "nodes": [entry("shelf"), entry("pole")]}
     parts = block("shelf/cup", 0, 1), block("shelf/jug", 0, 2), block("pole", 1)

@@ -61,7 +61,7 @@ def test_mp4_without_its_extra(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_ffmpeg_is_told_to_convert_and_tag_by_bt709(tmp_path, monkeypatch):
+def test_ffmpeg_is_asked_to_convert_and_tag_by_bt709(tmp_path, monkeypatch):
     """The command line alone, which can be checked where ffmpeg is not installed."""
     asked = {}
 
