@@ -115,7 +115,7 @@ def parse_archive(data: memoryview, where: str, *, verify: bool = True) -> dict[
 
 
 def _members(data: memoryview, where: str) -> tuple[list[Member], int]:
-    """What the directory claims, with offsets recomputed; and where the directory begins."""
+    """The members that the directory lists, with offsets recomputed, and where the directory begins."""
     end = data[-END.size :]
     if len(data) < END.size or end[:4] != b"PK\x05\x06":
         raise TruncatedBundle(f"{where}: has no ZIP end record: cut short or appended to; copy it again")

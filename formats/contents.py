@@ -1,4 +1,4 @@
-"""Which objects a bundle holds, from its history and from what its fields say of themselves."""
+"""Which objects a bundle holds, from its history and its fields' metadata."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator

@@ -68,7 +68,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class CodedSpec:
-    """An array that is stored as codes of so many bits and their scales."""
+    """An array that is stored as codes of 8 or 4 bits and their scales."""
 
     bits: int
     shape: tuple[int, ...]

@@ -303,7 +303,7 @@ def expand_scene(path: Path | str, allow_outside: bool = False) -> SceneGraph:
 
 
 def inline_scenes(scene: SceneGraph, path: Path | str, allow_outside: bool = False) -> SceneGraph:
-    """As `expand_scene`, of a `scene` already read from `path` (a bundle's, say)."""
+    """As `expand_scene`, of a `scene` already read from `path`, which may be a bundle."""
     expansion = _Expansion(Path(path).parent, scene.composition, allow_outside)
     nodes = expansion.nodes(scene.nodes, Path(path), "", (os.path.realpath(path),))
     try:

@@ -1,4 +1,4 @@
-"""What can go wrong outside the files themselves; `formats.errors` has the ways a file can be wrong.
+"""Errors that are not about the content of a file; those are in `formats.errors`.
 
 `str(error)` is the one sentence a person reads; `exit_code` is what the process returns.
 """
