@@ -3,14 +3,21 @@
 import hashlib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from formats.archive import MAGIC, parse_archive, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
 from formats.contents import objects_in, world_aabb
-from formats.errors import BadHeader, ChecksumMismatch, FormatError, MissingMember, UnknownMember
+from formats.errors import (
+    BadHeader,
+    BadSchema,
+    ChecksumMismatch,
+    FormatError,
+    MissingMember,
+    UnknownMember,
+)
 from formats.inputs import open_input
 from formats.records import FieldHeader, FieldRecord, decode_field, decode_header, encode_field
 from formats.scene import (
@@ -24,6 +31,8 @@ from formats.scene import (
 )
 
 SCENE = "scene.json"
+SHARED = "shared"  # of a field's metadata: its parts that are members of their own
+PART = "part"  # the kind of such a member
 
 
 @dataclass(frozen=True)
@@ -47,17 +56,35 @@ class BundleWriter:
         self.members: dict[str, bytes] = {}
 
     def add_field(self, record: FieldRecord, precision: str = "float16") -> str:
-        """The member name of `record`, encoded; equal fields share one member. Raises as `encode_field`."""
+        """The member name of `record`, encoded; equal fields share one member. Raises as `encode_field`.
+
+        The parts that `record.metadata["shared"]` names, arrays NAME.*, become members of their own, so that
+        what several fields share lies in the bundle once.
+        """
+        if SHARED in record.metadata:
+            record = self._with_parts_apart(record, precision)
         name, data = field_member(record, precision)
         self.members[name] = data
         return name
 
+    def _with_parts_apart(self, record: FieldRecord, precision: str) -> FieldRecord:
+        arrays, parts = dict(record.arrays), {}
+        for part in record.metadata[SHARED]:
+            own = {
+                n.removeprefix(f"{part}."): arrays.pop(n) for n in record.arrays if n.startswith(f"{part}.")
+            }
+            parts[part] = self.add_field(FieldRecord(PART, own), precision)
+        return FieldRecord(record.kind, arrays, record.metadata | {SHARED: parts})
+
     def copy_field(self, path: Path | str, member: str) -> str:
-        """Take over `member` of the bundle at `path` byte for byte; raises as `read_bundle`."""
+        """Take over `member` of the bundle at `path`, and the parts it shares, byte for byte; raises as
+        `read_bundle`."""
         views = _checked_members(read_archive(path), str(path), verify=True)
         if member not in views:
             raise MissingMember(f"{path}: holds no member {member!r}")
-        self.members[member] = bytes(views[member])
+        header = decode_header(views[member], f"{path}: {member}")
+        for name in (member, *shared_members(member, header, views, str(path)).values()):
+            self.members[name] = bytes(views[name])
         return member
 
     def write(self, path: Path | str, scene: SceneGraph | None = None, *, overwrite: bool = False) -> None:
@@ -120,7 +147,29 @@ def read_field(path: Path | str, member: str) -> FieldRecord:
     views = read_archive(path, verify=False)
     if member not in views:
         raise MissingMember(f"{path}: no longer holds {member!r}; was the file replaced meanwhile?")
-    return decode_field(views[member], f"{path}: {member}")
+    record = decode_field(views[member], f"{path}: {member}")
+    for part, name in shared_members(member, record, views, str(path)).items():
+        _take_part(record, part, decode_field(views[name], f"{path}: {name}"))
+    return record
+
+
+def _take_part(record: FieldRecord, part: str, found: FieldRecord) -> None:
+    """Give a field the arrays of a part that it shares, as PART.NAME."""
+    record.arrays.update({f"{part}.{key}": array for key, array in found.arrays.items()})
+
+
+def shared_members(
+    member: str, field: FieldRecord | FieldHeader, members: Container[str], where: str
+) -> dict[str, str]:
+    """The members in which the parts lie that a field shares with others, by the part's name. Raises
+    BadSchema and MissingMember."""
+    parts = field.metadata.get(SHARED, {})
+    if not isinstance(parts, dict) or not all(isinstance(name, str) for name in parts.values()):
+        raise BadSchema(f"{where}: {member}: '{SHARED}' should name a member for each shared part")
+    for part, name in parts.items():
+        if name not in members or name == member:
+            raise MissingMember(f"{where}: {member} shares {part!r} as {name!r}, no member of this bundle")
+    return parts
 
 
 def parse_bundle(data: bytes | memoryview, where: str) -> Bundle:
@@ -179,7 +228,11 @@ def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
     scene = _scene(views, where)
     members = _checked_members(views, where, verify)
     check_fields(scene, members, where)
-    return Bundle(scene, {name: decode_field(view, f"{where}: {name}") for name, view in members.items()})
+    fields = {name: decode_field(view, f"{where}: {name}") for name, view in members.items()}
+    for member, record in fields.items():
+        for part, name in shared_members(member, record, fields, where).items():
+            _take_part(record, part, fields[name])
+    return Bundle(scene, fields)
 
 
 def _headers(
@@ -188,7 +241,10 @@ def _headers(
     scene = _scene(views, where)
     members = _checked_members(views, where, verify)
     check_fields(scene, members, where)
-    return scene, {name: decode_header(view, f"{where}: {name}") for name, view in members.items()}
+    headers = {name: decode_header(view, f"{where}: {name}") for name, view in members.items()}
+    for member, header in headers.items():
+        shared_members(member, header, headers, where)
+    return scene, headers
 
 
 def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:

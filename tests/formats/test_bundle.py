@@ -19,14 +19,17 @@ from formats.bundle import (
     BundleWriter,
     field_member,
     is_bundle,
+    member_name,
     parse_bundle,
     read_bundle,
+    read_field,
+    read_headers,
     read_summary,
     sha256_of,
     single_field_bundle,
     world_aabb,
 )
-from formats.records import FieldRecord
+from formats.records import FieldRecord, encode_field
 from formats.scene import SceneGraph, dump_scene, make_node, write_scene
 
 GOLDEN = Path(__file__).parent / "golden" / "lamp.rfpack"
@@ -268,3 +271,48 @@ def test_opening_a_bundle_loads_no_engine_and_runs_no_code():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout == "[]\n[]\n"
+
+
+def sharing(seed: int) -> FieldRecord:
+    """A field with numbers of its own and a part that does not depend on the seed."""
+    own = np.full((2, 3), seed, np.float32)
+    return FieldRecord(
+        "dense", {"own": own, "decoder.weight": np.eye(3, dtype=np.float32)}, {"shared": ["decoder"]}
+    )
+
+
+def test_what_fields_share_lies_in_a_bundle_once_and_comes_back_with_each(tmp_path):
+    writer = BundleWriter()
+    members = [writer.add_field(sharing(seed)) for seed in (1, 2)]
+    assert len(writer.members) == 3
+    writer.write(tmp_path / "a.rfpack", SceneGraph(tuple(make_node(m[7:11], field=m) for m in members)))
+    for seed, member in zip((1, 2), members, strict=True):
+        found = read_field(tmp_path / "a.rfpack", member)
+        assert np.array_equal(found.arrays["own"], np.full((2, 3), seed))
+        assert np.array_equal(found.arrays["decoder.weight"], np.eye(3))
+        assert list(found.metadata["shared"]) == ["decoder"]
+        whole = read_bundle(tmp_path / "a.rfpack").fields[member]
+        assert np.array_equal(whole.arrays["decoder.weight"], np.eye(3))
+    copier = BundleWriter()
+    copier.copy_field(tmp_path / "a.rfpack", members[0])
+    assert len(copier.members) == 2
+
+
+def test_a_field_read_and_written_again_shares_the_same_part(tmp_path):
+    writer = BundleWriter()
+    member = writer.add_field(sharing(1))
+    writer.write(tmp_path / "a.rfpack", SceneGraph((make_node("a", field=member),)))
+    assert BundleWriter().add_field(read_field(tmp_path / "a.rfpack", member)) == member
+
+
+@pytest.mark.parametrize(
+    "shared", [{"decoder": "fields/" + "0" * 16 + ".safetensors"}, {"decoder": 3}, ["decoder"]]
+)
+def test_a_part_that_is_not_there_is_refused_by_name(tmp_path, shared):
+    data = encode_field(FieldRecord("dense", {"own": np.zeros(1, np.float32)}, {"shared": shared}))
+    writer = BundleWriter()
+    writer.members[member_name(data)] = data
+    writer.write(tmp_path / "a.rfpack", SceneGraph((make_node("a", field=member_name(data)),)))
+    for read in (read_bundle, read_headers, lambda path: read_field(path, member_name(data))):
+        with pytest.raises(errors.FormatError, match="shared|shares"):
+            read(tmp_path / "a.rfpack")
