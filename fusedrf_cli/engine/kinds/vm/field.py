@@ -16,10 +16,16 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_cells, transformed_aabb
+from fusedrf_cli.engine.fields.occupancy import (
+    PROBES,
+    SCENE_CELLS,
+    OccupancyGrid,
+    placed_cells,
+    transformed_aabb,
+)
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
 
-OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
+OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
