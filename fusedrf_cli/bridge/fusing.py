@@ -211,9 +211,11 @@ def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str,
     elif not student.learnt and (count > 1 or request.target_psnr is not None) and not maker.budget.over:
         neighbours = choosing.neighbours(tried)
         seconds["neighbours"] = time.monotonic() - started
-    psnr = {"before_rgb": tried.before, "after_rgb": after, "stored": tried.psnr, "views": maker.views}
+    psnr = {"before_rgb": tried.before, "after_rgb": after}
+    psnr |= {"rgb_kept": did.rgb_kept} if learnt else {}
+    psnr |= {"stored": tried.psnr, "views": maker.views}
     figures = {
-        "psnr": psnr | ({"rgb_kept": did.rgb_kept} if learnt else {}),
+        "psnr": psnr,
         "seconds": seconds | (did.seconds if did is not None else {}),
     }
     if learnt:
