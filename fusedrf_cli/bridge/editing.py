@@ -31,7 +31,6 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.interim import moved
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
@@ -129,7 +128,7 @@ def add(request: AddRequest, progress) -> dict:
         progress.phase("measuring", None)
         truth = ComposedField([Placed("", fused.field.to(place), np.eye(4)), *objects])
         judge = Judge(truth, REGION_SETTINGS.views, REGION_SETTINGS.view_size, request.seed)
-        as_read = moved(stored(edited.field, precision), truth.origin)
+        as_read = stored(edited.field, precision).moved(truth.origin)
         reached = judge(as_read.to(place))
         nodes = history_nodes(new, request.output, {})
         entry = {

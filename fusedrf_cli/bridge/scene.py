@@ -16,7 +16,6 @@ from fusedrf_cli.bridge.memory import READING, Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields import interim
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import StreamedField
 from fusedrf_cli.engine.kinds import registry
@@ -239,7 +238,7 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
 
 def stored(field: StoredField, precision: str) -> StoredField:
     """The field as it will come back from a bundle of that precision."""
-    return interim.stored(field, lambda array, name: as_stored(array, precision, name))
+    return field.stored(lambda array, name: as_stored(array, precision, name))
 
 
 def write_field(

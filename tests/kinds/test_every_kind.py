@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
+from fusedrf_cli.bridge.ladders import in_flags
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.commands.chart import fuse_request
-from fusedrf_cli.bridge.ladders import in_flags
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent

@@ -13,8 +13,7 @@ from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import PASSES, Batch
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.interim import box_of, peaks, resolution_of
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts, texels
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Way
@@ -234,7 +233,7 @@ class FitRun:
         if self.stages and share >= self.stages[0][0]:
             _, part = self.stages.pop(0)
             self.guard.check()
-            self.resize(box_of(self.field), round(self.settings.longest * part))
+            self.resize(self.field.aabb, round(self.settings.longest * part))
 
     def refresh_occupancy(self) -> None:
         """Mark the cells that hold matter, and cut the box down to them where that saves much. Where none
@@ -252,8 +251,8 @@ class FitRun:
         tight = occupancy.tight_aabb()
         if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
             before = self.field
-            self.resize(tight, max(resolution_of(self.field)))
-            occupancy = occupancy_of(self.field)
+            self.resize(tight, max(self.field.resolution))
+            occupancy = occupancy_of(self.field, tight)
             if not occupancy.occupied.any():  # what there was lies between the new texels
                 self.field = before
                 self.optimiser = Adam.of(self.field)
@@ -314,18 +313,20 @@ def volume(aabb: np.ndarray) -> float:
     return float(np.prod(aabb[3:] - aabb[:3]))
 
 
-def occupancy_of(field: StoredField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
-    """Cells of the box of a field on one grid in which the optical depth across the cell passes EMPTY_BELOW
-    somewhere, grown by one cell.
+def occupancy_of(
+    field: StoredField, box: np.ndarray | None = None, cells: int = DEFAULT_CELLS
+) -> OccupancyGrid:
+    """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
+    optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
     """
-    box = box_of(field)
-    counts = cell_counts(box, min(cells, max(resolution_of(field))))
+    box = field.aabb if box is None else box
+    counts = cell_counts(box, min(cells, max(field.resolution)))
     cell = (box[3:] - box[:3]) / counts
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
-    sigma = peaks(field, box[:3].copy(), cell, index)
+    sigma = field.peaks(box[:3], cell, index, PROBES)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
     return OccupancyGrid(box, occupied).dilated()

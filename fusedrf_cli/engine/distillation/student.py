@@ -4,8 +4,7 @@ import numpy as np
 
 from fusedrf_cli.engine.distillation.fit import EMPTY_BELOW
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.interim import box_of, peaks, resolution_of
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, harmless_depth
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
 
 COARSE_FROM = 64  # texels along a student's longest axis from which it starts at half of them
 LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
@@ -13,19 +12,18 @@ LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to h
 
 def starts_coarse(student: StoredField) -> bool:
     """Whether a student is on one grid large enough to have half its resolution first."""
-    resolution = resolution_of(student)
-    return resolution is not None and max(resolution) >= COARSE_FROM
+    return student.resolution is not None and max(student.resolution) >= COARSE_FROM
 
 
 def halved(student: StoredField) -> StoredField:
     """A student on one grid at half its resolution, over the same occupancy."""
-    resolution = tuple((int(n) + 1) // 2 for n in resolution_of(student))
-    return student.resampled(box_of(student), resolution).with_occupancy(student.occupancy)
+    resolution = tuple((int(n) + 1) // 2 for n in student.resolution)
+    return student.resampled(student.aabb, resolution).with_occupancy(student.occupancy)
 
 
 def resampled_like(student: StoredField, other: StoredField) -> StoredField:
     """A student's numbers at the resolution of another over the same box."""
-    return student.resampled(box_of(other), resolution_of(other)).with_occupancy(student.occupancy)
+    return student.resampled(other.aabb, other.resolution).with_occupancy(student.occupancy)
 
 
 def pruned(student: StoredField) -> OccupancyGrid:
@@ -33,7 +31,7 @@ def pruned(student: StoredField) -> OccupancyGrid:
     grid = student.occupancy
     cells = np.argwhere(grid.occupied)
     depth = np.zeros(grid.occupied.shape, np.float32)
-    depth[tuple(cells.T)] = peaks(student, grid.aabb[:3].copy(), grid.cell, cells) * grid.cell.min()
+    depth[tuple(cells.T)] = student.peaks(grid.aabb[:3], grid.cell, cells, PROBES) * grid.cell.min()
     occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)
     kept = OccupancyGrid(grid.aabb, occupied).dilated().occupied & grid.occupied
     return OccupancyGrid(grid.aabb, kept)

@@ -10,10 +10,10 @@ import numpy as np
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
-from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE
 from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
+from fusedrf_cli.engine.kinds.sparse.bodies import ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, with_fringe
 from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
