@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator
 
 import click
+from click.shell_completion import CompletionItem
 
 from formats.errors import FormatWarning, MissingFile, printable
 from fusedrf_cli.errors import FusedRFError
@@ -190,6 +191,48 @@ class RanksType(_Text):
         return ranks
 
 
+class KindType(click.ParamType):
+    """The name of a kind of field, or another word that is allowed. Names are looked up when they are needed,
+    and no kind is imported for it."""
+
+    name = "KIND"
+
+    def __init__(self, *others: str):
+        self.others = others
+
+    def names(self) -> list[str]:
+        """All that may be given."""
+        from fusedrf_cli.engine.kinds import registry
+
+        return [*self.others, *registry.names()]
+
+    def get_metavar(self, param, ctx=None):
+        return f"[{'|'.join(self.names())}]"
+
+    def shell_complete(self, ctx, param, incomplete):
+        return [CompletionItem(name) for name in self.names() if name.startswith(incomplete)]
+
+    def convert(self, value, param, ctx):
+        if value not in self.names():
+            self.fail(f"{value[:80]!r} is not one of {', '.join(self.names())}", param, ctx)
+        return value
+
+
+class KindsType(KindType):
+    """'a,b' -> those kinds, in the order of their names."""
+
+    name = "KINDS"
+
+    def get_metavar(self, param, ctx=None):
+        return self.name
+
+    def convert(self, value, param, ctx):
+        if not isinstance(value, str):  # the default
+            return value
+        asked = [super(KindsType, self).convert(name, param, ctx) for name in value.split(",")]
+        return tuple(name for name in self.names() if name in asked)
+
+
 RANKS = RanksType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
@@ -228,7 +271,9 @@ ranks = click.option(
 sh_degree = click.option(
     "--sh-degree", type=click.IntRange(0, 3), help="Keep colour's dependence on the view up to this SH band."
 )
-time_budget = click.option("--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds.")
+time_budget = click.option(
+    "--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds, all tries together."
+)
 max_size = click.option("--max-size", type=BYTES, help="Largest output file, such as 25MB.")
 memory = click.option(
     "--memory", type=BYTES, help="Most memory to take, such as 8GiB; default: 80 % of what is free."

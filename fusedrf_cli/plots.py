@@ -7,7 +7,15 @@ from pathlib import Path
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.report import readable_size
 
-LOOKS = {"blocks": ("#0072B2", "o"), "vm": ("#D55E00", "s"), "sparse": ("#009E73", "^")}
+LOOKS = (  # Okabe and Ito's colours, which colour-blind readers tell apart; a kind keeps its own
+    ("#0072B2", "o"),
+    ("#E69F00", "D"),
+    ("#56B4E9", "v"),
+    ("#009E73", "^"),
+    ("#D55E00", "s"),
+    ("#CC79A7", "P"),
+    ("#000000", "X"),
+)
 AXES = {"seconds": "seconds to fuse", "bytes": "bytes", "ms": "milliseconds per frame"}
 PALE = 0.25
 ROW_INCHES = 0.19
@@ -55,8 +63,9 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
             draw_composed(panel, cost, composed[cost], max(getattr(p, cost) for p in points))
     panels[0].set_ylabel("PSNR against the scene as composed, dB")
     above.suptitle(title, parse_math=False)
-    above.legend(handles=kind_handles(points), loc="outside upper right", ncols=len(LOOKS), fontsize=FONT)
-    write_list(below, best)
+    handles = kind_handles(points)
+    above.legend(handles=handles, loc="outside upper right", ncols=len(handles), fontsize=FONT)
+    write_list(below, best, looks(points))
     figure.draw_without_rendering()  # places are final from here on
     for panel, cost in zip(panels, AXES, strict=True):
         number(panel, cost, points, best)
@@ -67,8 +76,9 @@ def draw_panel(panel, cost: str, points: Sequence) -> None:
     """The points over one cost, the surpassed ones pale, and the frontier as a line."""
     from matplotlib import ticker
 
+    seen = looks(points)
     for point in points:
-        colour, marker = LOOKS[point.kind]
+        colour, marker = seen[point.kind]
         alpha = 1 if cost in point.frontier else PALE
         look = {"color": colour, "alpha": alpha, "markersize": 6, "markeredgewidth": 0}
         panel.plot(getattr(point, cost), point.psnr, marker, **look)
@@ -106,8 +116,16 @@ def kind_handles(points: Sequence) -> list:
     """A legend's marks for the kinds that are there."""
     from matplotlib.lines import Line2D
 
-    found = [kind for kind in LOOKS if kind in {p.kind for p in points}]
-    return [Line2D([], [], color=LOOKS[k][0], marker=LOOKS[k][1], linestyle="", label=k) for k in found]
+    return [
+        Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
+        for kind, (colour, marker) in looks(points).items()
+    ]
+
+
+def looks(points: Sequence) -> dict[str, tuple[str, str]]:
+    """Colour and marker of the kinds of some points, by the kinds' names: told apart as far as there are
+    looks."""
+    return {kind: LOOKS[i % len(LOOKS)] for i, kind in enumerate(sorted({p.kind for p in points}))}
 
 
 def number(panel, cost: str, points: Sequence, best: Sequence) -> None:
@@ -129,7 +147,7 @@ def clear(place: tuple[float, float], taken: Sequence[tuple[float, float]], enou
     return min(enough, min(((place[0] - x) ** 2 + (place[1] - y) ** 2) ** 0.5 for x, y in taken))
 
 
-def write_list(figure, best: Sequence) -> None:
+def write_list(figure, best: Sequence, seen: dict[str, tuple[str, str]]) -> None:
     """What the numbers stand for: the flags, and what they give."""
     longest = max(len(p.flags) for p in best)
     head = f"{'':4}{'fusedrf fuse …':{longest}}{'dB':>8}{'SSIM':>8}{'size':>9}{'fuse, s':>9}{'frame, ms':>11}"
@@ -137,7 +155,7 @@ def write_list(figure, best: Sequence) -> None:
         f"{i:<4}{p.flags:{longest}}{p.psnr:8.2f}{p.ssim:8.4f}{readable_size(p.bytes):>9}{p.seconds:9.2f}{p.ms:11.1f}"
         for i, p in enumerate(best, 1)
     ]
-    colours = ["black", *(LOOKS[p.kind][0] for p in best)]
+    colours = ["black", *(seen[p.kind][0] for p in best)]
     for row, (text, colour) in enumerate(zip([head, *rows], colours, strict=True)):
         y = 1 - (row + 0.5) / (len(rows) + 1.5)
         figure.text(0.05, y, text, family="monospace", fontsize=FONT + 0.5, color=colour, va="center")

@@ -13,7 +13,7 @@ from benchmarks.paper.sources import four_objects
 from benchmarks.paper.work import KINDS, MOST_BYTES, SIZES, Work, course, fusedrf, tell, write_csv
 from formats.captures import write_capture
 from formats.views import View
-from fusedrf_cli.bridge.render import to_pixels
+from fusedrf_cli.bridge.rendering import to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.volume import render_image

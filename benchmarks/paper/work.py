@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fusedrf_cli.bridge.chart import Course
+from fusedrf_cli.bridge.charting import Course
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.main import cli
 

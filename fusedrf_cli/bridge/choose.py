@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 
+from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.report import readable_size
 
 DB_PER_E_FOLD = 8.0  # that PSNR gains about when the bytes grow by e: only the next guess rests on it
@@ -20,21 +21,12 @@ TRIES = 8  # sizes of one way
 FINALISTS = 3  # ways that are finished where a size is given; the others are judged as they are
 
 
-@dataclass(frozen=True)
-class Way:
-    """A way to store a field, but for its size."""
-
-    precision: str
-    ranks: tuple[int, int] | None = None
-    """Density and colour components per mode at most; None: as many as the sources have."""
-    sh_degree: int | None = None
-
-    def flags(self, kind: str, limit: int) -> str:
-        """The flags of `fuse` that take this way to a size (bytes)."""
-        words = [f"--kind {kind}", f"--precision {self.precision}"]
-        words += [f"--ranks {self.ranks[0]},{self.ranks[1]}"] if self.ranks is not None else []
-        words += [f"--sh-degree {self.sh_degree}"] if self.sh_degree is not None else []
-        return " ".join([*words, f"--max-size {limit}"])
+def flags(kind: str, way: Way, limit: int) -> str:
+    """The flags of `fuse` that take a way of a kind to a size (bytes)."""
+    words = [f"--kind {kind}", f"--precision {way.precision}"]
+    words += [f"--ranks {way.ranks[0]},{way.ranks[1]}"] if way.ranks is not None else []
+    words += [f"--sh-degree {way.sh_degree}"] if way.sh_degree is not None else []
+    return " ".join([*words, f"--max-size {limit}"])
 
 
 @dataclass(frozen=True)
@@ -46,14 +38,27 @@ class Tried:
     """Bytes that were allowed."""
     bytes: int
     psnr: float
+    """dB, of the field as it will be read back."""
     before: float
     """PSNR before finishing on rays."""
     whole: bool
     """Whether more bytes would change nothing."""
+    exact: bool = False
+    """Whether there is nothing that finishing could teach it."""
 
-    def told(self, kind: str) -> dict:
+    def better(self, other: "Tried | None", target: float | None) -> bool:
+        """Whether it is to be preferred: what reaches the target with fewer bytes, else what shows more."""
+        if other is None:
+            return True
+        if target is None or max(self.psnr, other.psnr) < target:
+            return self.psnr > other.psnr
+        if min(self.psnr, other.psnr) < target:
+            return self.psnr >= target
+        return self.bytes < other.bytes
+
+    def report(self, kind: str) -> dict:
         """For a report."""
-        return {"flags": self.way.flags(kind, self.limit), "bytes": self.bytes, "psnr": self.psnr}
+        return {"flags": flags(kind, self.way, self.limit), "bytes": self.bytes, "psnr": self.psnr}
 
 
 Make = Callable[[Way, int, bool], Tried | None]
@@ -63,23 +68,42 @@ Make = Callable[[Way, int, bool], Tried | None]
 class Choosing:
     """One search: remembers what it tried."""
 
-    def __init__(self, make: Make, kind: str, tell: Callable[[str], None]):
-        self.kind, self.tell, self.tried = kind, tell, []
+    def __init__(self, make: Make, kind: str, note: Callable[[str], None]):
+        self.kind, self.note, self.tried = kind, note, []
+        self._plain: dict[tuple[Way, int], Tried | None] = {}
         self.make = cache(lambda way, limit, finished: self._made(make, way, limit, finished))
 
     def _made(self, make: Make, way: Way, limit: int, finished: bool) -> Tried | None:
-        found = make(way, limit, finished)
-        if found is not None and finished:
-            self.tried.append(found)
-            self.tell(f"{way.flags(self.kind, limit)}: {found.psnr:.2f} dB, {readable_size(found.bytes)}")
+        if finished:
+            plain = self._plain.get((way, limit))
+            found = plain if plain is not None and plain.exact else make(way, limit, True)
+            if found is not None:
+                self.record(found)
+            return found
+        self._plain[way, limit] = found = make(way, limit, False)
         return found
+
+    def record(self, found: Tried) -> None:
+        """Remember a finished try and tell of it."""
+        self.tried.append(found)
+        told = f"{found.psnr:.2f} dB, {readable_size(found.bytes)}"
+        self.note(f"{flags(self.kind, found.way, found.limit)}: {told}")
+
+    def first_reaching(self, tries: Iterable[Tried], target: float | None) -> Tried | None:
+        """The first of finished tries, each made when it is its turn, that reaches a target (dB), or that
+        there is where there is no target; None where none does."""
+        for found in tries:
+            self.record(found)
+            if target is None or found.psnr >= target:
+                return found
+        return None
 
     def best_within(self, ways: Iterable[Way], limit: int) -> Tried | None:
         """The highest PSNR under a size, None where nothing fits."""
         plain = [t for way in ways if (t := self.make(way, limit, False)) is not None]
         plain.sort(key=lambda t: -t.psnr)
-        finished = [self.make(t.way, limit, True) for t in plain[:FINALISTS]]
-        return max(finished, key=lambda t: t.psnr, default=None)
+        made = (self.make(t.way, limit, True) for t in plain[:FINALISTS])
+        return max((t for t in made if t is not None), key=lambda t: t.psnr, default=None)
 
     def smallest_reaching(
         self, ways: list[list[Way]], target: float, limit: int, gain: float
@@ -152,5 +176,5 @@ class Choosing:
                 near = [made] if made is not None else []
             if near:
                 best = max(near, key=lambda t: (t.psnr - chosen.psnr) / abs(math.log(t.bytes / chosen.bytes)))
-                found[f"next_{name}"] = best.told(self.kind)
+                found[f"next_{name}"] = best.report(self.kind)
         return found

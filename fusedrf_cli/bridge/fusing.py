@@ -1,62 +1,304 @@
-"""What fusing is asked for, whatever the kind, and what it gives back."""
+"""`fuse`: a scene to one field, of any kind, by one search over the ways and sizes it can be made in."""
 
-from dataclasses import dataclass
+import time
+from dataclasses import asdict, replace
 
-from fusedrf_cli.bridge.memory import READING, Memory, sources
-from fusedrf_cli.bridge.scene import LoadedScene
+from fusedrf_cli.bridge.choose import Choosing, Tried, flags
+from fusedrf_cli.bridge.making import Kept, Maker, Scene
+from fusedrf_cli.bridge.memory import READING, Memory, stages
+from fusedrf_cli.bridge.memory import sources as in_memory
+from fusedrf_cli.bridge.running import Saved, checkpoint_path, engine, load_checkpoint
+from fusedrf_cli.bridge.scene import (
+    LoadedScene,
+    history_nodes,
+    load_scene,
+    refuse_options,
+    unusable_kind,
+    write_field,
+)
+from fusedrf_cli.bridge.sizes import BundleSizes, graph_bytes
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Detail
+from fusedrf_cli.engine.fields.base import holds_matter
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.student import Student, StudentRequest, TooSmall
+from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
+from fusedrf_cli.report import readable_size
+from fusedrf_cli.requests import FuseRequest
 
+DEFAULT_MAX_SIZE = 25_000_000
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What a person fixed of how a scene is stored; None is left to choose."""
+def fuse(request: FuseRequest, progress) -> dict:
+    """Turn a composed scene into one field and write it with the scene's history."""
+    with engine(request.device, request.threads, progress) as place:
+        progress.phase("reading", None)
+        saved = load_checkpoint(request.output, "fuse") if request.resume else None
+        memory = Memory(request.memory)
+        loaded = load_scene(request.scene, request.allow_outside, memory, place)
+        loaded = without_empty(loaded, request.scene, progress)
+        scene = Scene.of(loaded)
+        kind, suits = choose_kind(request.kind, loaded, scene.composed)
+        refuse_options(kind, request)
+        started = time.monotonic()
+        kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
+        nodes = history_nodes(loaded, request.output, kept)
+        asked = student_request(request, loaded, nodes)
+        try:
+            student = kind.student(scene.composed, asked)
+            held = make_room(memory, student, scene, request)
+            maker, choosing, seconds = begin(student, scene, request, place, progress)
+            maker.sources_in_memory = held
+            found = search(maker, choosing, student, request, saved, seconds)
+        except TooSmall as error:
+            raise UsageProblem(
+                f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
+                f"where {readable_size(asked.limit)} were allowed; give more"
+            ) from error
+        details = student.details(found.field)
+        warn_of_detail(details, remedy(kind, loaded, scene.composed), progress)
+        figures = figures_of(found, maker, choosing, seconds)
+        entry = {
+            "event": "fused",
+            "kind": kind.name,
+            "composition": loaded.composition,
+            "nodes": nodes,
+            "settings": {
+                "seed": request.seed,
+                "max_size": asked.limit,
+                "rgb": request.rgb,
+                "from_scratch": request.from_scratch,
+            },
+            "psnr": figures["psnr"],
+        }
+        size = write_field(
+            request.output,
+            found.field,
+            "fused",
+            precision=found.tried.way.precision,
+            overwrite=request.overwrite,
+            origin=scene.composed.origin,
+            history=(entry,),
+            kept=kept,
+        )
+        checkpoint_path(request.output).unlink(missing_ok=True)
+    report = {
+        "output": request.output,
+        "bytes": size,
+        "source_bytes": source_bytes(loaded),
+        "kind": kind.name,
+        **({"kind_because": suits} if request.kind == registry.AUTO else {}),
+        **figures,
+        "objects": [asdict(d) for d in details],
+        "total_seconds": time.monotonic() - started,
+        "memory": memory.report(),
+    }
+    check_target(report, request.target_psnr, request.output)
+    return report
 
-    limit: int
-    """Bytes of the file."""
-    overhead: int
-    """Bytes of the file besides the field."""
-    target: float | None
-    """PSNR in dB."""
-    precision: str | None
-    ranks: tuple[int, int] | None
-    """Components per mode of density and of colour at most."""
-    sh_degree: int | None
-    rgb: bool
-    """Whether to finish on rendered rays."""
-    seed: int
-    time_budget: float | None = None
-    """Seconds after which nothing more is learnt."""
+
+def student_request(request: FuseRequest, loaded: LoadedScene, nodes: list[dict]) -> StudentRequest:
+    """What is asked of the kind's student."""
+    return StudentRequest(
+        sizes=BundleSizes(),
+        limit=request.max_size or DEFAULT_MAX_SIZE,
+        overhead=graph_bytes(nodes),
+        target=request.target_psnr,
+        precision=request.precision,
+        ranks=request.ranks,
+        sh_degree=request.sh_degree,
+        source_bytes=tuple(loaded.sizes),
+    )
 
 
-@dataclass(frozen=True)
-class Fused:
-    """A field, and how to store and report it."""
+# -- kinds ---------------------------------------------------------------------------------------------------
 
-    field: object
-    precision: str
-    figures: dict
-    """For the report; psnr.stored is that of the field as it will be read back."""
-    details: list[Detail]
-    remedy: str
+
+def choose_kind(name: str, loaded: LoadedScene, composed: ComposedField) -> tuple[Kind, str]:
+    """The kind that was asked for, or for auto the one that says of itself that it suits the scene best; and
+    why it does. InvalidInput where it cannot hold the scene."""
+    if name == registry.AUTO:
+        return best_suited(composed)
+    try:
+        kind = registry.kind(name)
+    except ValueError as error:
+        raise unusable_kind(error) from error
+    suits = kind.suits(composed)
+    if suits.score is None:
+        raise InvalidInput(f"{loaded.path}: {suits.why}; use --kind {best_suited(composed)[0].name}")
+    return kind, suits.why
+
+
+def best_suited(composed: ComposedField) -> tuple[Kind, str]:
+    """The kind that suits a scene best, and why."""
+    found = [(kind.suits(composed), kind) for kind in registry.kinds()]
+    suits, kind = max((pair for pair in found if pair[0].score is not None), key=lambda pair: pair[0].score)
+    return kind, suits.why
+
+
+def remedy(kind: Kind, loaded: LoadedScene, composed: ComposedField) -> str:
     """What helps an object that is held too coarsely."""
+    best = best_suited(composed)[0]
+    return "a larger --max-size" if best is kind else f"--kind {best.name}, or a larger --max-size"
 
 
-def make_room(budget: Memory, loaded: LoadedScene, *stages: tuple[float, dict[str, float]]) -> None:
-    """Keep no more sources in memory than fit beside what every stage needs, which is so many copies of the
-    largest one and other things; ResourceProblem where not even one does.
-    """
-    sizes, shelf = loaded.sizes, loaded.shelf
-    room = min(budget.room(needed) - copies * max(sizes) for copies, needed in stages)
+# -- the search ----------------------------------------------------------------------------------------------
+
+
+def begin(
+    student: Student, scene: Scene, request: FuseRequest, place: str, progress
+) -> tuple[Maker, Choosing, dict[str, float]]:
+    """What makes students, what chooses among them, and the seconds that measuring the scene took."""
+    started = time.monotonic()
+    progress.phase("measuring", None)
+    maker = Maker(student, scene, request, place, progress)
+    choosing = Choosing(maker.make, student.kind.name, progress.note)
+    progress.phase(student.kind.name, None)
+    return maker, choosing, {"measuring the scene": time.monotonic() - started}
+
+
+def search(
+    maker: Maker,
+    choosing: Choosing,
+    student: Student,
+    request: FuseRequest,
+    saved: Saved | None,
+    seconds: dict[str, float],
+) -> Kept:
+    """The best of what was tried, its numbers as they were measured. Raises TooSmall where nothing fits."""
+    started = time.monotonic()
+    if student.learnt:
+        choosing.first_reaching(maker.learn(saved), request.target_psnr)
+    else:
+        choose(choosing, student, request)
+    if maker.best is None:
+        raise TooSmall(student.smallest())
+    seconds["making"] = time.monotonic() - started
+    return maker.best
+
+
+def choose(choosing: Choosing, student: Student, request: FuseRequest) -> Tried | None:
+    """The best of the ways that need no learning to begin with; None where none fits."""
+    groups, limit, target = student.ways(), student.request.limit, request.target_psnr
+    found = None
+    if target is not None:
+        found = choosing.smallest_reaching(groups, target, limit, student.gain if request.rgb else 0.0)
+    elif not student.compares:
+        return choosing.make(student.plain(), limit, True)
+    else:
+        plain = choosing.make(student.plain(), limit, False)
+        if plain is not None and plain.whole:
+            return choosing.make(student.plain(), limit, True)
+    if found is None:
+        ways = [way for group in groups for way in group] if student.compares else [student.plain()]
+        found = choosing.best_within(ways, limit)
+    return found
+
+
+def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str, float]) -> dict:
+    """What the report says of a choice."""
+    tried, did, student, request = found.tried, found.did, maker.student, maker.request
+    kind = student.kind.name
+    learnt = did is not None and student.learnt
+    after = did.psnr_after_rgb if learnt else tried.psnr if tried.psnr > tried.before else None
+    count = len(choosing.tried)
+    started = time.monotonic()
+    neighbours = {}
+    if student.learnt and count > 1:
+        neighbours = {"next_smaller": choosing.tried[-2].report(kind)}
+    elif not student.learnt and (count > 1 or request.target_psnr is not None) and not maker.budget.over:
+        neighbours = choosing.neighbours(tried)
+        seconds["neighbours"] = time.monotonic() - started
+    psnr = {"before_rgb": tried.before, "after_rgb": after}
+    psnr |= {"rgb_kept": did.rgb_kept} if learnt else {}
+    psnr |= {"stored": tried.psnr, "views": maker.views}
+    figures = {
+        "psnr": psnr,
+        "seconds": seconds | (did.seconds if did is not None else {}),
+    }
+    if learnt:
+        figures["steps"] = did.steps
+        figures["curve"] = [dict(zip(("seconds", "steps", "psnr"), p, strict=True)) for p in did.curve]
+    return figures | {
+        "chosen": {
+            **student.kind.describe(found.field),
+            "precision": tried.way.precision,
+            "flags": flags(kind, tried.way, tried.limit),
+            "why": why(found, student, request, count),
+            **({"start": found.start} if found.start else {}),
+            "voxel": float(found.field.voxel_size),
+            "finest_teacher_voxel": float(maker.scene.composed.voxel_size),
+            **neighbours,
+        },
+        **(did.numeric if did is not None else {}),
+    }
+
+
+def why(found: Kept, student: Student, request: FuseRequest, count: int) -> str:
+    """One sentence on the choice."""
+    what, target = student.why(found.field), request.target_psnr
+    if target is not None and found.tried.psnr >= target:
+        return f"{what}: the smallest that reaches {target:g} dB, of {count} choices tried"
+    if count > 1:
+        return f"{what}: the best under {student.request.limit} bytes, of {count} choices tried"
+    if found.tried.exact:
+        return f"{what}, as the sources have them"
+    return f"{what}, under {student.request.limit} bytes"
+
+
+def check_target(report: dict, target_psnr: float | None, output: str) -> None:
+    """QualityNotReached, after the output was written, where a target was given and missed."""
+    reached = report["psnr"]["stored"]
+    if target_psnr is not None and reached < target_psnr:
+        raise QualityNotReached(
+            f"{output}: reached {reached:.2f} dB where --target-psnr asked for {target_psnr:g}; give more "
+            "--max-size or --time-budget",
+            report=report,
+        )
+
+
+# -- the scene -----------------------------------------------------------------------------------------------
+
+
+def source_bytes(loaded: LoadedScene) -> int:
+    """Bytes of the distinct source files."""
+    return sum(
+        path.stat().st_size for path in {f.path for f in loaded.fields} if path is not None and path.is_file()
+    )
+
+
+def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
+    """The scene without the fields that show nothing, each named in a warning; InvalidInput where none is
+    left."""
+    full = {id(p.field): p.field for p in loaded.placed}
+    full = {key for key, field in full.items() if holds_matter(field)}
+    for f in loaded.fields:
+        if id(f.placed.field) not in full:
+            progress.warn(f"'{f.placed.name}' is empty and was left out")
+    kept = tuple(f for f in loaded.fields if id(f.placed.field) in full)
+    if not kept:
+        raise InvalidInput(f"{scene}: all its fields are empty; train them again")
+    return replace(loaded, fields=kept)
+
+
+def make_room(memory: Memory, student: Student, scene: Scene, request: FuseRequest) -> bool:
+    """Keep no more sources in memory than fit beside what every stage of a student needs; ResourceProblem
+    where not even the largest does. Whether all of them may be held at once, as a teacher."""
+    needed = stages(student, scene.composed, scene.boxes, request)
+    sizes, shelf = scene.loaded.sizes, scene.loaded.shelf
+    room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
     if room < sum(sizes):  # then one is read now and then in every stage
-        stages = tuple((max(copies, READING), needed) for copies, needed in stages)
-        room = min(budget.room(needed) - copies * max(sizes) for copies, needed in stages)
+        needed = [(max(copies, READING), parts) for copies, parts in needed]
+        room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
     shelf.resize(room)
-    budget.expect(
-        *(sources(sizes, shelf.room, copies) | needed for copies, needed in stages),
+    memory.expect(
+        *(in_memory(sizes, shelf.room, copies) | parts for copies, parts in needed),
         advice="give a smaller --max-size",
     )
+    _, learning = needed[-1]
+    return memory.room(learning) > 2 * sum(sizes)
 
 
 def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:

@@ -1,63 +1,41 @@
 """Ways to fuse a scene, from cheap to dear: flags of `fusedrf fuse` in the order in which they are tried."""
 
-import itertools
-import math
 from collections.abc import Generator
+
+from fusedrf_cli.engine.kinds import ladders as kinds_ladders
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.ladders import Rung
 
 Flags = tuple[str, ...]
 Ladder = Generator[Flags, tuple[int, float] | None, None]
-"""Gives flags, takes the bytes and the PSNR that came of them, or None where they are not to be had."""
-
-SHRINK = 1.5  # a rung's --max-size over the next one's
-SMALLEST = 50_000  # bytes, below which a bundle is mostly headers
-PRECISIONS = ("int8", "float16", "int4")
-RANKS = ((), ("--ranks", "8,24"), ("--ranks", "8,16"))
-DEGREES = ("1", "0")
-SPARSE_SIZES = ("1MB", "3MB", "8MB")
-FINISHED = ("int8", "int4")  # what was finished at 16 bits is surpassed by twice the numbers at 8
-VM_SIZES = ("25MB", "12MB", "6MB")
-VM_BUDGETS = (("--time-budget", "5"), ("--time-budget", "15"), ("--time-budget", "45"), ())
+"""Gives flags, takes the bytes and the PSNR that came of them, or None where nothing did."""
 
 
 def ladders(kind: str, least_psnr: float) -> dict[str, list[Ladder]]:
     """The ladders of a kind, in groups that take about as long; those that learn nothing come first."""
-    if kind == "vm":
-        return {"vm": [distilled()]}
-    if kind == "sparse":
-        return {"sparse": [bricks()]}
-    plain = [("--precision", p, *m, "--no-rgb") for m, p in itertools.product(RANKS, PRECISIONS)]
-    finished = [("--precision", p, *m) for m, p in itertools.product(RANKS, FINISHED)]
-    groups = {kind: plain, f"{kind}, finished": finished}
-    return {
-        name: [shrinking(("--kind", kind, *flags), least_psnr) for flags in found]
-        for name, found in groups.items()
-    }
+    groups = registry.kind(kind).ladders(least_psnr)
+    return {name: [in_flags(kind, ladder) for ladder in found] for name, found in groups.items()}
 
 
-def shrinking(flags: Flags, least_psnr: float) -> Ladder:
-    """The flags as they are, then under an ever smaller --max-size until the PSNR falls below least_psnr."""
-    found, size = (yield flags), math.inf
-    while found is not None and found[1] >= least_psnr and min(size, found[0]) > SMALLEST:
-        size = readable_floor(min(size, found[0]) / SHRINK)
-        found = yield (*flags, "--max-size", in_words(size))
+def in_flags(kind: str, ladder: kinds_ladders.Ladder) -> Ladder:
+    """A kind's ladder as flags."""
+    try:
+        rung = next(ladder)
+        while True:
+            rung = ladder.send((yield flags_of(kind, rung)))
+    except StopIteration:
+        return
 
 
-def distilled() -> Ladder:
-    """One tensor over the scene: the steps decide last, since that takes longest."""
-    for budget, size, rgb in itertools.product(VM_BUDGETS, VM_SIZES, (("--no-rgb",), ())):
-        yield ("--kind", "vm", "--max-size", size, *rgb, *budget)
-
-
-def bricks() -> Ladder:
-    """From few bricks to more, since many take minutes."""
-    for rgb, size, degree in itertools.product((("--no-rgb",), ()), SPARSE_SIZES, DEGREES):
-        yield ("--kind", "sparse", "--precision", "int8", "--sh-degree", degree, "--max-size", size, *rgb)
-
-
-def readable_floor(size: float) -> int:
-    """The largest number of two digits and zeros that is no more than size."""
-    unit = 10 ** max(0, math.floor(math.log10(size)) - 1)
-    return int(size // unit) * unit
+def flags_of(kind: str, rung: Rung) -> Flags:
+    """The flags that ask for a rung."""
+    words = ["--kind", kind]
+    words += ["--precision", rung.precision] if rung.precision is not None else []
+    words += ["--ranks", f"{rung.ranks[0]},{rung.ranks[1]}"] if rung.ranks is not None else []
+    words += ["--sh-degree", str(rung.sh_degree)] if rung.sh_degree is not None else []
+    words += [] if rung.rgb else ["--no-rgb"]
+    words += ["--max-size", in_words(rung.bytes)] if rung.bytes is not None else []
+    return (*words, *(("--time-budget", f"{rung.seconds:g}") if rung.seconds is not None else ()))
 
 
 def in_words(size: int) -> str:

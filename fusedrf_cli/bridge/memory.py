@@ -12,21 +12,23 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from fusedrf_cli.engine.distillation.fit import FitSettings, texels
-from fusedrf_cli.engine.distillation.settings import DistillSettings
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
-from fusedrf_cli.engine.kinds.vm.field import OWNERSHIP_CELLS
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.finish import RAYS
+from fusedrf_cli.engine.distillation.teacher import points_kept
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
+from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
 from fusedrf_cli.errors import ResourceProblem
 from fusedrf_cli.report import readable_size
+from fusedrf_cli.requests import FuseRequest
 
 SHARE_OF_FREE = 0.8
 FLOAT = 4
 COMPILED = 130 << 20  # kernels, once they are loaded, and the libraries that come with them
 READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
 RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
-TRUNCATING = RESAMPLING + 6  # and while its ranks are truncated: sections in float64 before and after
 PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
 PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
@@ -128,7 +130,7 @@ def measured(width: int, height: int) -> dict[str, float]:
 
 def ownership(aabb: np.ndarray) -> dict[str, float]:
     """Grids over a scene's box (6,)."""
-    return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, OWNERSHIP_CELLS)))}
+    return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, SCENE_CELLS)))}
 
 
 def result(numbers: int, measured: bool = True) -> dict[str, float]:
@@ -147,11 +149,11 @@ def photos(count: int, width: int, height: int, cameras: int) -> dict[str, float
     return {"the photos": count * pixels * PER_PIXEL_OF_PHOTOS + cameras * pixels * PER_OWN_RAY}
 
 
-def fitting(settings: FitSettings, aabb: np.ndarray, threads: int) -> dict[str, float]:
-    """The field of a fit over a box (6,) at its full resolution, while its occupancy is made anew."""
-    numbers = settings.shape.size(texels(aabb, settings.longest))
-    grid = np.prod(cell_counts(aabb, min(DEFAULT_CELLS, settings.longest)))
-    return {**learning(numbers, threads), "its occupancy": float(grid) * PER_TRIED_CELL}
+def fitting(plan: Plan, longest: int, threads: int) -> dict[str, float]:
+    """The field of a fit at its full resolution, with so many texels along the longest axis, while its
+    occupancy is made anew."""
+    grid = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, longest)))
+    return {**learning(plan.numbers, threads), "its occupancy": float(grid) * PER_TRIED_CELL}
 
 
 def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
@@ -162,6 +164,41 @@ def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
 def lesson(rays: int) -> dict[str, float]:
     """Rays to learn from, and what they show."""
     return {"rays to learn from": rays * PER_RAY}
+
+
+def stages(
+    student: Student, scene: ComposedField, boxes: list[np.ndarray], request: FuseRequest
+) -> list[tuple[float, dict[str, float]]]:
+    """The stages of fusing a scene: making a student, measuring it, learning. Each is so many copies of the
+    largest source, and bytes by what they are for."""
+    needs, settings = student.needs(), student.lesson or DistillSettings()
+    numbers, grids = needs.numbers, ownership(scene.aabb)
+    if student.lesson is None:
+        taught = lesson(RAYS)
+    else:
+        points = needs.points
+        if points is None:
+            step = 0.5 * student.largest().voxel
+            points = points_kept(scene, boxes, settings.rays, step, request.seed)
+        taught = teaching(settings, points)
+    learns = (
+        learning(numbers, torch.get_num_threads()) | taught | grids
+        if learning_is_asked(student, request)
+        else {}
+    )
+    if learns and request.target_psnr is not None:
+        learns["the best so far"] = numbers * FLOAT
+    making = needs.making | (taught | picture(256, 256, composed=True) if student.learnt else {})
+    return [
+        (needs.copies, result(numbers, measured=False) | making | grids),
+        (0.0, result(numbers) | grids | judged()),
+        (0.0, learns),
+    ]
+
+
+def learning_is_asked(student: Student, request: FuseRequest) -> bool:
+    """Whether anything is going to be learnt."""
+    return student.learnt or request.rgb
 
 
 def judged() -> dict[str, float]:

@@ -20,6 +20,8 @@ from fusedrf_cli.engine.rendering.volume import is_out_of_memory
 from fusedrf_cli.errors import InvalidInput, NumericFailure, ResourceProblem
 from fusedrf_cli.report import readable_size
 
+Saved = tuple[dict[str, np.ndarray], dict]
+"""Arrays and JSON-able state of an interrupted run."""
 FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
 
 
@@ -66,7 +68,7 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
         raise
 
 
-class WholeSteps:
+class Uninterrupted:
     """A context to go through once per step, in which an interrupt waits for the step's end: what is saved
     then is no half of one. A second interrupt does not wait, and `torn` tells that there is nothing to save.
     """
@@ -74,10 +76,10 @@ class WholeSteps:
     def __init__(self):
         self.torn, self.waiting, self.previous = False, None, {}
 
-    def __call__(self) -> "WholeSteps":
+    def __call__(self) -> "Uninterrupted":
         return self
 
-    def __enter__(self) -> "WholeSteps":
+    def __enter__(self) -> "Uninterrupted":
         if threading.current_thread() is threading.main_thread():
             found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
             self.previous = {number: handler for number, handler in found.items() if callable(handler)}
@@ -99,14 +101,14 @@ class WholeSteps:
 
 
 @contextlib.contextmanager
-def resumable(output: str, checkpoint) -> Iterator[WholeSteps]:
-    """Run steps inside the `WholeSteps` that this gives; an interrupt leaves `checkpoint()` beside the output
-    and goes on its way, saying so."""
-    whole = WholeSteps()
+def resumable(output: str, checkpoint) -> Iterator[Uninterrupted]:
+    """Run steps inside the `Uninterrupted` that this gives; an interrupt leaves `checkpoint()` beside the
+    output and goes on its way, saying so."""
+    steps = Uninterrupted()
     try:
-        yield whole
+        yield steps
     except KeyboardInterrupt as interrupt:
-        if not whole.torn:
+        if not steps.torn:
             path = save_checkpoint(output, *checkpoint())
             interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
         raise
@@ -159,3 +161,10 @@ def load_checkpoint(output: str, command: str) -> tuple[dict[str, np.ndarray], d
             "another output"
         )
     return arrays, state
+
+
+def checkpoint_mismatch(output: str) -> InvalidInput:
+    """The error of a checkpoint that was made with other settings."""
+    return InvalidInput(
+        f"{checkpoint_path(output)}: made with other settings; repeat them, or run without --resume"
+    )

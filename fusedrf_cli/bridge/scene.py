@@ -1,6 +1,5 @@
 """Files to placed engine fields, and back."""
 
-import math
 import os
 import sys
 from collections.abc import Container
@@ -8,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldHeader, FieldRecord, as_stored
@@ -18,13 +16,15 @@ from fusedrf_cli.bridge.memory import READING, Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import StreamedField
-from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField
-from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.errors import FusedRFError, InvalidInput, UsageProblem
+from fusedrf_cli.requests import FuseRequest, TrainRequest
 
 STDIN_LIMIT = 4 << 20
+OPTIONS = {"ranks": "--ranks", "sh_degree": "--sh-degree"}
 
 
 @dataclass(frozen=True)
@@ -65,32 +65,43 @@ class LoadedScene:
         return ComposedField(self.placed, self.composition)
 
 
-def make_field(record: FieldRecord, where: str):
+def make_field(record: FieldRecord, where: str) -> StoredField:
     """An engine field from a bundle's record; InvalidInput for an unknown kind or arrays that do not fit
     it.
     """
-    kinds = field_kinds()
-    if record.kind not in kinds:
-        raise InvalidInput(
-            f"{where}: field of unknown kind '{record.kind}'; this version knows {', '.join(sorted(kinds))}"
-        )
     try:
-        return kinds[record.kind].from_state(record.arrays, record.metadata)
+        field = registry.kind(record.kind).field
+        if field is None:
+            raise registry.UnknownKind(f"kind '{record.kind}' is a way of fusing, and no field is of it")
+    except ValueError as error:
+        raise InvalidInput(f"{where}: {error}") from error
+    try:
+        return field.from_state(record.arrays, record.metadata)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise InvalidInput(
             f"{where}: the '{record.kind}' field is malformed ({error}); make the bundle again"
         ) from error
 
 
+def unusable_kind(error: ValueError) -> FusedRFError:
+    """What a person reads of a kind that they named and that the registry does not have."""
+    return (InvalidInput if isinstance(error, registry.BrokenKind) else UsageProblem)(f"--kind: {error}")
+
+
+def refuse_options(kind: Kind, request: FuseRequest | TrainRequest) -> None:
+    """UsageProblem for an option that a kind does not heed."""
+    for word, option in OPTIONS.items():
+        if getattr(request, word) is not None and word not in kind.takes:
+            raise UsageProblem(f"{option} says nothing to kind '{kind.name}'; leave it out")
+
+
 def held_size(header: FieldHeader) -> int:
-    """Bytes of a field in memory: its arrays, and of bricks the indices that follow from them."""
-    masks = header.specs.get("masks") if header.kind == SparseField.kind else None
-    return header.decoded_size + (PER_BRICK * math.prod(masks.shape) // 8 if masks is not None else 0)
-
-
-def placed_on(field, place: str):
-    """A field on the device where it is to be asked; what is no vm field stays on the CPU."""
-    return field.to(place) if type(field) is VMField else field
+    """Bytes of a field in memory: its arrays, and what follows from them."""
+    shapes = {name: tuple(spec.shape) for name, spec in header.specs.items()}
+    try:
+        return registry.kind(header.kind).held_bytes(header.decoded_size, shapes)
+    except ValueError:  # reading the field says so
+        return header.decoded_size
 
 
 def load_scene(
@@ -182,7 +193,7 @@ class _Loader:
         size = held_size(header)
 
         def read():
-            return placed_on(make_field(read_field(path, member), f"{path}: node '{name}'"), self.place)
+            return make_field(read_field(path, member), f"{path}: node '{name}'").to(self.place)
 
         if member not in self.fields:
             self.fields[member] = StreamedField(lambda: self.shelf.take(member, size, read))
@@ -225,14 +236,9 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
     return nodes
 
 
-def stored(field: VMField, precision: str) -> VMField:
+def stored(field: StoredField, precision: str) -> StoredField:
     """The field as it will come back from a bundle of that precision."""
-    back = field.with_params(torch.zeros_like(field.params))
-    for t in range(len(field.tensors)):
-        target = back.sections(t)
-        for name, view in field.sections(t).items():
-            target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), precision, name)))
-    return back
+    return field.stored(lambda array, name: as_stored(array, precision, name))
 
 
 def write_field(

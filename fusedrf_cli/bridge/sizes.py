@@ -1,50 +1,61 @@
-"""How many bytes a field takes in a bundle, told from its shape before its numbers are made."""
+"""How many bytes a field takes in a bundle, told from its contents before its numbers are made."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from formats.quantised import BLOCKS, code_bytes, is_coded
-from formats.records import BITS, coded_bytes
+from formats.records import BITS, BYTES_PER_NUMBER, FieldRecord, coded_bytes, encode_field
 from formats.scene import SceneGraph, dump_scene, make_node
-from fusedrf_cli.engine.composition.trimming import read_texels
-from fusedrf_cli.engine.kinds.vm.field import VMShape, VMTensor
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.kinds.student import Contents, Section
 
-HEADER = 512  # of a field: its metadata but for tensors and blocks
-HEADER_PER_TENSOR = 2000  # its shape, and 14 arrays' names and offsets
-HEADER_PER_PLANE = 250  # of those: as codes and scales
-HEADER_PER_BLOCK = 700
+HEADER = 512  # of a field: its metadata but for arrays, parts and placements
+HEADER_PER_PART = 2000  # its shape, and some 14 arrays' names and offsets
+HEADER_PER_ARRAY = 150
+HEADER_PER_CODED = 250  # and where an array is codes and scales
+HEADER_PER_PLACEMENT = 700
 BESIDES = 1024  # of a bundle: settings, figures and file headers
 
 
-def vm_bytes(shape: VMShape, tensors: Sequence[VMTensor], blocks: int, precision: str) -> int:
-    """At most so many bytes for a vm field of tensors without unread texels (trimming.py), coded or not."""
-    total = HEADER + HEADER_PER_BLOCK * blocks
-    for tensor in tensors:
-        total += HEADER_PER_TENSOR + tensor.occupancy.occupied.size // 8 + 1
-        for name, section in shape.sections(tensor.resolution):
-            total += section_bytes(tensor, name, section, precision)
-    return total
+class BundleSizes:
+    """Bytes of a field in a bundle (engine/kinds/student.py: StoredSizes)."""
+
+    def of(self, contents: Contents, precision: str) -> int:
+        """At most so many bytes for a field of those contents."""
+        headers = max(HEADER_PER_PART * contents.parts, HEADER_PER_ARRAY * len(contents.sections))
+        total = HEADER + headers + HEADER_PER_PLACEMENT * contents.placements + contents.bits // 8
+        return total + sum(section_bytes(section, precision) for section in contents.sections)
+
+    def exactly(self, field: StoredField, precision: str) -> int:
+        """The bytes of a field, encoded."""
+        return len(encode_field(FieldRecord(field.kind, *field.state()), precision))
+
+    def per_number(self, precision: str) -> float:
+        """About so many bytes for a number."""
+        return BYTES_PER_NUMBER[precision]
 
 
-def section_bytes(tensor: VMTensor, name: str, section: tuple[int, ...], precision: str) -> int:
-    """Bytes of one section (TensoRF's planes, lines, basis) of a tensor."""
-    most = coded_bytes(section, precision)
-    if precision not in BITS or not is_coded(section) or "_plane_" not in name:
+def section_bytes(section: Section, precision: str) -> int:
+    """At most so many bytes for one array: blocks of numbers of which none is used have no codes."""
+    most = coded_bytes(section.shape, precision)
+    if precision not in BITS or not is_coded(section.shape):
         return most
-    kept = section[2] * kept_texels(read_texels(tensor, int(name[-1])))
-    left_out = code_bytes(int(np.prod(section)), BITS[precision]) - code_bytes(kept, BITS[precision])
-    return HEADER_PER_PLANE + most - left_out
+    most += HEADER_PER_CODED
+    if section.used is None or len(section.shape) != 3:
+        return most
+    kept = section.shape[2] * kept_texels(section.used)
+    left_out = code_bytes(math.prod(section.shape), BITS[precision]) - code_bytes(kept, BITS[precision])
+    return most - left_out
 
 
-def kept_texels(read: np.ndarray) -> int:
-    """Texels in those blocks of a plane (na, nb) of which at least one is read: the others have no codes."""
-    held, sides = read, []
+def kept_texels(used: np.ndarray) -> int:
+    """Texels in those blocks of a plane (na, nb) of which at least one is used: the others have no codes."""
+    held, sides = used, []
     for axis, side in enumerate(BLOCKS[3][:2]):
-        starts = np.arange(0, read.shape[axis], side)
+        starts = np.arange(0, used.shape[axis], side)
         held = np.logical_or.reduceat(held, starts, axis=axis)
-        sides.append(np.diff(np.append(starts, read.shape[axis])))
+        sides.append(np.diff(np.append(starts, used.shape[axis])))
     return int(sides[0] @ held @ sides[1])
 
 

@@ -4,6 +4,7 @@ import click
 
 from fusedrf_cli import options
 from fusedrf_cli.placement import node_words
+from fusedrf_cli.requests import AddRequest
 
 
 @click.command("add")
@@ -18,7 +19,7 @@ from fusedrf_cli.placement import node_words
 @options.edited_precision
 @options.seeded
 @options.reporting
-def command(fused, source, output, name, translate, rotate, scale, matrix, **words):
+def command(fused, source, output, name, translate, rotate, scale, matrix, progress, **words):
     """Put one more object into a fused field.
 
     OBJECT is scaled, then turned, then moved. What is in FUSED
@@ -33,4 +34,6 @@ def command(fused, source, output, name, translate, rotate, scale, matrix, **wor
     node = make_node(name, source=source, **node_words(translate, rotate, scale, matrix))
     from fusedrf_cli import bridge
 
-    return bridge.add(fused, source, output, name=name, object_to_world=node.node_to_parent, **words)
+    where = node.node_to_parent
+    request = AddRequest(fused=fused, source=source, output=output, name=name, object_to_world=where, **words)
+    return bridge.add(request, progress)

@@ -3,32 +3,19 @@
 import click
 
 from fusedrf_cli import options
+from fusedrf_cli.requests import ChartRequest, FuseRequest
 
-KINDS = ("blocks", "vm", "sparse")
-NOT_OF_FUSING = ("scene", "output", "overwrite", "as_json", "quiet", "verbose")
-
-
-class KindsType(click.ParamType):
-    """'blocks,vm' -> those kinds of fused fields, in the order of KINDS."""
-
-    name = "KINDS"
-
-    def convert(self, value, param, ctx):
-        if not isinstance(value, str):  # the default
-            return value
-        asked = value.split(",")
-        if unknown := [kind for kind in asked if kind not in KINDS]:
-            self.fail(f"{unknown[0]!r} is not one of {', '.join(KINDS)}", param, ctx)
-        return tuple(kind for kind in KINDS if kind in asked)
+DEFAULT_KINDS = ("blocks", "vm", "sparse")
+REPORTING = ("as_json", "quiet", "verbose")
 
 
-def fuse_words(flags: tuple[str, ...]) -> dict:
-    """What `fusedrf fuse` makes of flags, as bridge.fuse takes it."""
+def fuse_request(flags: tuple[str, ...]) -> FuseRequest:
+    """What `fusedrf fuse` asks of the bridge with these flags."""
     from fusedrf_cli.commands.fuse import command as fuse
 
     line = [options.STDIO, "-o", options.STDIO, *flags]
     words = fuse.make_context("fuse", line).params
-    return {name: value for name, value in words.items() if name not in NOT_OF_FUSING}
+    return FuseRequest(**{name: value for name, value in words.items() if name not in REPORTING})
 
 
 def shown(report: dict) -> dict:
@@ -48,7 +35,11 @@ def shown(report: dict) -> dict:
     help="Start no new point after S seconds.",
 )
 @click.option(
-    "--kinds", type=KindsType(), default=KINDS, help=f"Kinds to try; default: {','.join(KINDS)}."
+    "--kinds",
+    type=options.KindsType(),
+    default=",".join(DEFAULT_KINDS),
+    show_default=True,
+    help="Kinds to try, separated by commas.",
 )
 @click.option(
     "--least-psnr",
@@ -65,7 +56,7 @@ def shown(report: dict) -> dict:
 @options.allow_outside
 @options.seeded
 @options.reporting(brief=shown)
-def command(scene, output, **words):
+def command(scene, output, progress, **words):
     """Chart PSNR against seconds, bytes and time per frame.
 
     SCENE, a scene.json or a bundle, is fused in many ways; each is compared with the scene as composed, on
@@ -77,4 +68,5 @@ def command(scene, output, **words):
     """
     from fusedrf_cli import bridge
 
-    return bridge.chart(scene, output, fuse_words=fuse_words, **words)
+    request = ChartRequest(scene=scene, output=output, fuse_request=fuse_request, **words)
+    return bridge.chart(request, progress)

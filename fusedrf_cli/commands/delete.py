@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options
+from fusedrf_cli.requests import DeleteRequest
 
 
 @click.command("delete")
@@ -11,15 +12,16 @@ from fusedrf_cli import options
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @options.time_budget
 @options.rgb
+@options.memory
 @options.edited_precision
 @options.allow_outside
 @options.seeded
 @options.reporting
-def command(fused, names, output, **words):
+def command(fused, names, output, progress, **words):
     """Take objects out of a fused field.
 
-    The blocks of the objects NAME... are dropped; out of a distilled tensor only the cells of their boxes are
-    cut, and learned again where the other sources are known.
+    Objects that the field holds apart, as blocks are, are dropped. Of others the region is emptied, and shows
+    what they hid where the other sources are known.
 
     \b
     Example:
@@ -27,4 +29,4 @@ def command(fused, names, output, **words):
     """
     from fusedrf_cli import bridge
 
-    return bridge.delete(fused, names, output, **words)
+    return bridge.delete(DeleteRequest(fused=fused, names=names, output=output, **words), progress)

@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options
+from fusedrf_cli.requests import EvaluateRequest
 
 
 @click.command("eval")
@@ -20,7 +21,7 @@ from fusedrf_cli import options
 @options.allow_outside
 @options.running
 @options.reporting
-def command(bundle, against, **words):
+def command(bundle, against, progress, **words):
     """Measure PSNR and SSIM against photos or a scene.
 
     BUNDLE (or a scene.json, or - for a scene on stdin) is rendered from the views of --against.
@@ -31,4 +32,4 @@ def command(bundle, against, **words):
     """
     from fusedrf_cli import bridge
 
-    return bridge.evaluate(bundle, against, **words)
+    return bridge.evaluate(EvaluateRequest(bundle=bundle, against=against, **words), progress)

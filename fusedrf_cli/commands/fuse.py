@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options
+from fusedrf_cli.requests import FuseRequest
 
 
 def brief(report: dict) -> dict:
@@ -15,11 +16,10 @@ def brief(report: dict) -> dict:
 @options.writing("The fused field to write, OUT.rfpack.")
 @click.option(
     "--kind",
-    type=click.Choice(["auto", "vm", "blocks", "sparse"]),
+    type=options.KindType("auto"),
     default="auto",
     show_default=True,
-    help="blocks: tensors in their objects' own axes; vm: one distilled tensor; sparse: bricks of voxels, as "
-    "fine as each place needs; auto: blocks where it can.",
+    help="Kind of field, or way of fusing; auto: what suits the scene best.",
 )
 @options.max_size
 @options.smallest
@@ -37,7 +37,7 @@ def brief(report: dict) -> dict:
 @options.allow_outside
 @options.seeded
 @options.reporting(brief=brief)
-def command(scene, output, **words):
+def command(scene, output, progress, **words):
     """Turn a whole scene into one field.
 
     SCENE is a scene.json, a bundle, or - for a scene on stdin.
@@ -48,4 +48,4 @@ def command(scene, output, **words):
     """
     from fusedrf_cli import bridge
 
-    return bridge.fuse(scene, output, **words)
+    return bridge.fuse(FuseRequest(scene=scene, output=output, **words), progress)

@@ -4,6 +4,7 @@ import click
 
 from fusedrf_cli import options
 from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli.requests import RenderRequest
 
 
 @click.command("render")
@@ -24,9 +25,9 @@ from fusedrf_cli.errors import UsageProblem
 @click.option("--fps", type=options.POSITIVE, default=24.0, show_default=True, help="Frames per second.")
 @options.memory
 @options.allow_outside
-@options.seeded
+@options.running
 @options.reporting
-def command(scene, output, cameras, path, orbit, **words):
+def command(scene, output, cameras, path, orbit, progress, **words):
     """Render pictures or a film.
 
     SCENE is a bundle, a scene.json, or - for a scene on stdin. By default one view frames all of it.
@@ -39,4 +40,5 @@ def command(scene, output, cameras, path, orbit, **words):
         raise UsageProblem("--cameras, --path and --orbit each choose the views; give one of them")
     from fusedrf_cli import bridge
 
-    return bridge.render(scene, output, cameras=cameras, path=path, orbit=orbit, **words)
+    views = {"cameras": cameras, "path": path, "orbit": orbit}
+    return bridge.render(RenderRequest(scene=scene, output=output, **views, **words), progress)

@@ -3,27 +3,15 @@
 import click
 
 from fusedrf_cli import options
+from fusedrf_cli.requests import TrainRequest
 
 
 @click.command("train")
 @click.argument("source", type=options.INPUT)
 @options.writing("The field to write, FIELD.rfpack.")
-@click.option("--kind", type=click.Choice(["vm"]), default="vm", show_default=True, help="Kind of field.")
-@click.option(
-    "--colour",
-    "--color",
-    type=click.Choice(["sh", "mlp"]),
-    default="sh",
-    show_default=True,
-    help="Spherical harmonics, or a small network.",
-)
-@click.option(
-    "--sh-degree",
-    type=click.IntRange(0, 3),
-    default=2,
-    show_default=True,
-    help="How far colour may depend on the view.",
-)
+@click.option("--kind", type=options.KindType(), default="vm", show_default=True, help="Kind of field.")
+@options.ranks
+@options.sh_degree
 @options.max_size
 @options.target_psnr
 @click.option(
@@ -51,7 +39,7 @@ from fusedrf_cli import options
 @options.resume
 @options.seeded
 @options.reporting
-def command(source, output, **words):
+def command(source, output, progress, **words):
     """Learn one field from photos or a mesh.
 
     SOURCE is a capture's folder, its transforms.json, or a .glb, .gltf, .obj or .ply mesh.
@@ -62,4 +50,4 @@ def command(source, output, **words):
     """
     from fusedrf_cli import bridge
 
-    return bridge.train(source, output, **words)
+    return bridge.train(TrainRequest(source=source, output=output, **words), progress)

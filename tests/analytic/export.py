@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, ColourNetwork, VMMLPField
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
@@ -22,6 +23,11 @@ SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's
 BANDED = VMShape(16, 24, 2)  # the default one, for tints of degree 2
 Y0, Y1 = 0.28209479177387814, 0.4886025119029199  # constants of the first two SH bands
 CELLS = 4  # of the occupancy, per axis
+
+
+def way_of(shape: VMShape) -> Way:
+    """The way in which a student has a shape."""
+    return Way(ranks=(shape.density_rank, shape.colour_rank), sh_degree=shape.sh_degree)
 
 
 class NotExportable(ValueError):

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import FRAMING_FOV, Camera, look_at
 from tests.analytic.export import exported, vm_field

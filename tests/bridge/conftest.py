@@ -23,9 +23,11 @@ from fusedrf_cli.engine.distillation import distill, finish
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.settings import DistillSettings
+from fusedrf_cli.engine.kinds.blocks import students as blocks
+from fusedrf_cli.engine.kinds.student import DistillSettings, Student
+from fusedrf_cli.engine.kinds.vm import editing, students
 from fusedrf_cli.engine.kinds.vm import field as vm
-from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.main import _interrupt, cli
@@ -37,7 +39,6 @@ from tests.analytic.fields import Box, Tint
 class TinySettings(DistillSettings):
     """A distillation of a second."""
 
-    shape: VMShape = SHAPE
     rays: int = 3000
     steps: int = 50
     rgb_steps: int = 10
@@ -95,17 +96,18 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(vm, "OWNERSHIP_CELLS", 48)
     patch.setattr(composed, "OCCUPANCY_CELLS", 48)
     patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
-    for name in ("fuse_blocks", "fuse_vm", "edit"):
+    for name in ("making", "editing"):
         patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
-    patch.setattr(part("fuse_vm"), "DistillSettings", TinySettings)
-    patch.setattr(part("fuse_blocks"), "RANKS", (None,))  # others would be compiled
-    patch.setattr(part("fuse_blocks"), "VIEWS_TO_CHOOSE_BY", 2)
+    patch.setattr(Student, "lesson", TinySettings())
+    patch.setattr(students, "SHAPE", SHAPE)
+    patch.setattr(blocks, "RANKS", (None,))  # others would be compiled
+    patch.setattr(part("making"), "VIEWS_TO_CHOOSE_BY", 2)
     patch.setattr(finish, "RAYS_PER_STEP", 500)
     patch.setattr(finish, "STEPS", 30)
-    patch.setattr(part("edit"), "REGION_SETTINGS", TinySettings(max_numbers=SHAPE.size((20, 20, 20))))
-    patch.setattr(part("train"), "VMShape", partial(VMShape, SHAPE.density_rank, SHAPE.colour_rank))
+    patch.setattr(part("editing"), "REGION_SETTINGS", TinySettings())
+    patch.setattr(editing, "NUMBERS", SHAPE.size((20, 20, 20)))
     draft = FitSettings(longest=24, steps=60, samples=1 << 13)
-    patch.setattr(part("train"), "QUALITY", dict.fromkeys(("draft", "normal", "high"), draft))
+    patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high"), draft))
 
 
 @pytest.fixture(scope="module", autouse=True)

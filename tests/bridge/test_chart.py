@@ -13,12 +13,17 @@ import numpy as np
 import pytest
 
 from fusedrf_cli import plots
-from fusedrf_cli.bridge.ladders import distilled, in_words, ladders, readable_floor, shrinking
-from fusedrf_cli.commands.chart import fuse_words
+from fusedrf_cli.bridge.ladders import in_flags, in_words, ladders
+from fusedrf_cli.commands.chart import fuse_request
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.blocks import students as blocks
+from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor
+from fusedrf_cli.engine.kinds.ladders import shrinking as shrinking_rungs
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
 from fusedrf_cli.main import _interrupt
 from fusedrf_cli.options import BYTES
 from fusedrf_cli.progress import NullProgress
+from fusedrf_cli.requests import ChartRequest
 from tests.bridge.conftest import done, part, write_scene_of
 
 CHART = ("chart", "scene.json", "-o", "chart", "--size", "24x24")
@@ -28,15 +33,15 @@ CHART = ("chart", "scene.json", "-o", "chart", "--size", "24x24")
 def charted(shop, tmp_path_factory):
     """(folder, the report of a chart of blocks there, the bundles that were made for it)."""
     folder = shutil.copytree(shop, tmp_path_factory.mktemp("charted") / "shop")
-    module, made = part("chart"), []
+    module, made = part("charting"), []
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("PRECISIONS", "FINISHED"):
-            patch.setattr(part("ladders"), name, ("float16",))
-        patch.setattr(part("ladders"), "RANKS", ((),))
+        for name in ("LADDER_PRECISIONS", "LADDER_FINISHED"):
+            patch.setattr(blocks, name, ("float16",))
+        patch.setattr(blocks, "LADDER_RANKS", (None,))
 
-        def noted(scene, output, **words):
-            report = fuse(scene, output, **words)
-            made.append(Path(output).read_bytes())
+        def noted(request, progress):
+            report = fuse(request, progress)
+            made.append(Path(request.output).read_bytes())
             return report
 
         fuse = module.fuse
@@ -105,12 +110,12 @@ def test_what_cannot_be_charted(run, folder, monkeypatch):
 def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
     before = sorted(folder.iterdir())
 
-    def interrupted(scene, output, **words):
-        Path(output).touch()
-        Path(f"{output}.checkpoint").touch()
+    def interrupted(request, progress):
+        Path(request.output).touch()
+        Path(f"{request.output}.checkpoint").touch()
         _interrupt(signal.SIGINT, None)
 
-    monkeypatch.setattr(part("chart"), "fuse", interrupted)
+    monkeypatch.setattr(part("charting"), "fuse", interrupted)
     result = run(*CHART)
     assert result.exit_code == 130 and "nothing was written" in result.stderr
     assert sorted(folder.iterdir()) == before
@@ -119,15 +124,37 @@ def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
 # --- frontiers ----------------------------------------------------------------------------------------------
 
 
+CHARTED = ChartRequest(
+    scene="scene.json",
+    output="chart",
+    overwrite=False,
+    budget=60.0,
+    kinds=(),
+    least_psnr=30.0,
+    size=(24, 24),
+    memory=None,
+    allow_outside=False,
+    seed=0,
+    device="cpu",
+    threads=None,
+    fuse_request=fuse_request,
+)
+
+
+def shrinking(kind: str, least_psnr: float):
+    """The ladder of flags that shrinks what a kind gives."""
+    return in_flags(kind, shrinking_rungs(Rung(), least_psnr))
+
+
 def point(**values):
-    return part("chart").Point(**{"flags": "", "kind": "vm", "ssim": 1.0, "ms": 1.0} | values)
+    return part("charting").Point(**{"flags": "", "kind": "vm", "ssim": 1.0, "ms": 1.0} | values)
 
 
 def test_a_frontier_is_what_no_other_point_surpasses():
     rng = np.random.default_rng(0)
     sizes, psnrs = rng.integers(1, 20, 60), rng.integers(20, 40, 60).astype(float)
     points = [point(psnr=q, bytes=int(b), seconds=1.0) for q, b in zip(psnrs, sizes, strict=True)]
-    part("chart").mark_frontiers(points)
+    part("charting").mark_frontiers(points)
 
     def surpassed(p):
         return any(
@@ -142,7 +169,7 @@ def test_a_frontier_is_what_no_other_point_surpasses():
 def test_times_within_the_noise_are_equal():
     times = [(50, 1.0), (49, 0.97), (48, 0.94), (47, 0.5)]
     points = [point(psnr=q, bytes=1, seconds=s) for q, s in times]
-    part("chart").mark_frontiers(points)
+    part("charting").mark_frontiers(points)
     assert ["seconds" in p.frontier for p in points] == [True, False, True, True]
 
 
@@ -155,14 +182,14 @@ def climbing(
     """(what Charting.climb left, its points, its warnings) where a fuse of a kind takes so many seconds of a
     clock of its own, or is refused; from one to the next the PSNR falls by 5 dB, and the bytes by a tenth of
     those of the kind, a million by default."""
-    module, clock, heard = part("chart"), [0.0], NullProgress()
+    module, clock, heard = part("charting"), [0.0], NullProgress()
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    course = SimpleNamespace(scene="scene.json", quality=lambda path: (50.0 - 5 * len(run.points), 1.0))
+    benchmark = SimpleNamespace(scene="scene.json", quality=lambda path: (50.0 - 5 * len(run.points), 1.0))
     paths = iter(map(Path, "abcdefghijklmnop"))
-    run = module.Charting(course, paths, lambda flags: {"flags": flags}, {"seed": 0}, heard)
+    run = module.Charting(benchmark, paths, CHARTED, heard)
 
-    def fuse(scene, output, *, flags, **words):
-        kind = flags[flags.index("--kind") + 1]
+    def fuse(request, progress):
+        kind = request.kind
         clock[0] += seconds[kind] / 2  # the first of a kind is done twice
         if kind in refused:
             raise refused[kind]
@@ -170,7 +197,7 @@ def climbing(
         return {"bytes": int(size), "total_seconds": seconds[kind]}
 
     monkeypatch.setattr(module, "fuse", fuse)
-    waiting = {k: {k: [shrinking(("--kind", k), 0)]} for k in seconds}
+    waiting = {k: {k: [shrinking(k, 0)]} for k in seconds}
     return lambda budget: (run.climb(waiting, budget), run.points, heard.warnings)
 
 
@@ -188,8 +215,8 @@ def test_a_kind_that_others_surpass_gets_a_third_of_the_time(monkeypatch):
 
 def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
     """The second one's first rung shows 2 dB less than the other in more bytes, its next ones are as good."""
-    chart = part("chart")
-    ahead, slow = chart.Climber(shrinking(("a",), 30), ("a",)), chart.Climber(shrinking(("b",), 30), ("b",))
+    chart = part("charting")
+    ahead, slow = chart.Climber(shrinking("a", 30), ("a",)), chart.Climber(shrinking("b", 30), ("b",))
     for climber, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
         climber.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
     found = [*ahead.points, *slow.points]
@@ -197,7 +224,7 @@ def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
     slow.points.append(point(psnr=46.9, bytes=6, seconds=1.0))
     found = [*ahead.points, *slow.points]
     assert not slow.behind(found)
-    assert not chart.Climber(shrinking((), 30), ()).behind(found)
+    assert not chart.Climber(shrinking("c", 30), ()).behind(found)
 
 
 def test_a_kind_that_does_not_fit_leaves_the_others(monkeypatch):
@@ -228,16 +255,16 @@ def climbed(ladder, give) -> list[tuple[str, ...]]:
 
 def test_a_ladder_shrinks_until_quality_is_lost():
     psnrs = iter((50.0, 45.0, 40.0, 29.0))
-    rungs = climbed(shrinking(("--kind", "blocks"), 30), lambda flags: (18_400_000, next(psnrs)))
+    rungs = climbed(shrinking("blocks", 30), lambda flags: (18_400_000, next(psnrs)))
     assert rungs[0] == ("--kind", "blocks")
     assert [r[-1] for r in rungs[1:]] == ["12MB", "8MB", "5.3MB"]
-    assert climbed(shrinking((), 30), lambda flags: None) == [()]
-    smallest = climbed(shrinking((), 30), lambda flags: (400_000, 99.0))[-1]
+    assert climbed(shrinking("vm", 30), lambda flags: None) == [("--kind", "vm")]
+    smallest = climbed(shrinking("vm", 30), lambda flags: (400_000, 99.0))[-1]
     assert smallest[-1] == "48kB"
 
 
 def test_a_distilled_ladder_goes_on_past_what_does_not_fit():
-    rungs = climbed(distilled(), lambda flags: None)
+    rungs = climbed(in_flags("vm", by_sizes()), lambda flags: None)
     assert len(rungs) == len(set(rungs)) == 24
     assert all("--time-budget" not in r for r in rungs[-6:])
 
@@ -249,10 +276,10 @@ def test_sizes_are_rounded_down_to_what_the_flag_reads_back(size):
     assert BYTES.parse(in_words(floor)) == floor
 
 
-@pytest.mark.parametrize("kind", ["blocks", "sparse", "vm"])
+@pytest.mark.parametrize("kind", registry.names())
 def test_fuse_takes_what_a_ladder_begins_with(kind):
     found = [ladder for group in ladders(kind, 30).values() for ladder in group]
-    assert all(fuse_words(next(ladder))["kind"] == kind for ladder in found)
+    assert all(fuse_request(next(ladder)).kind == kind for ladder in found)
 
 
 # --- the drawing --------------------------------------------------------------------------------------------
@@ -262,7 +289,7 @@ def test_numbers_in_a_panel_do_not_overlap():
     rng = np.random.default_rng(2)
     points = [point(psnr=30 + i, bytes=int(1e6 * 1.3**i), seconds=1.0) for i in range(20)]
     points += [point(psnr=25 + 10 * v, bytes=int(1e6 + 4e7 * v), seconds=1.0) for v in rng.random(40)]
-    part("chart").mark_frontiers(points)
+    part("charting").mark_frontiers(points)
     figure = plots.pyplot().figure(figsize=(4.3, 4.4))
     panel = figure.subplots()
     plots.draw_panel(panel, "bytes", points)

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from fusedrf_cli.bridge.choose import CLOSE, Choosing, Tried, Way
+from fusedrf_cli.bridge.choose import CLOSE, Choosing, Tried, flags
+from fusedrf_cli.engine.kinds.student import Way
 
 INT4 = [Way("int4", (8, 16)), Way("int4", (8, 24)), Way("int4")]
 INT8 = [Way("int8", (8, 16)), Way("int8")]
@@ -76,7 +77,7 @@ def test_the_next_larger_and_smaller_are_told_with_what_they_give():
 
 
 def test_flags_name_what_is_fixed():
-    assert Way("int4", (8, 16), 1).flags("blocks", 9) == (
+    assert flags("blocks", Way("int4", (8, 16), 1), 9) == (
         "--kind blocks --precision int4 --ranks 8,16 --sh-degree 1 --max-size 9"
     )
-    assert Way("float16").flags("blocks", 9) == "--kind blocks --precision float16 --max-size 9"
+    assert flags("blocks", Way("float16"), 9) == "--kind blocks --precision float16 --max-size 9"

@@ -1,7 +1,6 @@
 """Every command that writes numbers, in 8 and 4 bits, on the shop's tiny scenes."""
 
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,8 +10,9 @@ from formats.bundle import read_bundle, read_headers
 from formats.records import PRECISIONS
 from fusedrf_cli import options
 from fusedrf_cli.bridge.scene import load_scene, stored, write_field
-from fusedrf_cli.engine.distillation.fit import FitSettings, texels
+from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.vm import KIND
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.bridge.conftest import done, part
 
@@ -70,12 +70,12 @@ def test_training_in_8_bits(report, folder, picture):
 
 
 def test_fewer_bits_leave_room_for_more_texels():
-    train, box, longest = part("train"), np.array([0, 0, 0, 2.0, 1, 1]), {}
+    train, box, longest = part("training"), np.array([0, 0, 0, 2.0, 1, 1]), {}
     settings = FitSettings(longest=256)
     for precision in PRECISIONS:
-        longest[precision] = train.fitting_longest(box, settings, 1_000_000, precision)
-        size = partial(train.tensor_bytes, settings.shape, precision=precision)
-        assert size(texels(box, longest[precision])) <= 1_000_000 < size(texels(box, longest[precision] + 4))
+        found = longest[precision] = train.fitting_longest(KIND, box, settings, 1_000_000, precision)
+        sizes = [train.bytes_of(KIND.untrained(box, n, settings.way), precision) for n in (found, found + 4)]
+        assert sizes[0] <= 1_000_000 < sizes[1]
     assert longest["float32"] < longest["float16"] < longest["int8"] < longest["int4"]
 
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from formats.records import FieldRecord, encode_field
-from fusedrf_cli.bridge.sizes import vm_bytes
-from fusedrf_cli.engine.composition.trimming import without_unread
+from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.students import contents_of
+from fusedrf_cli.engine.kinds.vm.trimming import without_unread
 
 
 @pytest.mark.parametrize("precision", ["float16", "float32", "int8", "int4"])
@@ -28,5 +29,5 @@ def test_a_vm_field_takes_what_was_said(precision, share):
     )
     field = without_unread(VMField.assembled(shape, tensors, blocks, params))
     found = len(encode_field(FieldRecord(field.kind, *field.state()), precision))
-    said = vm_bytes(shape, tensors, len(blocks), precision)
+    said = BundleSizes().of(contents_of(shape, tensors, len(blocks)), precision)
     assert found <= said <= 1.01 * found + 8000

@@ -5,8 +5,9 @@ import pytest
 
 from formats.bundle import read_bundle
 from fusedrf_cli.bridge.scene import make_field
+from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import PLACES, TinySettings, done, part
+from tests.bridge.conftest import PLACES, TinySettings, done
 from tests.bridge.test_edit import AT, blues, covered
 
 SPARSE = ("--kind", "sparse", "--max-size", "600kB", "--precision", "float16")
@@ -15,7 +16,7 @@ SPARSE = ("--kind", "sparse", "--max-size", "600kB", "--precision", "float16")
 @pytest.fixture(scope="module", autouse=True)
 def short(tiny):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(part("fuse_sparse"), "FINISH", TinySettings(steps=0, rgb_steps=10))
+        patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
         yield
 
 

@@ -23,7 +23,7 @@ def train(report, output="out.rfpack", *more):
 
 def test_photos_become_a_field(report, folder, monkeypatch):
     longer = {"normal": FitSettings(longest=24, steps=300, samples=1 << 13)}
-    monkeypatch.setattr(part("train"), "QUALITY", longer)
+    monkeypatch.setattr(part("training"), "QUALITY", longer)
     said = train(report)
     assert said["views"] == 8 and said["steps"] == 300 and said["kind"] == "vm" and said["holdout"] is None
     assert said["bytes"] == (folder / "out.rfpack").stat().st_size

@@ -46,8 +46,8 @@ def bridge(monkeypatch) -> types.ModuleType:
     stub.report, stub.error, stub.call = {}, None, None
 
     def verb(name):
-        def note(*words, **options):
-            stub.call = (name, words, options)
+        def note(request, progress):
+            stub.call = (name, dict(vars(request)))
             if stub.error is not None:
                 raise stub.error
             return stub.report

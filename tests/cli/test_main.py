@@ -27,8 +27,8 @@ atexit.register(lambda: print(sorted({HEAVY | {"numpy"}!r} & set(sys.modules)), 
 WAITING = f"""
 import time, types
 from formats.atomic import atomic_writer
-def train(source, output, **words):
-    with atomic_writer(output) as file:
+def train(request, progress):
+    with atomic_writer(request.output) as file:
         file.write(b"half")
         print("ready", flush=True)
         time.sleep(60)
@@ -104,7 +104,7 @@ def test_options_come_from_the_environment(run, bridge, monkeypatch):
     monkeypatch.setenv("FUSEDRF_TRAIN_SEED", "7")
     monkeypatch.setenv("FUSEDRF_TRAIN_MAX_SIZE", "2MB")
     run("train", "chair.rfpack", "-o", "out.rfpack")
-    _, _, options = bridge.call
+    _, options = bridge.call
     assert (options["seed"], options["max_size"]) == (7, 2_000_000)
 
 

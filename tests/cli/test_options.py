@@ -71,7 +71,7 @@ def test_an_affine_may_lie_in_a_file(tmp_path, text):
 def test_an_affine_may_come_by_pipe(run, bridge):
     words = ("add", "chair.rfpack", "table.rfpack", "-o", "out", "--name", "a", "--matrix", "-")
     assert run(*words, stdin=SPELLED.replace("1,0,0,0,", "1,0,0,5,")).exit_code == 0
-    assert bridge.call[2]["object_to_world"][0].tolist() == [1, 0, 0, 5]
+    assert bridge.call[1]["object_to_world"][0].tolist() == [1, 0, 0, 5]
 
 
 # --- placement ----------------------------------------------------------------------------------------------
@@ -110,18 +110,20 @@ def test_a_matrix_goes_with_no_other_word():
 
 # --- commands and their bridge ------------------------------------------------------------------------------
 
+EDIT = ("fused", "output", "precision", "rgb", "time_budget")
 COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False, "memory": None}
 
 
 def test_train_hands_on_what_was_asked(run, bridge):
     run("train", "chair.rfpack", "-o", "out", "--max-size", "1MB", "--aabb", "0,0,0,1,1,1", "--holdout", "8")
-    name, words, given_options = bridge.call
-    given_options.pop("progress")
-    assert (name, words) == ("train", ("chair.rfpack", "out"))
-    assert given_options == COMMON | {
+    name, asked = bridge.call
+    assert name == "train"
+    assert asked == COMMON | {
+        "source": "chair.rfpack",
+        "output": "out",
+        "ranks": None,
         "kind": "vm",
-        "colour": "sh",
-        "sh_degree": 2,
+        "sh_degree": None,
         "max_size": 1_000_000,
         "target_psnr": None,
         "time_budget": None,
@@ -137,10 +139,11 @@ def test_train_hands_on_what_was_asked(run, bridge):
 
 def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
     run("fuse", "-", "-o", "out", "--no-rgb", "--device", "cpu", "--threads", "2", "--seed", "5")
-    name, words, given_options = bridge.call
-    given_options.pop("progress")
-    assert (name, words) == ("fuse", ("-", "out"))
-    assert given_options == COMMON | {
+    name, asked = bridge.call
+    assert name == "fuse"
+    assert asked == COMMON | {
+        "scene": "-",
+        "output": "out",
         "device": "cpu",
         "threads": 2,
         "seed": 5,
@@ -161,19 +164,23 @@ def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
 
 def test_add_hands_on_one_matrix(run, bridge):
     run("add", "chair.rfpack", "table.rfpack", "-o", "out", "--name", "a", "-t", "1,0,0", "-s", "2")
-    name, words, given_options = bridge.call
-    assert (name, words) == ("add", ("chair.rfpack", "table.rfpack", "out"))
-    matrix = given_options.pop("object_to_world")
+    name, asked = bridge.call
+    matrix = asked.pop("object_to_world")
+    assert (name, asked["fused"], asked["source"], asked["output"]) == (
+        "add",
+        "chair.rfpack",
+        "table.rfpack",
+        "out",
+    )
     assert matrix.tolist() == [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
-    assert set(given_options) == {*COMMON, "name", "time_budget", "rgb", "precision", "progress"}
+    assert set(asked) == {*COMMON, *EDIT, "source", "name"}
 
 
 def test_delete_hands_on_its_names(run, bridge):
     run("delete", "chair.rfpack", "a", "b", "-o", "out")
-    name, words, given_options = bridge.call
-    assert (name, words) == ("delete", ("chair.rfpack", ("a", "b"), "out"))
-    wanted = {*COMMON, "time_budget", "rgb", "precision", "allow_outside", "progress"} - {"memory"}
-    assert set(given_options) == wanted
+    name, asked = bridge.call
+    assert (name, asked["fused"], asked["names"]) == ("delete", "chair.rfpack", ("a", "b"))
+    assert set(asked) == {*COMMON, *EDIT, "names", "allow_outside"}
 
 
 @pytest.mark.parametrize(
@@ -181,11 +188,11 @@ def test_delete_hands_on_its_names(run, bridge):
 )
 def test_render_hands_on_a_background(run, bridge, colour, background):
     run("render", "chair.rfpack", "-o", "out.png", *(["--background", colour] if colour else []))
-    name, words, given_options = bridge.call
-    assert (name, words) == ("render", ("chair.rfpack", "out.png"))
-    assert given_options.pop("background") == background
-    others = {"cameras", "path", "orbit", "size", "depth", "fps", "allow_outside", "progress"}
-    assert set(given_options) == {*COMMON, *others}
+    name, asked = bridge.call
+    assert (name, asked["scene"], asked["output"]) == ("render", "chair.rfpack", "out.png")
+    assert asked["background"] == background
+    others = {"cameras", "path", "orbit", "size", "depth", "fps", "allow_outside"}
+    assert set(asked) == {*COMMON, "scene", "output", "background", *others} - {"seed"}
 
 
 def test_render_takes_one_choice_of_views(run, bridge):
@@ -195,9 +202,11 @@ def test_render_takes_one_choice_of_views(run, bridge):
 
 def test_eval_hands_on_both_sides(run, bridge):
     run("eval", "chair.rfpack", "--against", "table.rfpack", "--size", "40x30")
-    name, words, given_options = bridge.call
-    assert (name, words, given_options["size"]) == ("evaluate", ("chair.rfpack", "table.rfpack"), (40, 30))
-    assert set(given_options) == {"split", "size", "memory", "allow_outside", "device", "threads", "progress"}
+    name, asked = bridge.call
+    sides = asked["bundle"], asked["against"], asked["size"]
+    assert (name, *sides) == ("evaluate", "chair.rfpack", "table.rfpack", (40, 30))
+    wanted = {"split", "size", "memory", "allow_outside", "device", "threads", "bundle", "against"}
+    assert set(asked) == wanted
 
 
 # --- what every command does --------------------------------------------------------------------------------
@@ -213,7 +222,7 @@ def test_an_output_in_the_way_is_refused_before_any_work(run, bridge, folder, ou
 
 def test_overwrite_lets_an_output_be_replaced(run, bridge):
     assert run("fuse", "chair.rfpack", "-o", "table.rfpack", "-w").exit_code == 0
-    assert bridge.call[2]["overwrite"] is True
+    assert bridge.call[1]["overwrite"] is True
 
 
 REPORT = {
@@ -270,7 +279,7 @@ def test_the_report_of_an_error_is_printed_before_it(run, bridge):
     ],
 )
 def test_warnings_of_libraries_become_lines(run, bridge, category, flags, shown):
-    bridge.fuse = lambda *words, **given_options: warnings.warn("odd", category, stacklevel=1) or {"a": 1}
+    bridge.fuse = lambda request, progress: warnings.warn("odd", category, stacklevel=1) or {"a": 1}
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         result = run("fuse", "chair.rfpack", "-o", "out", "--json", *flags)

@@ -14,8 +14,10 @@ from pathlib import Path
 import pytest
 
 from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from tests.analytic.export import NotExportable
+from fusedrf_cli.engine.kinds.student import Student
+from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings, part
 
 ROW = re.compile(r"test_([a-z]+\d+)_")
@@ -75,11 +77,12 @@ def quick(monkeypatch) -> None:
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 48)
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 48)
     monkeypatch.setattr("fusedrf_cli.engine.distillation.distill.POINTS_PER_STEP", 1 << 13)
-    monkeypatch.setattr(part("fuse_vm"), "DistillSettings", TinySettings)
-    monkeypatch.setattr(part("fuse_blocks"), "RANKS", (None,))  # others would be compiled
+    monkeypatch.setattr(Student, "lesson", TinySettings())
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.students.SHAPE", SHAPE)
+    monkeypatch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.RAYS_PER_STEP", 500)
     monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.STEPS", 30)
-    for name in ("fuse_blocks", "fuse_vm", "edit"):
+    for name in ("making", "editing"):
         judge = lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed)  # noqa: E731
         monkeypatch.setattr(part(name), "Judge", judge)
 

@@ -16,18 +16,18 @@ from formats.records import FieldRecord, decode_field, encode_field
 from formats.scene import NODE_KEYS, SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import distill
-from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.errors import InvalidInput
 from tests.analytic import scenes
-from tests.analytic.export import EXPORTERS, SHAPE, exported, vm_field
+from tests.analytic.export import EXPORTERS, SHAPE, exported, vm_field, way_of
 from tests.analytic.fields import Activation, Box, Gaussian
 from tests.analytic.files import write_bundles
 from tests.analytic.measure import LSB, answers, depth_along, photo, worst_relative
@@ -292,8 +292,8 @@ def test_b8_an_opaque_box_from_inside(row, kind):
 
 def test_b8_an_opaque_teacher_gives_finite_losses(row):
     teacher = scene_of((Box(1e8, 0.5, tint=scenes.RED), np.eye(4))).composed("vm")
-    settings = TinySettings(max_numbers=SHAPE.size((16, 16, 16)), steps=20, rays=1000)
-    student = empty_student(teacher, settings, torch.Generator().manual_seed(0), "one")
+    settings, numbers = TinySettings(steps=20, rays=1000), SHAPE.size((16, 16, 16))
+    student = VM.empty(teacher, way_of(SHAPE), numbers, torch.Generator().manual_seed(0), "one")
     student, report = distill(teacher, student, [teacher.occupancy.tight_aabb(0)], settings)
     told = (report.psnr_before_rgb, report.psnr_after_rgb, student.params.abs().max())
     row.check("B8", "finite figures of a distilled opaque box", np.isfinite(told).sum(), 3, scene="S9")

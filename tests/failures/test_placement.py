@@ -13,17 +13,18 @@ from formats.errors import FormatError
 from formats.scene import Node, SceneGraph, make_node, read_scene, write_scene
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
-from fusedrf_cli.engine.composition.detail import block_details, opacity_off
+from fusedrf_cli.engine.composition.detail import opacity_off
 from fusedrf_cli.engine.distillation.distill import distill
-from fusedrf_cli.engine.distillation.settings import DistillSettings
-from fusedrf_cli.engine.distillation.student import empty_student
 from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.student import DistillSettings
+from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.details import block_details
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.analytic import scenes
-from tests.analytic.export import SHAPE, exported
+from tests.analytic.export import SHAPE, exported, way_of
 from tests.analytic.fields import Box, Gaussian, Tint
 from tests.analytic.files import write_bundles, write_camera
 from tests.analytic.measure import answers, depth_along, photo, worst_relative
@@ -144,9 +145,9 @@ def test_a2_the_measured_opacity_keeps_to_the_prediction(row, condition):
     """A translucent stretched ball distilled to one isotropic tensor, against its closed depth."""
     scene = scene_of((Gaussian(density=4.0, centre=(0, 0, 0), tint=scenes.RED), affine((1, 1, condition))))
     composed = scene.composed()
-    settings = DistillSettings(shape=SHAPE, max_numbers=SHAPE.size((48, 48, 48)), rays=30_000, steps=400)
+    settings, numbers = DistillSettings(rays=30_000, steps=400), SHAPE.size((48, 48, 48))
     generator = torch.Generator().manual_seed(0)
-    student = empty_student(composed, settings, generator, "one")
+    student = VM.empty(composed, way_of(SHAPE), numbers, generator, "one")
     student, _ = distill(composed, student, [composed.occupancy.tight_aabb(0)], settings, rgb=False)
     rays_o, rays_d = rays_at(composed.occupancy.tight_aabb(0) * 0.5, 1000, seed=5, away=8.0)
     spans = np.tile([0.0, 16.0], (1000, 1))

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fusedrf_cli.bridge.train import QUALITY
+from fusedrf_cli.bridge.training import QUALITY
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.fit import fit

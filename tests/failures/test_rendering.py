@@ -26,7 +26,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import EARLY_STOP, STEP_PER_VOXEL, render_image, render_rays
 from fusedrf_cli.main import cli
 from tests.analytic import scenes
-from tests.analytic.export import SHAPE, exported, vm_field
+from tests.analytic.export import SHAPE, exported, vm_field, way_of
 from tests.analytic.fields import Box, Gaussian, Slow
 from tests.analytic.rays import affine, turn
 
@@ -117,7 +117,7 @@ def trained():
         pixels = np.concatenate([straight, found[..., 3:]], -1)
         pictures.append(np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
     torch.set_num_threads(2)
-    settings = FitSettings(shape=SHAPE, longest=40, steps=200, samples=1 << 12)
+    settings = FitSettings(way=way_of(SHAPE), longest=40, steps=200, samples=1 << 12)
     field = fit(cameras, np.stack(pictures), box, settings)
     unseen = scattered(box, 3, 40, 40, seed=9, lowest=-0.6)
     return field, unseen, np.stack([scene.image(camera) for camera in unseen])

@@ -16,14 +16,14 @@ from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of, without
 from fusedrf_cli.engine.distillation.distill import distill
-from fusedrf_cli.engine.distillation.student import empty_student
+from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, without
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.main import cli
 from tests.analytic import scenes
-from tests.analytic.export import SHAPE, exported, vm_field
+from tests.analytic.export import SHAPE, exported, vm_field, way_of
 from tests.analytic.fields import Box, Gaussian, Tint
 from tests.analytic.rays import affine, turn
 from tests.bridge.conftest import TinySettings, tiny  # noqa: F401  (grids, steps and pictures made small)
@@ -324,8 +324,9 @@ def test_c8_turned_boxes_are_as_good_as_upright_ones(row):
 def distilled(scene, seed: int, **more):
     """A student of one tensor of a scene, and the scene composed."""
     teacher = scene.composed("vm")
-    settings = TinySettings(seed=seed, max_numbers=SHAPE.size((32,) * 3), steps=300, rays=12000, **more)
-    student = empty_student(teacher, settings, torch.Generator().manual_seed(seed), "student")
+    settings = TinySettings(seed=seed, steps=300, rays=12000, **more)
+    generator = torch.Generator().manual_seed(seed)
+    student = VM.empty(teacher, way_of(SHAPE), SHAPE.size((32,) * 3), generator, "student")
     boxes = [teacher.occupancy.tight_aabb(0), *(p.aabb for p in teacher.placed)]
     return distill(teacher, student, boxes, settings, rgb=False)[0], teacher
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.bridge.train import QUALITY
+from fusedrf_cli.bridge.training import QUALITY
 from fusedrf_cli.engine.distillation import fit as module
 from fusedrf_cli.engine.distillation.fit import RATE, RETRY_AFTER, FitRun, FitSettings, fit
 from fusedrf_cli.engine.distillation.losses import point_step
@@ -25,10 +25,11 @@ from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO
 from tests.engine.distillation.test_fit import pictures
 
-BRIEF = FitSettings(shape=THIRTY_TWO, longest=24, steps=80, samples=1 << 12)
+BRIEF = FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
 LONG = replace(BRIEF, longest=32, steps=300)
 CAMERAS = orbit(BOX, 14, 24, 24) + orbit(BOX, 8, 24, 24, elevation=-0.5)
 UNSEEN = scattered(BOX, 4, 24, 24, seed=3)

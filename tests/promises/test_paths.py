@@ -135,7 +135,7 @@ def test_a_history_cannot_send_an_edit_outside(folder, source, monkeypatch):
 )
 def test_a_history_of_another_shape_is_refused(nodes):
     """P9, P12: the format leaves a history free; an edit says what it cannot use."""
-    from fusedrf_cli.bridge.edit import check_history
+    from fusedrf_cli.bridge.editing import check_history
     from fusedrf_cli.errors import InvalidInput
 
     scene = SceneGraph((), history=({"event": "fused", "nodes": nodes},))

@@ -11,7 +11,7 @@ from formats import scene as scene_file
 from formats.bundle import BundleWriter, read_bundle, read_summary
 from formats.errors import FormatWarning, NewerVersion
 from formats.images import read_image
-from fusedrf_cli.bridge.render import renderable, to_pixels
+from fusedrf_cli.bridge.rendering import renderable, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image

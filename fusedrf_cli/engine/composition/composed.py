@@ -6,10 +6,9 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_cells
-from fusedrf_cli.engine.kinds.vm.field import OWNERSHIP_CELLS
+from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, placed_cells
 
-OCCUPANCY_CELLS = OWNERSHIP_CELLS  # so that a scene and what it is fused to are framed alike
+OCCUPANCY_CELLS = SCENE_CELLS
 RULES = ("max", "add")
 
 
@@ -73,7 +72,8 @@ class ComposedField:
         return sigma.float(), rgb.float()
 
     def _densest(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
-        """Where a field is denser than those before it (at points of indices `inside`), it has the say."""
+        """Where a field is denser than those before it (at points of indices `inside`), its answer is
+        taken."""
         found = _sigma(placed, points[inside], dirs[inside])
         denser = found > sigma[inside]
         won = inside[denser]

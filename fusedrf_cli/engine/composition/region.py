@@ -1,16 +1,20 @@
-"""A region of a field: emptying it, and a teacher that exists only inside it."""
+"""Teachers of a region of a field: one that exists only inside it, and one that shows something else
+there."""
 
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
-
-RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
+from fusedrf_cli.engine.fields.occupancy import (
+    DEFAULT_CELLS,
+    SCENE_CELLS,
+    OccupancyGrid,
+    cell_counts,
+    marked_cells,
+)
 
 
 class ClippedField:
@@ -49,37 +53,69 @@ class ClippedField:
         return sigma * ((points >= box[:3]) & (points <= box[3:])).all(1), rgb
 
 
-def region_of(field: VMField, aabb: np.ndarray) -> np.ndarray:
-    """(6,) the box grown to whole cells of the field's distilled tensor (block 0), so that cutting it out
-    leaves no seam.
-    """
-    tensor = field.tensors[field.blocks[0].tensor]
-    at = field.blocks[0].object_to_field[:3, 3]
-    cell, lo = tensor.occupancy.cell, tensor.aabb[:3] + at
-    low = np.floor((aabb[:3] - lo) / cell - 1e-9)
-    high = np.ceil((aabb[3:] - lo) / cell + 1e-9)
-    shape = np.asarray(tensor.occupancy.occupied.shape)
-    return np.concatenate([lo + np.clip(low, 0, shape) * cell, lo + np.clip(high, 0, shape) * cell])
+class MaxOf:
+    """Placed fields as one that answers as the densest of them; of none, that there is nothing."""
+
+    kind = "densest"
+
+    def __init__(self, placed: list[Placed]):
+        self.placed = placed
+
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
+        sigma, rgb = torch.zeros(len(points)), torch.zeros(len(points), 3)
+        for one in self.placed:
+            x, d, stretch = one.to_object(points, dirs)
+            found, colour = one.field.query(x, d, with_colour)
+            found = (found.double() * stretch).float()
+            won = found > sigma
+            sigma[won], rgb[won] = found[won], colour[won].float()
+        return sigma, rgb
 
 
-def cleared(field: VMField, region: np.ndarray) -> VMField:
-    """The field with the cells of a region (of `region_of`) empty in its distilled tensor, and in the tensors
-    that earlier cuts filled in; no number changes.
-    """
-    blocks = [field.blocks[0], *(b for b in field.blocks[1:] if b.name == RESTORED)]
-    emptied = {
-        b.tensor: emptied_tensor(field.tensors[b.tensor], b.object_to_field[:3, 3], region) for b in blocks
-    }
-    tensors = tuple(emptied.get(t, tensor) for t, tensor in enumerate(field.tensors))
-    return VMField.assembled(field.shape, tensors, field.blocks, field.params)
+class PatchedField:
+    """A field that inside a region of its frame answers as others do."""
 
+    kind = "patched"
 
-def emptied_tensor(tensor: VMTensor, at: np.ndarray, region: np.ndarray) -> VMTensor:
-    """A tensor placed by a mere shift `at` (3,), without the cells whose centres lie in the region."""
-    grid = tensor.occupancy
-    cells = np.argwhere(grid.occupied)
-    centres = grid.aabb[:3] + at + (cells + 0.5) * grid.cell
-    inside = ((centres > region[:3]) & (centres < region[3:])).all(1)
-    occupied = grid.occupied.copy()
-    occupied[tuple(cells[inside].T)] = False
-    return replace(tensor, occupied=occupied)
+    def __init__(self, field: RadianceField, aabb: np.ndarray, region: np.ndarray, inside: MaxOf):
+        """aabb (6,) is the box of it all, region (6,) a part of it where `inside` answers."""
+        self.field, self.aabb, self.region, self.inside = field, aabb, region, inside
+
+    @property
+    def voxel_size(self) -> float:
+        """The finest of all."""
+        return min([self.field.voxel_size, *(p.voxel_size for p in self.inside.placed)])
+
+    @cached_property
+    def occupancy(self) -> OccupancyGrid:
+        """Cells that the field reaches outside of the region, or the others inside of it."""
+        own = self.field.occupancy
+        longest = int(
+            np.clip(np.ceil((self.aabb[3:] - self.aabb[:3]).max() / own.cell.min()), 1, SCENE_CELLS)
+        )
+        longest = max(longest, min(DEFAULT_CELLS, SCENE_CELLS))
+        counts = cell_counts(self.aabb, longest)
+        grid = OccupancyGrid(self.aabb, np.ones(counts, bool))
+        centres = grid.centres()
+        reach = grid.cell / 2
+        within = ((centres > self.region[:3] + reach) & (centres < self.region[3:] - reach)).all(1)
+        found = own.dilated().contains(centres) & ~within
+        beside = ((centres > self.region[:3] - reach) & (centres < self.region[3:] + reach)).all(1)
+        for one in self.inside.placed:
+            reached = marked_cells(one.field.occupancy, one.object_to_world, self.aabb, longest)
+            found |= reached.ravel() & beside
+        return OccupancyGrid(self.aabb, found.reshape(counts))
+
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
+        sigma, rgb = self.field.query(points, dirs, with_colour)
+        region = torch.from_numpy(self.region)
+        within = ((points >= region[:3]) & (points <= region[3:])).all(1)
+        if within.any():
+            sigma[within], rgb[within] = self.inside.query(points[within], dirs[within], with_colour)
+        return sigma, rgb

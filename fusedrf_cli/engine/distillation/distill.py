@@ -1,4 +1,4 @@
-"""Distil any radiance field into a VM student (FusedRF; PVD for one teacher).
+"""Distil any radiance field into a student of any kind (FusedRF; PVD for one teacher).
 
 Three phases: ask the teacher on rays through it, fit the student's σ and colour at the points of those rays
 (3D losses), at half the resolution first, then pass over the rays themselves (RGB loss) at a far lower rate,
@@ -25,15 +25,14 @@ from fusedrf_cli.engine.distillation.losses import (
 )
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
-from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, matter_first, random_rays
-from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.student import DistillSettings
 
 RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
-RGB_RATE = 0.003
 OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
 COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
@@ -48,7 +47,8 @@ class Recipe:
     density_loss: DensityLoss = log_depth
     visibility: Visibility = mostly_seen
     rate: float = RATE
-    rgb_rate: float = RGB_RATE
+    rgb_rate: float | None = None
+    """None: the settings' own."""
     coarse: Callable[[RadianceField], bool] = starts_coarse
     """Whether a student begins at half its resolution."""
     schedule: type[Schedule] = Schedule
@@ -77,15 +77,14 @@ class DistillReport:
 
 def distill(
     teacher: RadianceField,
-    student: VMField,
+    student: StoredField,
     boxes: list[np.ndarray],
     settings: DistillSettings,
     rgb: bool = True,
     phase: Callable[[str], None] = lambda name: None,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
-) -> tuple[VMField, DistillReport]:
-    """Teach a one-block VM student in the teacher's frame; boxes are the scene's and the objects' (6,), for
-    sampling.
+) -> tuple[StoredField, DistillReport]:
+    """Teach a student in the teacher's frame; boxes are the scene's and the objects' (6,), for sampling.
 
     Raises FloatingPointError when the student's numbers do not stay finite.
     """
@@ -101,7 +100,7 @@ class DistillRun:
     def __init__(
         self,
         teacher: RadianceField,
-        student: VMField,
+        student: StoredField,
         boxes: list[np.ndarray],
         settings: DistillSettings,
         rgb: bool = True,
@@ -121,6 +120,8 @@ class DistillRun:
         self.optimiser = Adam.of(self.student)
         self.guard = Guard(lambda: self.optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
+        self.learnt_seconds = 0.0
+        """That this process has learnt for."""
         self.schedule = recipe.schedule()
         self.began = working_time()
         self.before: torch.Tensor | None = None
@@ -133,9 +134,10 @@ class DistillRun:
         self,
         phase: Callable[[str], None] = lambda name: None,
         advance: Callable[[float, dict], None] = lambda share, figures: None,
-        whole: Callable[[], AbstractContextManager] = nullcontext,
-    ) -> tuple[VMField, DistillReport]:
-        """Run to the end. Every step happens inside a `whole()`, which may hold an interrupt back."""
+        uninterrupted: Callable[[], AbstractContextManager] = nullcontext,
+    ) -> tuple[StoredField, DistillReport]:
+        """Run to the end. Every step happens inside an `uninterrupted()`, which may hold an interrupt
+        back."""
         report, settings = self.report, self.settings
         self.began = working_time() - (report.curve[-1][0] if report.curve else 0.0)
         clock = _Clock(report.seconds)
@@ -152,14 +154,14 @@ class DistillRun:
         if self.phase == "points":
             phase("points")
             if len(pool.points) and settings.steps:
-                self._learn(PointPass(pool, self), settings.steps, held_out, advance, whole)
-            with whole():
+                self._learn(PointPass(pool, self), settings.steps, held_out, advance, uninterrupted)
+            with uninterrupted():
                 self._begin_pictures()
                 report.psnr_before_rgb = judge(self.student)
             clock.lap("points")
         if self.rgb:
             phase("pictures")
-            self._learn(RayPass(pool, self), settings.rgb_steps, held_out, advance, whole)
+            self._learn(RayPass(pool, self), settings.rgb_steps, held_out, advance, uninterrupted)
             report.steps["pictures"] = self.steps
             report.psnr_after_rgb = judge(self.student)
             report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
@@ -190,9 +192,9 @@ class DistillRun:
         self.guard.renew()
 
     def _prune(self) -> None:
-        """Leave out the cells that turned out empty, unless that would be all of them; only a student of one
-        block over its own box has cells to give up."""
-        if type(self.student) is not VMField or len(self.student.blocks) != 1:
+        """Leave out the cells that turned out empty, unless that would be all of them; only a student on one
+        grid over its own box has cells to give up."""
+        if self.student.resolution is None:
             return
         occupancy = pruned(self.student)
         self.report.found_nothing = bool(self.teacher.occupancy.occupied.any() > occupancy.occupied.any())
@@ -205,12 +207,13 @@ class DistillRun:
         steps: int,
         held_out: HeldOut,
         advance: Callable,
-        whole: Callable,
+        uninterrupted: Callable,
     ) -> None:
         """The steps of one phase."""
-        started = working_time() - self.elapsed
+        entered = working_time()
+        started = entered - self.elapsed
         while (share := self._share(steps, working_time() - started)) < self.schedule.end:
-            with whole():
+            with uninterrupted():
                 if self.refined is not None and share >= COARSE_UNTIL:
                     self._refine()
                 self.guard.keep()
@@ -223,6 +226,7 @@ class DistillRun:
                 self.elapsed = working_time() - started
             if self.steps % 20 == 1:
                 advance(share / self.schedule.end, figures)
+        self.learnt_seconds += working_time() - entered
         self.guard.check()
 
     def _look(self, held_out: HeldOut, share: float) -> None:
@@ -234,10 +238,17 @@ class DistillRun:
         self.report.curve.append((working_time() - self.began, made, found))
 
     def _share(self, steps: int, seconds: float) -> float:
-        """The share of the phase that is done: of its steps, or of its seconds where a budget is given."""
-        if self.settings.time_budget is None:
-            return self.steps / steps if steps else 1.0
-        return seconds / (self.settings.time_budget / (2 if self.rgb else 1))
+        """The share of the phase that is done: of its steps, or of its seconds where a budget is given, which
+        the phases that have steps share alike."""
+        if not steps:
+            return self.schedule.end
+        settings = self.settings
+        if settings.time_budget is None:
+            return self.steps / steps
+        if settings.time_budget <= 0:
+            return self.schedule.end
+        phases = (settings.steps > 0) + (self.rgb and settings.rgb_steps > 0)
+        return seconds / (settings.time_budget / phases)
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
@@ -315,7 +326,9 @@ class RayPass:
     """The RGB loss over the teacher's own rays, colour over white and opacity."""
 
     def __init__(self, pool: TeacherPool, run: DistillRun):
-        self.pool, self.run, self.rate = pool, run, run.recipe.rgb_rate
+        self.pool, self.run = pool, run
+        own = run.recipe.rgb_rate
+        self.rate = run.settings.rgb_rate if own is None else own
         self.target = pool.pixels.clone()
         self.target[:, :3] += 1 - self.target[:, 3:]
 
@@ -326,9 +339,9 @@ class RayPass:
         jitter = torch.rand(len(chosen), generator=run.generator, dtype=torch.float64).numpy()
         loss = np.zeros((run.optimiser.parts, 3))
         white = np.ones((len(chosen), 3), np.float32)
-        rays = pool.rays_o[chosen], pool.rays_d[chosen], jitter, run.step, EARLY_STOP
-        target = self.target[chosen].numpy()
-        run.student.train_rays(*rays, target, white, OPACITY_WEIGHT, run.optimiser.grads, loss)
+        rays = pool.rays_o[chosen], pool.rays_d[chosen], jitter, self.target[chosen].numpy(), white
+        batch = Batch(*rays, OPACITY_WEIGHT, 0.0, run.step, EARLY_STOP)
+        run.student.train_rays(batch, run.optimiser.grads, loss)
         sums = loss.sum(0)
         wanted = run.settings.rgb_samples * len(chosen) / max(sums[2], 1)
         run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))

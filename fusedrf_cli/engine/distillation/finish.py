@@ -10,7 +10,9 @@ from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import random_rays
-from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.computed import Batch
+from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.rendering.volume import STEP_PER_VOXEL, render_rays
 
 RATE, RATE_DECAY = 3e-3, 0.1
@@ -35,34 +37,34 @@ class RayLesson:
         self.target[:, :3] += 1 - self.target[:, 3:]
 
     def teach(
-        self, student, steps: int | None = None, advance: Callable[[float], None] = lambda share: None
+        self,
+        student: StoredField,
+        steps: int | None = None,
+        seconds: float | None = None,
+        advance: Callable[[float], None] = lambda share: None,
     ) -> None:
         """Steps (default: STEPS) of Adam on a student's numbers, in place, by the squared error of colour
-        over white and of opacity. Raises FloatingPointError when they do not stay finite.
+        over white and of opacity; fewer where the seconds are over before. Raises FloatingPointError when the
+        numbers do not stay finite.
         """
         steps = steps or STEPS
         generator = torch.Generator().manual_seed(self.seed + 1)
         epochs, optimiser = Epochs(len(self.rays_o), generator), Adam.of(student)
         guard = Guard(optimiser.numbers)
         step, white = STEP_PER_VOXEL * student.voxel_size, np.ones((RAYS_PER_STEP, 3), np.float32)
+        started, share = working_time(), 0.0
         for i in range(steps):
+            share = i / steps if seconds is None else max(i / steps, (working_time() - started) / seconds)
+            if share >= 1:
+                break
             guard.keep()
             chosen = epochs.draw(RAYS_PER_STEP).numpy()
             jitter = torch.rand(len(chosen), generator=generator, dtype=torch.float64).numpy()
             loss = np.zeros((optimiser.parts, 3))
-            student.train_rays(
-                self.rays_o[chosen],
-                self.rays_d[chosen],
-                jitter,
-                step,
-                EARLY_STOP,
-                self.target[chosen],
-                white[: len(chosen)],
-                OPACITY_WEIGHT,
-                optimiser.grads,
-                loss,
-            )
+            rays = self.rays_o[chosen], self.rays_d[chosen], jitter, self.target[chosen], white[: len(chosen)]
+            batch = Batch(*rays, OPACITY_WEIGHT, 0.0, step, EARLY_STOP)
+            student.train_rays(batch, optimiser.grads, loss)
             if guard.accepts(loss.sum(0), optimiser):
-                optimiser.step(RATE * RATE_DECAY ** (i / steps) * guard.rate)
+                optimiser.step(RATE * RATE_DECAY**share * guard.rate)
             advance((i + 1) / steps)
         guard.check()

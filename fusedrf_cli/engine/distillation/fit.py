@@ -1,5 +1,5 @@
-"""Fit a VM field to posed pictures: rays in random order, coarse to fine, samples only where the occupancy
-grid is set."""
+"""Fit a field of any kind to posed pictures: rays in random order, coarse to fine, samples only where the
+occupancy grid is set."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -12,10 +12,11 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.passes import PASSES, Batch
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.kinds.vm.field import PROBES, VMField, VMShape
-from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
 
 RATE = 0.02
@@ -29,18 +30,19 @@ RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36,
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
-THINNEST = 12
 RAYS_PER_STEP = (512, 1 << 14)
 # share of the box's volume that its occupied part must fall under for the box to be cut down
 SHRINK_BELOW = 0.8
-COLOURS = {"sh": VMField, "mlp": VMMLPField}  # what a colour is asked for by, and the field it needs
 
 
 @dataclass(frozen=True)
 class FitSettings:
     """What a fit is asked for."""
 
-    shape: VMShape = VMShape()
+    kind: str = registry.DEFAULT
+    """Of the field."""
+    way: Way = Way()
+    """Its ranks and SH degree."""
     longest: int = 256
     """Texels on the longest axis at the end."""
     steps: int = 3000
@@ -54,10 +56,8 @@ class FitSettings:
     target_psnr: float | None = None
     """dB of the training rays, less a margin, at which the fit may stop early."""
     seed: int = 0
-    colour: str = "sh"
-    """One of COLOURS: spherical harmonics, or a shallow network over features."""
     device: str = "cpu"
-    """Where the field is trained, "cpu" or "cuda"; the latter with spherical harmonics only."""
+    """Where the field is trained, "cpu" or "cuda"."""
 
 
 class RayPool:
@@ -96,8 +96,8 @@ def fit(
     settings: FitSettings,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
     name: str = "",
-) -> VMField | VMMLPField:
-    """Train a VM field on pictures (n, H, W, 4) uint8 with straight alpha, inside aabb (6,).
+) -> StoredField:
+    """Train a field on pictures (n, H, W, 4) uint8 with straight alpha, inside aabb (6,).
 
     `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is
     given, so that the same seed and number of threads gives the same numbers.
@@ -110,7 +110,7 @@ class FitRun:
 
     def __init__(
         self,
-        field: VMField | VMMLPField,
+        field: StoredField,
         pool: RayPool,
         settings: FitSettings,
         generator: torch.Generator,
@@ -136,25 +136,26 @@ class FitRun:
         """A fit before its first step; the arguments are those of `fit`."""
         generator = torch.Generator().manual_seed(settings.seed)
         pool = RayPool(cameras, images, generator)
-        coarse = texels(aabb, max(16, round(settings.longest * RESOLUTION_STAGES[0][1])))
-        field = COLOURS[settings.colour].create(aabb, coarse, settings.shape, generator, name)
-        field = field.to(settings.device)
+        coarse = max(LEAST_TEXELS, round(settings.longest * RESOLUTION_STAGES[0][1]))
+        kind = registry.kind(settings.kind)
+        field = kind.create(kind.untrained(aabb, coarse, settings.way), generator, name).to(settings.device)
         return cls(field, pool, settings, generator)
 
     def finish(
         self,
         advance: Callable[[float, dict], None] = lambda share, figures: None,
-        whole: Callable[[], AbstractContextManager] = nullcontext,
-    ) -> VMField | VMMLPField:
+        uninterrupted: Callable[[], AbstractContextManager] = nullcontext,
+    ) -> StoredField:
         """Run to the end, or to the target PSNR of the training rays where there is one. Every step happens
-        inside a `whole()`, which may hold an interrupt back. Raises FloatingPointError on divergence."""
+        inside an `uninterrupted()`, which may hold an interrupt back. Raises FloatingPointError on
+        divergence."""
         while (share := self.share()) < 1.0 and not self.reached():
-            with whole():
+            with uninterrupted():
                 self.refresh(share)
                 self.step(share)
             if self.steps % 20 == 0:
                 advance(share, {"psnr": self.psnr})
-        with whole():
+        with uninterrupted():
             if self.refreshes:  # not where the run was interrupted after it
                 self.refreshes.clear()
                 self.guard.check()
@@ -179,6 +180,7 @@ class FitRun:
         arrays |= order
         state = {
             "command": "train",
+            "kind": self.field.kind,
             "field": metadata,
             "steps": self.steps,
             "elapsed": working_time() - self.started,
@@ -231,7 +233,7 @@ class FitRun:
         if self.stages and share >= self.stages[0][0]:
             _, part = self.stages.pop(0)
             self.guard.check()
-            self.resize(self.field.tensors[0].aabb, round(self.settings.longest * part))
+            self.resize(self.field.aabb, round(self.settings.longest * part))
 
     def refresh_occupancy(self) -> None:
         """Mark the cells that hold matter, and cut the box down to them where that saves much. Where none
@@ -249,8 +251,8 @@ class FitRun:
         tight = occupancy.tight_aabb()
         if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
             before = self.field
-            self.resize(tight, max(self.field.tensors[0].resolution))
-            occupancy = occupancy_of(self.field)
+            self.resize(tight, max(self.field.resolution))
+            occupancy = occupancy_of(self.field, tight)
             if not occupancy.occupied.any():  # what there was lies between the new texels
                 self.field = before
                 self.optimiser = Adam.of(self.field)
@@ -311,26 +313,20 @@ def volume(aabb: np.ndarray) -> float:
     return float(np.prod(aabb[3:] - aabb[:3]))
 
 
-def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
-    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets THINNEST
-    across."""
-    return tuple(max(min(THINNEST, longest), n) for n in cell_counts(aabb, longest))
-
-
-def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> OccupancyGrid:
-    """Cells of a one-block field's box in which the optical depth across the cell passes EMPTY_BELOW
-    somewhere, grown by one cell.
+def occupancy_of(
+    field: StoredField, box: np.ndarray | None = None, cells: int = DEFAULT_CELLS
+) -> OccupancyGrid:
+    """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
+    optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
     """
-    box = field.tensors[0].aabb
-    counts = cell_counts(box, min(cells, max(field.tensors[0].resolution)))
+    box = field.aabb if box is None else box
+    counts = cell_counts(box, min(cells, max(field.resolution)))
     cell = (box[3:] - box[:3]) / counts
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
-    sigma = np.zeros(len(index), np.float32)
-    cells = box[:3].copy(), cell, index
-    field.loops.density_at_cells(field.kernel_shape[0], field.arrays, 0, *cells, PROBES, sigma)
+    sigma = field.peaks(box[:3], cell, index, PROBES)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
     return OccupancyGrid(box, occupied).dilated()

@@ -17,6 +17,7 @@ EMPTY_SHARE = 0.15  # of the samples with less that are kept: nine in ten are su
 WHOLE_SCENE_SHARE = (
     0.5  # of the rays; the others are shared out over the objects, so that a small one is not missed
 )
+RECKONED_RAYS = 2000  # of which the number of points is reckoned
 BELOW_SHARE = 0.1  # of the rays that look from under the horizon
 
 Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
@@ -124,6 +125,13 @@ def ask(
     for i, column in enumerate(columns):
         columns[i] = column[order]
     return TeacherPool(rays_o, rays_d, pixels, Points(*columns))
+
+
+def points_kept(teacher: RadianceField, boxes: list[np.ndarray], rays: int, step: float, seed: int) -> int:
+    """About how many points `ask` keeps of so many rays, reckoned from a few of them."""
+    generator = torch.Generator().manual_seed(seed)
+    few = random_rays(boxes, RECKONED_RAYS, generator)
+    return len(ask(teacher, *few, step, generator).points) * rays // RECKONED_RAYS
 
 
 def _ask_part(

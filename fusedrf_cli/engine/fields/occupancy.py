@@ -10,6 +10,8 @@ import numpy as np
 from fusedrf_cli.engine.kernels import GridArrays
 
 DEFAULT_CELLS = 128
+SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
+THINNEST = 12  # texels across a flat box
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -99,6 +101,12 @@ def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     """Cells per axis of near-cubic cells, `longest` of them on the longest axis."""
     extent = np.asarray(aabb, np.float64)[3:] - np.asarray(aabb, np.float64)[:3]
     return tuple(int(n) for n in np.maximum(np.ceil(extent / extent.max() * longest - 1e-9), 1))
+
+
+def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
+    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets THINNEST
+    across."""
+    return tuple(max(min(THINNEST, longest), n) for n in cell_counts(aabb, longest))
 
 
 def placed_cells(

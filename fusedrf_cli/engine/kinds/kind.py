@@ -1,17 +1,150 @@
-"""What a kind of field is to the rest of the program."""
+"""What a kind of field is to the rest of the program.
 
-from dataclasses import dataclass
+A new kind derives `Kind`, says `name`, `good_for`, `field`, `sections` and `create`, and leaves the rest as
+it is here: it is then trained from photos, distilled from any scene, grown, edited, stored and charted.
+"""
 
-from fusedrf_cli.engine.fields.base import StoredField
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.occupancy import texels
+from fusedrf_cli.engine.kinds import refitting
+from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach
+from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
+from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Suits, Way, finest_within
 
 
-@dataclass(frozen=True)
 class Kind:
-    """A kind of field: what it is called, what it is good for, and how its fields are made."""
+    """A kind of field: what it is called, what it is good for, how its fields are made, learnt and edited."""
 
     name: str
     """As people type it and as bundles say it."""
     good_for: str
     """One sentence for the list of kinds."""
-    field: type[StoredField] | None
+    field: type[StoredField] | None = None
     """The class of its fields; None for a way of fusing whose fields are another kind's."""
+    trains = True
+    """Whether a field of it can begin from photos."""
+    takes: frozenset[str] = frozenset()
+    """Which of Way's words it heeds, besides the precision: "ranks", "sh_degree"."""
+    takes_over = False
+    """Whether a student may start as the scene's background (`taken_over`)."""
+    precisions: tuple[str, ...] = ("int4", "int8")
+    """That are tried where a quality is asked for, the cheapest first."""
+    faithful = "float16"
+    """The precision where only a size is given."""
+
+    # -- making ----------------------------------------------------------------------------------------------
+
+    def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
+        """The arrays of numbers that a field of a resolution (texels per axis) is stored with."""
+        raise NotImplementedError
+
+    def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> StoredField:
+        """An untrained field as planned, whose occupancy is full."""
+        raise NotImplementedError
+
+    def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
+        """Floats of such a field in memory."""
+        return sum(int(np.prod(section.shape)) for section in self.sections(way, resolution))
+
+    def plan(self, box: np.ndarray, finest: float, way: Way, most: int) -> Plan:
+        """The finest field over a box (6,) with voxels no finer than `finest` and at most so many numbers."""
+        return self.plan_at(box, finest_within(box, finest, lambda r: self.numbers(way, r), most), way, most)
+
+    def plan_at(
+        self, box: np.ndarray, resolution: tuple[int, int, int], way: Way, allowed: int | None = None
+    ) -> Plan:
+        """A field over a box (6,) at a resolution."""
+        numbers = self.numbers(way, resolution)
+        return Plan(
+            way,
+            box,
+            resolution,
+            numbers,
+            numbers if allowed is None else allowed,
+            self.sections(way, resolution),
+        )
+
+    def untrained(self, box: np.ndarray, longest: int, way: Way) -> Plan:
+        """What a field learnt from photos of a box (6,) is, with so many texels on the longest axis."""
+        return self.plan_at(box, texels(box, longest), way)
+
+    def empty(
+        self, teacher: RadianceField, way: Way, most: int, generator: torch.Generator, name: str
+    ) -> StoredField:
+        """An untrained student of at most so many numbers over a teacher's box, with the teacher's
+        occupancy."""
+        plan = self.plan(teacher.occupancy.aabb, teacher.voxel_size, way, most)
+        return self.create(plan, generator, name).with_occupancy(teacher.occupancy)
+
+    # -- standing for a scene --------------------------------------------------------------------------------
+
+    def suits(self, scene: ComposedField) -> Suits:
+        """Whether it can hold a scene, and how well."""
+        return Suits(0.0, f"a field of kind '{self.name}' learns whatever a scene shows")
+
+    def student(self, scene: ComposedField, request: StudentRequest) -> Student:
+        """Its stand for a scene that it suits."""
+        return Student(self, scene, request)
+
+    def taken_over(
+        self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
+    ) -> StoredField | None:
+        """A student that starts as a placed field; None where that cannot be."""
+        return None
+
+    def grown(self, before: StoredField, plan: Plan) -> StoredField:
+        """A field with what a smaller one has learnt, as planned."""
+        return before.resampled(plan.box, plan.resolution)
+
+    # -- telling ---------------------------------------------------------------------------------------------
+
+    def describe(self, field: StoredField) -> dict:
+        """What a report says of a field's size and make."""
+        return {"resolution": [int(n) for n in field.resolution]}
+
+    def details(self, scene: ComposedField, field: StoredField) -> list[Detail]:
+        """What a field holds of the objects placed in a scene."""
+        return details_at_voxel(scene.placed, field.voxel_size)
+
+    def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
+        """Bytes of a field in memory whose arrays, of these shapes, take `decoded` once they are read."""
+        return decoded
+
+    def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
+        """The ways to fuse that are worth charting, in groups that take about as long; those that learn least
+        come first."""
+        return {self.name: [by_sizes()]}
+
+    def counts(self, field: StoredField) -> dict[str, int]:
+        """What a field is made of, and how many of it, where that can be counted."""
+        return {}
+
+    # -- editing ---------------------------------------------------------------------------------------------
+
+    def parts(self, field: StoredField) -> list[Part]:
+        """Objects in a field that can be taken out as they are; most kinds know of none."""
+        return []
+
+    def without(self, field: StoredField, names: set[str]) -> StoredField | None:
+        """A field without the parts that go by those names; None where nothing is left."""
+        return field
+
+    def added(self, field: StoredField, objects: list[Placed], teach: Teach) -> Edited:
+        """A field with objects placed in its frame put in, by the rule `max`. Raises ValueError where they
+        cannot be."""
+        return refitting.added(field, objects, teach)
+
+    def refilled(
+        self, field: StoredField, box: np.ndarray, rest: list[Placed] | None, teach: Teach
+    ) -> Edited | None:
+        """A field that in a box (6,) of its frame shows what `rest`, placed in it, does there; None for rest:
+        nothing is known of it, and the box stays empty. None where nothing is left of the field."""
+        return refitting.refilled(field, box, rest or [], teach)

@@ -4,14 +4,19 @@ point of the group GROUP, and says what it is in an object named KIND.
 Names are found without importing anything, for `--help`; a kind is imported when it is used.
 """
 
+import contextlib
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fusedrf_cli.engine.kinds.kind import Kind
+if TYPE_CHECKING:
+    from fusedrf_cli.engine.kinds.kind import Kind
 
 GROUP = "fusedrf.kinds"
+AUTO = "auto"  # the name under which a kind is chosen by what the kinds say of a scene
+DEFAULT = "vm"  # what photos become where no kind is named
 
 
 class UnknownKind(ValueError):
@@ -45,7 +50,7 @@ def names() -> list[str]:
 
 
 @cache
-def kind(name: str) -> Kind:
+def kind(name: str) -> "Kind":
     """The kind of a name. Raises UnknownKind, or BrokenKind for a plug-in that fails to import or is no
     kind."""
     if name in own_kinds():
@@ -61,6 +66,8 @@ def kind(name: str) -> Kind:
             f"the kind '{name}' of the package '{package}' does not load "
             f"({type(error).__name__}: {error}); update or uninstall that package"
         ) from error
+    from fusedrf_cli.engine.kinds.kind import Kind
+
     found = getattr(found, "KIND", found)
     if not isinstance(found, Kind) or found.name != name:
         raise BrokenKind(
@@ -70,14 +77,15 @@ def kind(name: str) -> Kind:
     return found
 
 
-def field_kinds() -> dict[str, type]:
-    """The fields that bundles may hold, by kind; a plug-in that does not load is left out."""
-    found = {}
+def kinds() -> "list[Kind]":
+    """All kinds that load; a plug-in that does not is left out."""
+    found = []
     for name in names():
-        try:
-            field = kind(name).field
-        except BrokenKind:
-            continue
-        if field is not None:
-            found[name] = field
+        with contextlib.suppress(BrokenKind):
+            found.append(kind(name))
     return found
+
+
+def field_kinds() -> dict[str, type]:
+    """The fields that bundles may hold, by kind."""
+    return {kind.name: kind.field for kind in kinds() if kind.field is not None}

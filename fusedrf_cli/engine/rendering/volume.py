@@ -10,6 +10,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
+from fusedrf_cli.engine.spaces import bounded
 
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
@@ -150,8 +151,9 @@ def waves(
     n = len(rays_o)
     start = np.zeros(n, np.int64)
     ts, counts = np.zeros((n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
+    loops = cpu.loops_for(None, (), getattr(field, "space", bounded))
     while True:
-        cpu.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), ts, counts)
+        loops.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), ts, counts)
         ray = np.flatnonzero(counts)
         if not len(ray):
             return

@@ -5,7 +5,9 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import (
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.kernels.reference import vm_query
+from fusedrf_cli.engine.kinds.vm.blocks import (
     MAX_BLOCKS,
     blocks_of,
     common_shape,
@@ -13,8 +15,6 @@ from fusedrf_cli.engine.composition.blocks import (
     tensor_field,
     without,
 )
-from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.kernels.reference import vm_query
 from fusedrf_cli.engine.kinds.vm.field import VMShape
 from tests.analytic.rays import SHEAR, affine, turn
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Gaussian, points_in, random_vm, unit

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
-from fusedrf_cli.engine.composition.detail import block_details, lost_shares, opacity_off, tensor_details
+from fusedrf_cli.engine.composition.detail import details_at_voxel, opacity_off
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.details import block_details, lost_shares
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Box, Tint
 from tests.analytic.rays import affine
@@ -25,7 +26,7 @@ def test_what_a_stretch_costs_is_the_largest_gap_of_two_exponentials(condition):
 def test_voxels_across_are_of_the_fused_field(monkeypatch):
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 24)
     placed = [Placed("big", BLOCK, np.eye(4)), Placed("flat", BLOCK, affine((0.2, 0.2, 0.1), (2, 0, 0)))]
-    big, flat = tensor_details(placed, 0.25)
+    big, flat = details_at_voxel(placed, 0.25)
     assert (big.voxels_across, flat.voxels_across) == (pytest.approx(4), pytest.approx(0.8))
     assert flat.stretch == pytest.approx(2) and flat.opacity_off > 0.1
     big, flat = block_details(placed, blocks_of(placed))

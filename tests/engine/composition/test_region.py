@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
-from fusedrf_cli.engine.composition.region import ClippedField, cleared, region_of
+from fusedrf_cli.engine.composition.region import ClippedField
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.editing import cleared, region_of
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.rays import affine
 from tests.engine.conftest import BOX, THIRTY_TWO, Gaussian, chord_of_box, points_in, random_vm, rays_at, unit

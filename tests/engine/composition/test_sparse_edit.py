@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.composition.resample import resampled
-from fusedrf_cli.engine.composition.sparse_edit import Several, added, emptied
+from fusedrf_cli.engine.composition.region import MaxOf
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.sparse.editing import added, emptied
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.resample import resampled
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -42,7 +43,7 @@ def likeness(field, truth, over) -> float:
     return psnr(*(np.stack([render_image(f, c).over((1, 1, 1)) for c in cameras]) for f in (field, truth)))
 
 
-class Truth(Several):
+class Truth(MaxOf):
     """Placed fields in a common frame, for rendering."""
 
     def __init__(self, *fields):

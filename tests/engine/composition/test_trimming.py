@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.composition.trimming import (
+from fusedrf_cli.engine.kinds.vm.field import MODES, VMShape
+from fusedrf_cli.engine.kinds.vm.trimming import (
     fewer_components,
     leading,
     read_texels,
     truncated,
     without_unread,
 )
-from fusedrf_cli.engine.kinds.vm.field import MODES, VMShape
 from tests.engine.conftest import SIXTY_FOUR, THIRTY_TWO, random_vm, unit
 
 

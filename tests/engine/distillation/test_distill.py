@@ -9,24 +9,25 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import DistillRun, distill
-from fusedrf_cli.engine.distillation.fit import texels
 from fusedrf_cli.engine.distillation.judging import Judge
-from fusedrf_cli.engine.distillation.settings import DistillSettings
-from fusedrf_cli.engine.distillation.student import empty_student, pruned, resolution_for, student_from
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.distillation.student import pruned
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
+from fusedrf_cli.engine.kinds.student import DistillSettings, finest_within
+from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from tests.analytic.export import way_of
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
 
 TEACHER = Ball(density=40.0, radius=0.7).occupy(16)
 SETTINGS = DistillSettings(
-    shape=THIRTY_TWO, max_numbers=THIRTY_TWO.size(texels(BOX, 32)), rays=4000, steps=60, rgb_steps=30,
-    rgb_samples=1 << 13,
-    views=2, view_size=32,
+    rays=4000, steps=60, rgb_steps=30, rgb_samples=1 << 13, views=2, view_size=32
 )  # fmt: skip
+NUMBERS = THIRTY_TWO.size(texels(BOX, 32))
+WAY = way_of(THIRTY_TWO)
 
 
 @pytest.fixture(autouse=True)
@@ -37,14 +38,14 @@ def small_steps(monkeypatch):
 
 
 def taught(settings: DistillSettings, rgb: bool = True, recipe: module.Recipe = module.DEFAULT_RECIPE):
-    student = empty_student(TEACHER, settings, torch.Generator().manual_seed(settings.seed), "ball")
+    student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
     return DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings, rgb, recipe).finish()
 
 
 def test_a_ball_is_learnt():
     """60 steps give 22 dB on views of its own, where an untrained student has less than 15."""
     told = []
-    student = empty_student(TEACHER, SETTINGS, torch.Generator().manual_seed(0), "ball")
+    student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(0), "ball")
     judge = Judge(TEACHER, 3, 32, 77)
     before = judge(student)
     student, report = distill(
@@ -229,7 +230,7 @@ def test_the_coarse_student_learns_too(monkeypatch):
 
 
 def a_run(settings: DistillSettings) -> module.DistillRun:
-    student = empty_student(TEACHER, settings, torch.Generator().manual_seed(settings.seed), "ball")
+    student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
     return module.DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings)
 
 
@@ -245,8 +246,8 @@ def test_a_student_starts_as_the_upright_background(scale):
     source = random_vm(THIRTY_TWO, (20, 21, 22), torch.float32)
     source = replace_voxels(source)
     teacher = ComposedField([Placed("ground", source, matrix)])
-    settings = replace(SETTINGS, max_numbers=10**7)
-    student = student_from(teacher.placed[0], teacher, settings, torch.Generator().manual_seed(0))
+    plan = VM.plan(teacher.aabb, teacher.voxel_size, WAY, 10**7)
+    student = VM.taken_over(teacher.placed[0], plan, teacher, torch.Generator().manual_seed(0))
     inner = teacher.aabb + 0.1 * np.array([1, 1, 1, -1, -1, -1])
     points, dirs = torch.from_numpy(points_in(inner, 2000)), torch.from_numpy(unit(points_in(BOX, 2000)))
     (sigma, rgb), (wanted, colour) = student.query(points, dirs), teacher.query(points, dirs)
@@ -263,15 +264,17 @@ def replace_voxels(field):
 @pytest.mark.parametrize("linear", [turn(20), np.diag([1.0, 1, 2]), -1.0])
 def test_a_turned_background_cannot_be_taken_over(linear):
     placed = Placed("ground", random_vm(THIRTY_TWO, dtype=torch.float32), affine(linear))
-    assert student_from(placed, ComposedField([placed]), SETTINGS, torch.Generator()) is None
     ball = Placed("ball", TEACHER, np.eye(4))
-    assert student_from(ball, ComposedField([ball]), SETTINGS, torch.Generator()) is None
+    for one in (placed, ball):
+        scene = ComposedField([one])
+        plan = VM.plan(scene.aabb, scene.voxel_size, WAY, NUMBERS)
+        assert VM.taken_over(one, plan, scene, torch.Generator()) is None
 
 
 def test_resolution_is_the_teachers_or_what_fits():
-    assert resolution_for(BOX, 0.1, THIRTY_TWO, 10**9) == texels(BOX, 23)
+    assert finest_within(BOX, 0.1, THIRTY_TWO.size, 10**9) == texels(BOX, 23)
     tight = THIRTY_TWO.size(texels(BOX, 40))
-    found = resolution_for(BOX, 1e-3, THIRTY_TWO, tight)
+    found = finest_within(BOX, 1e-3, THIRTY_TWO.size, tight)
     assert 0.9 * tight < THIRTY_TWO.size(found) <= tight
 
 

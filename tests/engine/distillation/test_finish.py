@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, random_vm

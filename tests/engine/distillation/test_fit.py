@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.fit import THINNEST, FitSettings, RayPool, fit, occupancy_of, texels
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.distillation.fit import FitSettings, RayPool, fit, occupancy_of
+from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, random_vm
 
-SETTINGS = FitSettings(shape=THIRTY_TWO, longest=32, steps=200, samples=1 << 13)
+SETTINGS = FitSettings(way=way_of(THIRTY_TWO), longest=32, steps=200, samples=1 << 13)
 
 
 def pictures(cameras) -> np.ndarray:
@@ -48,7 +49,9 @@ def test_a_ball_is_learnt(capture):
 def test_the_same_seed_gives_the_same_bits(capture):
     def numbers(seed):
         return fit(
-            *capture, BOX, FitSettings(shape=THIRTY_TWO, longest=24, steps=25, samples=1 << 12, seed=seed)
+            *capture,
+            BOX,
+            FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=25, samples=1 << 12, seed=seed),
         ).params
 
     first, again, other = numbers(1), numbers(1), numbers(2)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 
 MAX_LEVEL = 7
 MAX_TOP_CELLS = 1 << 22
@@ -369,7 +369,7 @@ def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def corner_offsets(n: int) -> np.ndarray:
     """(8,) offsets of a voxel's corners from its first in a brick of n voxels a side, as `corner` of
-    sparse_bodies.py."""
+    sparse/bodies.py."""
     return (OCTANTS * [(n + 1) ** 2, n + 1, 1]).sum(1)
 
 

@@ -1,10 +1,5 @@
 """The `vm` kind: TensoRF's vector-matrix decomposition with spherical-harmonic colour."""
 
-from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm.students import VMKind
 
-KIND = Kind(
-    name="vm",
-    good_for="Objects and scenes in their own axes: small, smooth, quick to train.",
-    field=VMField,
-)
+KIND = VMKind()

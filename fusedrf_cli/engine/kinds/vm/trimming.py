@@ -20,9 +20,7 @@ def read_texels(tensor: VMTensor, mode: int) -> np.ndarray:
         reading_cells(n, cells)
         for n, cells in zip((tensor.resolution[a], tensor.resolution[b]), held.shape, strict=True)
     )
-    return (
-        sums[a1[:, None], b1] - sums[a0[:, None], b1] - sums[a1[:, None], b0] + sums[a0[:, None], b0]
-    ) > 0
+    return (sums[a1[:, None], b1] - sums[a0[:, None], b1] - sums[a1[:, None], b0] + sums[a0[:, None], b0]) > 0
 
 
 def reading_cells(texels: int, cells: int) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +41,7 @@ def without_unread(field: VMField) -> VMField:
     for t, tensor in enumerate(trimmed.tensors):
         sections = trimmed.sections(t)
         for mode in range(3):
-            unread = torch.from_numpy(~read_texels(tensor, mode))
+            unread = torch.from_numpy(~read_texels(tensor, mode)).to(field.params.device)
             for what in ("density", "colour"):
                 sections[f"{what}_plane_{mode}"][unread] = 0
     return trimmed
@@ -65,6 +63,8 @@ def truncated(field: VMField, shape: VMShape) -> VMField:
     least = smaller_shape(field.shape, shape)
     if least == field.shape:
         return field
+    if field.params.device.type != "cpu":
+        return truncated(field.to("cpu"), shape).to(field.params.device)
     params = torch.zeros(sum(least.size(t.resolution) for t in field.tensors), dtype=field.params.dtype)
     small = VMField(least, field.tensors, field.blocks, params, field.occupancy, field.owners)
     for t in range(len(field.tensors)):

@@ -6,9 +6,8 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.filling import LEAST, density, fill, set_density
-from fusedrf_cli.engine.composition.resample import FAINT, EmptyField, demanded, leaves, shown, thinned
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.composition.region import MaxOf
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     OCTANTS,
@@ -19,8 +18,10 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     node_keys,
 )
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.filling import LEAST, density, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.resample import FAINT, EmptyField, demanded, leaves, shown, thinned
 
-Takes = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+RefillMask = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Which vertices (V,) bool are filled anew, by their places (V, 3), the sides of their voxels (V,), and the σ
 (V,) of the field as it was and of what is put there."""
 
@@ -29,7 +30,7 @@ def added(field: SparseField, placed: Placed) -> SparseField:
     """The field with an object put in, placed in its frame: where that is the densest, at the level that it
     needs. Raises ValueError where it would be too large."""
     tree = field.tree.extended(placed.aabb)
-    both = Several([Placed("", field, np.eye(4)), placed])
+    both = MaxOf([Placed("", field, np.eye(4)), placed])
     level = level_for(placed.voxel_size, tree.top)
     wanted = [np.zeros(0, np.int64)] * (level + 1)
     wanted[level] = demanded(both, placed, level, tree.lo, tree.top, tree.counts)
@@ -43,7 +44,7 @@ def added(field: SparseField, placed: Placed) -> SparseField:
 def emptied(field: SparseField, region: np.ndarray, rest: list[Placed]) -> SparseField | None:
     """The field whose vertices in a box (6,) show what the rest, placed in its frame, does there; nothing
     where there is no rest. None where nothing is left."""
-    inside = Several([p for p in rest if meets(p.aabb[:3], p.aabb[3:], region)])
+    inside = MaxOf([p for p in rest if meets(p.aabb[:3], p.aabb[3:], region)])
     tree, wanted = field.tree, [np.zeros(0, np.int64)] * (MAX_LEVEL + 1)
     for one in inside.placed:
         level = level_for(one.voxel_size, tree.top)
@@ -68,24 +69,6 @@ def with_fringe(field: SparseField, box: np.ndarray) -> np.ndarray:
     return box + np.repeat([-1, 1], 3) * field.fine.finest_voxel[inside].max(initial=0)
 
 
-class Several:
-    """Placed fields as one that says what the densest of them says; of none, that there is nothing."""
-
-    def __init__(self, placed: list[Placed]):
-        self.placed = placed
-
-    def query(self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True):
-        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
-        sigma, rgb = torch.zeros(len(points)), torch.zeros(len(points), 3)
-        for one in self.placed:
-            x, d, stretch = one.to_object(points, dirs)
-            found, colour = one.field.query(x, d, with_colour)
-            found = (found.double() * stretch).float()
-            won = found > sigma
-            sigma[won], rgb[won] = found[won], colour[won].float()
-        return sigma, rgb
-
-
 def meets(low: np.ndarray, high: np.ndarray, box: np.ndarray) -> np.ndarray:
     """(N,) whether boxes of corners low and high (N, 3) and a box (6,) have a point in common."""
     return (low <= box[3:]).all(-1) & (box[:3] <= high).all(-1)
@@ -102,14 +85,14 @@ def refilled(
     wanted: list[np.ndarray],
     source,
     shows,
-    takes: Takes,
+    takes: RefillMask,
     box: np.ndarray,
 ) -> SparseField:
     """A field over the field's bricks, in the box of `tree`, and the wanted ones (keys by level), whose
     vertices in a box (6,) that `takes` chooses by the σ of a source show what `shows` does. All others keep
     their bits.
     """
-    old = Carried(field.fine, field.rows.numpy(), tree)
+    old = CarriedRows(field.fine, field.rows.numpy(), tree)
     lattice = Lattice(with_bricks(old, wanted, box), SIDE)
     taken, sigma = chosen(field, old, lattice, source, takes, box)
     new = taken[lattice.corners].any(1)
@@ -131,7 +114,7 @@ def refilled(
     rows[fresh] = local.rows.numpy()[local.fine.find(lattice.keys[fresh])[0]]
     result.rows[:] = torch.from_numpy(rows)
     if field.coarse:
-        bands, _ = Carried(field.coarse, field.bands.numpy(), tree).at(result.coarse)
+        bands, _ = CarriedRows(field.coarse, field.bands.numpy(), tree).at(result.coarse)
         taken, _ = chosen(field, old, result.coarse, source, takes, box)
         at, found = local.coarse.find(result.coarse.keys)
         fresh = (taken | np.isnan(bands[:, 0])) & found
@@ -141,7 +124,7 @@ def refilled(
     return result
 
 
-class Carried:
+class CarriedRows:
     """The rows of a lattice, wherever they are asked for, in the box of another tree of the same bricks."""
 
     def __init__(self, lattice: Lattice, rows: np.ndarray, tree: BrickTree):
@@ -179,7 +162,7 @@ class Carried:
         return self.tree.voxels_at(halves, self.lattice.n, self.lattice.active, MAX_LEVEL)[2]
 
 
-def with_bricks(old: Carried, wanted: list[np.ndarray], box: np.ndarray) -> BrickTree:
+def with_bricks(old: CarriedRows, wanted: list[np.ndarray], box: np.ndarray) -> BrickTree:
     """The tree of the old bricks and the wanted ones, with all voxels active in those that reach into a
     box."""
     tree = old.tree
@@ -200,7 +183,7 @@ def with_bricks(old: Carried, wanted: list[np.ndarray], box: np.ndarray) -> Bric
 
 
 def chosen(
-    field: SparseField, old: Carried, lattice: Lattice, source, takes: Takes, box: np.ndarray
+    field: SparseField, old: CarriedRows, lattice: Lattice, source, takes: RefillMask, box: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which vertices of a lattice (V,) are filled anew, and the σ (V,) that is to be there, taken or
     carried."""

@@ -6,45 +6,36 @@ import numpy as np
 
 from formats.captures import is_capture, load_images, read_capture
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
-from fusedrf_cli.bridge.render import picture_memory, renderable
+from fusedrf_cli.bridge.rendering import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.bridge.train import WHITE, camera_of, over_white
+from fusedrf_cli.bridge.training import WHITE, camera_of, over_white
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.requests import EvaluateRequest
 
 SCENE_VIEWS = 8
 SCENE_SIZE = (400, 400)
 SCENE_SEED = 1_000
 
 
-def evaluate(
-    bundle: str,
-    against: str,
-    *,
-    split: str,
-    size: tuple[int, int] | None,
-    memory: int | None,
-    allow_outside: bool,
-    device: str,
-    threads: int | None,
-    progress,
-) -> dict:
+def evaluate(request: EvaluateRequest, progress) -> dict:
     """Compare a bundle, over white, with a capture's views or with another scene on seeded views that fusing
     never uses.
     """
-    with engine(device, threads, progress) as place:
+    bundle, against, allow_outside = request.bundle, request.against, request.allow_outside
+    with engine(request.device, request.threads, progress) as place:
         progress.phase("reading", None)
-        budget = Memory(memory)
+        budget = Memory(request.memory)
         loaded = load_scene(bundle, allow_outside, budget, place)
         field, origin = renderable(loaded)
         pairs = (
-            capture_pairs(against, split, size)
+            capture_pairs(against, request.split, request.size)
             if is_capture(against)
-            else scene_pairs(against, size, allow_outside, budget, place)
+            else scene_pairs(against, request.size, allow_outside, budget, place)
         )
         views = []
         for i, (camera, truth, total) in enumerate(pairs):

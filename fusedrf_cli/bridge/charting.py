@@ -6,7 +6,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from pathlib import Path
 
@@ -14,20 +14,21 @@ import numpy as np
 
 from formats.atomic import atomic_folder, hidden_sibling
 from fusedrf_cli import plots
-from fusedrf_cli.bridge.fuse import fuse, source_bytes
+from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
-from fusedrf_cli.bridge.render import renderable
+from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import checkpoint_path, engine
-from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
-from fusedrf_cli.bridge.train import WHITE
+from fusedrf_cli.bridge.training import WHITE
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
 from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import FusedRFError, Interrupted, InvalidInput, UsageProblem
 from fusedrf_cli.progress import NullProgress
+from fusedrf_cli.requests import ChartRequest, FuseRequest
 
 VIEWS = 8
 HELD_OUT = (JUDGED_SEED, 2)  # a pair seeds a stream that no single number, such as a person's --seed, does
@@ -60,7 +61,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Course:
+class Benchmark:
     """What all fused fields of a scene are held to."""
 
     scene: str
@@ -75,7 +76,7 @@ class Course:
     source_bytes: int
 
     @classmethod
-    def lay(
+    def prepare(
         cls,
         scene: str,
         memory: Memory,
@@ -132,48 +133,37 @@ def frame_seconds(render, camera, origin: np.ndarray) -> float:
     return time.perf_counter() - started
 
 
-def chart(
-    scene: str,
-    output: str,
-    *,
-    budget: float,
-    kinds: Sequence[str],
-    least_psnr: float,
-    size: tuple[int, int],
-    memory: int | None,
-    allow_outside: bool,
-    overwrite: bool,
-    seed: int,
-    device: str,
-    threads: int | None,
-    fuse_words: Callable[[Flags], dict],
-    progress,
-) -> dict:
+def chart(request: ChartRequest, progress) -> dict:
     """Fuse a scene in the ways that are worth it, measure each, and draw them in a folder.
 
-    `fuse_words` makes of a command line's flags what `fuse` takes: so every label is the flags that gave the
-    point. Raises the error of fusing where no way can be gone.
+    Raises the error of fusing where no way can be gone.
     """
     plots.check()
-    where = {"memory": memory, "allow_outside": allow_outside, "seed": seed, "device": device}
-    where |= {"threads": threads, "overwrite": True}
-    with engine(device, threads, progress) as place, scratch(output) as paths:
+    output, budget, size = request.output, request.budget, request.size
+    with engine(request.device, request.threads, progress) as place, scratch(output) as paths:
         progress.phase("the scene as composed", None)
-        course = Course.lay(scene, Memory(memory), size, allow_outside, place)
-        run = Charting(course, paths, fuse_words, where, progress)
+        benchmark = Benchmark.prepare(
+            request.scene, Memory(request.memory), size, request.allow_outside, place
+        )
+        run = Charting(benchmark, paths, request, progress)
         progress.phase("fusing", budget)
-        left = run.climb({kind: ladders(kind, least_psnr) for kind in kinds}, budget)
+        try:
+            waiting = {kind: ladders(kind, request.least_psnr) for kind in request.kinds}
+        except ValueError as error:
+            raise unusable_kind(error) from error
+        left = run.climb(waiting, budget)
         progress.phase("frames", 1 + ROUNDS)
-        composed_ms, *ms = course.frame_times(run.bundles, progress.advance)
+        composed_ms, *ms = benchmark.frame_times(run.bundles, progress.advance)
     for point, value in zip(run.points, ms, strict=True):
         point.ms = value
     mark_frontiers(run.points)
     best = sorted((p for p in run.points if p.frontier), key=lambda p: (-p.psnr, p.bytes))
-    composed = {"ms": composed_ms, "bytes": course.source_bytes}
-    with atomic_folder(output, overwrite=overwrite) as folder:
+    composed = {"ms": composed_ms, "bytes": benchmark.source_bytes}
+    with atomic_folder(output, overwrite=request.overwrite) as folder:
         write_csv(folder / "chart.csv", run.points, composed)
         for suffix in ("png", "svg"):
-            plots.chart(run.points, best, composed, Path(scene).name, folder / f"chart.{suffix}")
+            title = Path(request.scene).name
+            plots.chart(run.points, best, composed, title, folder / f"chart.{suffix}")
     if left:
         progress.warn(f"{left} ladders were left off where --budget {budget:g} ended; give more to go on")
     columns = ("flags", "psnr", "ssim", "bytes", "seconds", "ms")
@@ -238,9 +228,8 @@ class Climber:
 class Charting:
     """The points found so far, and the bundles they were measured on."""
 
-    def __init__(self, course: Course, paths: Iterator[Path], fuse_words, where: dict, progress):
-        self.course, self.paths, self.fuse_words, self.where = course, paths, fuse_words, where
-        self.progress = progress
+    def __init__(self, benchmark: Benchmark, paths: Iterator[Path], request: ChartRequest, progress):
+        self.benchmark, self.paths, self.request, self.progress = benchmark, paths, request, progress
         self.points: list[Point] = []
         self.bundles: list[Path] = []
         self.refused: dict[str, FusedRFError] = {}
@@ -286,20 +275,20 @@ class Charting:
         kind, and a name of what loads the same kernels.
         """
         kind, _ = group
-        if self.where["seed"]:
-            flags = (*flags, "--seed", str(self.where["seed"]))
-        words, path = self.fuse_words(flags), next(self.paths)
+        if self.request.seed:
+            flags = (*flags, "--seed", str(self.request.seed))
+        wanted, path = self.request.fuse_request(flags), next(self.paths)
         try:
             if group not in self.warm:  # the first of a group also loads kernels, so the second one counts
-                self.fuse(path, words)
+                self.fuse(path, wanted)
                 self.warm.add(group)
-            report, warnings = self.fuse(path, words)
+            report, warnings = self.fuse(path, wanted)
         except FusedRFError as error:
             if isinstance(error, InvalidInput):  # this scene never becomes that kind
                 self.refused[kind] = error
             self.progress.warn(f"left out {' '.join(flags)}: {error}")
             return None
-        quality = self.course.quality(path)
+        quality = self.benchmark.quality(path)
         point = Point(" ".join(flags), kind, *quality, report["total_seconds"], report["bytes"])
         point.warnings = warnings
         self.points.append(point)
@@ -307,11 +296,21 @@ class Charting:
         self.progress.note(f"{point.flags}: {point.psnr:.2f} dB, {point.bytes:,} bytes")
         return point
 
-    def fuse(self, path: Path, words: dict) -> tuple[dict, list[str]]:
+    def fuse(self, path: Path, wanted: FuseRequest) -> tuple[dict, list[str]]:
         """A fuse's report, and what it warned of."""
-        heard = NullProgress()
-        report = fuse(self.course.scene, str(path), **words | self.where, progress=heard)
-        return report, heard.warnings
+        heard, own = NullProgress(), self.request
+        wanted = replace(
+            wanted,
+            scene=self.benchmark.scene,
+            output=str(path),
+            overwrite=True,
+            memory=own.memory,
+            allow_outside=own.allow_outside,
+            seed=own.seed,
+            device=own.device,
+            threads=own.threads,
+        )
+        return fuse(wanted, heard), heard.warnings
 
 
 def mark_frontiers(points: list[Point]) -> None:

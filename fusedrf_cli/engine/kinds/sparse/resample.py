@@ -7,20 +7,8 @@ much, what is finest gives way most. What no camera sees is not held. filling.py
 import numpy as np
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.filling import (
-    AT_ONCE,
-    LEAST,
-    density,
-    density_scale,
-    even_directions,
-    fill,
-    pieces,
-    placed_in,
-    set_density,
-    touching,
-)
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,
@@ -32,6 +20,18 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     sides,
 )
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.filling import (
+    AT_ONCE,
+    LEAST,
+    density,
+    density_scale,
+    even_directions,
+    fill,
+    pieces,
+    placed_in,
+    set_density,
+    touching,
+)
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
 YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way

@@ -15,49 +15,33 @@ from formats.png import depth_png_writer, png_writer
 from fusedrf_cli.bridge.memory import Memory, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
-from fusedrf_cli.bridge.train import camera_of
+from fusedrf_cli.bridge.training import camera_of
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli.requests import RenderRequest
 
 DEFAULT_SIZE = (800, 800)
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
-def render(
-    scene: str,
-    output: str,
-    *,
-    cameras: str | None,
-    path: str | None,
-    orbit: int | None,
-    size: tuple[int, int] | None,
-    background: tuple[float, float, float] | None,
-    depth: bool,
-    fps: float,
-    memory: int | None,
-    allow_outside: bool,
-    overwrite: bool,
-    seed: int,
-    device: str,
-    threads: int | None,
-    progress,
-) -> dict:
+def render(request: RenderRequest, progress) -> dict:
     """Render views of a bundle or scene to a picture, a folder of pictures or a film, by the output's
     name.
     """
+    output = request.output
     suffix = Path(output).suffix.lower()
     if suffix in FILMS:
         check_film(output)
-        if depth or background is None:
+        if request.depth or request.background is None:
             raise UsageProblem("a film has neither depth nor transparency; render to a folder instead")
-    with engine(device, threads, progress) as place:
+    with engine(request.device, request.threads, progress) as place:
         progress.phase("reading", None)
-        budget = Memory(memory)
-        loaded = load_scene(scene, allow_outside, budget, place)
+        budget = Memory(request.memory)
+        loaded = load_scene(request.scene, request.allow_outside, budget, place)
         field, origin = renderable(loaded)
-        views = choose_views(field, origin, cameras or path, orbit, size)
+        views = choose_views(field, origin, request.cameras or request.path, request.orbit, request.size)
         if suffix == ".png" and len(views) > 1:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
@@ -66,14 +50,14 @@ def render(
         loaded.shelf.resize(budget.room(needed))
         budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
         progress.phase("rendering", len(views))
-        shooting = _Shooting(field, origin, background, depth, progress)
+        shooting = _Shooting(field, origin, request.background, request.depth, progress)
         if suffix in FILMS:
-            write_film(output, shooting.frames(views), fps)
+            write_film(output, shooting.frames(views), request.fps)
             files = [output]
         elif suffix == ".png":
             files = [shooting.picture(Path(output), views[0])]
         else:
-            files = shooting.folder(Path(output), views, overwrite)
+            files = shooting.folder(Path(output), views, request.overwrite)
     return {
         "output": output,
         "files": files,

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.trimming import smaller_shape, truncated
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.editing import goes_by
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.trimming import smaller_shape, truncated
 
 MAX_BLOCKS = 255
 FINER = 1 / 8  # of the finest voxel: with a stretched block a common voxel may lie under it
@@ -59,11 +60,9 @@ def blocks_of(
     params = torch.empty(sum(shape.size(t.resolution) for t in tensors), dtype=dtype)
     at = 0
     for key, streamed in fields.items():  # one after the other: not all of them need to be in memory
-        field = reshaped(opened(streamed), whole)
+        field = reshaped(opened(streamed).to("cpu"), whole)
         for t in range(len(field.tensors)):
-            numbers = truncated(
-                tensor_field(field, t, tensors[first[key] + t].resolution), shape
-            ).params
+            numbers = truncated(tensor_field(field, t, tensors[first[key] + t].resolution), shape).params
             params[at : at + len(numbers)] = numbers
             at += len(numbers)
     return VMField.assembled(shape, tuple(tensors), tuple(blocks), params)
@@ -78,16 +77,11 @@ def block_name(placed: Placed, block: Block, own: dict[int, tuple[Block, ...]]) 
     return placed.name if len(own[id(placed.field)]) == 1 else f"{placed.name}/{block.name}"
 
 
-def named(block: Block, names: set[str]) -> bool:
-    """Whether a block goes by one of the names, or belongs to a node that does."""
-    return block.name in names or any(block.name.startswith(f"{name}/") for name in names)
-
-
 def without(field: VMField, names: set[str]) -> VMField | None:
     """The field without the blocks of those names and the tensors that only they used; None when nothing is
     left.
     """
-    kept = [b for b in field.blocks if not named(b, names)]
+    kept = [b for b in field.blocks if not goes_by(b.name, names)]
     if not kept:
         return None
     used = sorted({b.tensor for b in kept})

@@ -1,0 +1,380 @@
+"""`add` and `delete`: edits of a fused bundle that leave everything outside the touched region as it was, or
+as near to it as its kind of field can."""
+
+import os
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from formats.bundle import is_bundle, read_field, read_headers, sha256_of
+from formats.records import FieldRecord
+from formats.scene import Leaf, Matrix4, SceneGraph
+from fusedrf_cli.bridge.budget import Budget
+from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
+from fusedrf_cli.bridge.memory import result as finished
+from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.scene import (
+    LoadedScene,
+    held_size,
+    history_nodes,
+    load_scene,
+    make_field,
+    stored,
+    write_field,
+)
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.editing import Edited, enclosing
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.student import DistillSettings
+from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.requests import AddRequest, DeleteRequest, EditRequest
+
+REGION_SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+SAME_BITS = "outside of it all numbers are the same bits"
+NEARLY = "outside of it the field was held to what it showed, and is not the same to the bit"
+
+
+class HistoryNode(msgspec.Struct):
+    """What an edit reads of a node in a bundle's history."""
+
+    name: str
+    object_to_world: Matrix4
+    aabb: Annotated[list[float], msgspec.Meta(min_length=6, max_length=6)]
+    field: str
+    source: str = ""
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A bundle of one field that is to be edited."""
+
+    path: str
+    scene: SceneGraph
+    others: list[str]
+    """Members besides the field: sources that were kept inside."""
+    node: Leaf
+    field: StoredField
+    kind: Kind
+    precision: str
+    """Of the field as it is stored."""
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) of the field's frame in the world."""
+        return self.node.object_to_world[:3, 3]
+
+    @property
+    def names(self) -> set[str]:
+        """Of the objects that can be deleted: those that the history and those that the field tell of."""
+        parts = {part.name for part in self.kind.parts(self.field)} - {self.node.name}
+        return {n["name"] for n in graph_nodes(self.scene)} | parts
+
+
+class Teacher:
+    """Teaches students for an edit (engine/kinds/editing.py: Teach), within one command's budget."""
+
+    def __init__(self, request: EditRequest, place: str, progress, tries: int = 1):
+        """tries: how many times it may be asked, about."""
+        self.seed, self.rgb, self.place, self.progress = request.seed, request.rgb, place, progress
+        self.budget, self.tries = Budget(request.time_budget), tries
+
+    def __call__(
+        self, teacher: RadianceField, student: StoredField, boxes: list[np.ndarray], fresh: bool
+    ) -> tuple[StoredField, dict]:
+        """See Teach."""
+        seconds = self.budget.part(max(1, self.tries))
+        self.tries -= 1
+        settings = replace(REGION_SETTINGS, seed=self.seed, time_budget=seconds)
+        recipe = DEFAULT_RECIPE if fresh else replace(DEFAULT_RECIPE, coarse=lambda student: False)
+        run = DistillRun(teacher, student.to(self.place), boxes, settings, self.rgb, recipe)
+        learnt, did = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
+        self.budget.spent += run.learnt_seconds
+        psnr = {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb}
+        return learnt.to("cpu"), {"psnr": psnr, "seconds": did.seconds}
+
+
+def add(request: AddRequest, progress) -> dict:
+    """Put one more object into a fused field; cells that it does not reach keep their numbers where the kind
+    of field allows that. Without a precision the field keeps its own.
+    """
+    with engine(request.device, request.threads, progress) as place:
+        started = time.monotonic()
+        progress.phase("reading", None)
+        memory = Memory(request.memory)
+        fused = read_fused(request.fused, memory)
+        precision = request.precision or fused.precision
+        if request.name in fused.names:
+            raise InvalidInput(f"{request.fused}: there is a '{request.name}' already; choose another --name")
+        new = load_scene(request.source, budget=memory, place=place)
+        memory.expect(*addition_memory(fused.field, new), advice="add a smaller object")
+        objects = [placed_at(p, opened(p.field), request).moved(fused.origin) for p in new.placed]
+        progress.phase("adding", 1.0)
+        try:
+            edited = fused.kind.added(fused.field, objects, Teacher(request, place, progress, len(objects)))
+        except ValueError as error:
+            raise InvalidInput(f"{request.fused}: {error}") from error
+        progress.phase("measuring", None)
+        truth = ComposedField([Placed("", fused.field.to(place), np.eye(4)), *objects])
+        judge = Judge(truth, REGION_SETTINGS.views, REGION_SETTINGS.view_size, request.seed)
+        as_read = stored(edited.field, precision).moved(truth.origin)
+        reached = judge(as_read.to(place))
+        nodes = history_nodes(new, request.output, {})
+        entry = {
+            "event": "added",
+            "nodes": [placed_note(n, request.object_to_world, request.name) for n in nodes],
+            "psnr": reached,
+        }
+        size = write_edited(request, fused, edited.field, precision, entry)
+    figures = {**edited.figures, "psnr": {"before_rgb": reached}, "memory": memory.report()}
+    return edit_report(request, size, request.name, fused, edited, figures, started)
+
+
+def delete(request: DeleteRequest, progress) -> dict:
+    """Take objects out of a fused field: those that it holds apart are dropped; the region of another is
+    emptied or learnt again.
+
+    What an object hid is taken from the remaining sources where these are known, else left empty. Without a
+    precision the field keeps its own.
+    """
+    with engine(request.device, request.threads, progress) as place:
+        started = time.monotonic()
+        progress.phase("reading", None)
+        memory = Memory(request.memory)
+        fused = read_fused(request.fused, memory)
+        names = set(request.names)
+        check_names(request, fused)
+        edited, restored = without_objects(request, fused, names, place, progress)
+        if edited is None:
+            raise nothing_left(request)
+        entry = {"event": "deleted", "names": list(request.names), "restored": restored}
+        size = write_edited(request, fused, edited.field, request.precision or fused.precision, entry)
+    figures = {"restored": restored, "seconds": {}} | edited.figures | {"memory": memory.report()}
+    return edit_report(request, size, ", ".join(request.names), fused, edited, figures, started)
+
+
+def without_objects(
+    request: DeleteRequest, fused: Fused, names: set[str], place: str, progress
+) -> tuple[Edited | None, bool]:
+    """The field without some objects, None where nothing is left; and whether what they hid is shown."""
+    kind, field, restored = fused.kind, fused.field, True
+    apart = [part for part in kind.parts(field) if part.belongs(names)]
+    edits: list[Edited] = []
+    if apart:
+        field = kind.without(field, names)
+        if field is None:
+            return None, True
+        edits.append(Edited(field, enclosing([part.box for part in apart]), "its blocks dropped"))
+    inside = [
+        node
+        for node in graph_nodes(fused.scene)
+        if node["name"] in names and not any(part.belongs({node["name"]}) for part in apart)
+    ]
+    teach = Teacher(request, place, progress, len(inside))
+    for node in inside:
+        progress.phase(f"deleting {node['name']}", 1.0)
+        box = np.asarray(node["aabb"], np.float64) - np.tile(fused.origin, 2)
+        rest = remaining(request, fused, place, progress)
+        restored &= rest is not None
+        edited = kind.refilled(field, box, rest, teach)
+        if edited is None:
+            return None, restored
+        field = edited.field
+        edits.append(edited)
+    return joined(edits), restored
+
+
+def joined(edits: list[Edited]) -> Edited:
+    """One edit that tells of several, one after the other."""
+    figures = {}
+    for edit in edits:
+        figures |= edit.figures
+    how = "; ".join(dict.fromkeys(edit.how for edit in edits))
+    box, local = enclosing([edit.box for edit in edits]), all(edit.local for edit in edits)
+    return Edited(edits[-1].field, box, how, local, figures)
+
+
+def check_names(request: DeleteRequest, fused: Fused) -> None:
+    """InvalidInput for a name that is not there, or where all of them are to go."""
+    for name in request.names:
+        if name not in fused.names:
+            raise InvalidInput(
+                f"{request.fused}: there is no '{name}' to delete; it holds "
+                f"{', '.join(sorted(fused.names)) or 'nothing that has a name'}"
+            )
+    if set(request.names) == fused.names:
+        raise nothing_left(request)
+
+
+def nothing_left(request: DeleteRequest) -> InvalidInput:
+    """The refusal of a deletion that would empty the field."""
+    return InvalidInput(
+        f"{request.fused}: deleting {', '.join(sorted(request.names))} would leave nothing; keep one object, "
+        "or delete the file"
+    )
+
+
+def write_edited(request: EditRequest, fused: Fused, field: StoredField, precision: str, entry: dict) -> int:
+    """Write the edited field with one more entry of history; the bytes written."""
+    return write_field(
+        request.output,
+        field,
+        fused.node.name,
+        precision=precision,
+        overwrite=request.overwrite,
+        origin=fused.origin,
+        history=(*fused.scene.history, entry),
+        kept=dict.fromkeys(fused.others, fused.path),
+        extras=fused.scene.extras,
+    )
+
+
+def addition_memory(field: StoredField, new: LoadedScene) -> list[dict[str, float]]:
+    """The stages of adding a scene's fields to a field: putting together, measuring."""
+    view, old = REGION_SETTINGS.view_size, field.params.numel() * FLOAT
+    sizes, numbers = [old, *new.sizes], (old + sum(new.sizes)) // FLOAT
+    return [
+        sources(sizes, copies=RESAMPLING) | finished(numbers, measured=False) | ownership(field.aabb),
+        sources(sizes) | finished(numbers) | ownership(field.aabb) | picture(view, view // 2, composed=True),
+    ]
+
+
+def read_fused(path: str, memory: Memory) -> Fused:
+    """A bundle of one field; InvalidInput when it is something else."""
+    if not is_bundle(path):
+        raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
+    scene, headers = read_headers(path)
+    check_history(scene, path)
+    leaves = [leaf for leaf in scene.leaves() if leaf.field is not None]
+    if len(leaves) != 1:
+        raise InvalidInput(
+            f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
+        )
+    (leaf,) = leaves
+    memory.expect(sources([held_size(headers[leaf.field])], copies=READING), advice="edit a smaller field")
+    field = make_field(read_field(path, leaf.field), path)
+    if not np.array_equal(leaf.object_to_world[:3, :3], np.eye(3)):
+        raise InvalidInput(f"{path}: its field is turned or scaled, and cannot be edited; fuse it first")
+    others = [member for member in headers if member != leaf.field]
+    return Fused(path, scene, others, leaf, field, registry.kind(field.kind), headers[leaf.field].precision)
+
+
+def check_history(scene: SceneGraph, path: str) -> None:
+    """InvalidInput where the history, which the format leaves free, does not tell of nodes as an edit needs
+    them.
+    """
+    for entry in scene.history:
+        try:
+            msgspec.convert(entry.get("names", []), list[str])
+            for node in msgspec.convert(entry.get("nodes", []), list[HistoryNode]):
+                Placed(node.name, None, np.array(node.object_to_world))
+                if not node.source.isprintable():
+                    raise ValueError("a source that is no path")
+        except ValueError as error:
+            raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
+
+
+def graph_nodes(scene: SceneGraph) -> list[dict]:
+    """The named objects that the history says are in the field now."""
+    nodes: dict[str, dict] = {}
+    for entry in scene.history:
+        for node in entry.get("nodes", ()):
+            nodes[node["name"]] = node
+        for name in entry.get("names", ()):
+            nodes.pop(name, None)
+    return list(nodes.values())
+
+
+def placed_at(placed: Placed, field: StoredField, request: AddRequest) -> Placed:
+    """A field placed as another one and then once more, under a name; InvalidInput where both placements
+    together are singular."""
+    try:
+        return Placed(request.name, field, request.object_to_world @ placed.object_to_world)
+    except ValueError as error:
+        raise InvalidInput(f"{request.source}: {error}; give an invertible placement") from error
+
+
+def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
+    """A history node of an added object, in the world it was added to."""
+    return node | {
+        "name": name,
+        "object_to_world": (object_to_world @ np.asarray(node["object_to_world"])).tolist(),
+        "aabb": transformed_aabb(np.asarray(node["aabb"]), object_to_world).tolist(),
+    }
+
+
+def remaining(request: DeleteRequest, fused: Fused, place: str, progress) -> list[Placed] | None:
+    """The other objects of the graph as placed fields, from inside the bundle or from their files; None, with
+    a warning, where one of them is not found as it was."""
+    found, path = [], Path(fused.path)
+    for node in graph_nodes(fused.scene):
+        name = node["name"]
+        if name in request.names:
+            continue
+        if node["field"] in fused.others:
+            record = read_field(path, node["field"])
+        else:
+            record = record_from_file(node, path, request.allow_outside)
+        if record is None:
+            progress.warn(
+                f"the source of '{name}' is gone, has changed, or lies outside of the folder, so what the "
+                "deleted objects hid stays empty"
+            )
+            return None
+        field = make_field(record, name).to(place)
+        placed = Placed(name, field, np.asarray(node["object_to_world"], np.float64))
+        found.append(placed.moved(fused.origin))
+    return found
+
+
+def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord | None:
+    """A source's field from the file the history names, if it is still there, unchanged, and may be read."""
+    source = (path.resolve().parent / node.get("source", "")).resolve()
+    inside = source.is_relative_to(path.resolve().parent)
+    if (
+        "source" not in node
+        or not os.path.isfile(source)
+        or not (inside or allow_outside)
+        or sha256_of(source) != node["sha256"]
+    ):
+        return None
+    return read_field(source, node["field"]) if node["field"] in read_headers(source)[1] else None
+
+
+def edit_report(
+    request: EditRequest,
+    size: int,
+    names: str,
+    fused: Fused,
+    edited: Edited,
+    figures: dict,
+    started: float,
+) -> dict:
+    """The report of an edit."""
+    extent = edited.box[3:] - edited.box[:3]
+    whole = edited.field.occupancy.aabb[3:] - edited.field.occupancy.aabb[:3]
+    return {
+        "output": request.output,
+        "bytes": size,
+        "source_bytes": Path(request.fused).stat().st_size,
+        "touched": {
+            "names": names,
+            "aabb": (edited.box + np.tile(fused.origin, 2)).tolist(),
+            **fused.kind.counts(edited.field),
+            "share_of_box": float(min(1.0, np.prod(extent / whole))),
+            "how": f"{edited.how}; {SAME_BITS if edited.local else NEARLY}",
+        },
+        **figures,
+        "total_seconds": time.monotonic() - started,
+    }

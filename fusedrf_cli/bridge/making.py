@@ -1,0 +1,221 @@
+"""Makes, stores and measures a kind's students of one scene, and keeps the best of them as it is."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+
+from fusedrf_cli.bridge.budget import Budget
+from fusedrf_cli.bridge.choose import Tried
+from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable
+from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
+from fusedrf_cli.bridge.training import warn_of_numbers
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun
+from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.student import DistillSettings, MadeStudent, Plan, Student, Way
+from fusedrf_cli.requests import FuseRequest
+
+VIEWS_TO_CHOOSE_BY = 8
+RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
+TRIES = 4  # that a search's next try leaves time for, where seconds are given
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is to be fused."""
+
+    loaded: LoadedScene
+    composed: ComposedField
+    boxes: list
+    """(6,) the scene's and its objects', in an order that does not depend on the nodes', so that equal scenes
+    draw equal rays."""
+
+    @classmethod
+    def of(cls, loaded: LoadedScene) -> "Scene":
+        """A loaded scene."""
+        composed = loaded.composed()
+        boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
+        return cls(loaded, composed, boxes)
+
+    def background(self) -> Placed:
+        """The background in the composed scene's frame, its numbers on the CPU."""
+        found = background_of(self.loaded).placed
+        at = [p.name for p in self.loaded.placed].index(found.name)
+        return Placed(found.name, opened(found.field).to("cpu"), self.composed.placed[at].object_to_world)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A try, its field with the very numbers that were measured, and what its learning did."""
+
+    tried: Tried
+    field: StoredField
+    did: DistillReport | None = None
+    start: str | None = None
+    """What it started from."""
+
+
+class Maker:
+    """Makes the students of one scene."""
+
+    def __init__(self, student: Student, scene: Scene, request: FuseRequest, place: str, progress):
+        self.student, self.scene, self.request = student, scene, request
+        self.place, self.progress = place, progress
+        self.budget = Budget(request.time_budget)
+        lesson = student.lesson or DistillSettings()
+        compares = request.target_psnr is not None and student.lesson is None
+        self.views = VIEWS_TO_CHOOSE_BY if compares else lesson.views
+        self.judge = Judge(scene.composed, self.views, lesson.view_size, request.seed)
+        self.best: Kept | None = None
+        self.sources_in_memory = True
+        """Whether all sources may be in memory at once, as a teacher."""
+        self._rays: RayLesson | None = None
+
+    def measured(self, field: StoredField, way: Way) -> float:
+        """PSNR (dB) of the field as it will be read back."""
+        return self.judge(stored(field, way.precision).to(self.place))
+
+    def offer(self, kept: Kept) -> None:
+        """Keep a finished try where it is the best so far: what was measured is what will be written."""
+        if kept.tried.better(self.best and self.best.tried, self.request.target_psnr):
+            self.best = kept
+
+    # -- students that are made ------------------------------------------------------------------------------
+
+    def make(self, way: Way, limit: int, finished: bool) -> Tried | None:
+        """A student of at most `limit` bytes, finished on rays where that helps; None where not even the
+        coarsest is so small."""
+        student: MadeStudent = self.student
+        made = student.made(way, limit)
+        if made is None:
+            return None
+        field, size, did = made.field.to(self.place), made.bytes, None
+        before = psnr = self.measured(field, way)
+        if finished and not made.exact and self.request.rgb and not self.budget.over:
+            learnt, did = self.finished(field)
+            found, learnt_size = self.measured(learnt, way), student.bytes_of(learnt, way)
+            if found > before and learnt_size <= limit:
+                field, psnr, size = learnt, found, learnt_size
+        tried = Tried(way, limit, size, psnr, before, made.whole, made.exact)
+        if finished or made.exact:
+            self.offer(Kept(tried, field.to("cpu"), did))
+        return tried
+
+    def finished(self, field: StoredField) -> tuple[StoredField, DistillReport | None]:
+        """A field after it learnt from rays of the scene; the one that is given stays as it is."""
+        learnt = field.with_params(field.params.clone())
+        alone = self.request.target_psnr is None and not self.student.compares
+        seconds = self.budget.part(1 if alone else TRIES)
+        if self.student.lesson is None:
+            rays = self.rays()
+            with self.budget.learning():
+                rays.teach(learnt, seconds=seconds)
+            return learnt, None
+        settings = replace(self.student.lesson, seed=self.request.seed, time_budget=seconds)
+        run = DistillRun(self.scene.composed, learnt, self.scene.boxes, settings, True, judge=self.judge)
+        student, did = run.finish(*self.telling())
+        self.budget.spent += run.learnt_seconds
+        warn_of_numbers(did.numeric, self.progress)
+        return student, did
+
+    def rays(self) -> RayLesson:
+        """What there is to learn from, drawn once."""
+        if self._rays is None:
+            teacher = self.student.teacher(self.sources_in_memory)
+            teacher = teacher.to(self.place) if hasattr(teacher, "to") else teacher
+            self._rays = RayLesson(teacher, self.scene.boxes, self.request.seed)
+        return self._rays
+
+    # -- students that learn from nothing --------------------------------------------------------------------
+
+    def learn(self, saved: Saved | None) -> Iterator[Tried]:
+        """Students of growing size, each from what the one before has learnt, in every precision."""
+        before: StoredField | None = None
+        ways = [way for group in self.student.ways() for way in group]
+        plans = list(self.student.plans())
+        for i, plan in enumerate(plans):
+            if before is not None and self.budget.over:
+                return
+            begun, start = self.begun(plan, before)
+            if saved is not None and len(plans) > 1 and saved[1].get("numbers") != begun.params.numel():
+                continue  # the run that was interrupted had grown further
+            field, did = self.taught(begun.to(self.place), start, saved, len(plans) - i)
+            before, saved = field.to("cpu"), None
+            for way in ways:
+                size = self.student.bytes_of_plan(plan, way)
+                limit = self.request_limit if plan is plans[-1] and way == ways[-1] else size
+                psnr = self.measured(before, way)
+                tried = Tried(way, limit, size, psnr, did.psnr_before_rgb, False)
+                self.offer(Kept(tried, before, did, start))
+                yield tried
+        if before is None:
+            raise checkpoint_mismatch(self.request.output)
+
+    @property
+    def request_limit(self) -> int:
+        """Bytes of the file that were allowed."""
+        return self.student.request.limit
+
+    def begun(self, plan: Plan, before: StoredField | None) -> tuple[StoredField, str]:
+        """A student before it learns, and what it starts from."""
+        generator = torch.Generator().manual_seed(self.request.seed)
+        wanted = before is None and self.student.kind.takes_over and not self.request.from_scratch
+        background = self.scene.background() if wanted else None
+        field, start = self.student.begun(plan, before, background, generator)
+        if wanted and start == "nothing":
+            self.progress.warn(
+                f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
+                "nothing"
+            )
+        return field, start
+
+    def taught(
+        self, field: StoredField, start: str, saved: Saved | None, tries: int
+    ) -> tuple[StoredField, DistillReport]:
+        """A student that has learnt; an interrupt saves a checkpoint."""
+        request, seconds = self.request, self.budget.part(tries)
+        settings = replace(self.student.lesson, seed=request.seed, time_budget=seconds)
+        if seconds is not None:  # more than there is time to learn from need not be asked
+            settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * seconds) + 1))
+        run = DistillRun(
+            self.scene.composed, field, self.scene.boxes, settings, request.rgb, judge=self.judge
+        )
+        made_with = {  # with other words the saved numbers would go on to something else
+            "kind": self.student.kind.name,
+            "numbers": field.params.numel(),
+            # one that grows to a target goes on from whatever it started from
+            "start": start if request.target_psnr is None else None,
+            "rgb": request.rgb,
+            "seed": request.seed,
+            "boxes": [box.tolist() for box in self.scene.boxes],
+        }
+        if saved is not None:
+            if any(saved[1].get(word) != value for word, value in made_with.items()):
+                raise checkpoint_mismatch(request.output)
+            run.restore(*saved)
+
+        def checkpoint() -> tuple[dict, dict]:
+            arrays, state = run.checkpoint()
+            return arrays, state | made_with
+
+        with resumable(request.output, checkpoint) as uninterrupted:
+            student, did = run.finish(*self.telling(), uninterrupted)
+        self.budget.spent += run.learnt_seconds
+        warn_of_numbers(did.numeric, self.progress)
+        if did.found_nothing:
+            self.progress.warn(
+                "the student holds no matter yet; no cell was given up. Give it more --time-budget"
+            )
+        return student, did
+
+    def telling(self):
+        """What a run tells of its phases and of how far it is."""
+        return (
+            lambda name: self.progress.phase(name, 1.0),
+            lambda share, figures: self.progress.advance(share, **figures),
+        )

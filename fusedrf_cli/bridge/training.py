@@ -1,0 +1,244 @@
+"""`train`: photos or a mesh to one field."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from formats.atomic import check_space
+from formats.captures import hold_out, is_mesh, load_images, read_capture
+from formats.meshes import mesh_capture
+from formats.views import Capture, View
+from fusedrf_cli.bridge.memory import Memory, fitting, photos
+from fusedrf_cli.bridge.running import (
+    checkpoint_mismatch,
+    checkpoint_path,
+    engine,
+    load_checkpoint,
+    resumable,
+)
+from fusedrf_cli.bridge.scene import refuse_options, unusable_kind, write_field
+from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Way
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.metrics import psnr, ssim
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.errors import QualityNotReached, UsageProblem
+from fusedrf_cli.report import readable_size
+from fusedrf_cli.requests import TrainRequest
+
+FEWER_TEXELS = 4  # steps in which a size is looked for that fits
+QUALITY = {
+    "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
+    "normal": FitSettings(longest=224, steps=4000, samples=1 << 14),
+    "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
+}
+WHITE = (1.0, 1.0, 1.0)
+
+
+def train(request: TrainRequest, progress) -> dict:
+    """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
+    with engine(request.device, request.threads, progress) as place:
+        memory = Memory(request.memory)
+        saved = load_checkpoint(request.output, "train") if request.resume else None
+        kind = trained_kind(request)
+        progress.phase("reading", None)
+        capture = read_views(request, progress)
+        box = np.asarray(request.aabb if request.aabb is not None else capture.aabb, np.float64)
+        settings = fit_settings(request, kind, capture, box, place)
+        plan = kind.untrained(box, settings.longest, settings.way)
+        check_space(request.output, bytes_of(plan, request.precision))
+        memory.expect(
+            fit_memory(capture, plan, settings), advice="use fewer or smaller photos, or a lower --quality"
+        )
+        cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
+        run = FitRun.start(cameras, images, box, settings, Path(request.source).resolve().stem)
+        if saved:
+            if saved[1].get("kind") != kind.name:
+                raise checkpoint_mismatch(request.output)
+            run.restore(*saved)
+        field, seconds = _run(run, request.output, progress)
+        progress.phase("measuring", None)
+        measured = measure(field, capture) if request.holdout else None
+        size = write_field(
+            request.output,
+            field,
+            Path(request.output).stem,
+            precision=request.precision,
+            overwrite=request.overwrite,
+        )
+        checkpoint_path(request.output).unlink(missing_ok=True)
+    report = {
+        "output": request.output,
+        "bytes": size,
+        "kind": field.kind,
+        "views": len(capture.train),
+        "steps": run.steps,
+        **kind.describe(field),
+        "seconds": {"training": seconds},
+        "training_psnr": run.psnr,
+        "holdout": measured,
+        "memory": memory.report(),
+        **run.guard.figures(),
+    }
+    reached, target = measured["psnr"] if measured else run.psnr, request.target_psnr
+    if target is not None and reached < target:
+        raise QualityNotReached(
+            f"{request.output}: reached {reached:.2f} dB where --target-psnr asked for {target:g}; give more "
+            "--time-budget or --quality high",
+            report=report,
+        )
+    return report
+
+
+def trained_kind(request: TrainRequest) -> Kind:
+    """The kind that was asked for; UsageProblem where none of its fields can begin from photos."""
+    try:
+        kind = registry.kind(request.kind)
+    except ValueError as error:
+        raise unusable_kind(error) from error
+    if not kind.trains:
+        others = [k.name for k in registry.kinds() if k.trains]
+        raise UsageProblem(
+            f"--kind {kind.name} does not begin from photos: train another kind ({', '.join(others)}), and "
+            f"fuse it to '{kind.name}'"
+        )
+    refuse_options(kind, request)
+    return kind
+
+
+def read_views(request: TrainRequest, progress) -> Capture:
+    """The photos, or the views of a mesh, some of them held out where that is asked."""
+    source = request.source
+    capture = (
+        mesh_capture(source, n_train=request.views, size=request.size, seed=request.seed)
+        if is_mesh(source)
+        else read_capture(source)
+    )
+    if capture.missing:
+        progress.warn(f"{source}: {capture.missing} frames have no photo and were left out")
+    return hold_out(capture, request.holdout) if request.holdout else capture
+
+
+def fit_settings(
+    request: TrainRequest, kind: Kind, capture: Capture, box: np.ndarray, place: str
+) -> FitSettings:
+    """How to fit; UsageProblem where not even the coarsest field is as small as asked."""
+    settings = replace(
+        QUALITY[request.quality],
+        kind=kind.name,
+        way=Way(request.precision, request.ranks, request.sh_degree),
+        seed=request.seed,
+        time_budget=request.time_budget,
+        target_psnr=request.target_psnr,
+        opacity_weight=0.0 if capture.opaque else 0.1,
+        near=0.0,
+        device=place,
+    )
+    longest = fitting_longest(kind, box, settings, request.max_size, request.precision)
+    plan = kind.untrained(box, longest, settings.way)
+    check_size(bytes_of(plan, request.precision), request.max_size)
+    return replace(settings, longest=longest)
+
+
+def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:
+    """What a fit to a capture's photos needs."""
+    width, height = capture.train[0].width, capture.train[0].height
+    cameras = len({camera_of(v).intrinsics for v in capture.train})
+    return {
+        **photos(len(capture.train), width, height, cameras),
+        **fitting(plan, settings.longest, torch.get_num_threads()),
+    }
+
+
+def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
+    """Train to the end; an interrupt leaves a checkpoint and goes on its way."""
+    progress.phase("training", 1.0)
+    started = time.monotonic()
+    with resumable(output, run.checkpoint) as uninterrupted:
+        field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
+    warn_of_numbers(run.guard.figures(), progress)
+    if not run.found_matter:
+        progress.warn(
+            f"{output}: no matter was found, so that all of the box was kept; look at the photos' alpha, "
+            "their poses, and --aabb"
+        )
+    return field, time.monotonic() - started
+
+
+def warn_of_numbers(figures: dict[str, int], progress) -> None:
+    """Say that steps were not finite, where some were (`Guard.figures`)."""
+    if figures:
+        progress.warn(
+            f"{figures['skipped_steps']} steps were not finite and were skipped; returned "
+            f"{figures['roll_backs']} times to the last good state"
+        )
+
+
+def fitting_longest(
+    kind: Kind, box: np.ndarray, settings: FitSettings, max_size: int | None, precision: str
+) -> int:
+    """Texels on the longest axis, fewer than the settings' where the file would grow past max_size
+    (bytes).
+    """
+    longest = settings.longest
+    while (
+        max_size
+        and longest > LEAST_TEXELS
+        and bytes_of(kind.untrained(box, longest, settings.way), precision) > max_size
+    ):
+        longest -= FEWER_TEXELS
+    return longest
+
+
+def bytes_of(plan: Plan, precision: str) -> int:
+    """At most so many bytes of a bundle with a field as planned."""
+    cells = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, max(plan.resolution))))
+    return BESIDES + BundleSizes().of(plan.contents(int(cells)), precision)
+
+
+def check_size(smallest: int, allowed: float | None) -> None:
+    """UsageProblem where even the smallest output, in bytes, is more than --max-size allows."""
+    if allowed is not None and smallest > allowed:
+        raise UsageProblem(
+            f"--max-size is too small: the file takes up to {readable_size(smallest)} at its coarsest, where "
+            f"{readable_size(int(allowed))} were allowed; give more"
+        )
+
+
+def camera_of(view: View) -> Camera:
+    """A capture's view as the engine's camera."""
+    return Camera(
+        view.camera_to_world,
+        view.fl_x,
+        view.fl_y,
+        view.cx,
+        view.cy,
+        view.width,
+        view.height,
+        tuple(view.distortion),
+        view.name,
+    )
+
+
+def measure(field, capture: Capture) -> dict:
+    """Mean PSNR and SSIM of the held-out views over white."""
+    truth = over_white(load_images(capture.test))
+    shots = [render_image(field, camera_of(v)).over(WHITE) for v in capture.test]
+    return {
+        "psnr": float(np.mean([psnr(a, b) for a, b in zip(shots, truth, strict=True)])),
+        "ssim": float(np.mean([ssim(a, b) for a, b in zip(shots, truth, strict=True)])),
+        "views": len(shots),
+    }
+
+
+def over_white(images: np.ndarray) -> np.ndarray:
+    """(n, H, W, 4) uint8 straight alpha to (n, H, W, 3) float32 over white."""
+    values = images.astype(np.float32) / 255
+    return values[..., :3] * values[..., 3:] + 1 - values[..., 3:]

@@ -1,0 +1,49 @@
+"""Ways to fuse a scene that a chart tries, from cheap to dear."""
+
+import itertools
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+SHRINK = 1.5  # a rung's bytes over the next one's
+SMALLEST = 50_000  # bytes, below which a bundle is mostly headers
+SIZES = (25_000_000, 12_000_000, 6_000_000)
+SECONDS = (5.0, 15.0, 45.0, None)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """What fusing is asked for; None is left to it."""
+
+    precision: str | None = None
+    ranks: tuple[int, int] | None = None
+    sh_degree: int | None = None
+    bytes: int | None = None
+    rgb: bool = True
+    """Whether to finish on rendered rays."""
+    seconds: float | None = None
+    """Of learning."""
+
+
+Ladder = Generator[Rung, tuple[int, float] | None, None]
+"""Gives rungs, takes the bytes and the PSNR that came of them, or None where nothing did."""
+
+
+def shrinking(rung: Rung, least_psnr: float) -> Ladder:
+    """The rung as it is, then with ever fewer bytes until the PSNR falls below least_psnr."""
+    found, size = (yield rung), math.inf
+    while found is not None and found[1] >= least_psnr and min(size, found[0]) > SMALLEST:
+        size = readable_floor(min(size, found[0]) / SHRINK)
+        found = yield replace(rung, bytes=size)
+
+
+def by_sizes() -> Ladder:
+    """Few sizes; the seconds decide last, since that takes longest."""
+    for seconds, size, rgb in itertools.product(SECONDS, SIZES, (False, True)):
+        yield Rung(bytes=size, rgb=rgb, seconds=seconds)
+
+
+def readable_floor(size: float) -> int:
+    """The largest number of two digits and zeros that is no more than size."""
+    unit = 10 ** max(0, math.floor(math.log10(size)) - 1)
+    return int(size // unit) * unit

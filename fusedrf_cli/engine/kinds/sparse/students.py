@@ -1,0 +1,177 @@
+"""A sparse field as a student: bricks where the scene has matter, filled by asking it, and finished on
+rays."""
+
+from collections.abc import Mapping
+from itertools import product
+from math import prod
+
+import numpy as np
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
+from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
+from fusedrf_cli.engine.kinds.sparse.bodies import ROW, SIDE
+from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, with_fringe
+from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
+from fusedrf_cli.engine.kinds.student import (
+    Contents,
+    DistillSettings,
+    Made,
+    MadeStudent,
+    Needs,
+    StudentRequest,
+    Way,
+)
+
+POINTS = 3_000_000  # that are kept of the teachers' answers, about
+PADDED = 1.6  # floats in memory for each number that is stored: rows are padded, hanging vertices too
+WHOLE_BELOW = 0.8  # of the numbers allowed: fewer are taken where no object needs more
+PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squares of a vertex
+BYTES_PER_BRICK = 10  # masks and nodes
+VERTICES_PER_BRICK = 25  # at least, in scenes of surfaces
+DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0
+DEGREES = (0, 1, 2)
+LEAST_BYTES = 20_000  # told where nothing fits: a few hundred vertices and their bricks
+LADDER_BYTES = (1_000_000, 3_000_000, 8_000_000)
+
+
+class SparseKind(Kind):
+    """Bricks of voxels."""
+
+    name = "sparse"
+    good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local to the bit."
+    field = SparseField
+    trains = False
+    takes = frozenset({"sh_degree"})
+    precisions = ("int8", "float16")
+    faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
+
+    def student(self, scene: ComposedField, request: StudentRequest) -> "SparseStudent":
+        """Bricks of a scene."""
+        return SparseStudent(self, scene, request)
+
+    def describe(self, field: SparseField) -> dict:
+        """The voxel and the bricks of every level, and how many vertices they have."""
+        return {"levels": levels(field), "sh_degree": field.shape.sh_degree, "vertices": field.fine.free}
+
+    def counts(self, field: SparseField) -> dict[str, int]:
+        """Its bricks."""
+        return {"bricks": len(field.tree.level)}
+
+    def details(self, scene: ComposedField, field: SparseField) -> list[Detail]:
+        """What bricks hold of placed objects."""
+        return [
+            Detail(p.name, p.condition, opacity_off(p.condition), p.voxel_size, v, extent(p) / v)
+            for p, v in zip(scene.placed, held_voxels(scene, field), strict=True)
+        ]
+
+    def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
+        """The numbers, and the indices that follow from the bricks."""
+        return decoded + PER_BRICK * prod(shapes.get("masks", (0,))) // 8
+
+    def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
+        """One ladder."""
+        return {self.name: [bricks_ladder()]}
+
+    def added(self, field: SparseField, objects: list[Placed], teach: Teach) -> Edited:
+        """Bricks of the objects, filled by asking them."""
+        for placed in objects:
+            field = added(field, placed)
+        return Edited(field, enclosing([p.aabb for p in objects]), "the bricks that it reaches filled anew")
+
+    def refilled(
+        self, field: SparseField, box: np.ndarray, rest: list[Placed] | None, teach: Teach
+    ) -> Edited | None:
+        """The bricks in a box, filled by asking the rest."""
+        if rest is not None:
+            box = with_fringe(field, box)
+        result = emptied(field, box, rest or [])
+        how = (
+            "the bricks in its box filled from the other sources" if rest else "the bricks in its box emptied"
+        )
+        return None if result is None else Edited(result, box, how)
+
+
+class SparseStudent(MadeStudent):
+    """Bricks about as fine as each object of a scene needs, all wider by one factor under a limit."""
+
+    # what was asked needs no learning from points
+    lesson = DistillSettings(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
+    compares = False
+
+    def ways(self) -> list[list[Way]]:
+        """By precision, and degrees of the colour."""
+        request = self.request
+        precisions = (request.precision,) if request.precision else self.kind.precisions
+        degrees = DEGREES if request.sh_degree is None else (request.sh_degree,)
+        return [[Way(p, None, degree) for degree in degrees] for p in precisions]
+
+    def plain(self) -> Way:
+        """The degree that was measured to be worth its bytes."""
+        request = self.request
+        degree = DEGREE if request.sh_degree is None else request.sh_degree
+        return Way(request.precision or self.kind.faithful, None, degree)
+
+    def made(self, way: Way, limit: int) -> Made | None:
+        """Bricks filled by asking the scene."""
+        numbers = self.numbers_within(limit, way.precision)
+        try:
+            field = resampled(self.scene, SparseShape(way.sh_degree), numbers)
+        except TooFewNumbers:
+            return None
+        size = self.bytes_of(field, way)
+        return Made(field, size, field.numbers < WHOLE_BELOW * numbers) if size <= limit else None
+
+    def numbers_within(self, limit: int, precision: str) -> int:
+        """How many numbers a file of so many bytes holds beside its bricks' masks."""
+        sizes = self.request.sizes
+        each = sizes.per_number(precision) + BYTES_PER_BRICK / (ROW * VERTICES_PER_BRICK)
+        bare = self.request.overhead + sizes.of(Contents((), parts=0, placements=0), precision)
+        return max(0, int((limit - bare) / each))
+
+    def smallest(self) -> int:
+        """About so many bytes for the widest voxels."""
+        return max(LEAST_BYTES, self.request.limit + 1)
+
+    def why(self, field: SparseField) -> str:
+        """How fine the voxels are."""
+        return "voxels as wide as each object needs where that fits"
+
+    def needs(self) -> Needs:
+        """Vertices while they are filled, padded rows afterwards."""
+        numbers = self.numbers_within(self.request.limit, self.plain().precision)
+        filling = {"vertices while they are found and filled": float(PER_NUMBER_FILLED * numbers)}
+        return Needs(int(PADDED * numbers), making=filling, points=POINTS)
+
+
+def bricks_ladder() -> Ladder:
+    """From few bricks to more, since many take minutes."""
+    for rgb, size, degree in product((False, True), LADDER_BYTES, (1, 0)):
+        yield Rung("int8", sh_degree=degree, bytes=size, rgb=rgb)
+
+
+def levels(field: SparseField) -> list[dict]:
+    """For the report: the voxel and the bricks of every level."""
+    level, depth = field.tree.level, field.tree.depth
+    return [
+        {"voxel": float(field.voxel_size * 2 ** (depth - n)), "bricks": int(np.count_nonzero(level == n))}
+        for n in range(depth + 1)
+    ]
+
+
+def held_voxels(scene: ComposedField, field: SparseField) -> list[float]:
+    """The side of the voxels that hold most of each placed object."""
+    tree, found = field.tree, []
+    for p in scene.placed:
+        centres = p.field.occupancy.centres() @ p.object_to_world[:3, :3].T + p.object_to_world[:3, 3]
+        halves = 2 * np.floor((centres - tree.lo) / tree.unit).astype(np.int64) + 1
+        inside = ((halves > 0) & (halves < 2 * (field.aabb[3:] - tree.lo) / tree.unit)).all(1)
+        brick = tree.voxels_at(halves[inside], SIDE, field.fine.active)[0]
+        level = tree.level[brick[brick >= 0]].astype(np.int64)
+        depth = np.median(level) if len(level) else 0
+        found.append(float(field.voxel_size * 2.0 ** (tree.depth - depth)))
+    return found

@@ -1,0 +1,325 @@
+"""How a kind of field stands for a composed scene: the ways and sizes it can be made in, and how it learns.
+
+Bytes are told by whoever knows files (`StoredSizes`): nothing here does.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.detail import Detail
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.occupancy import texels
+
+if TYPE_CHECKING:
+    from fusedrf_cli.engine.kinds.kind import Kind
+
+LEAST_TEXELS = 16  # along the longest axis: no student is coarser
+GROWTH = 2  # of the numbers, from one size to the next
+SMALLEST = 32  # times fewer numbers than the limit allows: where growing begins
+SHRINK = 0.98  # steps in which a size is looked for that fits
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to hold a scene, but for its size."""
+
+    precision: str = "float16"
+    """How numbers are stored."""
+    ranks: tuple[int, int] | None = None
+    """Density and colour components per mode at most; None: as the kind or the sources have them."""
+    sh_degree: int | None = None
+    """SH degree at most; None: as the kind or the sources have it."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """An array of numbers that a field is stored with."""
+
+    name: str
+    shape: tuple[int, ...]
+    used: np.ndarray | None = None
+    """Bool, of the first two axes: where the array may hold numbers other than 0; None: everywhere."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a field is stored with, before its numbers are made."""
+
+    sections: Sequence[Section]
+    bits: int = 0
+    """Of all its masks."""
+    parts: int = 1
+    """Tensors, say, that its metadata tell of."""
+    placements: int = 1
+    """Of parts in its frame."""
+
+
+class StoredSizes(Protocol):
+    """Bytes of what is stored."""
+
+    def of(self, contents: Contents, precision: str) -> int:
+        """At most so many bytes for a field of those contents."""
+        ...
+
+    def exactly(self, field: StoredField, precision: str) -> int:
+        """The bytes of a field."""
+        ...
+
+    def per_number(self, precision: str) -> float:
+        """About so many bytes for a number."""
+        ...
+
+
+@dataclass(frozen=True)
+class DistillSettings:
+    """How a student learns from a teacher."""
+
+    rays: int = 800_000
+    """That the teacher is asked for."""
+    steps: int = 800
+    """From the points on those rays; 0 where the student knows already what they would teach it."""
+    rgb_steps: int = 600
+    """From the pictures that the rays make."""
+    rgb_samples: int = 1 << 15
+    """Samples per step that the number of rays is steered to."""
+    rgb_rate: float = 0.003
+    time_budget: float | None = None
+    """Seconds of learning, shared alike by the phases that have steps. None: the steps decide, and equal
+    seeds give equal bytes."""
+    seed: int = 0
+    views: int = 4
+    view_size: int = 160
+    """Pixels a side of the views it is judged on."""
+
+
+@dataclass(frozen=True)
+class StudentRequest:
+    """What is asked of a student; None is left to choose."""
+
+    sizes: StoredSizes
+    limit: int
+    """Bytes of the file."""
+    overhead: int = 0
+    """Bytes of the file besides the field."""
+    target: float | None = None
+    """PSNR in dB to be reached with the fewest bytes."""
+    precision: str | None = None
+    ranks: tuple[int, int] | None = None
+    sh_degree: int | None = None
+    source_bytes: tuple[int, ...] = ()
+    """In memory, of the distinct sources."""
+
+
+class TooSmall(ValueError):
+    """The limit on bytes is under what the coarsest student takes."""
+
+    def __init__(self, smallest: int):
+        """smallest: bytes of the file with the coarsest student."""
+        super().__init__(f"the coarsest takes {smallest} bytes")
+        self.smallest = smallest
+
+
+@dataclass(frozen=True)
+class Suits:
+    """Whether a kind can hold a scene, and how well."""
+
+    score: float | None
+    """None: not at all. `auto` takes the highest; a kind of 0 is only taken where it is asked for."""
+    why: str
+    """One clause, after which a sentence can go on."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A field on a grid that is to be made."""
+
+    way: Way
+    box: np.ndarray
+    """(6,) float64."""
+    resolution: tuple[int, int, int]
+    """Texels per axis, corners on the faces of the box."""
+    numbers: int
+    """In memory."""
+    allowed: int
+    """Numbers it may have."""
+    sections: Sequence[Section]
+
+    @property
+    def voxel(self) -> float:
+        """Finest texel spacing."""
+        return float(((self.box[3:] - self.box[:3]) / (np.asarray(self.resolution) - 1)).min())
+
+    def contents(self, bits: int) -> Contents:
+        """What it is stored with, beside so many bits of occupancy."""
+        return Contents(self.sections, bits)
+
+
+@dataclass(frozen=True)
+class Made:
+    """A student that was made without learning."""
+
+    field: StoredField
+    bytes: int
+    """Of the file."""
+    whole: bool
+    """Whether more bytes would change nothing."""
+    exact: bool = False
+    """Whether it shows what the scene does, so that it has nothing to learn."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a student takes of memory, besides what every fusing does."""
+
+    numbers: int
+    """Floats of the result in memory."""
+    copies: float = 0.0
+    """Of the largest source's numbers, while it is made."""
+    making: dict[str, float] = field(default_factory=dict)
+    """Bytes while it is made, by what they are for."""
+    points: int | None = None
+    """Of the teachers that it keeps while it learns; None: to be reckoned from a few rays."""
+
+
+def finest_within(
+    box: np.ndarray, finest: float, numbers: Callable[[tuple[int, int, int]], int], most: int
+) -> tuple[int, int, int]:
+    """Texels per axis over a box (6,): voxels no finer than `finest`, and no more numbers than `most`, as far
+    as LEAST_TEXELS allow."""
+    longest = int(np.ceil((box[3:] - box[:3]).max() / finest)) + 1
+    while longest > LEAST_TEXELS and numbers(texels(box, longest)) > most:
+        longest -= max(1, longest // 100)
+    return texels(box, longest)
+
+
+class Student:
+    """One kind's stand for one composed scene: a field over the scene's box that learns from nothing, and
+    that under a target grows from few numbers to many.
+
+    A kind that needs no learning to begin with derives `MadeStudent` instead.
+    """
+
+    learnt = True
+    """Whether it learns from nothing; else it is made (MadeStudent) and learning only finishes it."""
+    lesson: DistillSettings | None = DistillSettings()
+    """None: rays drawn once for all tries, from its own `teacher` (distillation/finish.py)."""
+
+    def __init__(self, kind: "Kind", scene: ComposedField, request: StudentRequest):
+        self.kind, self.scene, self.request = kind, scene, request
+
+    # -- ways and sizes --------------------------------------------------------------------------------------
+
+    def ways(self) -> list[list[Way]]:
+        """The ways that are left to choose from, in groups of one precision, the cheapest first."""
+        request = self.request
+        choice = self.kind.precisions if request.target is not None else (self.kind.faithful,)
+        found = (request.precision,) if request.precision else choice
+        return [[Way(p, request.ranks, request.sh_degree)] for p in found]
+
+    def plans(self) -> Iterator[Plan]:
+        """What to make, one after the other, until one shows enough; without a target the largest alone."""
+        largest, before = self.largest(), None
+        if self.request.target is None:
+            yield largest
+            return
+        for k in range(SMALLEST.bit_length() - 1, -1, -1):
+            numbers = largest.allowed // GROWTH**k
+            plan = self.plan(largest.way, numbers)
+            made_of = plan.way, plan.resolution
+            if made_of != before and (plan.numbers <= numbers or k == 0):
+                before = made_of
+                yield plan
+
+    def largest(self) -> Plan:
+        """The largest that the limit allows at the dearest precision; TooSmall where it allows none."""
+        way, limit = self.ways()[-1][-1], self.request.limit
+        smallest = self.bytes_of_plan(self.plan(way, 1), way)
+        if smallest > limit:
+            raise TooSmall(smallest)
+        sizes = self.request.sizes
+        bare = self.request.overhead + sizes.of(
+            Contents((), self.scene.occupancy.occupied.size), way.precision
+        )
+        numbers = max(1, int((limit - bare) / sizes.per_number(way.precision)))
+        while self.bytes_of_plan(plan := self.plan(way, numbers), way) > limit:  # small planes are not coded
+            numbers = int(SHRINK * numbers)
+        return plan
+
+    def plan(self, way: Way, numbers: int) -> Plan:
+        """The finest student of at most so many numbers."""
+        return self.kind.plan(self.scene.aabb, self.scene.voxel_size, way, numbers)
+
+    def bytes_of_plan(self, plan: Plan, way: Way) -> int:
+        """At most so many bytes of the file."""
+        contents = plan.contents(self.scene.occupancy.occupied.size)
+        return self.request.overhead + self.request.sizes.of(contents, way.precision)
+
+    # -- beginning -------------------------------------------------------------------------------------------
+
+    def begun(
+        self, plan: Plan, before: StoredField | None, background: Placed | None, generator: torch.Generator
+    ) -> tuple[StoredField, str]:
+        """A student before it learns, and what it starts from: a smaller one, the scene's background, or
+        nothing. background is placed in the scene's frame; None: not to be taken over."""
+        scene = self.scene
+        if before is not None:
+            return self.kind.grown(before, plan).with_occupancy(scene.occupancy), "a smaller student"
+        if background is not None:
+            taken = self.kind.taken_over(background, plan, scene, generator)
+            if taken is not None:
+                return taken, f"the weights of '{background.name}'"
+        box = scene.occupancy.aabb
+        fresh = self.kind.create(replace(plan, box=box), generator, "fused")
+        return fresh.with_occupancy(scene.occupancy), "nothing"
+
+    # -- telling ---------------------------------------------------------------------------------------------
+
+    def bytes_of(self, field: StoredField, way: Way) -> int:
+        """Bytes of the file with a field."""
+        return self.request.overhead + self.request.sizes.exactly(field, way.precision)
+
+    def why(self, field: StoredField) -> str:
+        """What it is, for the sentence that tells why it was chosen."""
+        return f"one {self.kind.name} field over the scene, learnt from it"
+
+    def details(self, field: StoredField) -> list[Detail]:
+        """What it holds of the scene's objects."""
+        return self.kind.details(self.scene, field)
+
+    def needs(self) -> Needs:
+        """What it takes of memory."""
+        return Needs(self.largest().numbers)
+
+
+class MadeStudent(Student):
+    """A student that is made without learning, in many ways and at any size; learning only finishes it."""
+
+    learnt = False
+    gain = 8.0
+    """dB that finishing adds at most."""
+    compares = True
+    """Whether, where only a size is given, ways are compared under it; else `plain` is taken."""
+
+    def plain(self) -> Way:
+        """The way that leaves most as it is."""
+        request = self.request
+        return Way(request.precision or self.kind.faithful, request.ranks, request.sh_degree)
+
+    def made(self, way: Way, limit: int) -> Made | None:
+        """The student of at most `limit` bytes; None where not even the coarsest is that small."""
+        raise NotImplementedError
+
+    def smallest(self) -> int:
+        """Bytes of the file with the coarsest student."""
+        raise NotImplementedError
+
+    def teacher(self, in_memory: bool) -> RadianceField:
+        """What it learns from where that is no composition; in_memory: whether all sources may be held at
+        once."""
+        return self.scene

@@ -1,0 +1,106 @@
+"""Edits of a vm field: blocks come and go, and of a distilled tensor the cells of a box are emptied and
+filled by a tensor of their own. All other numbers stay as they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.region import ClippedField
+from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach, enclosing, overlaps
+from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
+
+RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
+UNNAMED = ("", "fused", RESTORED)  # blocks that stand for no object
+NUMBERS = 2_000_000  # of a tensor that a region or an object is learnt into
+
+
+def parts(field: VMField) -> list[Part]:
+    """The blocks that stand for an object."""
+    return [
+        Part(b.name, transformed_aabb(field.tensors[b.tensor].occupancy.tight_aabb(0), b.object_to_field))
+        for b in field.blocks
+        if b.name not in UNNAMED
+    ]
+
+
+def added(kind, field: VMField, objects: list[Placed], teach: Teach) -> Edited:
+    """The field with the blocks of placed objects, of which those of another kind become a tensor in their
+    own frame first. Raises ValueError where there would be too many."""
+    objects = [as_vm(kind, p, teach) for p in objects]
+    result = blocks_of([Placed("", field, np.eye(4)), *objects])
+    return Edited(result, enclosing([p.aabb for p in objects]), "blocks appended")
+
+
+def as_vm(kind, placed: Placed, teach: Teach) -> Placed:
+    """A placed vm field with the same content: itself, or what distilling another kind gives, in the object's
+    own frame."""
+    if type(placed.field) is VMField:
+        return placed
+    teacher = ComposedField([Placed(placed.name, placed.field, np.eye(4))])
+    student = kind.empty(teacher, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), placed.name)
+    student, _ = teach(teacher, student, [teacher.occupancy.tight_aabb(0)], True)
+    back = placed.object_to_world.copy()
+    back[:3, 3] += back[:3, :3] @ teacher.origin
+    return Placed(placed.name, student, back)
+
+
+def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, teach: Teach) -> Edited | None:
+    """The field whose distilled tensor is empty in the cells of a box (6,), and a tensor of its own that
+    holds what the rest shows there; None where nothing is left."""
+    region = region_of(field, box)
+    emptied = cleared(field, region)
+    rest = [p for p in rest or [] if overlaps(p.aabb, region)]
+    teacher = ComposedField(rest) if rest else None
+    local = ClippedField(teacher, region - np.tile(teacher.origin, 2)) if rest else None
+    if local is None or not local.occupancy.occupied.any():
+        left = emptied.occupancy.occupied.any()
+        return Edited(emptied, region, "the cells of its box emptied") if left else None
+    student = kind.empty(local, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), RESTORED)
+    student, figures = teach(local, student, [local.occupancy.tight_aabb(0)], True)
+    back = np.eye(4)
+    back[:3, 3] = teacher.origin
+    whole = blocks_of([Placed("", emptied, np.eye(4)), Placed(RESTORED, student, back)])
+    how = "the cells of its box emptied, and what the other sources show there learnt into a block"
+    return Edited(whole, region, how, figures=figures)
+
+
+def region_of(field: VMField, aabb: np.ndarray) -> np.ndarray:
+    """(6,) the box grown to whole cells of the field's distilled tensor (block 0), so that cutting it out
+    leaves no seam.
+    """
+    tensor = field.tensors[field.blocks[0].tensor]
+    at = field.blocks[0].object_to_field[:3, 3]
+    cell, lo = tensor.occupancy.cell, tensor.aabb[:3] + at
+    low = np.floor((aabb[:3] - lo) / cell - 1e-9)
+    high = np.ceil((aabb[3:] - lo) / cell + 1e-9)
+    shape = np.asarray(tensor.occupancy.occupied.shape)
+    return np.concatenate([lo + np.clip(low, 0, shape) * cell, lo + np.clip(high, 0, shape) * cell])
+
+
+def cleared(field: VMField, region: np.ndarray) -> VMField:
+    """The field with the cells of a region (of `region_of`) empty in its distilled tensor, and in the tensors
+    that earlier cuts filled in; no number changes.
+    """
+    blocks = [field.blocks[0], *(b for b in field.blocks[1:] if b.name == RESTORED)]
+    emptied = {
+        b.tensor: emptied_tensor(field.tensors[b.tensor], b.object_to_field[:3, 3], region) for b in blocks
+    }
+    tensors = tuple(emptied.get(t, tensor) for t, tensor in enumerate(field.tensors))
+    return VMField.assembled(field.shape, tensors, field.blocks, field.params)
+
+
+def emptied_tensor(tensor: VMTensor, at: np.ndarray, region: np.ndarray) -> VMTensor:
+    """A tensor placed by a mere shift `at` (3,), without the cells whose centres lie in the region."""
+    grid = tensor.occupancy
+    cells = np.argwhere(grid.occupied)
+    centres = grid.aabb[:3] + at + (cells + 0.5) * grid.cell
+    inside = ((centres > region[:3]) & (centres < region[3:])).all(1)
+    occupied = grid.occupied.copy()
+    occupied[tuple(cells[inside].T)] = False
+    return replace(tensor, occupied=occupied)

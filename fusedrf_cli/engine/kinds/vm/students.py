@@ -1,0 +1,142 @@
+"""A vm field as a student: one tensor over a scene's box, from the background's numbers where these can be
+taken over."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.student import Contents, Plan, Section, Suits, Way, finest_within
+from fusedrf_cli.engine.kinds.vm import editing
+from fusedrf_cli.engine.kinds.vm.blocks import common_shape, reshaped, without
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
+
+SHAPE = VMShape(16, 24, 2)
+NOISE = 0.03  # of the factors of a student that takes over others' numbers
+
+
+def shape_of(way: Way) -> VMShape:
+    """The shape of a field in a way, SHAPE's where that leaves a choice."""
+    ranks = way.ranks or (SHAPE.density_rank, SHAPE.colour_rank)
+    return VMShape(*ranks, SHAPE.sh_degree if way.sh_degree is None else way.sh_degree)
+
+
+class VMKind(Kind):
+    """TensoRF's vector-matrix decomposition."""
+
+    name = "vm"
+    good_for = "Objects and scenes in their own axes: small, smooth, quick to train."
+    field = VMField
+    takes = frozenset({"ranks", "sh_degree"})
+    takes_over = True
+
+    def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
+        """Planes, lines and the colour basis of one tensor."""
+        return [Section(*named) for named in shape_of(way).sections(resolution)]
+
+    def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
+        """Floats of one tensor, each section on a cache line."""
+        return shape_of(way).size(resolution)
+
+    def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> VMField:
+        """One tensor."""
+        return VMField.create(plan.box, plan.resolution, shape_of(plan.way), generator, name)
+
+    def suits(self, scene: ComposedField) -> Suits:
+        """It holds any scene, one that is not stretched and has its detail everywhere best."""
+        return Suits(1.0, "one tensor over the scene learns any sources by any rule")
+
+    def taken_over(
+        self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
+    ) -> VMField | None:
+        """A tensor over the scene's box that begins as the background does, where that is one, placed upright
+        and scaled alike along all axes."""
+        moved = upright(background)
+        if moved is None:
+            return None
+        if plan.way.ranks is not None:
+            moved = truncated(moved, shape_of(plan.way))
+        return widened(moved, plan, scene, generator)
+
+    def describe(self, field: VMField) -> dict:
+        """Texels per axis of its tensor, or of each of its tensors, ranks and SH degree."""
+        texels = [list(t.resolution) for t in field.tensors]
+        return {
+            "resolution": texels if len(field.blocks) > 1 else texels[0],
+            "ranks": [field.shape.density_rank, field.shape.colour_rank],
+            "sh_degree": field.shape.sh_degree,
+        }
+
+    def counts(self, field: VMField) -> dict[str, int]:
+        """Its blocks."""
+        return {"blocks": len(field.blocks)}
+
+    def parts(self, field: VMField) -> list[Part]:
+        """Its named blocks."""
+        return editing.parts(field)
+
+    def without(self, field: VMField, names: set[str]) -> VMField | None:
+        """Without the blocks of those names."""
+        return without(field, names)
+
+    def added(self, field: VMField, objects: list[Placed], teach: Teach) -> Edited:
+        """Blocks appended."""
+        return editing.added(self, field, objects, teach)
+
+    def refilled(
+        self, field: VMField, box: np.ndarray, rest: list[Placed] | None, teach: Teach
+    ) -> Edited | None:
+        """Cells emptied, and a tensor for what the rest shows there."""
+        return editing.refilled(self, field, box, rest, teach)
+
+
+def upright(background: Placed) -> VMField | None:
+    """A placed field of one tensor in the frame it is placed in, or None where its axes are others: a
+    decomposition follows them, so it must only be moved and scaled alike along all of them."""
+    linear = background.object_to_world[:3, :3]
+    scale = linear[0, 0]
+    field = background.field
+    if type(field) is not VMField or len(field.blocks) != 1 or scale <= 0:
+        return None
+    if not np.allclose(linear, scale * np.eye(3), atol=1e-9 * scale):
+        return None
+    source = field.tensors[0]
+    box = source.aabb * scale + np.tile(background.object_to_world[:3, 3], 2)
+    tensor = VMTensor(source.resolution, box, source.scale / scale, source.shift)
+    return VMField(
+        field.shape, (tensor,), (Block(0, np.eye(4), "fused"),), field.params, OccupancyGrid.full(box)
+    )
+
+
+def widened(field: VMField, plan: Plan, scene: ComposedField, generator: torch.Generator) -> VMField:
+    """A field of one tensor over a scene's box, with as many components as planned at least."""
+    shape, box = common_shape([field.shape, shape_of(plan.way)]), scene.occupancy.aabb
+    resolution = finest_within(box, scene.voxel_size, shape.size, plan.allowed)
+    student = reshaped(field, shape).resampled(box, resolution).with_occupancy(scene.occupancy)
+    add_noise(student, generator)
+    return student
+
+
+def add_noise(student: VMField, generator: torch.Generator) -> None:
+    """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for
+    ever."""
+    for name, section in student.sections(0).items():
+        if name != "colour_basis":
+            section += NOISE * torch.randn(section.shape, generator=generator)
+
+
+def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Contents:
+    """What a field of tensors without unread texels (trimming.py) is stored with."""
+    sections, bits = [], 0
+    for tensor in tensors:
+        bits += tensor.occupancy.occupied.size + 8  # each is packed by itself
+        for name, section in shape.sections(tensor.resolution):
+            used = read_texels(tensor, int(name[-1])) if "_plane_" in name else None
+            sections.append(Section(name, section, used))
+    return Contents(sections, bits, len(tensors), blocks)

@@ -1,0 +1,150 @@
+"""What every command asks of the bridge: its words, checked by the command line, in one object each.
+
+Sizes are bytes, times seconds, lengths world units.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Running:
+    """Where to compute."""
+
+    device: str
+    threads: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learning(Running):
+    """How to learn."""
+
+    time_budget: float | None
+    """Seconds of learning in the whole command, all tries together."""
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainRequest(Learning):
+    """Photos or a mesh to one field."""
+
+    source: str
+    output: str
+    overwrite: bool
+    kind: str
+    quality: str
+    ranks: tuple[int, int] | None
+    sh_degree: int | None
+    precision: str
+    max_size: int | None
+    target_psnr: float | None
+    holdout: int | None
+    views: int
+    size: int
+    aabb: tuple[float, ...] | None
+    memory: int | None
+    resume: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class FuseRequest(Learning):
+    """A scene to one field; None is left to choose."""
+
+    scene: str
+    output: str
+    overwrite: bool
+    kind: str
+    max_size: int | None
+    target_psnr: float | None
+    precision: str | None
+    ranks: tuple[int, int] | None
+    """Components per mode of density and of colour at most."""
+    sh_degree: int | None
+    rgb: bool
+    """Whether to finish on rendered rays."""
+    from_scratch: bool
+    keep_sources: bool
+    memory: int | None
+    allow_outside: bool
+    resume: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditRequest(Learning):
+    """What `add` and `delete` have in common."""
+
+    fused: str
+    output: str
+    overwrite: bool
+    precision: str | None
+    """None: the field's own."""
+    rgb: bool
+    memory: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddRequest(EditRequest):
+    """One more object."""
+
+    source: str
+    name: str
+    object_to_world: Any
+    """(4, 4) float64."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeleteRequest(EditRequest):
+    """Objects to be taken out."""
+
+    names: tuple[str, ...]
+    allow_outside: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderRequest(Running):
+    """Pictures or a film of a scene."""
+
+    scene: str
+    output: str
+    overwrite: bool
+    cameras: str | None
+    path: str | None
+    orbit: int | None
+    size: tuple[int, int] | None
+    background: tuple[float, float, float] | None
+    """None: transparent."""
+    depth: bool
+    fps: float
+    memory: int | None
+    allow_outside: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRequest(Running):
+    """A bundle against photos or another scene."""
+
+    bundle: str
+    against: str
+    split: str
+    size: tuple[int, int] | None
+    memory: int | None
+    allow_outside: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChartRequest(Running):
+    """A scene fused in the ways that are worth it."""
+
+    scene: str
+    output: str
+    overwrite: bool
+    budget: float
+    kinds: tuple[str, ...]
+    least_psnr: float
+    size: tuple[int, int]
+    memory: int | None
+    allow_outside: bool
+    seed: int
+    fuse_request: Callable[[tuple[str, ...]], FuseRequest]
+    """What `fusedrf fuse` makes of flags: so every label is the flags that gave the point."""

@@ -1,0 +1,108 @@
+"""What every kind of field does, whoever wrote it: fused, edited, trained and charted as whole commands."""
+
+import numpy as np
+import pytest
+
+from formats.bundle import read_bundle
+from fusedrf_cli.bridge.ladders import in_flags
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.commands.chart import fuse_request
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
+from fusedrf_cli.engine.rendering.metrics import psnr
+from tests.bridge.conftest import TinySettings
+from tests.bridge.test_edit import AT, blues, covered
+
+KINDS = registry.names()
+SIZE = 900_000
+PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short(tiny):  # noqa: F811
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
+        yield
+
+
+@pytest.fixture
+def fused(report, kind):
+    """What fusing floor and red to a kind says, sources inside."""
+    words = ("--kind", kind, "--max-size", str(SIZE), "--keep-sources")
+    return report("fuse", "pair.json", "-o", "fused.rfpack", *words)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
+    inside = sum((folder / f"{name}.rfpack").stat().st_size for name in ("floor", "red"))
+    assert fused["kind"] == kind and fused["bytes"] <= SIZE + inside
+    assert fused["chosen"]["why"] and f"--kind {kind}" in fused["chosen"]["flags"]
+    own = registry.kind(kind).field
+    assert own is None or type(opened(load_scene(str(folder / "fused.rfpack")).placed[0].field)) is own
+    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 15
+    assert fused["memory"]["predicted_bytes"] > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_equal_seeds_give_equal_bytes(report, folder, kind):
+    for name in ("one", "two"):
+        words = ("--kind", kind, "--max-size", str(SIZE), "--no-rgb", "--seed", "4")
+        report("fuse", "pair.json", "-o", f"{name}.rfpack", *words)
+    assert (folder / "one.rfpack").read_bytes() == (folder / "two.rfpack").read_bytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_object_comes_and_goes(fused, report, picture, folder, kind):
+    """It shows where it was put and nowhere else; taken out, it is gone, and the report says how."""
+    before = picture("fused.rfpack")
+    said = report("add", "fused.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
+    more, away = picture("more.rfpack"), ~covered("blue")
+    local = "the same bits" in said["touched"]["how"]
+    assert local or "is not the same to the bit" in said["touched"]["how"]
+    assert psnr(more[away], before[away]) >= (45 if local else 17)
+    assert more[covered("blue", -0.1)].mean(0)[2] > before[covered("blue", -0.1)].mean(0)[2] - 0.05
+    assert blues(more) > 10 and blues(before) == 0
+    said = report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
+    less = picture("less.rfpack")
+    assert blues(less) < 0.2 * blues(more) and said["touched"]["how"]
+    history = read_bundle(folder / "less.rfpack").scene.history
+    assert [entry["event"] for entry in history] == ["fused", "added", "deleted"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, kind):
+    if not registry.kind(kind).trains:
+        result = run(*PHOTOS, "--kind", kind)
+        assert result.exit_code == 2 and "does not begin from photos" in result.stderr
+        assert not (folder / "out.rfpack").exists()
+        return
+    said = report(*PHOTOS, "--kind", kind)
+    assert said["kind"] == kind and said["steps"] == 60
+    assert said["bytes"] == (folder / "out.rfpack").stat().st_size
+    assert np.isfinite(said["training_psnr"]) and said["training_psnr"] > 9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_target_that_is_easy_takes_few_bytes(report, kind):
+    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "12", "--no-rgb")
+    said = report("fuse", "pair.json", "-o", "small.rfpack", *words)
+    assert said["psnr"]["stored"] >= 12 and said["bytes"] < SIZE
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_its_ladders_are_flags_of_fuse(kind):
+    groups = registry.kind(kind).ladders(30.0)
+    first = [next(in_flags(kind, ladder)) for found in groups.values() for ladder in found]
+    assert first and all(fuse_request(flags).kind == kind for flags in first)
+
+
+def test_a_kind_that_nobody_has_is_a_clear_sentence(run, folder):
+    for words in (("fuse", "pair.json", "-o", "no.rfpack"), PHOTOS):
+        result = run(*words, "--kind", "hash")
+        assert result.exit_code == 2 and "'hash' is not one of" in result.stderr
+
+
+def test_auto_says_why(report):
+    said = report("fuse", "pair.json", "-o", "fused.rfpack")
+    assert said["kind"] == "blocks" and "vm" in said["kind_because"]
