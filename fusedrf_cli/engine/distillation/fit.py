@@ -11,7 +11,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.passes import PASSES, Batch
+from fusedrf_cli.engine.distillation.passes import PASSES, Batch, FusedPass
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
@@ -117,7 +117,7 @@ class FitRun:
     ):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.optimiser = Adam.of(field)
-        self.rays_pass = PASSES[field.kind](field)
+        self.rays_pass = PASSES.get(field.kind, FusedPass)(field)
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
@@ -199,7 +199,7 @@ class FitRun:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
         self.field = self.field.to(self.settings.device)
-        self.rays_pass = PASSES[self.field.kind](self.field)
+        self.rays_pass = PASSES.get(self.field.kind, FusedPass)(self.field)
         self.rays_pass.restore(part_of(arrays, "pass."))
         self.optimiser = Adam.of(self.field)
         self.optimiser.restore(arrays, state["adam_steps"])

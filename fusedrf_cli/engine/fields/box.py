@@ -1,0 +1,257 @@
+"""Fields over one box whose numbers lie on texels along its axes."""
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+
+LINE = 16  # floats: a part begins on a cache line
+MAX_TEXELS = 8192  # per axis, in a stored field
+MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
+DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
+DENSITY_SCALE_PER_EXTENT = 75.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a field's numbers."""
+
+    name: str
+    shape: tuple[int, ...]
+    """In memory."""
+    axes: tuple[int, ...] = ()
+    """Axes of the box (0 x, 1 y, 2 z) that its leading dimensions run along, texel by texel."""
+    rate: float = 1.0
+    """What it learns at, relative to the optimiser's rate."""
+    spread: float = 0.0
+    """Standard deviation of an untrained field's numbers."""
+
+
+class BoxField(ComputedField):
+    """A field over one box; σ = scale softplus(feature + shift), scale in 1/length.
+
+    A kind sets `kind`, `bodies` and `shape_type`, a frozen dataclass of whole numbers that refuses what its
+    bodies were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and `check_answers`.
+    """
+
+    shape_type: type
+
+    def __init__(
+        self,
+        shape: object,
+        box: np.ndarray,
+        resolution: tuple[int, int, int],
+        scale: float,
+        shift: float = DENSITY_SHIFT,
+        params: torch.Tensor | None = None,
+        occupancy: OccupancyGrid | None = None,
+    ):
+        """box (6,) float64; resolution: texels per axis, corners on the faces, at least 2; params None: zeros;
+        occupancy None: full."""
+        self.shape, self.box, self.resolution = shape, np.asarray(box, np.float64), tuple(resolution)
+        self.scale, self.shift = float(scale), float(shift)
+        self.params = torch.zeros(self.size) if params is None else params
+        self.occupancy = OccupancyGrid.full(self.box) if occupancy is None else occupancy
+
+    # -- for kinds to define -----------------------------------------------------------------------------
+
+    @classmethod
+    def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[Part]:
+        """The parts of `params`, in order."""
+        raise NotImplementedError
+
+    def check_answers(self) -> None:
+        """Raise ValueError where finite numbers could make an answer beyond MAX_ANSWER, whose difference from
+        another could be NaN."""
+        raise NotImplementedError
+
+    def stored_part(self, part: Part) -> tuple[int, ...]:
+        """Shape under which a part is stored; `pack` and `unpack` lead there and back."""
+        return part.shape
+
+    def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
+        """A part as it is stored."""
+        return values
+
+    def unpack(self, part: Part, stored: torch.Tensor) -> torch.Tensor:
+        """Inverse of `pack`."""
+        return stored
+
+    # -- making ------------------------------------------------------------------------------------------
+
+    @classmethod
+    def create(
+        cls, shape: object, box: np.ndarray, resolution: tuple[int, int, int], generator: torch.Generator
+    ) -> "BoxField":
+        """An untrained field: parts N(0, spread²), nearly transparent."""
+        box = np.asarray(box, np.float64)
+        field = cls(shape, box, resolution, DENSITY_SCALE_PER_EXTENT / float((box[3:] - box[:3]).mean()))
+        for part, view in zip(field.parts, field.sections().values(), strict=True):
+            if part.spread:
+                view.copy_(part.spread * torch.randn(part.shape, generator=generator))
+        return field
+
+    def resampled(self, box: np.ndarray, resolution: tuple[int, int, int]) -> "BoxField":
+        """The field on another box (6,) and resolution: interpolated along each axis, outside the old box
+        0."""
+        if self.params.device.type != "cpu":
+            return self.to("cpu").resampled(box, resolution).to(self.params.device)
+        new = type(self)(self.shape, box, resolution, self.scale, self.shift, occupancy=self.occupancy)
+        new.params = new.params.to(self.params.dtype)
+        at = [unit_texels(new.box, self.box, axis, new.resolution[axis]) for axis in range(3)]
+        for part, old, target in zip(
+            self.parts, self.sections().values(), new.sections().values(), strict=True
+        ):
+            for dimension, axis in enumerate(part.axes):
+                old = interpolate_axis(old, dimension, at[axis])
+            target.copy_(old)
+        return new
+
+    def moved(self, origin: np.ndarray) -> "BoxField":
+        """The same field in a frame whose origin is at `origin` (3,) of its own."""
+        shift = np.tile(origin, 2)
+        grid = OccupancyGrid(self.occupancy.aabb - shift, self.occupancy.occupied)
+        other = self.with_occupancy(grid)
+        other.box = self.box - shift
+        return other
+
+    # -- reading -----------------------------------------------------------------------------------------
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """The parts of `params`, in order."""
+        return self.parts_of(self.shape, self.resolution)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """(parts + 1,) int64: where each part begins in `params`, on a cache line, and the end."""
+        counts = [-(-int(np.prod(part.shape)) // LINE) * LINE for part in self.parts]
+        return np.cumsum([0, *counts], dtype=np.int64)
+
+    @property
+    def size(self) -> int:
+        """Floats of `params`."""
+        return int(self.starts[-1])
+
+    def sections(self) -> dict[str, torch.Tensor]:
+        """Views of the parts of `params` by name."""
+        return {
+            part.name: self.params[int(start) : int(start) + int(np.prod(part.shape))].view(part.shape)
+            for part, start in zip(self.parts, self.starts, strict=False)
+        }
+
+    @property
+    def voxel_size(self) -> float:
+        """Finest spacing of texels, in the field's frame."""
+        return float(((self.box[3:] - self.box[:3]) / (np.asarray(self.resolution) - 1)).min())
+
+    @property
+    def activation(self) -> np.ndarray:
+        """(2,) scale and shift, as kernels read them."""
+        return np.asarray([self.scale, self.shift], self.real)
+
+    @property
+    def corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Texels per axis (3,) int64, lower corner (3,) and sides (3,) of the box, as kernels read them."""
+        return np.asarray(self.resolution, np.int64), self.box[:3].copy(), self.box[3:] - self.box[:3]
+
+    def groups(self) -> list[Group]:
+        """See ComputedField."""
+        ends = zip(self.parts, self.starts, self.starts[1:], strict=False)
+        return [Group(int(low), int(high), part.rate) for part, low, high in ends]
+
+    # -- storing -----------------------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """Arrays and metadata for a bundle: the parts, and occupancy as packed bits."""
+        arrays = {
+            part.name: self.pack(part, view).detach().cpu().numpy()
+            for part, view in zip(self.parts, self.sections().values(), strict=True)
+        }
+        arrays["occupancy"] = np.packbits(self.occupancy.occupied)
+        metadata = {
+            "aabb": self.box.tolist(),
+            "resolution": list(self.resolution),
+            "scale": self.scale,
+            "shift": self.shift,
+            "cells": {"aabb": self.occupancy.aabb.tolist(), "counts": list(self.occupancy.occupied.shape)},
+            "shape": asdict(self.shape),
+        }
+        return arrays, metadata
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "BoxField":
+        """Inverse of `state`. Every number is checked before it can size an array or index one. Raises
+        ValueError, KeyError or TypeError for what does not fit."""
+        shape = cls.shape_type(**metadata["shape"])
+        resolution = whole_numbers(metadata["resolution"], 2, "resolution")
+        box, scale, shift = metadata["aabb"], float(metadata["scale"]), float(metadata["shift"])
+        if not (0 < scale < np.inf and np.isfinite(shift)):
+            raise ValueError(f"scale should be positive and shift finite, found {scale} and {shift}")
+        counts = list(whole_numbers(metadata["cells"]["counts"], 1, "cells"))
+        grid = OccupancyGrid(
+            checked_box(metadata["cells"]["aabb"], "cells"), unpack_bits(arrays, "occupancy", counts)
+        )
+        bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
+        for part in bare.parts:  # before `params` takes memory
+            found, expected = arrays.get(part.name), bare.stored_part(part)
+            if found is None or found.shape != expected:
+                have = "nothing" if found is None else list(found.shape)
+                raise ValueError(f"array '{part.name}' should have shape {list(expected)}, found {have}")
+        field = cls(shape, bare.box, resolution, scale, shift, occupancy=grid)
+        for part, view in zip(field.parts, field.sections().values(), strict=True):
+            stored = torch.from_numpy(np.ascontiguousarray(arrays[part.name], np.float32))
+            view.copy_(field.unpack(part, stored))
+        field.check_answers()
+        return field
+
+    def check_density(self, largest: float) -> None:
+        """Raise ValueError where a density feature of that size gives an answer beyond MAX_ANSWER."""
+        density = self.scale * (largest + abs(self.shift) + 1)
+        if not density <= MAX_ANSWER:
+            raise ValueError(f"the density would reach {density:.3g}, expected at most {MAX_ANSWER:g}")
+
+    def check_logit(self, largest: float) -> None:
+        """Raise ValueError where a colour's logit could be beyond MAX_ANSWER."""
+        if not largest <= MAX_ANSWER:
+            raise ValueError(f"a colour's logit would reach {largest:.3g}, expected at most {MAX_ANSWER:g}")
+
+
+def checked_box(values: list, what: str) -> np.ndarray:
+    """A stored box (6,) as float64; ValueError where it is none."""
+    box = np.asarray(values, np.float64)
+    if box.shape != (6,) or not np.isfinite(box).all() or (box[:3] >= box[3:]).any():
+        raise ValueError(f"{what} should be three minima below three maxima, found {values}")
+    return box
+
+
+def whole_numbers(values: list, least: int, what: str) -> tuple[int, int, int]:
+    """Three whole numbers from `least` to MAX_TEXELS; ValueError for anything else."""
+    if len(values) != 3 or any(type(n) is not int or not least <= n <= MAX_TEXELS for n in values):
+        raise ValueError(f"{what} should be three whole numbers from {least} to {MAX_TEXELS}, found {values}")
+    return tuple(values)
+
+
+def unit_texels(box: np.ndarray, old_box: np.ndarray, axis: int, count: int) -> torch.Tensor:
+    """(count,) float64 positions of a box's texels on one axis, in unit coordinates of another box."""
+    at = torch.linspace(float(box[axis]), float(box[axis + 3]), count, dtype=torch.float64)
+    return (at - old_box[axis]) / (old_box[axis + 3] - old_box[axis])
+
+
+def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> torch.Tensor:
+    """Linear interpolation of values along one axis at unit coordinates, corners aligned; 0 outside [0,
+    1]."""
+    n = values.shape[axis]
+    position = unit * (n - 1)
+    lower = position.floor().clamp(0, n - 2).long()
+    fraction = (position - lower).to(values.dtype)
+    inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)
+    shape = [-1 if a == axis else 1 for a in range(values.dim())]
+    fraction, inside = fraction.view(shape), inside.view(shape)
+    return inside * (
+        (1 - fraction) * values.index_select(axis, lower) + fraction * values.index_select(axis, lower + 1)
+    )
