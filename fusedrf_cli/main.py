@@ -15,8 +15,8 @@ from fusedrf_cli import __version__, options
 from fusedrf_cli.errors import FusedRFError, Interrupted
 
 COMMANDS = (
-    *("train", "compose", "fuse", "add", "delete", "render", "eval", "chart"),
-    *("info", "validate", "completion"),
+    *("train", "compose", "fuse", "convert", "add", "delete", "render", "eval", "chart"),
+    *("info", "kinds", "validate", "completion"),
 )
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"
 

@@ -71,6 +71,22 @@ class FuseRequest(Learning):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConvertRequest(Learning):
+    """A field to one of another kind; None is left to choose."""
+
+    field: str
+    output: str
+    overwrite: bool
+    kind: str
+    max_size: int | None
+    target_psnr: float | None
+    precision: str | None
+    ranks: tuple[int, int] | None
+    sh_degree: int | None
+    memory: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class EditRequest(Learning):
     """What `add` and `delete` have in common."""
 

@@ -6,10 +6,12 @@ whole or not at all, and returns a JSON-able report.
 """
 
 from fusedrf_cli.bridge.charting import chart
+from fusedrf_cli.bridge.converting import convert
 from fusedrf_cli.bridge.editing import add, delete
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
+from fusedrf_cli.bridge.listing import list_kinds
 from fusedrf_cli.bridge.rendering import render
 from fusedrf_cli.bridge.training import train
 
-__all__ = ["add", "chart", "delete", "evaluate", "fuse", "render", "train"]
+__all__ = ["add", "chart", "convert", "delete", "evaluate", "fuse", "list_kinds", "render", "train"]

@@ -58,7 +58,7 @@ def kind(name: str) -> "Kind":
     point = plugged_in().get(name)
     if point is None:
         raise UnknownKind(f"unknown kind '{name}'; this version knows {', '.join(names())}")
-    package = point.dist.name if point.dist else point.value
+    package = package_of(name)
     try:
         found = point.load()
     except Exception as error:  # whatever a stranger's module raises, the other kinds work
@@ -75,6 +75,14 @@ def kind(name: str) -> "Kind":
             "that package"
         )
     return found
+
+
+def package_of(name: str) -> str:
+    """The package that a kind comes from."""
+    point = plugged_in().get(name)
+    if point is None:
+        return __package__.partition("_")[0]
+    return point.dist.name if point.dist else point.value
 
 
 def kinds() -> "list[Kind]":

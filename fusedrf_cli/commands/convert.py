@@ -1,0 +1,36 @@
+"""`fusedrf convert`: a field of any kind to one of any other."""
+
+import click
+
+from fusedrf_cli import options
+from fusedrf_cli.requests import ConvertRequest
+
+
+@click.command("convert")
+@click.argument("field", type=options.INPUT)
+@options.writing("The field to write, OUT.rfpack.")
+@click.option(
+    "--kind", type=options.KindType(), required=True, help="Kind of field to make; see `fusedrf kinds`."
+)
+@options.max_size
+@options.smallest
+@options.time_budget
+@options.memory
+@options.fused_precision
+@options.ranks
+@options.sh_degree
+@options.seeded
+@options.reporting
+def command(field, output, progress, **words):
+    """Turn a field into one of another kind that shows the same.
+
+    FIELD is a bundle with one field, trained or fused. The report gives PSNR and SSIM against it on views that
+    nothing was learnt from, and bytes before and after.
+
+    \b
+    Example:
+      fusedrf convert tower.rfpack -o small.rfpack --kind cp
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.convert(ConvertRequest(field=field, output=output, **words), progress)

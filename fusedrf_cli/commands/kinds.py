@@ -1,0 +1,19 @@
+"""`fusedrf kinds`: the kinds of field, and what each is good for."""
+
+import click
+
+from fusedrf_cli import options
+
+
+@click.command("kinds")
+@options.reporting
+def command(**words):
+    """List the kinds of field, and what each is good for.
+
+    \b
+    Example:
+      fusedrf kinds
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.list_kinds(**words)
