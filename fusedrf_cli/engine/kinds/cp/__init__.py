@@ -1,0 +1,18 @@
+"""The `cp` kind: sums of products of three lines."""
+
+from fusedrf_cli.engine.kinds.boxes import BoxKind
+from fusedrf_cli.engine.kinds.cp.field import CPField
+
+
+class CPKind(BoxKind):
+    """See Kind."""
+
+    name = "cp"
+    good_for = (
+        "Single objects in a few hundred kilobytes, at some 3 dB less than vm and more time per sample."
+    )
+    field = CPField
+    takes = frozenset({"ranks", "sh_degree"})
+
+
+KIND = CPKind()
