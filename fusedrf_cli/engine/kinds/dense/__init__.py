@@ -1,0 +1,16 @@
+"""The `dense` kind: a grid of vertices with density and colour."""
+
+from fusedrf_cli.engine.kinds.boxes import BoxKind
+from fusedrf_cli.engine.kinds.dense.field import DenseField
+
+
+class DenseKind(BoxKind):
+    """See Kind."""
+
+    name = "dense"
+    good_for = "Sharp local detail and fast answers where megabytes do not matter; simple to read elsewhere."
+    field = DenseField
+    takes = frozenset({"sh_degree"})
+
+
+KIND = DenseKind()
