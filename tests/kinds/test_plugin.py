@@ -1,0 +1,88 @@
+"""A kind from another package: the whole one of docs/kinds.md, installed outside the tree, and broken ones."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "kinds.md"
+
+
+def installed(folder: Path, name: str, files: dict[str, str], entry: str) -> None:
+    """A package as pip leaves it: modules, and metadata that name its entry point."""
+    for path, text in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    metadata = folder / f"{name}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[fusedrf.kinds]\n{entry}\n")
+
+
+def page_files() -> dict[str, str]:
+    """The modules of the page, by path: a heading names one, the next block of Python is its text."""
+    found = re.findall(r"## `(fusedrf_cubes/\w+\.py)`.*?```python\n(.*?)```", PAGE.read_text(), re.S)
+    assert [path for path, _ in found] == [f"fusedrf_cubes/{n}.py" for n in ("bodies", "field", "__init__")]
+    return dict(found)
+
+
+def fusedrf(folder: Path, *words: str) -> subprocess.CompletedProcess:
+    """A command in a process that finds the packages of a folder."""
+    paths = os.pathsep.join([str(folder / "site"), str(ROOT)])
+    return subprocess.run(
+        [sys.executable, "-m", "fusedrf_cli", *words],
+        cwd=folder, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def cubes(tmp_path):
+    """A folder whose `site` has the page's kind."""
+    installed(tmp_path / "site", "fusedrf_cubes", page_files(), "cubes = fusedrf_cubes")
+    return tmp_path
+
+
+def test_the_page_s_kind_is_listed_trained_and_rendered(cubes):
+    subprocess.run(
+        [sys.executable, ROOT / "examples" / "make_scene.py", cubes], check=True, capture_output=True
+    )
+    listed = fusedrf(cubes, "kinds", "--json")
+    assert listed.returncode == 0, listed.stderr
+    assert any(
+        kind["name"] == "cubes" and kind["package"] == "fusedrf_cubes"
+        for kind in json.loads(listed.stdout)["kinds"]
+    )
+    learnt = fusedrf(
+        cubes, "train", "ball.glb", "-o", "ball.rfpack", "--kind", "cubes", "--views", "12", "--size", "48",
+        "--quality", "draft", "--time-budget", "4", "--json",
+    )  # fmt: skip
+    assert learnt.returncode == 0, learnt.stderr
+    report = json.loads(learnt.stdout)
+    assert report["kind"] == "cubes" and report["training_psnr"] > 18
+    shown = fusedrf(cubes, "render", "ball.rfpack", "-o", "ball.png", "--size", "32x32")
+    assert shown.returncode == 0, shown.stderr
+    elsewhere = fusedrf(cubes / "site", "render", str(cubes / "ball.rfpack"), "-o", str(cubes / "no.png"))
+    assert elsewhere.returncode == 3 and "unknown kind 'cubes'" in elsewhere.stderr
+    assert not (cubes / "no.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("raise RuntimeError('no luck')", "does not load (RuntimeError: no luck)"),
+        ("import a_module_that_is_not_there", "does not load (ModuleNotFoundError"),
+        ("KIND = 3", "is no Kind of that name"),
+    ],
+)
+def test_a_broken_plug_in_breaks_only_itself(tmp_path, text, said):
+    installed(tmp_path / "site", "broken_kind", {"broken_kind.py": text}, "broken = broken_kind")
+    listed = fusedrf(tmp_path, "kinds")
+    assert listed.returncode == 0 and "vm" in listed.stdout and "broken" in listed.stdout + listed.stderr
+    refused = fusedrf(tmp_path, "train", str(ROOT / "examples"), "-o", "x.rfpack", "--kind", "broken")
+    assert refused.returncode == 3 and said in refused.stderr and "broken_kind" in refused.stderr
+    assert not (tmp_path / "x.rfpack").exists()
