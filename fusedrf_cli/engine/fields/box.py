@@ -169,7 +169,7 @@ class BoxField(ComputedField):
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and metadata for a bundle: the parts, and occupancy as packed bits."""
         arrays = {
-            part.name: self.pack(part, view).detach().cpu().numpy()
+            part.name: self.pack(part, view.detach().cpu()).numpy()
             for part, view in zip(self.parts, self.sections().values(), strict=True)
         }
         arrays["occupancy"] = np.packbits(self.occupancy.occupied)

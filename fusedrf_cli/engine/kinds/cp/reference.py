@@ -11,7 +11,7 @@ def query(
     """σ (N,) and rgb (N, 3) of a cp field with numbers params (P,) at points (N, 3) along unit dirs (N, 3);
     empty cells answer 0. Differentiable in params, points and dirs."""
     sections, kind = field.with_params(params).sections(), params.dtype
-    points, box = exact(points, params.device), exact(field.aabb, params.device)
+    points, box = exact(points, params.device), exact(field.box, params.device)
     unit = ((points - box[:3]) / (box[3:] - box[:3])).to(kind)
     feature = products(sections, "density", unit).sum(1)
     _, occupied = cell_at(field.occupancy, points)

@@ -122,11 +122,16 @@ def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memo
         for q in range(8):
             vertex, weight = corner(field, place, q)
             scatter(WIDTH, grad, row_of(field, vertex), real(weight), scratch, np.uint64(D_ROW))
+    density_backward(field, place, pre, d_sigma, grad)
+
+
+def density_backward(field, place, pre, d_sigma, grad):
+    """Adjoint of `density`."""
     d_f = d_sigma * field.density[0] * sigmoid(pre + field.density[1])
     if d_f != 0:
         for q in range(8):
             vertex, weight = corner(field, place, q)
-            accumulate(grad, vertex, real(weight * d_f))
+            accumulate(grad, vertex, field.params.dtype.type(weight * d_f))
 
 
 def ahead_density(field, array, held, p):

@@ -31,9 +31,14 @@ class DenseShape:
         return (self.sh_degree + 1) ** 2
 
     @property
+    def numbers(self) -> int:
+        """Numbers of a vertex besides its density."""
+        return 3 * self.coefficients
+
+    @property
     def width(self) -> int:
         """Floats of a vertex's row of colour in memory."""
-        return -(-3 * self.coefficients // 8) * 8
+        return -(-self.numbers // 8) * 8
 
 
 class DenseField(BoxField):
@@ -66,22 +71,26 @@ class DenseField(BoxField):
 
     def stored_part(self, part: Part) -> tuple[int, ...]:
         """See BoxField: rows of the used vertices, in order."""
+        if not part.axes:
+            return part.shape
         count = int(np.count_nonzero(self.used))
-        return (count,) if part.name == "density" else (count, 3 * self.shape.coefficients)
+        return (count,) if len(part.shape) == 3 else (count, self.shape.numbers)
 
     def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
         """See BoxField."""
+        if not part.axes:
+            return values
         kept = values[torch.from_numpy(self.used)]
-        return kept if part.name == "density" else kept[:, : 3 * self.shape.coefficients]
+        return kept if len(part.shape) == 3 else kept[:, : self.shape.numbers]
 
     def unpack(self, part: Part, stored: torch.Tensor) -> torch.Tensor:
         """See BoxField; what is not stored is 0."""
+        if not part.axes:
+            return stored
         whole = torch.zeros(part.shape)
-        if part.name == "density":
-            whole[torch.from_numpy(self.used)] = stored
-        else:
-            rows = torch.nn.functional.pad(stored, (0, self.shape.width - stored.shape[1]))
-            whole[torch.from_numpy(self.used)] = rows
+        if len(part.shape) == 4:
+            stored = torch.nn.functional.pad(stored, (0, self.shape.width - stored.shape[1]))
+        whole[torch.from_numpy(self.used)] = stored
         return whole
 
     def check_answers(self) -> None:

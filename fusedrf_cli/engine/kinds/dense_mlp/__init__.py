@@ -1,0 +1,15 @@
+"""The `dense-mlp` kind: a grid of vertices with features, and a small decoder of colours."""
+
+from fusedrf_cli.engine.kinds.boxes import BoxKind
+from fusedrf_cli.engine.kinds.dense_mlp.field import DenseMLPField
+
+
+class DenseMLPKind(BoxKind):
+    """See Kind."""
+
+    name = "dense-mlp"
+    good_for = "Fields that are to share one decoder of colours, so that their features can be mixed."
+    field = DenseMLPField
+
+
+KIND = DenseMLPKind()
