@@ -10,8 +10,8 @@ from fusedrf_cli.requests import ConvertRequest, EvaluateRequest, FuseRequest
 
 
 def convert(request: ConvertRequest, progress) -> dict:
-    """Teach a field of another kind all that a field shows (PVD, Fang et al. AAAI 2023, for any two kinds), and
-    hold it against its source on views that nothing was learnt from."""
+    """Teach a field of another kind all that a field shows (after PVD, Fang et al., AAAI 2023), and hold it
+    against its source on views that nothing was learnt from."""
     before = kind_of(request.field)
     try:
         wanted = registry.kind(request.kind)

@@ -1,4 +1,4 @@
-"""A kind from another package: the whole one of docs/kinds.md, installed outside the tree, and broken ones."""
+"""A kind from another package: the one of docs/kinds.md, installed outside the tree, and broken ones."""
 
 import json
 import os

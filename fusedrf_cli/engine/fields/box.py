@@ -50,8 +50,8 @@ class BoxField(ComputedField):
         params: torch.Tensor | None = None,
         occupancy: OccupancyGrid | None = None,
     ):
-        """box (6,) float64; resolution: texels per axis, corners on the faces, at least 2; params None: zeros;
-        occupancy None: full."""
+        """box (6,) float64; resolution: texels per axis, corners on the faces, at least 2; params None:
+        zeros; occupancy None: full."""
         self.shape, self.box, self.resolution = shape, np.asarray(box, np.float64), tuple(resolution)
         self.scale, self.shift = float(scale), float(shift)
         self.params = torch.zeros(self.size) if params is None else params

@@ -1,5 +1,5 @@
-"""Scalar bodies of the `dense` kind: a grid of vertices with density and spherical-harmonic colour (Plenoxels;
-DVGO, Sun et al., CVPR 2022, eq. 5 to 7: what is between vertices is interpolated before the activation).
+"""Scalar bodies of the `dense` kind: a grid of vertices with density and spherical-harmonic colour (as
+Plenoxels; DVGO, Sun et al., CVPR 2022, eq. 5 to 7: interpolation comes before the activation).
 
     σ = scale softplus(f + shift), rgb_c = sigmoid(Σ_k SH_k(d) v[c, k]), f and v trilinear between vertices
 COEFFICIENTS are the spherical harmonics per channel, WIDTH the floats of a vertex's row of colour.

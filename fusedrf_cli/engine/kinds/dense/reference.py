@@ -17,9 +17,7 @@ def query(
     return sigma, torch.where((sigma > 0)[:, None], logits.sigmoid(), 0)
 
 
-def interpolated(
-    field, params: torch.Tensor, points: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def interpolated(field, params: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """σ (N,), 0 in empty cells, and rows (N, WIDTH) at points (N, 3)."""
     sections, kind = field.with_params(params).sections(), params.dtype
     points, box = exact(points, params.device), exact(field.box, params.device)

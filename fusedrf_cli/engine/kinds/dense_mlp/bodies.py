@@ -1,12 +1,12 @@
 """Scalar bodies of the `dense-mlp` kind: density is the `dense` kind's, colour a small decoder's of features
-that lie at the vertices (DVGO, Sun et al., CVPR 2022; Control-NeRF, Lazova et al., WACV 2023, for sharing it).
+that lie at the vertices (DVGO, Sun et al., CVPR 2022; for sharing it Control-NeRF, Lazova et al., 2023).
 
 With v the features of a point, trilinear between vertices, and the decoder's input x = [v, SH(d)] (INPUTS
 numbers): h = max(0, W x + b) of HIDDEN numbers, rgb = sigmoid(V h + c). Both layers lie in params from
 `decoder` on, each as (inputs, outputs) and then its bias; the three outputs are filled up to OUTPUTS.
 
-Scratch holds the gradients of the outputs (D_OUT), of h (D_HIDDEN) and of x (D_INPUT), and the harmonics (SH);
-of a shaded sample are kept x, h (HIDDEN_AT) and the outputs (OUT_AT).
+Scratch holds the gradients of the outputs (D_OUT), of h (D_HIDDEN) and of x (D_INPUT), and the harmonics
+(SH); of a shaded sample are kept x, h (HIDDEN_AT) and the outputs (OUT_AT).
 """
 
 from typing import NamedTuple
@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from fusedrf_cli.engine.kernels.parts import (
-    accumulate,
     add_scaled,
     dense,
     dense_backward,

@@ -1,5 +1,5 @@
-"""The `dense-mlp` field: a grid of vertices with density and features, and a small decoder of colours, its own
-or one that it shares with other fields (Control-NeRF, Lazova et al., WACV 2023)."""
+"""The `dense-mlp` field: a grid of vertices with density and features, and a small decoder of colours, its
+own or one that it shares with other fields (Control-NeRF, Lazova et al., WACV 2023)."""
 
 from dataclasses import dataclass, replace
 

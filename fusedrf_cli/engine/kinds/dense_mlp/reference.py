@@ -10,8 +10,8 @@ from fusedrf_cli.engine.kinds.dense_mlp.bodies import HARMONICS
 def query(
     field, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """σ (N,) and rgb (N, 3) of a dense-mlp field with numbers params (P,) at points (N, 3) along unit dirs (N,
-    3); empty cells answer 0. Differentiable in params, points and dirs."""
+    """σ (N,) and rgb (N, 3) of a dense-mlp field with numbers params (P,) at points (N, 3) along unit dirs
+    (N, 3); empty cells answer 0. Differentiable in params, points and dirs."""
     sigma, features = interpolated(field, params, points)
     sections = field.with_params(params).sections()
     shown = sh_basis(HARMONICS, exact(dirs, params.device)).to(params.dtype)
