@@ -11,7 +11,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.passes import PASSES, Batch
+from fusedrf_cli.engine.distillation.passes import PASSES, Batch, FusedPass
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
@@ -117,7 +117,7 @@ class FitRun:
     ):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.optimiser = Adam.of(field)
-        self.rays_pass = PASSES[field.kind](field)
+        self.rays_pass = PASSES.get(field.kind, FusedPass)(field)
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
@@ -199,7 +199,7 @@ class FitRun:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
         self.field = self.field.to(self.settings.device)
-        self.rays_pass = PASSES[self.field.kind](self.field)
+        self.rays_pass = PASSES.get(self.field.kind, FusedPass)(self.field)
         self.rays_pass.restore(part_of(arrays, "pass."))
         self.optimiser = Adam.of(self.field)
         self.optimiser.restore(arrays, state["adam_steps"])
@@ -246,8 +246,7 @@ class FitRun:
                 self.refreshes.insert(0, retry)
             return
         self.found_matter = True
-        self.field = self.field.with_occupancy(occupancy)
-        self.optimiser.field = self.field
+        self.occupy(occupancy)
         tight = occupancy.tight_aabb()
         if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
             before = self.field
@@ -257,8 +256,16 @@ class FitRun:
                 self.field = before
                 self.optimiser = Adam.of(self.field)
                 return
-            self.field = self.field.with_occupancy(occupancy)
+            self.occupy(occupancy)
+
+    def occupy(self, occupancy: OccupancyGrid) -> None:
+        """Another occupancy grid; the optimiser starts anew where the field has fewer numbers then."""
+        self.field = self.field.with_occupancy(occupancy)
+        if len(self.field.params) == len(self.optimiser.field.params):
             self.optimiser.field = self.field
+        else:
+            self.optimiser = Adam.of(self.field)
+            self.guard.renew()
 
     def resize(self, aabb: np.ndarray, longest: int) -> None:
         """Another box or resolution; the optimiser starts anew, since its moments belong to other texels."""
