@@ -20,8 +20,8 @@ from fusedrf_cli.requests import DeleteRequest
 def command(fused, names, output, progress, **words):
     """Take objects out of a fused field.
 
-    An object that the field holds apart is taken out as it is. Of others the region is emptied, and shows what
-    they hid where the other sources are known.
+    An object that the field holds apart is taken out as it is. Of others the region is emptied, and shows
+    what they hid where the other sources are known.
 
     \b
     Example:

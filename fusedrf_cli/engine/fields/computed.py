@@ -78,7 +78,7 @@ class ComputedField:
     def reference(self) -> "ComputedField":
         """A field of the same answers for devices that have no compiled loops; it has `query`. Raises
         ValueError where the kind has none."""
-        raise ValueError(f"{self.kind} fields are computed on 'cpu' and 'cuda', not on '{self.params.device}'")
+        raise ValueError(f"{self.kind} fields are computed on 'cpu' and 'cuda', found '{self.params.device}'")
 
     # -- the same field otherwise ------------------------------------------------------------------------
 
