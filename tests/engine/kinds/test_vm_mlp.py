@@ -16,6 +16,7 @@ from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untr
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from tests.analytic.export import way_of
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
 
