@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fusedrf_cli.bridge.fuse import DEFAULT_MAX_SIZE
+from fusedrf_cli.bridge.fusing import DEFAULT_MAX_SIZE
 from fusedrf_cli.bridge.scene import background_of, load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.losses import OPAQUE
 from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
-from fusedrf_cli.engine.distillation.settings import DistillSettings
-from fusedrf_cli.engine.distillation.student import empty_student, student_from
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Way
+from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 
 BESIDES = 16384  # bytes of a bundle that are no numbers, about
@@ -142,6 +142,7 @@ class Task:
     composed: ComposedField
     background: Placed
     boxes: list[np.ndarray]
+    plan: Plan
     settings: DistillSettings
 
     @classmethod
@@ -154,10 +155,11 @@ class Task:
         background = Placed(name, opened(placed.field), placed.object_to_world)
         boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
         numbers = (DEFAULT_MAX_SIZE - composed.occupancy.occupied.size // 8 - BESIDES) // 2
-        whole = DistillSettings(max_numbers=numbers)
+        plan = VM.plan(composed.aabb, composed.voxel_size, Way(), numbers)
+        whole = DistillSettings()
         fewer = {name: round(share * getattr(whole, name)) for name in ("rays", "steps", "rgb_steps")}
         settings = replace(whole, **fewer)
-        return cls(composed, background, boxes, settings)
+        return cls(composed, background, boxes, plan, settings)
 
     def distilled(self, variant: Variant) -> DistillReport:
         """What distilling by a variant's recipe gives."""
@@ -165,9 +167,9 @@ class Task:
         settings = replace(self.settings, seed=variant.seed, rays=rays)
         generator, student = torch.Generator().manual_seed(settings.seed), None
         if not variant.from_scratch:
-            student = student_from(self.background, self.composed, settings, generator)
+            student = VM.taken_over(self.background, self.plan, self.composed, generator)
         if student is None:
-            student = empty_student(self.composed, settings, generator, "fused")
+            student = VM.empty(self.composed, Way(), self.plan.allowed, generator, "fused")
         run = DistillRun(self.composed, student, self.boxes, settings, variant.rgb, variant.recipe)
         return run.finish()[1]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fusedrf_cli.bridge.charting import Course
+from fusedrf_cli.bridge.charting import Benchmark
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.main import cli
 
@@ -49,12 +49,12 @@ def fusedrf(folder: Path, *words: str) -> dict:
     return json.loads(said.getvalue())
 
 
-def course(scene: Path, size: int, box=None) -> Course:
+def course(scene: Path, size: int, box=None) -> Benchmark:
     """Views of a scene that nothing was trained or chosen on; box (6,) is what they frame."""
-    return Course.lay(str(scene), Memory(), (size, size), box=box)
+    return Benchmark.prepare(str(scene), Memory(), (size, size), box=box)
 
 
-def frame_times(held: Course, bundles: Sequence[Path]) -> list[float]:
+def frame_times(held: Benchmark, bundles: Sequence[Path]) -> list[float]:
     """Median ms of a frame of the scene as composed and of each bundle, all taking turns."""
     return held.frame_times(bundles, lambda done: None)
 

@@ -175,7 +175,8 @@ def without_objects(
         field = kind.without(field, names)
         if field is None:
             return None, True
-        edits.append(Edited(field, enclosing([part.box for part in apart]), "its blocks dropped"))
+        how = "taken out, since it was held apart"
+        edits.append(Edited(field, enclosing([part.box for part in apart]), how))
     inside = [
         node
         for node in graph_nodes(fused.scene)

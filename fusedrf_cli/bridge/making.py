@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from fusedrf_cli.bridge.budget import Budget
-from fusedrf_cli.bridge.choose import Tried
+from fusedrf_cli.bridge.choose import FINALISTS, Tried
 from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
@@ -22,7 +22,7 @@ from fusedrf_cli.requests import FuseRequest
 
 VIEWS_TO_CHOOSE_BY = 8
 RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
-TRIES = 4  # that a search's next try leaves time for, where seconds are given
+TRIES = 6  # that a search for a target makes, about
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ class Maker:
         self.sources_in_memory = True
         """Whether all sources may be in memory at once, as a teacher."""
         self._rays: RayLesson | None = None
+        self.finished_tries = 0
 
     def measured(self, field: StoredField, way: Way) -> float:
         """PSNR (dB) of the field as it will be read back."""
@@ -109,8 +110,8 @@ class Maker:
     def finished(self, field: StoredField) -> tuple[StoredField, DistillReport | None]:
         """A field after it learnt from rays of the scene; the one that is given stays as it is."""
         learnt = field.with_params(field.params.clone())
-        alone = self.request.target_psnr is None and not self.student.compares
-        seconds = self.budget.part(1 if alone else TRIES)
+        seconds = self.budget.part(self.tries_to_come())
+        self.finished_tries += 1
         if self.student.lesson is None:
             rays = self.rays()
             with self.budget.learning():
@@ -122,6 +123,12 @@ class Maker:
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)
         return student, did
+
+    def tries_to_come(self) -> int:
+        """How many tries the seconds that are left have to do for, about."""
+        if self.request.target_psnr is not None:
+            return max(2, TRIES - self.finished_tries)  # how many a search takes is not known
+        return max(1, (FINALISTS if self.student.compares else 1) - self.finished_tries)
 
     def rays(self) -> RayLesson:
         """What there is to learn from, drawn once."""

@@ -92,7 +92,7 @@ def refuse_options(kind: Kind, request: FuseRequest | TrainRequest) -> None:
     """UsageProblem for an option that a kind does not heed."""
     for word, option in OPTIONS.items():
         if getattr(request, word) is not None and word not in kind.takes:
-            raise UsageProblem(f"{option} says nothing to kind '{kind.name}'; leave it out")
+            raise UsageProblem(f"{option} does not apply to kind '{kind.name}'; leave it out")
 
 
 def held_size(header: FieldHeader) -> int:

@@ -20,7 +20,7 @@ from fusedrf_cli.requests import DeleteRequest
 def command(fused, names, output, progress, **words):
     """Take objects out of a fused field.
 
-    Objects that the field holds apart, as blocks are, are dropped. Of others the region is emptied, and shows
+    An object that the field holds apart is taken out as it is. Of others the region is emptied, and shows
     what they hid where the other sources are known.
 
     \b

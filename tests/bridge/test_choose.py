@@ -81,3 +81,16 @@ def test_flags_name_what_is_fixed():
         "--kind blocks --precision int4 --ranks 8,16 --sh-degree 1 --max-size 9"
     )
     assert flags("blocks", Way("float16"), 9) == "--kind blocks --precision float16 --max-size 9"
+
+
+def test_a_finished_try_that_fits_no_more_is_passed_over():
+    """Finishing may cost the bytes that were left: then the next best counts."""
+    law = Law(dict.fromkeys(INT4, 38.0) | {INT4[0]: 40.0}, dict.fromkeys(INT4, 2_000_000))
+
+    def make(way, limit, finished):
+        return None if finished and way == INT4[0] else law(way, limit, finished)
+
+    chosen = Choosing(make, "blocks", lambda sentence: None).best_within(INT4, 500_000)
+    assert chosen is not None and chosen.way != INT4[0]
+    none = Choosing(lambda w, n, f: None if f else law(w, n, f), "blocks", lambda sentence: None)
+    assert none.best_within(INT4, 500_000) is None

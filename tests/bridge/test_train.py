@@ -5,13 +5,14 @@ import shutil
 from functools import partial
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from safetensors.numpy import save
 
 from formats import atomic
 from formats.bundle import read_bundle
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
-from fusedrf_cli.engine.distillation.passes import FusedPass
+from fusedrf_cli.engine.fields.computed import ComputedField
 from tests.bridge.conftest import done, part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
@@ -81,14 +82,15 @@ def test_a_second_interrupt_does_not_wait(run, folder, interrupted_in_step):
 
 
 def test_bad_steps_are_told(report, run, folder, monkeypatch):
-    gradient, calls = FusedPass.gradient, []
+    train_rays, calls = ComputedField.train_rays, []
 
-    def bad_twice(*words):
+    def bad_twice(field, batch, grads, loss):
         calls.append(0)
-        return gradient(*words) * (float("inf") if len(calls) in (5, 25) else 1)
+        train_rays(field, batch, grads, loss)
+        loss *= float("inf") if len(calls) in (5, 25) else 1
 
     with monkeypatch.context() as patch:
-        patch.setattr(FusedPass, "gradient", bad_twice)
+        patch.setattr(ComputedField, "train_rays", bad_twice)
         said = train(report, "out.rfpack")
     assert said["skipped_steps"] == 2 and said["roll_backs"] == 0
     assert any("2 steps were not finite" in warning for warning in said["warnings"])
@@ -129,8 +131,7 @@ def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
 
 
 def test_divergence_is_exit_6(run, folder, monkeypatch):
-    gradient = FusedPass.gradient
-    monkeypatch.setattr(FusedPass, "gradient", lambda *words: float("nan") * gradient(*words))
+    monkeypatch.setattr(ComputedField, "train_rays", lambda field, batch, grads, loss: loss.fill(np.nan))
     result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 6 and "diverged" in result.stderr and not (folder / "out.rfpack").exists()
     assert "44 steps" in result.stderr and "3 returns" in result.stderr
@@ -162,10 +163,9 @@ def test_the_compiler_for_gpus_is_asked_for(run, monkeypatch):
     assert result.exit_code == 5 and "fusedrf[gpu]" in result.stderr
 
 
-def test_a_network_is_not_for_gpus(run):
-    words = ("train", "photos", "-o", "out.rfpack", *WORDS, "--device", "cuda", "--colour", "mlp")
-    result = run(*words)
-    assert result.exit_code == 2 and "CPU only" in result.stderr
+def test_an_option_that_a_kind_does_not_heed_is_refused(run):
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--kind", "vm-mlp")
+    assert result.exit_code == 2 and "--sh-degree does not apply to kind 'vm-mlp'" in result.stderr
 
 
 def test_an_output_in_the_way_is_left_alone(run, folder):

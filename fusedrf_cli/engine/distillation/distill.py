@@ -194,7 +194,7 @@ class DistillRun:
     def _prune(self) -> None:
         """Leave out the cells that turned out empty, unless that would be all of them; only a student on one
         grid over its own box has cells to give up."""
-        if self.student.resolution is None:
+        if self.student.resolution is None or not self.settings.steps:
             return
         occupancy = pruned(self.student)
         self.report.found_nothing = bool(self.teacher.occupancy.occupied.any() > occupancy.occupied.any())

@@ -242,8 +242,7 @@ class FitRun:
                 self.refreshes.insert(0, retry)
             return
         self.found_matter = True
-        self.field = self.field.with_occupancy(occupancy)
-        self.optimiser.field = self.field
+        self.occupy(occupancy)
         tight = occupancy.tight_aabb()
         if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
             before = self.field
@@ -253,8 +252,16 @@ class FitRun:
                 self.field = before
                 self.optimiser = Adam.of(self.field)
                 return
-            self.field = self.field.with_occupancy(occupancy)
+            self.occupy(occupancy)
+
+    def occupy(self, occupancy: OccupancyGrid) -> None:
+        """Another occupancy grid; the optimiser starts anew where the field has fewer numbers then."""
+        self.field = self.field.with_occupancy(occupancy)
+        if len(self.field.params) == len(self.optimiser.field.params):
             self.optimiser.field = self.field
+        else:
+            self.optimiser = Adam.of(self.field)
+            self.guard.renew()
 
     def resize(self, aabb: np.ndarray, longest: int) -> None:
         """Another box or resolution; the optimiser starts anew, since its moments belong to other texels."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.kinds.vm.field import MODES, VMShape
+from fusedrf_cli.engine.kinds.vm.field import MODES, VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.trimming import (
     fewer_components,
     leading,
@@ -110,3 +110,36 @@ def test_a_truncated_field_keeps_its_box_and_drops_bands():
 def test_ranks_that_are_there_already_stay():
     field = random_vm(SIXTY_FOUR)
     assert truncated(field, VMShape(8, 16, 3)) is field
+
+
+class Elsewhere(torch.Tensor):
+    """Numbers that are not the CPU's: they have no view as an array."""
+
+    @property
+    def device(self):
+        return torch.device("cuda:0")
+
+    def numpy(self, *words, **more):
+        raise TypeError("can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() first.")
+
+    def to(self, device, *words, **more):
+        here = torch.device(device).type == "cpu"
+        return self.as_subclass(torch.Tensor) if here else self
+
+
+def test_numbers_of_another_device_are_truncated_alike(monkeypatch):
+    """A GPU's tensors are no arrays; here their place is taken by tensors that refuse to be any."""
+    field = random_vm(VMShape(16, 24, 2), dtype=torch.float32)
+    there = field.with_params(field.params.clone().as_subclass(Elsewhere))
+    to = VMField.to
+
+    def moved(self, device):
+        if torch.device(device).type != "cpu":
+            return self.with_params(self.params.as_subclass(Elsewhere))
+        return to(self, device)
+
+    monkeypatch.setattr(VMField, "to", moved)
+    found = truncated(there, VMShape(8, 16, 1))
+    assert type(found.params) is Elsewhere
+    wanted = truncated(field, VMShape(8, 16, 1)).params
+    assert torch.equal(found.params.as_subclass(torch.Tensor), wanted)

@@ -16,6 +16,7 @@ from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untr
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from tests.analytic.export import way_of
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
 
@@ -251,7 +252,7 @@ def pictures_of_a_ball(count: int, size: int):
 
 def test_a_tiny_fit_learns_a_ball():
     cameras, images = pictures_of_a_ball(10, 40)
-    settings = FitSettings(THIRTY_TWO, longest=32, steps=150, samples=1 << 14, colour="mlp")
+    settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=32, steps=150, samples=1 << 14)
     field = fit(cameras[1:], images[1:], BOX, settings)
     assert isinstance(field, VMMLPField)
     alpha = images[0, ..., 3:] / 255
@@ -263,7 +264,7 @@ def test_a_tiny_fit_learns_a_ball():
 
 def test_a_fit_taken_up_from_a_checkpoint_goes_on_as_before():
     cameras, images = pictures_of_a_ball(3, 24)
-    settings = FitSettings(THIRTY_TWO, longest=24, steps=40, samples=1 << 11, colour="mlp")
+    settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=24, steps=40, samples=1 << 11)
     whole, again = (FitRun.start(cameras, images, BOX, settings, "") for _ in range(2))
     for _ in range(3):
         whole.step(0.0)

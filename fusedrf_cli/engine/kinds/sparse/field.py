@@ -17,7 +17,7 @@ import torch
 from fusedrf_cli.engine.fields.computed import ComputedField, exact
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.parts import LINE
-from fusedrf_cli.engine.kinds.sparse import bodies
+from fusedrf_cli.engine.kinds.sparse import bodies, training
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 
@@ -74,6 +74,26 @@ class SparseField(ComputedField):
         other.coarse = self.coarse.moved(origin) if self.coarse else None
         return other
 
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":
+        """The same numbers without the voxels that lie in empty cells alone; itself where that would leave
+        none."""
+        lattice = training.within(self.fine, occupancy)
+        if lattice is None:
+            return self
+        other = SparseField(self.shape, lattice, self.scale, None).to(self.params.device)
+        other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
+        if other.coarse:
+            other.bands[:] = self.bands[self.coarse.find(other.coarse.keys)[0]]
+        other.settle()
+        return other
+
+    def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "SparseField":
+        """A field of one level on another box (6,), in whole bricks with at least that many vertices per
+        axis, where this one's cells are occupied. Raises ValueError for a field of several levels."""
+        training.check_one_level(self)
+        lattice = training.whole_lattice(np.asarray(aabb, np.float64), resolution)
+        return training.carried(self, training.within(lattice, self.occupancy) or lattice)
+
     def stored(self, as_stored: Callable[[np.ndarray, str], np.ndarray]) -> "SparseField":
         """See ComputedField; where the bricks are stays as it is, and need not be found again."""
         back = self.with_params(self.params.clone())
@@ -91,6 +111,11 @@ class SparseField(ComputedField):
     def tree(self) -> BrickTree:
         """Where the bricks are."""
         return self.fine.tree
+
+    @property
+    def resolution(self) -> tuple[int, int, int] | None:
+        """Vertices per axis where all bricks are of one level; else None."""
+        return None if self.tree.depth else tuple(SIDE * int(n) + 1 for n in self.tree.counts)
 
     @property
     def bands_at(self) -> int:

@@ -1,11 +1,12 @@
 """A sparse field as a student: bricks where the scene has matter, filled by asking it, and finished on
 rays."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import product
 from math import prod
 
 import numpy as np
+import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -13,16 +14,19 @@ from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
 from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
-from fusedrf_cli.engine.kinds.sparse.bodies import ROW, SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, with_fringe
 from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
+from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
 from fusedrf_cli.engine.kinds.student import (
     Contents,
     DistillSettings,
     Made,
     MadeStudent,
     Needs,
+    Plan,
+    Section,
     StudentRequest,
     Way,
 )
@@ -36,6 +40,7 @@ VERTICES_PER_BRICK = 25  # at least, in scenes of surfaces
 DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0
 DEGREES = (0, 1, 2)
 LEAST_BYTES = 20_000  # told where nothing fits: a few hundred vertices and their bricks
+HELD_SHARE = 0.2  # of the vertices of a box: about what surfaces need
 LADDER_BYTES = (1_000_000, 3_000_000, 8_000_000)
 
 
@@ -45,10 +50,31 @@ class SparseKind(Kind):
     name = "sparse"
     good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local to the bit."
     field = SparseField
-    trains = False
     takes = frozenset({"sh_degree"})
     precisions = ("int8", "float16")
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
+
+    def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
+        """At most: the rows of all vertices of a box. What is empty is left out once that is known."""
+        shape = shape_of(way)
+        fine, coarse = (prod(n * whole + 1 for whole in bricks(resolution)) for n in (SIDE, COARSE))
+        rows = [Section("rows", (fine, ROW))]
+        return [*rows, Section("bands", (coarse, shape.band_numbers))] if shape.sh_degree else rows
+
+    def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
+        """Floats of a field of surfaces in that box."""
+        width = shape_of(way).band_width * COARSE**3 / SIDE**3
+        return int(HELD_SHARE * (ROW + width) * prod(resolution))
+
+    def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> SparseField:
+        """All of the box in bricks of one level, thinly filled."""
+        field = SparseField(
+            shape_of(plan.way),
+            whole_lattice(plan.box, plan.resolution),
+            SCALE_PER_EXTENT / float((plan.box[3:] - plan.box[:3]).mean()),
+        )
+        field.rows[:, 0] = UNTRAINED
+        return field
 
     def student(self, scene: ComposedField, request: StudentRequest) -> "SparseStudent":
         """Bricks of a scene."""
@@ -146,6 +172,16 @@ class SparseStudent(MadeStudent):
         numbers = self.numbers_within(self.request.limit, self.plain().precision)
         filling = {"vertices while they are found and filled": float(PER_NUMBER_FILLED * numbers)}
         return Needs(int(PADDED * numbers), making=filling, points=POINTS)
+
+
+def shape_of(way: Way) -> SparseShape:
+    """The shape of a field in a way."""
+    return SparseShape(DEGREE if way.sh_degree is None else way.sh_degree)
+
+
+def bricks(resolution: tuple[int, int, int]) -> list[int]:
+    """Whole bricks per axis for so many vertices."""
+    return [-(-(n - 1) // SIDE) for n in resolution]
 
 
 def bricks_ladder() -> Ladder:

@@ -1,0 +1,81 @@
+"""A sparse field while it learns from photos: bricks of one level over all of a box, ever finer, without
+those voxels in which nothing was found."""
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice
+
+UNTRAINED = -8.0  # density feature: with SCALE_PER_EXTENT 4 % opacity along the diagonal of an untrained box
+SCALE_PER_EXTENT = 75.0
+INSIDE = 1e-6  # of a voxel: so far from its corners it is asked whether it lies in an occupied cell
+
+
+def whole_lattice(box: np.ndarray, resolution: tuple[int, int, int]) -> Lattice:
+    """The vertices of a box (6,) in whole bricks of one level, at least as many per axis as asked."""
+    counts = -(-(np.asarray(resolution) - 1) // SIDE)
+    at = np.argwhere(np.ones(counts, bool))
+    mask = np.ones((len(at), SIDE, SIDE, SIDE), bool)
+    tree = BrickTree.of(box[:3], (box[3:] - box[:3]) / counts, counts, np.zeros(len(at), np.uint8), at, mask)
+    return Lattice(tree, SIDE)
+
+
+def within(lattice: Lattice, grid: OccupancyGrid) -> Lattice | None:
+    """The lattice of those active voxels that reach into an occupied cell of a grid; None where none does."""
+    low, high = lattice.places[lattice.corners[:, 0]], lattice.places[lattice.corners[:, 7]]
+    found = grid.contains((low + high) / 2)
+    for octant in INSIDE + (1 - 2 * INSIDE) * OCTANTS:
+        found |= grid.contains(low + (high - low) * octant)
+    if not found.any():
+        return None
+    whole, mask = lattice.tree, np.zeros(lattice.active.shape, bool)
+    mask[lattice.active] = found
+    own = mask.any(1)
+    mask = mask[own].reshape(-1, SIDE, SIDE, SIDE)
+    tree = BrickTree.of(whole.lo, whole.top, whole.counts, whole.level[own], whole.at[own], mask)
+    return Lattice(tree, SIDE)
+
+
+def on_grid(lattice: Lattice, values: torch.Tensor, missing: torch.Tensor) -> torch.Tensor:
+    """(1, D, X, Y, Z) rows (V, D) of a lattice of one level, and the row `missing` (D,) where there is
+    none."""
+    step = SIDE // lattice.n
+    sides = (np.asarray(lattice.tree.counts) * lattice.n + 1).tolist()
+    dense = missing.to(values).expand(*sides, -1).clone()
+    i, j, k = torch.from_numpy(lattice.vertices // step).T
+    dense[i, j, k] = values
+    return dense.permute(3, 0, 1, 2)[None]
+
+
+def interpolated(old: Lattice, values: torch.Tensor, missing: torch.Tensor, new: Lattice) -> torch.Tensor:
+    """(W, D) rows of a new lattice by interpolating those (V, D) of an old one of one level."""
+    box = old.tree.aabb
+    unit = torch.from_numpy((new.places - box[:3]) / (box[3:] - box[:3])).to(values)
+    at = (2 * unit - 1).flip(1)[None, None, None]  # torch counts axes from the last
+    grid = on_grid(old, values, missing)
+    return torch.nn.functional.grid_sample(
+        grid, at, mode="bilinear", padding_mode="border", align_corners=True
+    )[0, :, 0, 0].T.contiguous()
+
+
+def carried(field, lattice: Lattice):
+    """A field over another lattice of one level with what it holds, interpolated."""
+    other = type(field)(field.shape, lattice, field.scale)
+    here = field.to("cpu")
+    missing = torch.zeros(here.rows.shape[1])
+    missing[0] = UNTRAINED
+    other.rows[:] = interpolated(here.fine, here.rows, missing, other.fine)
+    if other.coarse:
+        nothing = torch.zeros(here.bands.shape[1])
+        other.bands[:] = interpolated(here.coarse, here.bands, nothing, other.coarse)
+    other.settle()
+    return other.to(field.params.device)
+
+
+def check_one_level(field) -> None:
+    """ValueError for a field of several levels, which was made for a scene and has no resolution to
+    change."""
+    if field.resolution is None:
+        raise ValueError("a sparse field of several levels has no one resolution")

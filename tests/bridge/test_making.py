@@ -1,0 +1,162 @@
+"""What is written is what was measured, and learning keeps to one command's seconds."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.bridge import making
+from fusedrf_cli.bridge.budget import Budget
+from fusedrf_cli.bridge.choose import Choosing, Tried
+from fusedrf_cli.bridge.fusing import choose
+from fusedrf_cli.bridge.sizes import BundleSizes
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.distill import DistillRun
+from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.kinds.student import Made, MadeStudent, StudentRequest, Way
+from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.progress import NullProgress
+from tests.analytic.export import SHAPE, way_of
+from tests.bridge.conftest import FIELDS, TinySettings
+
+WAYS = [Way("int4"), Way("int8")]
+SCENE = ComposedField([Placed("red", FIELDS["red"], np.eye(4))])
+BOXES = [SCENE.occupancy.tight_aabb(0)]
+
+
+class Restless(MadeStudent):
+    """A student that comes out otherwise each time it is made: a winner that is made again is another one."""
+
+    lesson = None
+    gain = 0.0
+
+    def __init__(self, target: float | None):
+        super().__init__(VM, SCENE, StudentRequest(BundleSizes(), 4000, target=target))
+        self.count = 0
+
+    def ways(self) -> list[list[Way]]:
+        return [WAYS]
+
+    def made(self, way: Way, limit: int) -> Made | None:
+        self.count += 1
+        numbers = torch.full_like(FIELDS["red"].params, float(self.count))
+        return Made(FIELDS["red"].with_params(numbers), limit, False)
+
+    def bytes_of(self, field, way: Way) -> int:
+        return 10
+
+
+def asked(**words) -> SimpleNamespace:
+    """The words of a FuseRequest that making a student heeds."""
+    usual = {"target_psnr": None, "time_budget": None, "rgb": False, "seed": 0, "from_scratch": True}
+    return SimpleNamespace(**usual | words)
+
+
+def maker_of(monkeypatch, student, psnr, request) -> making.Maker:
+    """A maker whose judge says psnr(field)."""
+    monkeypatch.setattr(making, "Judge", lambda *words: psnr)
+    monkeypatch.setattr(making, "stored", lambda field, precision: field)
+    scene = making.Scene(None, SCENE, BOXES)
+    return making.Maker(student, scene, request, "cpu", NullProgress())
+
+
+@pytest.mark.parametrize("target", [None, 30.0])
+def test_the_winner_is_written_as_it_was_measured(monkeypatch, target):
+    """Whatever was tried after it, and although it would come out otherwise if it were made again."""
+    student, measured = Restless(target), {}
+
+    def psnr(field) -> float:
+        mark = float(field.params[0])
+        return measured.setdefault(mark, 31.0 - 0.01 * len(measured))
+
+    request = asked(target_psnr=target)
+    maker = maker_of(monkeypatch, student, psnr, request)
+    choosing = Choosing(maker.make, "vm", lambda sentence: None)
+    choose(choosing, student, request)
+    choosing.neighbours(maker.best.tried)
+    assert student.count > 3
+    assert measured[float(maker.best.field.params[0])] == maker.best.tried.psnr
+
+
+def test_of_two_tries_the_better_is_kept():
+    def tried(psnr, size):
+        return Tried(Way(), size, size, psnr, psnr, False)
+
+    small, large, poor = tried(31.0, 100), tried(35.0, 300), tried(25.0, 10)
+    assert small.better(large, 30.0) and not large.better(small, 30.0)
+    assert large.better(small, None) and large.better(small, 34.0)
+    assert large.better(poor, 30.0) and not poor.better(small, 30.0) and small.better(poor, 40.0)
+    assert poor.better(None, 30.0)
+
+
+# -- seconds -------------------------------------------------------------------------------------------------
+
+
+def test_a_budget_is_shared_by_all_tries(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("fusedrf_cli.bridge.budget.working_time", lambda: clock[0])
+    budget = Budget(12.0)
+    for tries in (3, 2, 1):
+        assert budget.part(tries) == pytest.approx(4.0)
+        with budget.learning():
+            clock[0] += 4.0
+    assert budget.over and budget.part() == 0
+    assert Budget(None).part(3) is None and not Budget(None).over
+
+
+def test_all_sizes_together_keep_to_the_budget(run, monkeypatch):
+    """A target that is never reached grows the student through all its sizes."""
+    learnt, finish = [], DistillRun.finish
+
+    def noted(one, *words, **more):
+        found = finish(one, *words, **more)
+        learnt.append((one.learnt_seconds, one.report.steps))
+        return found
+
+    monkeypatch.setattr(DistillRun, "finish", noted)
+    words = ("--kind", "vm", "--max-size", "300kB", "--target-psnr", "90", "--time-budget", "3")
+    result = run("fuse", "pair.json", "-o", "f.rfpack", *words)
+    assert result.exit_code == 7 and len(learnt) >= 3
+    longest_step = max(seconds / max(1, sum(steps.values())) for seconds, steps in learnt)
+    assert sum(seconds for seconds, _ in learnt) <= 3.0 + 2 * len(learnt) * longest_step + 0.5
+
+
+@pytest.mark.parametrize("steps, phases", [(0, 1), (10, 2)])
+def test_a_phase_without_steps_takes_no_time_from_the_other(steps, phases):
+    student = VM.empty(SCENE, way_of(SHAPE), SHAPE.size((16,) * 3), torch.Generator().manual_seed(0), "")
+    settings = TinySettings(steps=steps, rgb_steps=10, time_budget=8.0)
+    run = DistillRun(SCENE, student, BOXES, settings)
+    assert run._share(10, 8.0 / phases) == pytest.approx(1.0)
+    assert run._share(10, 2.0) == pytest.approx(2.0 * phases / 8.0)
+
+
+def test_rays_are_learnt_from_no_longer_than_allowed(monkeypatch):
+    """By a clock that a step of the optimiser moves on by a second."""
+    from fusedrf_cli.engine.distillation import finish
+
+    clock, steps = [0.0], []
+    monkeypatch.setattr(finish, "working_time", lambda: clock[0])
+    step = finish.Adam.step
+
+    def counted(self, rate):
+        clock[0] += 1.0
+        steps.append(rate)
+        step(self, rate)
+
+    monkeypatch.setattr(finish.Adam, "step", counted)
+    lesson = RayLesson(SCENE, BOXES, 0, rays=500)
+    field = FIELDS["red"].with_params(FIELDS["red"].params.clone())
+    lesson.teach(field, steps=100, seconds=5.0)
+    assert len(steps) == 5 and steps[-1] < 0.3 * steps[0]
+    lesson.teach(field, steps=3)
+    assert len(steps) == 8
+
+
+def test_where_the_time_is_over_a_student_stays_as_it_was_made(monkeypatch):
+    student = Restless(None)
+    maker = maker_of(monkeypatch, student, lambda field: 20.0, asked(rgb=True, time_budget=1.0))
+    monkeypatch.setattr(maker, "finished", lambda field: pytest.fail("learnt"))
+    maker.budget.spent = 1.0
+    assert maker.make(WAYS[0], 4000, True).psnr == 20.0
