@@ -1,15 +1,27 @@
-"""The readable truth of the kernels: the same maths in plain torch, for any float dtype and device,
-differentiable, and slow.
+"""What the kinds' references share: the readable truth of the kernels in plain torch, for any float dtype and
+device, differentiable, and slow.
 
-Notation as in bodies.py. `sections` names a tensor's parameters as `VMField.sections` does; `unit` (N, 3) are
-points in the unit cube of the tensor. Gradients flow to the sections, not to points or directions. Fields are
-of one block here.
+A kind's own `reference.py` says what its field answers; tests hold the compiled loops to it, and where a
+device has no compiled loops it answers itself. `unit` are coordinates in a box, 0 at its lower face and 1 at
+its upper one.
 """
 
+import numpy as np
 import torch
 from torch.nn.functional import softplus
 
-MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
+EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
+
+
+def exact(values: torch.Tensor | np.ndarray, device: torch.device) -> torch.Tensor:
+    """Values on a device as float64, or as float32 where the device knows no other (Apple's)."""
+    kind = torch.float32 if device.type == "mps" else torch.float64
+    return torch.as_tensor(values).to(kind).to(device)
+
+
+def whole(values: np.ndarray, device: torch.device) -> torch.Tensor:
+    """Whole numbers on a device as int64: indices."""
+    return torch.from_numpy(np.ascontiguousarray(values, np.int64)).to(device)
 
 
 def linear(line: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
@@ -27,6 +39,24 @@ def bilinear(plane: torch.Tensor, unit_a: torch.Tensor, unit_b: torch.Tensor) ->
     return (1 - share_a) * lower + share_a * upper
 
 
+def trilinear(grid: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
+    """(N, R) values of a grid (n_x, n_y, n_z, R) at unit coordinates (N, 3)."""
+    lower, share = texel(unit[:, 0], grid.shape[0])
+    sides = torch.stack([bilinear_at(grid, lower + i, unit[:, 1], unit[:, 2]) for i in (0, 1)])
+    return (1 - share) * sides[0] + share * sides[1]
+
+
+def bilinear_at(
+    grid: torch.Tensor, i: torch.Tensor, unit_b: torch.Tensor, unit_c: torch.Tensor
+) -> torch.Tensor:
+    """(N, R) values of the planes i (N,) of a grid (n_x, n_y, n_z, R) at unit coordinates (N,) and (N,)."""
+    b, share_b = texel(unit_b, grid.shape[1])
+    c, share_c = texel(unit_c, grid.shape[2])
+    lower = (1 - share_c) * grid[i, b, c] + share_c * grid[i, b, c + 1]
+    upper = (1 - share_c) * grid[i, b + 1, c] + share_c * grid[i, b + 1, c + 1]
+    return (1 - share_b) * lower + share_b * upper
+
+
 def texel(unit: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Lower texel (N,) and share of the upper one (N, 1) on an axis of n texels."""
     position = unit * (n - 1)
@@ -34,37 +64,9 @@ def texel(unit: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     return lower, (position - lower)[:, None]
 
 
-def vm_products(sections: dict[str, torch.Tensor], what: str, unit: torch.Tensor) -> torch.Tensor:
-    """(N, 3 R) products P_r(a, b) L_r(c), mode after mode (TensoRF, eq. 5); what is "density" or "colour"."""
-    products = []
-    for m, (a, b, c) in enumerate(MODES):
-        plane = bilinear(sections[f"{what}_plane_{m}"], unit[:, a], unit[:, b])
-        products.append(plane * linear(sections[f"{what}_line_{m}"], unit[:, c]))
-    return torch.cat(products, 1)
-
-
-def vm_density_feature(sections: dict[str, torch.Tensor], unit: torch.Tensor) -> torch.Tensor:
-    """(N,) density before activation: the sum of the products over ranks and modes (TensoRF, eq. 6)."""
-    return vm_products(sections, "density", unit).sum(1)
-
-
 def density(feature: torch.Tensor, scale: float, shift: float) -> torch.Tensor:
     """σ = scale * log(1 + exp(feature + shift)), in the unit of scale."""
     return scale * softplus(feature + shift, threshold=40)
-
-
-def vm_query(
-    sections: dict[str, torch.Tensor], unit: torch.Tensor, dirs: torch.Tensor, scale: float, shift: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """σ (N,) in the object's frame and rgb (N, 3) along unit dirs (N, 3) of that frame; both 0 outside the
-    unit cube."""
-    inside = ((unit >= 0) & (unit <= 1)).all(1)
-    unit = unit.clamp(0, 1)
-    sigma = density(vm_density_feature(sections, unit), scale, shift)
-    basis = sections["colour_basis"]
-    features = vm_products(sections, "colour", unit)
-    logits = torch.einsum("nk,ckf,nf->nc", sh_basis(basis.shape[1], dirs).to(basis.dtype), basis, features)
-    return torch.where(inside, sigma, 0), torch.where(inside[:, None], logits.sigmoid(), 0)
 
 
 def sh_basis(count: int, dirs: torch.Tensor) -> torch.Tensor:
@@ -93,6 +95,20 @@ def sh_basis(count: int, dirs: torch.Tensor) -> torch.Tensor:
     return torch.stack(values[:count], 1)
 
 
+def cell_at(grid, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The cells (N, 3) int64 of an OccupancyGrid that points (N, 3) lie in, nearest ones where they lie
+    outside, and whether the points (N,) lie in an occupied one. A box is half open, as cells are: nothing is
+    at its upper faces."""
+    at = points.detach()
+    lo, side = exact(grid.aabb[:3], at.device), exact(grid.cell, at.device)
+    occupied = torch.from_numpy(grid.occupied).to(at.device)
+    last = torch.tensor(occupied.shape, device=at.device) - 1
+    index = ((at - lo) / side).floor().long()
+    inside = ((index >= 0) & (index <= last)).all(1)
+    index = index.clamp_min(0).minimum(last)
+    return index, inside & occupied[index.unbind(1)]
+
+
 def composite_weights(sigma: torch.Tensor, step: float) -> torch.Tensor:
     """(N, K) weights w_i = T_i alpha_i of consecutive samples, alpha_i = 1 - exp(-σ_i δ) (NeRF, eq. 3)."""
     alpha = -torch.expm1(-sigma * step)
@@ -101,44 +117,33 @@ def composite_weights(sigma: torch.Tensor, step: float) -> torch.Tensor:
     return before * alpha
 
 
-def field_query(field, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """σ (N,) in the frame of a one-block VM field, |A d| σ_object with A from field to object, and rgb (N,
-    3).
-
-    A box is half open, as cells are: nothing is at its upper faces.
-    """
-    (tensor,), (block,) = field.tensors, field.blocks
-    kind = field.params.dtype
-    to_object = torch.linalg.inv(torch.as_tensor(block.object_to_field, dtype=torch.float64))
-    box = torch.as_tensor(tensor.aabb)
-    unit = (points.double() @ to_object[:3, :3].T + to_object[:3, 3] - box[:3]) / (box[3:] - box[:3])
-    turned = dirs.double() @ to_object[:3, :3].T
-    stretch = turned.norm(dim=1)
-    turned = turned / stretch[:, None]
-    sigma, rgb = vm_query(field.sections(0), unit.to(kind), turned.to(kind), tensor.scale, tensor.shift)
-    known = torch.from_numpy(field.occupancy.contains(points.double().numpy()))
-    return torch.where(known, sigma * stretch.to(kind), 0), torch.where(known[:, None], rgb, 0)
-
-
-def lattice(field, rays_o, rays_d, near: float, step: float, jitter) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distances (N, K) of every ray's samples t_0 + (k + jitter) δ in the field's box, and which (N, K) lie
-    in occupied cells."""
-    lo, hi = torch.as_tensor(field.aabb[:3]), torch.as_tensor(field.aabb[3:])
+def interval(
+    rays_o: torch.Tensor, rays_d: torch.Tensor, box: torch.Tensor, near: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distances (N,) at which rays (N, 3) enter a box (6,), not before `near`, and leave it; a ray that
+    misses leaves before it enters. Differentiable in all three tensors."""
+    lo, hi = box[:3], box[3:]
     parallel = rays_d == 0
     held = (~parallel | ((rays_o >= lo) & (rays_o < hi))).all(1)
     safe = torch.where(parallel, 1, rays_d)
     a, b = (lo - rays_o) / safe, (hi - rays_o) / safe
     enter = torch.where(parallel, 0, torch.minimum(a, b)).amax(1).clamp_min(near).clamp_min(0)
     leave = torch.where(parallel, torch.inf, torch.maximum(a, b)).amin(1)
-    length = torch.where(held, leave - enter, 0).clamp_min(0)
+    return enter, torch.where(held, leave, enter)
+
+
+def lattice(field, rays_o, rays_d, near: float, step: float, jitter) -> tuple[torch.Tensor, torch.Tensor]:
+    """Distances (N, K) of every ray's samples t_0 + (k + jitter) δ in the field's box, and which (N, K) lie
+    in occupied cells."""
+    enter, leave = interval(rays_o, rays_d, torch.as_tensor(field.aabb), near)
+    length = (leave - enter).clamp_min(0)
     count = int(torch.ceil(length.max() / step)) + 1 if len(length) else 1
     ts = (enter + jitter * step)[:, None] + step * torch.arange(count, dtype=torch.float64)
-    inside = held[:, None] & (ts < leave[:, None])
     points = rays_o[:, None] + ts[..., None] * rays_d[:, None]
+    lo, cell = torch.as_tensor(field.aabb[:3]), torch.as_tensor(field.occupancy.cell)
     occupied = torch.from_numpy(field.occupancy.occupied)
-    shape = torch.tensor(occupied.shape)
-    cell = ((points - lo) / torch.as_tensor(field.occupancy.cell)).long().clamp_min(0).minimum(shape - 1)
-    return ts, inside & occupied[cell.unbind(-1)]
+    index = ((points - lo) / cell).long().clamp_min(0).minimum(torch.tensor(occupied.shape) - 1)
+    return ts, (ts < leave[:, None]) & occupied[index.unbind(-1)]
 
 
 def render_rays(
@@ -151,7 +156,8 @@ def render_rays(
     jitter=0.5,
     colour_from: float = 0.0,
 ) -> torch.Tensor:
-    """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) float64 through a one-block VM field.
+    """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) float64 through a field that has a
+    `reference`, on the CPU.
 
     Every sample of the lattice is asked. A sample counts while the transmittance before it is over
     early_stop, and its colour where its weight is over colour_from: both thresholds are the kernels' own, 0
@@ -160,7 +166,7 @@ def render_rays(
     ts, taken = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter, dtype=torch.float64))
     points = (rays_o[:, None] + ts[..., None] * rays_d[:, None])[taken]
     dirs = rays_d[:, None].expand(*ts.shape, 3)[taken]
-    found, colour = field_query(field, points, dirs)
+    found, colour = field.reference(field.params, points, dirs)
     sigma = found.new_zeros(ts.shape).masked_scatter(taken, found)
     rgb = found.new_zeros(*ts.shape, 3).masked_scatter(taken[..., None], colour)
     with torch.no_grad():

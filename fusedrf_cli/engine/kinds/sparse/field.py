@@ -17,6 +17,7 @@ from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
+from fusedrf_cli.engine.kinds.sparse import reference
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 
 COARSE = 2  # voxels of the bands' lattice along a brick's side
@@ -215,6 +216,12 @@ class SparseField:
         sides = (high - low).min(1)
         self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
         return clearest, facing
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `query` with other numbers params (P,), in plain torch; see sparse/reference.py."""
+        return reference.query(self, params, points, dirs)
 
     # -- learning --------------------------------------------------------------------------------------------
 

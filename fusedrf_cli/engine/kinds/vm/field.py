@@ -18,10 +18,11 @@ import torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_cells, transformed_aabb
 from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
+from fusedrf_cli.engine.kinds.vm import reference
+from fusedrf_cli.engine.kinds.vm.reference import MODES
 
 OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
-MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 MAX_STRIDE = 64
 MAX_TEXELS = 8192  # per axis, in a stored field
@@ -336,6 +337,12 @@ class VMField:
         columns in out (N, 5)."""
         read = *self.kernel_shape, self.arrays, self.grid
         self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `query` with other numbers params (P,), in plain torch; see vm/reference.py."""
+        return reference.query(self, params, points, dirs)
 
     # -- learning --------------------------------------------------------------------------------------------
 
