@@ -273,6 +273,13 @@ class SparseField:
                 *edges, target = lattice.spreading
                 self.loops.sums_of_rows(self.arrays.params, base, width, *edges, target, False)
 
+    def dependent(self) -> list[tuple[int, int]]:
+        """(low, high) of the runs of `params` that `settle` makes follow from the others: hanging rows."""
+        return [
+            (base + width * lattice.free, base + width * len(lattice.vertices))
+            for lattice, base, width in self._lattices()
+        ]
+
     def _collect(self, grads: np.ndarray) -> None:
         """Hand the gradients of hanging rows on to what they hang on; their own no longer count."""
         for lattice, base, width in self._lattices():

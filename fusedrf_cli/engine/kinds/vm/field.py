@@ -381,6 +381,13 @@ class VMField:
             target, background, opacity_weight, int(diagonal / step) + 2, grads, loss,
         )  # fmt: skip
 
+    def settle(self) -> None:
+        """Nothing: no number follows from others."""
+
+    def dependent(self) -> list[tuple[int, int]]:
+        """(low, high) of the runs of `params` that `settle` makes follow from the others: none."""
+        return []
+
     def parameter_groups(self) -> list[tuple[int, int, bool]]:
         """(low, high, whether it is a colour basis) of every group of `params`, in order."""
         ends = [*self.layout[1:, 0], self.params.numel()]
