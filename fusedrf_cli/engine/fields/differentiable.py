@@ -94,6 +94,8 @@ def gradient(
 ) -> torch.Tensor:
     """(P,) what the derivatives d_sigma (N,) and d_rgb (N, 3) of a loss send back to the field's numbers."""
     params = field.params.detach()
+    if not len(points):
+        return torch.zeros_like(params)
     on_cpu = params.device.type == "cpu"
     rows = params.new_zeros(torch.get_num_threads() if on_cpu else 1, len(params))
     back = (x.detach().cpu().contiguous() for x in (points, dirs, d_sigma, d_rgb))
