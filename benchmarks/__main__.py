@@ -19,14 +19,15 @@ import torch
 from benchmarks.peaks import Peaks, measured_peaks
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
 from fusedrf_cli.engine.distillation.teacher import Points
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu, reference
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.spaces import bounded
 
 POINTS, RAYS, REPEATS, TEXELS, CELLS, FRAME = 1 << 17, 1 << 11, 5, 224, 96, 800
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
@@ -110,12 +111,11 @@ def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> 
         torch.randn(POINTS, 3, generator=generator, dtype=torch.float64), dim=1
     )
     grads = torch.zeros(torch.get_num_threads(), field.params.numel()).numpy()
-    d_sigma, d_rgb = np.ones(POINTS, np.float32), np.full((POINTS, 3), float(with_colour), np.float32)
-    back = points.numpy(), dirs.numpy(), d_sigma, d_rgb, grads
+    back = points, dirs, torch.ones(POINTS), torch.full((POINTS, 3), float(with_colour)), grads
 
     def ours():
         field.query(points, dirs, with_colour)
-        cpu.query_backward(*field.kernel_shape, field.arrays, field.grid, *back)
+        field.query_backward(*back)
 
     sections = {name: view.clone().requires_grad_() for name, view in field.sections(0).items()}
     unit, ways, tensor = ((points + 1) / 2).float(), dirs.float(), field.tensors[0]
@@ -148,10 +148,11 @@ def march_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
     """All samples of rays that lie in occupied cells."""
     half, alive = np.full(RAYS, 0.5), np.ones(RAYS, bool)
     ts, found = np.zeros((RAYS, int(4 / STEP))), np.zeros(RAYS, np.int64)
+    loops = cpu.loops_for(None, (), bounded)
 
     def ours():
         start = np.zeros(RAYS, np.int64)
-        cpu.march(field.grid, rays_o, rays_d, 0.0, half, STEP, start, alive, ts, found)
+        loops.march(field.grid, rays_o, rays_d, 0.0, half, STEP, start, alive, ts, found)
 
     tensors = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
 
@@ -165,11 +166,10 @@ def train_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
     """A step of training: render, compare, backward, Adam."""
     target, white = np.full((RAYS, 4), 0.5, np.float32), np.ones((RAYS, 3), np.float32)
     batch = Batch(rays_o, rays_d, np.full(RAYS, 0.5), target, white, 0.1, 0.0, STEP, EARLY_STOP)
-    work = FusedPass(field)
     mine = Adam.of(field)
 
     def ours():
-        work.gradient(field, batch, mine.grads)
+        field.train_rays(batch, mine.grads, np.zeros((mine.parts, 3)))
         mine.step(0.0)
 
     copy = VMField(

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from fusedrf_cli.engine.kernels.prefetch import LINE, prefetch
+from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kernels.prefetch import prefetch
 
 FETCHED = 1 << 22  # random cache lines
 AHEAD = 16

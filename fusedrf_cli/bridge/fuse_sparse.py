@@ -18,7 +18,7 @@ from fusedrf_cli.engine.composition.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.settings import DistillSettings
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 
 POINTS = 3_000_000  # that are kept of the teacher's answers, about

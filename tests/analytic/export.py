@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor

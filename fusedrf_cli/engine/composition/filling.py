@@ -9,7 +9,7 @@ from scipy import sparse
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels.reference import sh_basis
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice, corner_offsets
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField
 

@@ -20,7 +20,7 @@ from fusedrf_cli.engine.composition.filling import (
     touching,
 )
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,

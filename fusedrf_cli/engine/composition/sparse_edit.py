@@ -8,7 +8,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.filling import LEAST, density, fill, set_density
 from fusedrf_cli.engine.composition.resample import FAINT, EmptyField, demanded, leaves, shown, thinned
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     OCTANTS,

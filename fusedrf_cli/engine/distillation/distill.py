@@ -29,6 +29,7 @@ from fusedrf_cli.engine.distillation.settings import DistillSettings
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, matter_first, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds.vm.field import VMField
 
@@ -326,9 +327,9 @@ class RayPass:
         jitter = torch.rand(len(chosen), generator=run.generator, dtype=torch.float64).numpy()
         loss = np.zeros((run.optimiser.parts, 3))
         white = np.ones((len(chosen), 3), np.float32)
-        rays = pool.rays_o[chosen], pool.rays_d[chosen], jitter, run.step, EARLY_STOP
-        target = self.target[chosen].numpy()
-        run.student.train_rays(*rays, target, white, OPACITY_WEIGHT, run.optimiser.grads, loss)
+        rays = pool.rays_o[chosen], pool.rays_d[chosen], jitter, self.target[chosen].numpy(), white
+        batch = Batch(*rays, OPACITY_WEIGHT, 0.0, run.step, EARLY_STOP)
+        run.student.train_rays(batch, run.optimiser.grads, loss)
         sums = loss.sum(0)
         wanted = run.settings.rgb_samples * len(chosen) / max(sums[2], 1)
         run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))

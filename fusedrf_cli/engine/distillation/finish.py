@@ -9,6 +9,7 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import STEP_PER_VOXEL, render_rays
@@ -50,18 +51,9 @@ class RayLesson:
             chosen = epochs.draw(RAYS_PER_STEP).numpy()
             jitter = torch.rand(len(chosen), generator=generator, dtype=torch.float64).numpy()
             loss = np.zeros((optimiser.parts, 3))
-            student.train_rays(
-                self.rays_o[chosen],
-                self.rays_d[chosen],
-                jitter,
-                step,
-                EARLY_STOP,
-                self.target[chosen],
-                white[: len(chosen)],
-                OPACITY_WEIGHT,
-                optimiser.grads,
-                loss,
-            )
+            rays = self.rays_o[chosen], self.rays_d[chosen], jitter, self.target[chosen], white[: len(chosen)]
+            batch = Batch(*rays, OPACITY_WEIGHT, 0.0, step, EARLY_STOP)
+            student.train_rays(batch, optimiser.grads, loss)
             if guard.accepts(loss.sum(0), optimiser):
                 optimiser.step(RATE * RATE_DECAY ** (i / steps) * guard.rate)
             advance((i + 1) / steps)

@@ -328,9 +328,7 @@ def occupancy_of(field: VMField | VMMLPField, cells: int = DEFAULT_CELLS) -> Occ
     cell = (box[3:] - box[:3]) / counts
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
-    sigma = np.zeros(len(index), np.float32)
-    cells = box[:3].copy(), cell, index
-    field.loops.density_at_cells(field.kernel_shape[0], field.arrays, 0, *cells, PROBES, sigma)
+    sigma = field.peaks(box[:3], cell, index, PROBES)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
     return OccupancyGrid(box, occupied).dilated()

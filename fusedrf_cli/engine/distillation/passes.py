@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels import autograd, bodies
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from fusedrf_cli.engine.rendering.volume import waves, weights_from_sigma
@@ -20,20 +20,6 @@ BETAS = (0.9, 0.99)
 THIN_BELOW = 1 / 64  # weight under which some samples are shaded for all; 0: every one is
 SCATTER = 7919.0  # makes of a ray's jitter another random number
 SHADING_COST = 8  # a sample with the network over one without: keeps steps short and many
-
-
-class Batch(NamedTuple):
-    """Rays, what they should show, and how they are sampled."""
-
-    rays_o: np.ndarray  # (n, 3) float64, in the field's frame
-    rays_d: np.ndarray  # (n, 3) float64, unit length
-    jitter: np.ndarray  # (n,) float64 in [0, 1), shift of a ray's samples in steps
-    target: np.ndarray  # (n, 4) float32, rgb over the background, and the captured alpha
-    background: np.ndarray  # (n, 3) float32
-    opacity_weight: float
-    near: float
-    step: float
-    early_stop: float
 
 
 class Pass(Protocol):
@@ -69,10 +55,7 @@ class FusedPass:
     def gradient(self, field: VMField, batch: Batch, grads: np.ndarray) -> np.ndarray:
         """See Pass."""
         loss = np.zeros((grads.shape[0], 3))
-        field.train_rays(
-            batch.rays_o, batch.rays_d, batch.jitter, batch.step, batch.early_stop, batch.target,
-            batch.background, batch.opacity_weight, grads, loss, batch.near,
-        )  # fmt: skip
+        field.train_rays(batch, grads, loss)
         return loss.sum(0)
 
     def step(self, decay: float) -> None:

@@ -99,11 +99,7 @@ def pruned(student: VMField) -> OccupancyGrid:
     """The student's occupancy without the cells in which it turned out to hold nothing."""
     grid = student.occupancy
     cells = np.argwhere(grid.occupied)
-
-    sigma = np.zeros(len(cells), np.float32)
-    student.loops.density_at_cells(
-        student.kernel_shape[0], student.arrays, 0, grid.aabb[:3].copy(), grid.cell, cells, PROBES, sigma
-    )
+    sigma = student.peaks(grid.aabb[:3], grid.cell, cells, PROBES)
     depth = np.zeros(grid.occupied.shape, np.float32)
     depth[tuple(cells.T)] = sigma * grid.cell.min()
     occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)

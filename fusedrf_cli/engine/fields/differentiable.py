@@ -12,8 +12,6 @@ from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kernels.reference import exact
 
-COMPILED = ("cpu", "cuda")  # devices that have compiled loops
-
 
 def query(
     field: RadianceField,
@@ -35,13 +33,13 @@ def query(
     if not hasattr(field, "reference"):
         if wanted or params is not None:
             raise ValueError(
-                f"a field of kind '{field.kind}' has no reference in torch, so that it cannot be "
-                "differentiated; convert it to a kind that has one"
+                f"fields of kind '{field.kind}' have no reference in torch and cannot be differentiated; "
+                "convert them to another kind"
             )
         return field.query(points, dirs, with_colour)
     params = asked[-1]
     points, dirs = exact(points, params.device), exact(dirs, params.device)
-    if params.device.type not in COMPILED:
+    if field.device_loops is None:
         return field.reference(params, points, dirs)
     if not wanted:
         return by_kernels(holding(field, params), points, dirs, with_colour)
@@ -99,7 +97,7 @@ def gradient(
     on_cpu = params.device.type == "cpu"
     rows = params.new_zeros(torch.get_num_threads() if on_cpu else 1, len(params))
     back = (x.detach().cpu().contiguous() for x in (points, dirs, d_sigma, d_rgb))
-    field.query_backward(*back, field.loops.shared(rows))
+    field.query_backward(*back, field.device_loops.shared(rows))
     found = rows.sum(0)
     for low, high in field.dependent():
         found[low:high] = 0

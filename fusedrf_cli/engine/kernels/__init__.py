@@ -24,9 +24,7 @@ def kernel_cache() -> Path:
 
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
-    names = "bodies", "prefetch", "items", "sparse_bodies"
-    inlined = [Path(__file__).with_name(f"{name}.py") for name in names]
-    bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined)).hexdigest()[:12]
+    bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined())).hexdigest()[:12]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = Path(home) / "fusedrf" / "kernels" / bodies
     try:
@@ -36,6 +34,12 @@ def kernel_cache() -> Path:
     except OSError:
         return temporary_cache(bodies)
     return wanted if is_ours(wanted, others=stat.S_IWGRP | stat.S_IWOTH) else temporary_cache(bodies)
+
+
+def inlined() -> list[Path]:
+    """Every file of the engine whose functions may be inlined into a loop."""
+    engine = Path(__file__).parent.parent
+    return sorted(p for at in ("kernels/*.py", "spaces/*.py", "kinds/*/bodies.py") for p in engine.glob(at))
 
 
 def temporary_cache(bodies: str) -> Path:
@@ -65,28 +69,17 @@ if "NUMBA_CACHE_DIR" not in os.environ:
 numba.config.SLP_VECTORIZE = 1
 
 from fusedrf_cli.engine.kernels import cpu  # noqa: E402  (compiles under the settings above)
-from fusedrf_cli.engine.kernels.bodies import NO_BLOCK, GridArrays, VMArrays  # noqa: E402
+from fusedrf_cli.engine.kernels.parts import GridArrays  # noqa: E402
 
 
-def loops(device: str) -> ModuleType:
-    """The module of compiled loops for arrays of a torch device type, "cpu" or "cuda". The first use of the
-    latter needs the `[gpu]` extra."""
+def device_loops(device: str) -> ModuleType | None:
+    """The module of compiled loops for arrays of a torch device type, "cpu" or "cuda", or None where there
+    are none. The first use of "cuda" needs the `[gpu]` extra."""
     if device == "cuda":
         from fusedrf_cli.engine.kernels import cuda
 
         return cuda
-    return cpu
-
-
-def sparse_loops(device: str) -> ModuleType:
-    """As `loops`, those of the `sparse` field."""
-    if device == "cuda":
-        from fusedrf_cli.engine.kernels import sparse_cuda
-
-        return sparse_cuda
-    from fusedrf_cli.engine.kernels import sparse_cpu
-
-    return sparse_cpu
+    return cpu if device == "cpu" else None
 
 
 def set_threads(count: int) -> None:
@@ -126,14 +119,11 @@ def working_time() -> float:
 
 
 __all__ = [
-    "NO_BLOCK",
     "GridArrays",
-    "VMArrays",
     "cpu",
+    "device_loops",
     "kernel_cache",
-    "loops",
     "set_threads",
-    "sparse_loops",
     "telling_of_compilation",
     "working_time",
 ]

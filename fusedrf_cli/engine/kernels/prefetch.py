@@ -5,10 +5,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from fusedrf_cli.engine.kernels.bodies import body, unit_point
-
-LINE = 16  # floats in a cache line
-DENSITY, COLOUR = 0, 6  # first sections of both in a layout
+from fusedrf_cli.engine.kernels.parts import LINE, body
 
 
 @intrinsic(prefer_literal=False)
@@ -28,9 +25,9 @@ def prefetch(typing, array, index):
 
 
 @body
-def prefetch_plane(ranks, array, plane, na, nb, a, b):
-    """Ask for the four texels of a plane around unit coordinates (a, b), which may lie outside."""
-    rank = len(ranks)
+def prefetch_plane(rank, array, plane, na, nb, a, b):
+    """Ask for the four texels, of `rank` numbers each, of a plane around unit coordinates (a, b), which may
+    lie outside."""
     real = array.dtype.type
     ia = min(max(int(a * real(na - 1)), 0), na - 2)
     ib = min(max(int(b * real(nb - 1)), 0), nb - 2)
@@ -43,17 +40,3 @@ def prefetch_plane(ranks, array, plane, na, nb, a, b):
         last = np.uint64(2 * rank - 1)
         prefetch(array, lower + last)
         prefetch(array, upper + last)
-
-
-@body
-def prefetch_planes(ranks, vm, array, first, b, x, y, z):
-    """Ask for what a query of block b at a field point reads, in params or gradients, of the planes from
-    section `first` on. A random point misses the cache a dozen times; asked for early, the misses overlap.
-    """
-    u, v, w, _ = unit_point(vm, b, x, y, z)
-    t = vm.tensor[b]
-    nx, ny, nz = vm.resolution[t, 0], vm.resolution[t, 1], vm.resolution[t, 2]
-    off = vm.layout[t]
-    prefetch_plane(ranks, array, off[first], nx, ny, u, v)
-    prefetch_plane(ranks, array, off[first + 1], nx, nz, u, w)
-    prefetch_plane(ranks, array, off[first + 2], ny, nz, v, w)

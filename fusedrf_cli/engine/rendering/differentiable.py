@@ -20,7 +20,6 @@ from fusedrf_cli.engine.composition.differentiable import (
     query,
     structure,
 )
-from fusedrf_cli.engine.fields import differentiable
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels.reference import exact, interval
 from fusedrf_cli.engine.rendering import volume
@@ -68,10 +67,7 @@ def render_rays(
     known, device = structure(field, poses), device_of(field)
     step = step or STEP_PER_VOXEL * known.voxel_size
     host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]
-    if (
-        not needs_gradient(field, rays_o, rays_d, *(poses or {}).values())
-        and device.type in differentiable.COMPILED
-    ):
+    if not needs_gradient(field, rays_o, rays_d, *(poses or {}).values()):
         found = volume.render_rays(known, *host, near=near, step=step, early_stop=early_stop)
         return torch.from_numpy(found).to(device)
     volume.check_directions(host[1])

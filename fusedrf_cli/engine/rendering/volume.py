@@ -10,6 +10,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
+from fusedrf_cli.engine.spaces import bounded
 
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
@@ -54,7 +55,8 @@ def render_rays(
     check_directions(rays_d)
     step = step or STEP_PER_VOXEL * field.voxel_size
     out = np.zeros((len(rays_o), 5), np.float32)
-    fast = getattr(field, "render_rays", None)
+    compiled = getattr(field, "device_loops", True) is not None
+    fast = getattr(field, "render_rays", None) if compiled else None
 
     def render(part: slice) -> None:
         if fast is not None:
@@ -156,8 +158,9 @@ def waves(
     n = len(rays_o)
     start = np.zeros(n, np.int64)
     ts, counts = np.zeros((n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
+    loops = cpu.loops_for(None, (), getattr(field, "space", bounded))
     while True:
-        cpu.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), ts, counts)
+        loops.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), ts, counts)
         ray = np.flatnonzero(counts)
         if not len(ray):
             return

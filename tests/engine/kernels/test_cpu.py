@@ -8,9 +8,12 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, bodies, cpu, reference
+from fusedrf_cli.engine.fields.computed import Batch
+from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, reference
+from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
+from fusedrf_cli.engine.spaces import bounded
 from tests.engine.conftest import (
     BOX,
     DIRECTIONS_26,
@@ -23,6 +26,7 @@ from tests.engine.conftest import (
     unit,
 )
 
+MARCH = cpu.loops_for(None, (), bounded).march
 TURN = np.array([[0.0, -1.0, 0.0, 0.2], [1.0, 0.0, 0.0, -0.1], [0.0, 0.0, 1.0, 0.3], [0, 0, 0, 1]])
 MIRROR = np.diag([-1.0, 0.8, 1.3, 1.0])
 SHEAR = np.array([[1.0, 0.8, 0.0, 0.0], [0.0, 0.5, 0.2, 0.1], [0.1, 0.0, 2.0, 0.0], [0, 0, 0, 1]])
@@ -245,7 +249,7 @@ def test_a_block_is_silent_where_its_tensor_is_empty():
 
 def backward(field, points, dirs, d_sigma, d_rgb, parts: int = 3) -> np.ndarray:
     grads = np.zeros((parts, field.params.numel()), field.arrays.params.dtype)
-    cpu.query_backward(*field.kernel_shape, field.arrays, field.grid, points, dirs, d_sigma, d_rgb, grads)
+    field.query_backward(*map(torch.from_numpy, (points, dirs, d_sigma, d_rgb)), grads)
     return grads.sum(0)
 
 
@@ -293,17 +297,8 @@ def test_query_backward_of_several_blocks_is_finite_differences():
 
 
 def train(
-    field,
-    rays_o,
-    rays_d,
-    step,
-    early_stop=0.0,
-    near=0.0,
-    parts=2,
-    opacity_weight=0.3,
-    seed=0,
-    max_samples=400,
-):
+    field, rays_o, rays_d, step, early_stop=0.0, near=0.0, parts=2, opacity_weight=0.3, seed=0
+):  # fmt: skip
     """train_rays with random targets, backgrounds and jitter: (target, background, jitter, gradients (P,),
     loss (3,))."""
     n, rng = len(rays_o), np.random.default_rng(seed)
@@ -311,10 +306,8 @@ def train(
     target, background = rng.random((n, 4)).astype(real), rng.random((n, 3)).astype(real)
     jitter = rng.random(n)
     grads, loss = np.zeros((parts, field.params.numel()), real), np.zeros((parts, 3))
-    cpu.train_rays(
-        *field.kernel_shape, field.arrays, field.grid, rays_o, rays_d, near, jitter, step, early_stop,
-        target, background, opacity_weight, max_samples, grads, loss,
-    )  # fmt: skip
+    batch = Batch(rays_o, rays_d, jitter, target, background, opacity_weight, near, step, early_stop)
+    field.train_rays(batch, grads, loss)
     return target, background, jitter, grads.sum(0), loss.sum(0)
 
 
@@ -325,7 +318,7 @@ def reference_loss(
     reference."""
     out = reference.render_rays(
         field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, step, early_stop,
-        torch.from_numpy(jitter), bodies.COLOUR_FROM,
+        torch.from_numpy(jitter), loops.COLOUR_FROM,
     )  # fmt: skip
     target, background = torch.from_numpy(target), torch.from_numpy(background)
     shown = out[:, :3] + (1 - out[:, 3:4]) * background
@@ -401,8 +394,9 @@ def test_parts_only_split_the_work():
 
 def render(field, rays_o, rays_d, near=0.0, step=0.05, early_stop=0.0, grid=None) -> np.ndarray:
     out = np.full((len(rays_o), 5), np.nan)
-    grid = field.grid if grid is None else grid
-    cpu.render(*field.kernel_shape, field.arrays, grid, rays_o, rays_d, near, step, early_stop, out)
+    if grid is not None:
+        field.grid = grid
+    field.render_rays(rays_o, rays_d, near, step, early_stop, out)
     return out
 
 
@@ -416,7 +410,7 @@ def test_render_is_the_reference(cells, early_stop):
     rays_d[36:40] *= -1  # and some that miss
     found = render(field, rays_o, rays_d, early_stop=early_stop)
     rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
-    cuts = dict(early_stop=early_stop, colour_from=bodies.COLOUR_FROM)
+    cuts = dict(early_stop=early_stop, colour_from=loops.COLOUR_FROM)
     wanted = reference.render_rays(field, *rays, 0.0, 0.05, **cuts).numpy()
     assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.3
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
@@ -440,7 +434,7 @@ def march(grid: GridArrays, rays_o, rays_d, step, near=0.0, jitter=0.5, wave=100
     found = [[] for _ in range(n)]
     while (start >= 0).any():
         ts, counts = np.zeros((n, wave)), np.zeros(n, np.int64)
-        cpu.march(grid, rays_o, rays_d, near, np.full(n, jitter), step, start, alive, ts, counts)
+        MARCH(grid, rays_o, rays_d, near, np.full(n, jitter), step, start, alive, ts, counts)
         for i in range(n):
             found[i].append(ts[i, : counts[i]])
     return [np.concatenate(parts) for parts in found]
@@ -534,7 +528,7 @@ def test_dead_rays_rest():
     rays_o, rays_d = rays_at(BOX, 4)
     ts, counts, start = np.zeros((4, 5)), np.ones(4, np.int64), np.zeros(4, np.int64)
     alive = np.array([True, False, True, False])
-    cpu.march(grid.arrays, rays_o, rays_d, 0.0, np.full(4, 0.5), 0.1, start, alive, ts, counts)
+    MARCH(grid.arrays, rays_o, rays_d, 0.0, np.full(4, 0.5), 0.1, start, alive, ts, counts)
     assert counts.tolist() == [5, 0, 5, 0] and start.tolist() == [5, 0, 5, 0]
 
 
@@ -556,17 +550,14 @@ def test_skipping_leaves_every_bit_of_the_image():
     assert (whole == creeping).all() and whole[:, 3].max() > 0.5
 
 
-# -- density at cells ----------------------------------------------------------------------------------------
+# -- peaks of cells ----------------------------------------------------------------------------------------
 
 
-def test_density_at_cells_is_the_largest_of_the_probes():
+def test_peaks_are_the_largest_of_the_probes():
     field = random_vm(cells=6)
     grid = OccupancyGrid.full(BOX, 5)
     cells, offsets = np.argwhere(grid.occupied), np.array([[0.25, 0.25, 0.25], [0.75, 0.5, 0.1]])
-    out = np.zeros(len(cells), np.float32)
-    cpu.density_at_cells(
-        field.kernel_shape[0], field.arrays, 0, BOX[:3].copy(), grid.cell, cells, offsets, out
-    )
+    out = field.peaks(BOX[:3], grid.cell, cells, offsets)
     tensor = field.tensors[0]
     wanted = []
     for offset in offsets:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     BrickTree,

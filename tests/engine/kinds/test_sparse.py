@@ -7,11 +7,12 @@ import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels.reference import sh_basis
-from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice
-from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.fields import Slow
 from tests.analytic.rays import points_in, rays_at, unit
@@ -125,7 +126,8 @@ def test_gradients_of_pictures_are_finite_differences(degree, rng):
 
     def value(grads: np.ndarray) -> float:
         loss = np.zeros((len(grads), 3))
-        field.train_rays(rays_o, rays_d, jitter, 0.02, 0.0, target, background, 0.3, grads, loss)
+        batch = Batch(rays_o, rays_d, jitter, target, background, 0.3, 0.0, 0.02, 0.0)
+        field.train_rays(batch, grads, loss)
         assert loss[:, 2].sum() > 100
         return float(loss[:, 0].sum() + 0.3 * loss[:, 1].sum()) / 12
 
@@ -157,7 +159,8 @@ def test_the_loss_of_rays_is_that_of_their_pictures(rng):
     target, background = rng.random((30, 4)), rng.random((30, 3))
     loss = np.zeros((2, 3))
     grads = np.zeros((2, field.size))
-    field.train_rays(rays_o, rays_d, np.full(30, 0.5), 0.02, 1e-3, target, background, 0.3, grads, loss)
+    batch = Batch(rays_o, rays_d, np.full(30, 0.5), target, background, 0.3, 0.0, 0.02, 1e-3)
+    field.train_rays(batch, grads, loss)
     found = render_rays(field, rays_o, rays_d, step=0.02, early_stop=1e-3).astype(float)
     error = found[:, :3] + (1 - found[:, 3:4]) * background - target[:, :3]
     assert loss[:, 0].sum() == pytest.approx((error**2).mean(1).sum(), rel=1e-4)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import NO_BLOCK
+from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels.sparse_bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 
 MAX_LEVEL = 7
 MAX_TOP_CELLS = 1 << 22

@@ -6,23 +6,21 @@ lattice of voxels twice as wide. σ = scale softplus(f) and rgb = sigmoid(Σ_k Y
 activation.
 """
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from types import ModuleType
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.fields.computed import ComputedField, exact
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kernels.sparse_bodies import ROW, SIDE, SparseArrays
-from fusedrf_cli.engine.kinds.sparse import reference
+from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kinds.sparse import bodies, reference
+from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 
-COARSE = 2  # voxels of the bands' lattice along a brick's side
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
-LINE = 16  # floats: the bands begin on a cache line, and a row of them is a whole number of half ones
 MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
 OCCUPANCY_CELLS = 192  # along the longest axis, at most, unless there are more top cells
@@ -56,11 +54,11 @@ class SparseShape:
         return -(-self.band_numbers // 8) * 8
 
 
-class SparseField:
+class SparseField(ComputedField):
     """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle`
     afterwards)."""
 
-    kind = "sparse"
+    kind, bodies = "sparse", bodies
 
     def __init__(self, shape: SparseShape, fine: Lattice, scale: float, params: torch.Tensor | None = None):
         """params (P,) float; None: zeros."""
@@ -68,22 +66,9 @@ class SparseField:
         self.coarse = Lattice(fine.tree, COARSE) if shape.sh_degree else None
         self.params = torch.zeros(self.size) if params is None else params
 
-    def with_params(self, params: torch.Tensor) -> "SparseField":
-        """The same vertices with other numbers."""
-        other = object.__new__(SparseField)
-        other.shape, other.fine, other.scale, other.coarse = self.shape, self.fine, self.scale, self.coarse
-        other.params = params
-        return other
-
-    def to(self, device: str | torch.device) -> "SparseField":
-        """The same field with its numbers on a device: there it is asked, rendered and trained."""
-        return (
-            self if self.params.device == torch.device(device) else self.with_params(self.params.to(device))
-        )
-
     def moved(self, origin: np.ndarray) -> "SparseField":
         """The same field in a frame whose origin is at `origin` (3,) of its own."""
-        other = self.with_params(self.params)
+        other = copy(self)._afresh("arrays", "grid", "occupancy")
         other.fine = self.fine.moved(origin)
         other.coarse = self.coarse.moved(origin) if self.coarse else None
         return other
@@ -140,20 +125,14 @@ class SparseField:
         """Cells that active voxels reach."""
         return self.tree.occupancy(OCCUPANCY_CELLS)
 
-    @property
-    def kernel_shape(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Widths and SH coefficients as tuples whose lengths the compiler sees (sparse_bodies.py)."""
-        return (0,) * self.shape.band_width, (0,) * self.shape.coefficients
-
-    @cached_property
-    def arrays(self) -> SparseArrays:
-        """What kernels read; `params` is shared, not copied."""
+    def kernel_arrays(self, params: object) -> bodies.Arrays:
+        """See ComputedField."""
         tree = self.tree
         offset, depth, table = tree.tables
         weights = np.uint64(1) << np.arange(SIDE**3, dtype=np.uint64)
         mask = (tree.mask.reshape(-1, SIDE**3) * weights).sum(1, dtype=np.uint64)
-        arrays = SparseArrays(
-            self.loops.shared(self.params),
+        return bodies.Arrays(
+            params,
             self.bands_at,
             self.scale,
             tree.lo,
@@ -165,46 +144,8 @@ class SparseField:
             mask,
             self.fine.rows,
             self.coarse.rows if self.coarse else np.zeros((0, 0), np.int32),
-            COARSE,
             tree.depth,
         )
-        return self.loops.on_device(arrays)
-
-    @property
-    def loops(self) -> ModuleType:
-        """The compiled loops of the device that the numbers lie on."""
-        return kernels.sparse_loops(self.params.device.type)
-
-    @cached_property
-    def grid(self) -> GridArrays:
-        """The occupancy's arrays."""
-        return self.loops.on_device(self.occupancy.arrays)
-
-    def query(
-        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); 0 where no voxel is active. Not
-        differentiable."""
-        sigma = np.empty(len(points), self.arrays.params.dtype)
-        rgb = np.empty((len(points), 3), self.arrays.params.dtype)
-        self.loops.query(
-            *self.kernel_shape, self.arrays, points.numpy(), dirs.numpy(), with_colour, sigma, rgb
-        )
-        return torch.from_numpy(sigma), torch.from_numpy(rgb)
-
-    def render_rays(
-        self,
-        rays_o: np.ndarray,
-        rays_d: np.ndarray,
-        near: float,
-        step: float,
-        early_stop: float,
-        out: np.ndarray,
-    ) -> None:
-        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same
-        columns in out (N, 5)."""
-        read = *self.kernel_shape, self.arrays, self.grid
-        self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
     def exposed(
         self, low: np.ndarray, high: np.ndarray, directions: np.ndarray, far: float, blocked: float
@@ -212,66 +153,27 @@ class SparseField:
         """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions
         (D, 3), (K,), from `far` away or from outside the box, and the mean direction along which each is seen
         (K, 3), of length 1 where from one side alone. Light of less than `blocked` counts as none."""
-        clearest, facing = np.zeros(len(low)), np.zeros((len(low), 3))
-        sides = (high - low).min(1)
-        self.loops.expose(self.arrays, (low + high) / 2, sides, directions, far, blocked, clearest, facing)
-        return clearest, facing
+        light = bodies.Light(
+            exact((low + high) / 2), (high - low).min(1), exact(directions), float(far), float(blocked)
+        )
+        found = bodies.Exposure(np.zeros(len(low)), np.zeros((len(low), 3)))
+        self.loops.each("expose_voxel", self.arrays, self.grid, light, len(low), found)
+        return found.clearest, found.facing
 
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `query` with other numbers params (P,), in plain torch; see sparse/reference.py."""
+        """See ComputedField and sparse/reference.py."""
         return reference.query(self, params, points, dirs)
 
     # -- learning --------------------------------------------------------------------------------------------
-
-    def query_backward(
-        self,
-        points: torch.Tensor,
-        dirs: torch.Tensor,
-        d_sigma: torch.Tensor,
-        d_rgb: torch.Tensor,
-        grads: np.ndarray,
-    ) -> None:
-        """Adjoint of `query`: add to the rows of grads (parts, P) what the derivatives d_sigma (N,) and d_rgb
-        (N, 3) of a loss send back to `params`."""
-        back = points.numpy(), dirs.numpy(), d_sigma.numpy(), d_rgb.numpy()
-        self.loops.query_backward(*self.kernel_shape, self.arrays, *back, grads)
-        self._collect(grads)
-
-    def train_rays(
-        self,
-        rays_o: np.ndarray,
-        rays_d: np.ndarray,
-        jitter: np.ndarray,
-        step: float,
-        early_stop: float,
-        target: np.ndarray,
-        background: np.ndarray,
-        opacity_weight: float,
-        grads: np.ndarray,
-        loss: np.ndarray,
-        near: float = 0.0,
-    ) -> None:
-        """Render rays (N, 3), compare with target (N, 4), add the gradient to the rows of grads (parts, P)
-        and the losses and samples to those of loss (parts, 3); see cpu.train_rays for the loss."""
-        slots = int(np.linalg.norm(self.aabb[3:] - self.aabb[:3]) / step) + 2
-        self.loops.train_rays(
-            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop,
-            target, background, opacity_weight, slots, grads, loss,
-        )  # fmt: skip
-        self._collect(grads)
-
-    def parameter_groups(self) -> list[tuple[int, int, bool]]:
-        """(low, high, whether it is a colour basis) of every group of `params`, in order."""
-        return [(0, self.params.numel(), False)]
 
     def settle(self) -> None:
         """Make the hanging rows follow from the free ones, after these have changed."""
         for lattice, base, width in self._lattices():
             if lattice.spread.shape[0]:
                 *edges, target = lattice.spreading
-                self.loops.sums_of_rows(self.arrays.params, base, width, *edges, target, False)
+                self.device_loops.sums_of_rows(self.arrays.params, base, width, *edges, target, False)
 
     def dependent(self) -> list[tuple[int, int]]:
         """(low, high) of the runs of `params` that `settle` makes follow from the others: hanging rows."""
@@ -280,13 +182,13 @@ class SparseField:
             for lattice, base, width in self._lattices()
         ]
 
-    def _collect(self, grads: np.ndarray) -> None:
+    def collect(self, grads: np.ndarray) -> None:
         """Hand the gradients of hanging rows on to what they hang on; their own no longer count."""
         for lattice, base, width in self._lattices():
             if lattice.spread.shape[0]:
                 *edges, target = lattice.gathering
                 for row in grads:
-                    self.loops.sums_of_rows(row, base, width, *edges, target, True)
+                    self.device_loops.sums_of_rows(row, base, width, *edges, target, True)
 
     def _lattices(self) -> list[tuple[Lattice, int, int]]:
         """Each lattice, where its rows begin in params, and how wide they are."""

@@ -10,15 +10,15 @@ edit appends or drops a block and leaves the rest as it is.
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import ModuleType
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, placed_cells, transformed_aabb
-from fusedrf_cli.engine.kernels import NO_BLOCK, GridArrays, VMArrays, cpu
-from fusedrf_cli.engine.kinds.vm import reference
+from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kinds.vm import bodies, reference
+from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.reference import MODES
 
 OWNERSHIP_CELLS = 160  # along the longest axis of a field of several blocks
@@ -27,7 +27,7 @@ TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets it
 MAX_STRIDE = 64
 MAX_TEXELS = 8192  # per axis, in a stored field
 MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
-SECTION_ALIGN = 16  # floats: a section starts on a cache line
+BASIS_RATE = 0.05  # TensoRF: 1e-3 for the colour basis where factors learn at 2e-2
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
 
@@ -99,7 +99,7 @@ class VMShape:
         return (self.sh_degree + 1) ** 2
 
     def sections(self, resolution: tuple[int, int, int]) -> list[tuple[str, tuple[int, ...]]]:
-        """Names and shapes of a tensor's 13 sections, in the kernels' order (bodies.py)."""
+        """Names and shapes of a tensor's 13 sections, in the order of bodies.py."""
         n = resolution
         named = []
         for what, rank in (("density", self.density_rank), ("colour", self.colour_rank)):
@@ -114,14 +114,14 @@ class VMShape:
 
 def aligned(count: int) -> int:
     """Count rounded up to whole cache lines."""
-    return -(-count // SECTION_ALIGN) * SECTION_ALIGN
+    return -(-count // LINE) * LINE
 
 
-class VMField:
+class VMField(ComputedField):
     """One or more placed VM tensors; see the module's docstring. Immutable but for `params`, which optimisers
     update in place."""
 
-    kind = "vm"
+    kind, bodies = "vm", bodies
 
     def __init__(
         self,
@@ -183,10 +183,6 @@ class VMField:
         settle_crowded(unsettled, np.argwhere(count > 2), first, second)
         return unsettled
 
-    def with_params(self, params: torch.Tensor) -> "VMField":
-        """The same tensors and blocks with other numbers."""
-        return VMField(self.shape, self.tensors, self.blocks, params, self.occupancy, self.owners)
-
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
         """A one-block field on another box and resolution: planes and lines are interpolated, outside the old
         box they are 0."""
@@ -214,18 +210,7 @@ class VMField:
         target["colour_basis"].copy_(old["colour_basis"])
         return new
 
-    def to(self, device: str | torch.device) -> "VMField":
-        """The same field with its numbers on a device: there it is asked, rendered and trained."""
-        if self.params.device == torch.device(device):
-            return self
-        return self.with_params(self.params.to(device))
-
     # -- reading ---------------------------------------------------------------------------------------------
-
-    @property
-    def aabb(self) -> np.ndarray:
-        """(6,) float64 box in the field's frame."""
-        return self.occupancy.aabb
 
     @property
     def voxel_size(self) -> float:
@@ -264,15 +249,8 @@ class VMField:
             rows.append(row)
         return np.asarray(rows, np.int64)
 
-    @property
-    def kernel_shape(self) -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-        """Ranks and SH coefficients as tuples whose lengths the compiler sees (bodies.py)."""
-        return (0,) * self.shape.density_rank, (0,) * self.shape.colour_rank, (0,) * self.shape.coefficients
-
-    @cached_property
-    def arrays(self) -> VMArrays:
-        """What kernels read; `params` is shared, not copied."""
-        real = np.dtype(str(self.params.dtype).removeprefix("torch."))
+    def kernel_arrays(self, params: object) -> bodies.Arrays:
+        """See ComputedField."""
         to_unit, to_object = [], []
         for block in self.blocks:
             box = self.tensors[block.tensor].aabb
@@ -286,114 +264,33 @@ class VMField:
                 )
             )
         first, second = self.owners if self.owners is not None else NO_OWNERS
-        arrays = VMArrays(
-            self.loops.shared(self.params),
+        return bodies.Arrays(
+            params,
             self.layout,
             np.asarray([t.resolution for t in self.tensors], np.int64),
             np.ascontiguousarray(to_unit, np.float64),
             np.ascontiguousarray(to_object, np.float64),
             np.asarray([b.tensor for b in self.blocks], np.int64),
-            np.asarray([[t.scale, t.shift] for t in self.tensors], real),
+            np.asarray([[t.scale, t.shift] for t in self.tensors], self.real),
             first,
             second,
             self._strides(),
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
         )
-        return self.loops.on_device(arrays)
-
-    @property
-    def loops(self) -> ModuleType:
-        """The compiled loops of the device that the numbers lie on."""
-        return kernels.loops(self.params.device.type)
-
-    @cached_property
-    def grid(self) -> GridArrays:
-        """The occupancy's arrays."""
-        return self.loops.on_device(self.occupancy.arrays)
-
-    def query(
-        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); empty cells answer 0. Not
-        differentiable (see autograd.py)."""
-        sigma = np.empty(len(points), self.arrays.params.dtype)
-        rgb = np.empty((len(points), 3), self.arrays.params.dtype)
-        self.loops.query(
-            *self.kernel_shape, self.arrays, self.grid, points.numpy(), dirs.numpy(), with_colour, sigma, rgb
-        )
-        return torch.from_numpy(sigma), torch.from_numpy(rgb)
-
-    def render_rays(
-        self,
-        rays_o: np.ndarray,
-        rays_d: np.ndarray,
-        near: float,
-        step: float,
-        early_stop: float,
-        out: np.ndarray,
-    ) -> None:
-        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same
-        columns in out (N, 5)."""
-        read = *self.kernel_shape, self.arrays, self.grid
-        self.loops.render(*read, rays_o, rays_d, near, step, early_stop, out)
 
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `query` with other numbers params (P,), in plain torch; see vm/reference.py."""
+        """See ComputedField and vm/reference.py."""
         return reference.query(self, params, points, dirs)
 
-    # -- learning --------------------------------------------------------------------------------------------
-
-    def query_backward(
-        self,
-        points: torch.Tensor,
-        dirs: torch.Tensor,
-        d_sigma: torch.Tensor,
-        d_rgb: torch.Tensor,
-        grads: np.ndarray,
-    ) -> None:
-        """Adjoint of `query`: add to the rows of grads (parts, P) what the derivatives d_sigma (N,) and d_rgb
-        (N, 3) of a loss send back to `params`."""
-        back = points.numpy(), dirs.numpy(), d_sigma.numpy(), d_rgb.numpy()
-        self.loops.query_backward(*self.kernel_shape, self.arrays, self.grid, *back, grads)
-
-    def train_rays(
-        self,
-        rays_o: np.ndarray,
-        rays_d: np.ndarray,
-        jitter: np.ndarray,
-        step: float,
-        early_stop: float,
-        target: np.ndarray,
-        background: np.ndarray,
-        opacity_weight: float,
-        grads: np.ndarray,
-        loss: np.ndarray,
-        near: float = 0.0,
-    ) -> None:
-        """Render rays (N, 3), compare with target (N, 4), add the gradient to the rows of grads (parts, P)
-        and the losses and samples to those of loss (parts, 3); see cpu.train_rays for the loss."""
-        diagonal = float(np.linalg.norm(self.aabb[3:] - self.aabb[:3]))
-        self.loops.train_rays(
-            *self.kernel_shape, self.arrays, self.grid, rays_o, rays_d, near, jitter, step, early_stop,
-            target, background, opacity_weight, int(diagonal / step) + 2, grads, loss,
-        )  # fmt: skip
-
-    def settle(self) -> None:
-        """Nothing: no number follows from others."""
-
-    def dependent(self) -> list[tuple[int, int]]:
-        """(low, high) of the runs of `params` that `settle` makes follow from the others: none."""
-        return []
-
-    def parameter_groups(self) -> list[tuple[int, int, bool]]:
-        """(low, high, whether it is a colour basis) of every group of `params`, in order."""
+    def groups(self) -> list[Group]:
+        """Each tensor's factors and its colour basis."""
         ends = [*self.layout[1:, 0], self.params.numel()]
         groups = []
         for row, end in zip(self.layout, ends, strict=True):
-            groups += [(int(row[0]), int(row[12]), False), (int(row[12]), int(end), True)]
+            groups += [Group(int(row[0]), int(row[12])), Group(int(row[12]), int(end), BASIS_RATE)]
         return groups
 
     # -- storing ---------------------------------------------------------------------------------------------
@@ -526,18 +423,6 @@ def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> tor
     )
 
 
-def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> np.ndarray:
-    """Inverse of np.packbits for the named array, a grid of a known shape."""
-    count = int(np.prod(shape))
-    packed = arrays.get(name)
-    if packed is None or packed.shape != (-(-count // 8),):
-        have = "nothing" if packed is None else list(packed.shape)
-        raise ValueError(
-            f"array '{name}' should have shape {[-(-count // 8)]} for a grid of {shape}, found {have}"
-        )
-    return np.unpackbits(packed, count=count).reshape(shape).astype(bool)
-
-
 def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
     """(T, 4) int64: offset of a tensor's cells in the concatenated occupancies, and cells per axis."""
     shapes = [t.occupancy.occupied.shape for t in tensors]
@@ -567,10 +452,7 @@ def settle_crowded(field: VMField, crowded: np.ndarray, first: np.ndarray, secon
     best = np.full((2, len(crowded)), -1.0, np.float32)
     densest = np.full((2, len(crowded)), NO_BLOCK, np.uint8)
     for b in range(len(field.blocks)):
-        peak = np.zeros(len(crowded), np.float32)
-        cpu.density_at_cells(
-            field.kernel_shape[0], field.arrays, b, grid.aabb[:3].copy(), grid.cell, crowded, PROBES, peak
-        )
+        peak = field.peaks(grid.aabb[:3], grid.cell, crowded, PROBES, b)
         # A probe misses matter that barely reaches into a cell: such blocks come last, by their peak
         # elsewhere.
         peak = np.where(peak > 0, peak, TOUCHING * peak.max())

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import GridArrays, VMArrays, autograd
+from fusedrf_cli.engine.kernels import GridArrays
+from fusedrf_cli.engine.kinds.vm.bodies import Arrays as VMArrays
 from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, Block, VMField, VMShape, VMTensor
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features

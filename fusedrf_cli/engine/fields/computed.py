@@ -1,0 +1,250 @@
+"""What all kinds of field share whose answers compiled loops compute from one flat vector of numbers."""
+
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels import GridArrays
+from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Answers, Cells, Points, Rays, Sent
+from fusedrf_cli.engine.spaces import bounded
+
+
+class Batch(NamedTuple):
+    """Rays, what they should show, and how they are sampled."""
+
+    rays_o: np.ndarray  # (n, 3) float64, in the field's frame
+    rays_d: np.ndarray  # (n, 3) float64, unit length
+    jitter: np.ndarray  # (n,) float64 in [0, 1), shift of a ray's samples in steps
+    target: np.ndarray  # (n, 4) float, rgb over the background, and the captured alpha
+    background: np.ndarray  # (n, 3) float
+    opacity_weight: float
+    near: float
+    step: float
+    early_stop: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """A stretch of a field's numbers that learn at one rate."""
+
+    low: int
+    high: int
+    rate: float = 1.0
+    """Relative to the optimiser's."""
+
+
+class ComputedField:
+    """A field that the loops of kernels/loops.py compute.
+
+    A kind sets `kind` and `bodies`, its module of scalar functions; a field of it has `params` (P,), whose
+    length is a multiple of LINE, `occupancy`, and `kernel_arrays`. Immutable but for `params`, which
+    optimisers update in place (`settle` afterwards).
+    """
+
+    kind: str
+    bodies: ModuleType
+    space: ModuleType = bounded
+    params: torch.Tensor
+    occupancy: OccupancyGrid
+
+    # -- for kinds to define -----------------------------------------------------------------------------
+
+    def kernel_arrays(self, params: object) -> NamedTuple:
+        """The kind's Arrays, on the host, over `params` as the loops take them."""
+        raise NotImplementedError
+
+    def groups(self) -> list[Group]:
+        """Parts of `params` that learn at rates of their own, in order, each of whole cache lines."""
+        return [Group(0, self.params.numel())]
+
+    def settle(self) -> None:
+        """Make those numbers follow that depend on others, after these have changed."""
+
+    def collect(self, grads: np.ndarray) -> None:
+        """Hand on the gradients, rows (parts, P), of numbers that follow from others."""
+
+    def dependent(self) -> list[tuple[int, int]]:
+        """(low, high) of the runs of `params` that `settle` makes follow from the others."""
+        return []
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `query`, with numbers params (P,), in plain torch: on any device, and differentiable in all
+        three. Raises ValueError where the kind has no reference."""
+        raise ValueError(
+            f"fields of kind '{self.kind}' have no reference in torch: they are computed on 'cpu' and 'cuda' "
+            "only, and cannot be differentiated in points or directions; convert them to another kind"
+        )
+
+    # -- the same field otherwise ------------------------------------------------------------------------
+
+    def with_params(self, params: torch.Tensor) -> "ComputedField":
+        """The same field with other numbers."""
+        other = copy(self)
+        other.params = params
+        return other._afresh("arrays", "grid", "loops")
+
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "ComputedField":
+        """The same numbers under another occupancy grid."""
+        other = copy(self)
+        other.occupancy = occupancy
+        return other._afresh("arrays", "grid")
+
+    def to(self, device: str | torch.device) -> "ComputedField":
+        """The same field with its numbers on a device: there it is asked, rendered and trained."""
+        if self.params.device == torch.device(device):
+            return self
+        return self.with_params(self.params.to(device))
+
+    def stored(self, as_stored) -> "ComputedField":
+        """The field as it comes back from a bundle that keeps as_stored(array, name) of each array."""
+        arrays, metadata = self.state()
+        kept = {name: as_stored(array, name) for name, array in arrays.items()}
+        return type(self).from_state(kept, metadata).to(self.params.device)
+
+    def _afresh(self, *names: str) -> "ComputedField":
+        """Itself without what was computed from things that have changed."""
+        for name in names:
+            self.__dict__.pop(name, None)
+        return self
+
+    # -- what the loops read -----------------------------------------------------------------------------
+
+    @property
+    def aabb(self) -> np.ndarray:
+        """(6,) float64 box in the field's frame."""
+        return self.occupancy.aabb
+
+    @property
+    def device_loops(self) -> ModuleType:
+        """The module of loops of the device that the numbers lie on."""
+        return kernels.device_loops(self.params.device.type)
+
+    @cached_property
+    def loops(self) -> kernels.cpu.Loops:
+        """The loops for fields of these sizes, on the device that the numbers lie on."""
+        sizes = tuple(sorted(self.bodies.sizes(self).items()))
+        return self.device_loops.loops_for(self.bodies, sizes, self.space)
+
+    @cached_property
+    def arrays(self) -> NamedTuple:
+        """What kernels read; `params` is shared, not copied."""
+        loops = self.device_loops
+        return loops.on_device(self.kernel_arrays(loops.shared(self.params)))
+
+    @cached_property
+    def grid(self) -> GridArrays:
+        """The occupancy's arrays."""
+        return self.device_loops.on_device(self.occupancy.arrays)
+
+    @property
+    def real(self) -> np.dtype:
+        """The type of the field's numbers."""
+        return np.dtype(str(self.params.dtype).removeprefix("torch."))
+
+    # -- answering ---------------------------------------------------------------------------------------
+
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) per unit of length and rgb (N, 3) at points (N, 3), seen along unit dirs (N, 3); 0 where the
+        field is empty. Not differentiable."""
+        if self.device_loops is None:
+            with torch.no_grad():
+                device = self.params.device
+                found = self.reference(self.params, points.to(device), dirs.to(device))
+                return tuple(answer.cpu() for answer in found)
+        asked = Points(exact(points), exact(dirs), bool(with_colour))
+        found = Answers(np.empty(len(points), self.real), np.empty((len(points), 3), self.real))
+        self.loops.each("query_point", self.arrays, self.grid, asked, len(points), found)
+        return torch.from_numpy(found.sigma), torch.from_numpy(found.rgb)
+
+    def render_rays(
+        self,
+        rays_o: np.ndarray,
+        rays_d: np.ndarray,
+        near: float,
+        step: float,
+        early_stop: float,
+        out: np.ndarray,
+    ) -> None:
+        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same
+        columns in out (N, 5)."""
+        rays = Rays(exact(rays_o), exact(rays_d), float(near), float(step), float(early_stop))
+        self.loops.each("render_ray", self.arrays, self.grid, rays, len(rays_o), out, RAYS_PER_TASK)
+
+    def peaks(
+        self, lo: np.ndarray, cell: np.ndarray, cells: np.ndarray, offsets: np.ndarray, frame: int = 0
+    ) -> np.ndarray:
+        """(N,) largest σ of one of the field's frames, as if unstretched, over offsets (K, 3) in each of
+        `cells` (N, 3) int64 of a grid with corner lo (3,) and cells of size cell (3,)."""
+        asked = Cells(exact(lo), exact(cell), np.ascontiguousarray(cells, np.int64), exact(offsets), frame)
+        out = np.zeros(len(cells), self.real)
+        self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(cells), out)
+        return out
+
+    # -- learning ----------------------------------------------------------------------------------------
+
+    def query_backward(
+        self,
+        points: torch.Tensor,
+        dirs: torch.Tensor,
+        d_sigma: torch.Tensor,
+        d_rgb: torch.Tensor,
+        grads: np.ndarray,
+    ) -> None:
+        """Adjoint of `query`: add to the rows of grads (parts, P) what the derivatives d_sigma (N,) and d_rgb
+        (N, 3) of a loss send back to `params`."""
+        sent = Sent(exact(points), exact(dirs), as_array(d_sigma, self.real), as_array(d_rgb, self.real))
+        unused = np.zeros((len(grads), 3))
+        most = 1, grads, unused
+        self.loops.sweep("query_point_backward", self.arrays, self.grid, sent, len(points), *most)
+        self.collect(grads)
+
+    def train_rays(self, batch: Batch, grads: np.ndarray, loss: np.ndarray) -> None:
+        """One pass over rays: render, compare, and add the gradient of the loss to the rows of grads (parts,
+        P).
+
+        The loss of a batch is the mean over its rays of mean_c (C_c + (1 - A) background_c - target_c)² +
+        opacity_weight (A - target_3)², with A the opacity. loss (parts, 3) gains the sums over rays of the
+        colour term, of the opacity term and of the samples taken.
+        """
+        count = len(batch.rays_o)
+        most = self.space.most_samples(self.aabb, batch.step)
+        batch = Batch(
+            exact(batch.rays_o), exact(batch.rays_d), exact(batch.jitter), as_array(batch.target, self.real),
+            as_array(batch.background, self.real), *map(float, batch[5:]),
+        )  # fmt: skip
+        self.loops.sweep("train_ray", self.arrays, self.grid, batch, count, most, grads, loss)
+        self.collect(grads)
+
+
+def exact(values: np.ndarray | torch.Tensor) -> np.ndarray:
+    """Numbers as the loops take places and directions: float64, one row after the other."""
+    return as_array(values, np.float64)
+
+
+def as_array(values: np.ndarray | torch.Tensor, kind: np.dtype) -> np.ndarray:
+    """A tensor or an array as an array of a type, one row after the other; not copied where it is one."""
+    values = values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else values
+    return np.ascontiguousarray(values, kind)
+
+
+def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> np.ndarray:
+    """Inverse of np.packbits for the named array, a grid of a known shape. Raises ValueError naming it."""
+    count = int(np.prod(shape))
+    packed = arrays.get(name)
+    if packed is None or packed.shape != (-(-count // 8),):
+        have = "nothing" if packed is None else list(packed.shape)
+        raise ValueError(
+            f"array '{name}' should have shape {[-(-count // 8)]} for a grid of {shape}, found {have}"
+        )
+    return np.unpackbits(packed, count=count).reshape(shape).astype(bool)

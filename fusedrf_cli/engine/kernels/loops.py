@@ -1,0 +1,420 @@
+"""The loops of every kind of field, written once: march, ask, render, train.
+
+These functions are templates: `specialise` gives them, the scalar functions of a kind (its bodies.py) and
+those of a space one namespace, compiled for the sizes of a field. So names that are not defined here, such as
+`density`, `piece` or SCRATCH, are the kind's, the space's and the field's.
+
+What a kind has in its bodies.py, with p the point in the space's coordinates, d the unit direction of the ray
+in the field's frame, `field` its Arrays, and `scratch` SCRATCH numbers of the field's type, 0 at first:
+    sizes(field)                       for Python: constants of the namespace by name; SCRATCH and KEPT, the
+                                       numbers kept per shaded sample for the way back, are among them
+    density(field, grid, k, p, d, scratch)
+                                       (σ, pre, steps, place): σ per length of the frame; `pre` what
+                                       `backward` needs of it; for how many steps of the ray the sample k
+                                       stands, 0 where there is nothing to sample; `place`, an int or a
+                                       tuple, what the other functions need to know of where p lies
+    colour(field, place, p, d, scratch, memory, at)
+                                       (r, g, b) in [0, 1] as floats; leaves KEPT numbers in memory[at:]
+    backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad)
+                                       adds to grad what d_sigma, and where shaded d_rgb (3), send back; rgb
+                                       and memory[at:] are as `colour` left them
+And what it may have, with the defaults below:
+    begin, end                         once per ray and frame before the first `colour`, and after the last
+                                       `backward`: fold the direction into a basis; scatter its gradient, and
+                                       leave 0 what has gathered it
+    frame_of, keep, again, advance, known, unstretched, ahead_density, ahead_colour
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from fusedrf_cli.engine.kernels.parts import accumulate, along, compared, next_sample, occupied  # noqa: F401
+
+COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
+POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
+SAMPLES_AHEAD = 2
+POINTS_PER_TASK = 2048
+RAYS_PER_TASK = 256
+
+
+class Points(NamedTuple):
+    """What `query_point` answers."""
+
+    points: object  # (N, 3) float64
+    dirs: object  # (N, 3) float64, unit length
+    with_colour: object  # bool
+
+
+class Answers(NamedTuple):
+    """What `query_point` fills."""
+
+    sigma: object  # (N,)
+    rgb: object  # (N, 3)
+
+
+class Sent(NamedTuple):
+    """What `query_point_backward` takes back to the field's numbers."""
+
+    points: object  # (N, 3) float64
+    dirs: object  # (N, 3) float64, unit length
+    d_sigma: object  # (N,)
+    d_rgb: object  # (N, 3)
+
+
+class Rays(NamedTuple):
+    """What `render_ray` follows."""
+
+    rays_o: object  # (N, 3) float64
+    rays_d: object  # (N, 3) float64, unit length
+    near: object  # float
+    step: object  # float
+    early_stop: object  # float, the transmittance at which a ray ends
+
+
+class Cells(NamedTuple):
+    """What `peak_of_cell` looks into."""
+
+    lo: object  # (3,) lower corner of cell (0, 0, 0)
+    cell: object  # (3,) size of a cell
+    cells: object  # (N, 3) int64
+    offsets: object  # (K, 3) in [0, 1], where in a cell
+    frame: object  # int, one of the field's frames
+
+
+class Kept(NamedTuple):
+    """What the way back of one ray needs of its samples. `memory` holds the KEPT numbers of as many shaded
+    samples as fit; its last slot serves all beyond, whose colours are then evaluated twice."""
+
+    k: object  # int, the sample's number in its piece
+    piece: object  # int
+    held: object  # int, what `again` makes the place of
+    steps: object  # int
+    slot: object  # int, where in memory, or -1: not shaded
+    pre: object
+    weight: object
+    carried: object  # weight that its colour stands for
+    rgb: object  # (K, 3)
+    memory: object
+
+
+# -- what a kind may leave out -------------------------------------------------------------------------------
+
+
+def begin(field, frame, d, scratch):
+    """Prepare `scratch` for colours seen along d in a frame."""
+
+
+def end(field, frame, d, scratch, grad):
+    """Send back what `backward` has gathered in `scratch` since `begin`, and clear it."""
+
+
+def frame_of(place):
+    """The frame that a place belongs to, from 0 on: `begin` is called where it changes."""
+    return 0
+
+
+def keep(place):
+    """An int from which `again` makes the place again."""
+    return 0
+
+
+def again(field, held, p):
+    """The place of a point p, from what `keep` made of it; whatever rounding does to p, this and `backward`
+    must read no number out of bounds."""
+    return held
+
+
+def advance(field, place, steps, k, p, way, u, u0, step):
+    """The number of the sample after k, which lies at u = u0 + k step on a line along `way`."""
+    return k + max(steps, 1)
+
+
+def known(field, grid, p):
+    """Whether a query of p is answered at all."""
+    return occupied(grid, p)
+
+
+def unstretched(field, grid, frame, p, scratch):
+    """σ at p of a frame, in units of that frame."""
+    return density(field, grid, 0, p, (0.0, 0.0, 1.0), scratch)[0]
+
+
+def ahead_density(field, array, held, p):
+    """Ask for what `density` will read at p in an array laid out as the field's numbers, in the place that
+    `held` (0 where it is not known) belongs to."""
+
+
+def ahead_colour(field, array, held, p):
+    """As `ahead_density`, what `colour` will read."""
+
+
+# -- one item of work ----------------------------------------------------------------------------------------
+
+
+def triple(values, i):
+    """Row i of an array (N, 3) as three floats."""
+    return float(values[i, 0]), float(values[i, 1]), float(values[i, 2])
+
+
+def query_point(field, grid, asked, i, scratch, memory, out):
+    """σ (1/length) and rgb at point i; both 0 where the field is not known."""
+    p, d = point(triple(asked.points, i)), triple(asked.dirs, i)
+    n = i + POINTS_AHEAD
+    if n < asked.points.shape[0]:
+        q = point(triple(asked.points, n))
+        ahead_density(field, field.params, 0, q)
+        if asked.with_colour:
+            ahead_colour(field, field.params, 0, q)
+    out.sigma[i] = 0
+    out.rgb[i, 0], out.rgb[i, 1], out.rgb[i, 2] = 0, 0, 0
+    if known(field, grid, p):
+        sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
+        if steps > 0:
+            out.sigma[i] = sigma
+            if asked.with_colour and sigma > 0:
+                begin(field, frame_of(place), d, scratch)
+                rgb = colour(field, place, p, d, scratch, memory, 0)
+                out.rgb[i, 0], out.rgb[i, 1], out.rgb[i, 2] = rgb
+
+
+def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
+    """Adjoint of `query_point`: adds to grad (P,) what d_sigma[i] and d_rgb[i] send back."""
+    p, d, d_rgb = point(triple(sent.points, i)), triple(sent.dirs, i), triple(sent.d_rgb, i)
+    n = i + POINTS_AHEAD
+    if n < sent.points.shape[0]:
+        q = point(triple(sent.points, n))
+        ahead_density(field, field.params, 0, q)
+        ahead_density(field, grad, 0, q)
+        if sent.d_rgb[n, 0] != 0 or sent.d_rgb[n, 1] != 0 or sent.d_rgb[n, 2] != 0:
+            ahead_colour(field, field.params, 0, q)
+            ahead_colour(field, grad, 0, q)
+    if known(field, grid, p):
+        sigma, pre, steps, place = density(field, grid, 0, p, d, scratch)
+        if steps > 0 and sigma > 0:
+            frame = frame_of(place)
+            shaded = d_rgb[0] != 0 or d_rgb[1] != 0 or d_rgb[2] != 0
+            rgb = 0.0, 0.0, 0.0
+            if shaded:
+                begin(field, frame, d, scratch)
+                rgb = colour(field, place, p, d, scratch, kept.memory, 0)
+            d_sigma = float(sent.d_sigma[i])
+            backward(
+                field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, kept.memory, 0, grad
+            )
+            if shaded:
+                end(field, frame, d, scratch, grad)
+
+
+def render_ray(field, grid, rays, i, scratch, memory, out):
+    """Marches, shades and composites ray i in one pass: out[i] is premultiplied rgb, opacity, Σ w t.
+
+    Samples sit at the middle of each step. `waiting` is the weight of samples too light to be shaded; the
+    next shaded one lends them its colour.
+    """
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
+    red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
+    trans, waiting = 1.0, 0.0
+    current = -1
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near)
+        u0 = u0 + 0.5 * step
+        k = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and trans > rays.early_stop:
+            u = u0 + k * step
+            p = along(origin, way, u)
+            sigma, _, steps, place = density(field, grid, k, p, d, scratch)
+            if steps > 0:
+                weight = trans * (1.0 - math.exp(-sigma * span(course, u, steps * step)))
+                trans -= weight
+                depth += weight * distance(course, u)
+                waiting += weight
+                if waiting > COLOUR_FROM:
+                    if frame_of(place) != current:
+                        current = frame_of(place)
+                        begin(field, current, d, scratch)
+                    r, g, b = colour(field, place, p, d, scratch, memory, 0)
+                    red += waiting * r
+                    green += waiting * g
+                    blue += waiting * b
+                    waiting = 0.0
+            k = advance(field, place, steps, k, p, way, u, u0, step)
+            k = next_sample(grid, origin, way, u0, u1, step, k)
+    out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
+
+
+def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
+    """Ray i of a batch: forward as in `render_ray`, compare, and back along the ray into grad (P,)."""
+    o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
+    red, green, blue = 0.0, 0.0, 0.0
+    trans, waiting = 1.0, 0.0
+    count, shaded, current = 0, 0, -1
+    last = kept.memory.shape[0] - KEPT
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, batch.near)
+        u0 = u0 + batch.jitter[i] * step
+        k = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and trans > batch.early_stop and count < kept.k.shape[0]:
+            u = u0 + k * step
+            p = along(origin, way, u)
+            sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
+            if steps > 0:
+                held = keep(place)
+                ahead_density(field, field.params, held, along(origin, way, u + SAMPLES_AHEAD * steps * step))
+                ahead_density(field, grad, held, p)
+                weight = trans * (1.0 - math.exp(-sigma * span(course, u, steps * step)))
+                trans -= weight
+                kept.k[count], kept.piece[count], kept.held[count], kept.steps[count] = k, number, held, steps
+                kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
+                waiting += weight
+                if waiting > COLOUR_FROM:
+                    if frame_of(place) != current:
+                        current = frame_of(place)
+                        begin(field, current, d, scratch)
+                    at = min(shaded * KEPT, last)
+                    ahead_colour(field, grad, held, p)
+                    r, g, b = colour(field, place, p, d, scratch, kept.memory, at)
+                    red += waiting * r
+                    green += waiting * g
+                    blue += waiting * b
+                    kept.rgb[count, 0], kept.rgb[count, 1], kept.rgb[count, 2] = r, g, b
+                    kept.slot[count], kept.carried[count] = at, waiting
+                    waiting = 0.0
+                    shaded += 1
+                count += 1
+            k = advance(field, place, steps, k, p, way, u, u0, step)
+            k = next_sample(grid, origin, way, u0, u1, step, k)
+    d_colour, d_trans = compared(batch, i, (red, green, blue), trans, count, loss)
+    if count > 0:
+        taken = count, shaded, current
+        train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad)
+
+
+def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad):
+    """The way back of `train_ray` over the samples taken: (how many, how many of them shaded, the frame begun
+    last).
+
+    d_colour is the gradient of the loss in the ray's colour, d_trans that in the transmittance behind it;
+    `behind` gathers the share of all that lies behind a sample.
+    """
+    count, shaded, current = taken
+    o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
+    last = kept.memory.shape[0] - KEPT
+    overwritten = shaded * KEPT > kept.memory.shape[0]
+    behind = trans * d_trans
+    after = trans
+    own = 0.0
+    number = kept.piece[count - 1]
+    origin, way, u0, _, course = piece(number, grid, o, d, batch.near)
+    for q in range(count - 1, -1, -1):
+        if PIECES > 1 and kept.piece[q] != number:
+            number = kept.piece[q]
+            origin, way, u0, _, course = piece(number, grid, o, d, batch.near)
+        u = u0 + batch.jitter[i] * step + kept.k[q] * step
+        p = along(origin, way, u)
+        place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
+        rgb, d_rgb = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        if at >= 0:
+            rgb = kept.rgb[q, 0], kept.rgb[q, 1], kept.rgb[q, 2]
+            own = d_colour[0] * rgb[0] + d_colour[1] * rgb[1] + d_colour[2] * rgb[2]
+            if frame_of(place) != current:
+                end(field, current, d, scratch, grad)
+                current = frame_of(place)
+                begin(field, current, d, scratch)
+            if overwritten and at == last:
+                colour(field, place, p, d, scratch, kept.memory, last)
+            carried = kept.carried[q]
+            d_rgb = d_colour[0] * carried, d_colour[1] * carried, d_colour[2] * carried
+        d_sigma = span(course, u, kept.steps[q] * step) * (after * own - behind)
+        behind += weight * own
+        after += weight
+        if weight > 0.0:
+            backward(
+                field, place, p, d, kept.pre[q], d_sigma, at >= 0, rgb, d_rgb, scratch, kept.memory, at, grad
+            )
+    if shaded > 0:
+        end(field, current, d, scratch, grad)
+
+
+def peak_of_cell(field, grid, cells, i, scratch, memory, out):
+    """Largest σ of a frame, in its units, over `offsets` in cell i."""
+    best = 0.0
+    for q in range(cells.offsets.shape[0]):
+        x = cells.lo[0] + (cells.cells[i, 0] + cells.offsets[q, 0]) * cells.cell[0]
+        y = cells.lo[1] + (cells.cells[i, 1] + cells.offsets[q, 1]) * cells.cell[1]
+        z = cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2]
+        best = max(best, unstretched(field, grid, cells.frame, (x, y, z), scratch))
+    out[i] = best
+
+
+# -- the CPU's loops over items ------------------------------------------------------------------------------
+# `item` is one of the functions above, or one of a kind's own with the same arguments.
+
+
+def each_task(field, grid, asked, low, high, scratch, memory, out):
+    """`each` for items low..high: the serial work of one core."""
+    for i in range(low, high):
+        item(field, grid, asked, i, scratch, memory, out)
+
+
+def each(field, grid, asked, count, per_task, out):
+    """An item of work for each i < count, each filling what is its own in `out`."""
+    for part in prange((count + per_task - 1) // per_task):
+        real = field.params.dtype
+        scratch, memory = np.zeros(SCRATCH, real), np.empty(max(KEPT, 1), real)
+        low, high = part * per_task, min(count, (part + 1) * per_task)
+        each_task(field, grid, asked, low, high, scratch, memory, out)
+
+
+def sweep_task(field, grid, batch, low, high, kept, scratch, grad, loss):
+    """`sweep` for items low..high, into one row of gradients and losses."""
+    for i in range(low, high):
+        item(field, grid, batch, i, kept, scratch, grad, loss)
+
+
+def sweep(field, grid, batch, count, most, grads, loss):
+    """An item of work, of at most so many samples, for each i < count, each adding to a gradient: part p of
+    them to row p of grads (parts, P) and of loss (parts, 3)."""
+    parts = grads.shape[0]
+    for p in prange(parts):
+        real = field.params.dtype
+        whole, reals = np.empty((5, most), np.int64), np.empty((3, most))
+        kept = Kept(
+            whole[0], whole[1], whole[2], whole[3], whole[4], reals[0], reals[1], reals[2],
+            np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
+        )  # fmt: skip
+        low, high = p * count // parts, (p + 1) * count // parts
+        sweep_task(field, grid, batch, low, high, kept, np.zeros(SCRATCH, real), grads[p], loss[p])
+
+
+# -- marching, which needs no field --------------------------------------------------------------------------
+
+
+def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, counts):
+    """The next samples of ray i, from start[i] (piece and number of the sample) on: distances ts[i], as many
+    as counts[i]."""
+    o, d = triple(rays_o, i), triple(rays_d, i)
+    for number in range(start[i] % PIECES, PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, near)
+        u0 = u0 + jitter[i] * step
+        first = start[i] // PIECES if number == start[i] % PIECES else 0
+        k = next_sample(grid, origin, way, u0, u1, step, first)
+        while k >= 0 and counts[i] < ts.shape[1]:
+            ts[i, counts[i]] = distance(course, u0 + k * step)
+            counts[i] += 1
+            k = next_sample(grid, origin, way, u0, u1, step, k + 1)
+        if k >= 0:
+            start[i] = k * PIECES + number
+            return
+    start[i] = -1
+
+
+def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
+    """The next samples of every living ray: ts (N, K) distances, counts (N,); start (N,) int64, 0 at first,
+    is where to go on, -1 at the end."""
+    for i in prange(rays_o.shape[0]):
+        counts[i] = 0
+        if alive[i] and start[i] >= 0:
+            march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, counts)

@@ -1,0 +1,310 @@
+"""Scalar parts that kinds of field, spaces and loops are put together from, compiled once for all of them; a
+GPU compiles the same source.
+
+Points and directions are tuples (x, y, z) of float64. Offsets are unsigned: a signed index costs a
+wrap-around test per load, a factor of five in all. What several rays may add to at the same time goes through
+`accumulate`, `scatter_8` and `scatter`, which a GPU replaces by atomic ones.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+body = njit(fastmath=True, error_model="numpy", cache=True, forceinline=True, _nrt=False)
+
+LINE = 16  # floats in a cache line
+FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must not be jumped over by rounding
+
+
+class GridArrays(NamedTuple):
+    """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
+    one."""
+
+    skip: object  # (X, Y, Z) uint8
+    lo: object  # (3,) float, lower corner
+    hi: object  # (3,) float, upper corner
+    cell: object  # (3,) float, size of a cell
+
+
+@body
+def along(origin, way, u):
+    """The point at length u of a straight line."""
+    return origin[0] + u * way[0], origin[1] + u * way[1], origin[2] + u * way[2]
+
+
+@body
+def hit_box(origin, way, lo, hi):
+    """Interval [t0, t1] in which a ray is inside a box; t1 < t0 when it misses. A zero component is tested
+    apart (0 * inf)."""
+    ox, oy, oz = origin
+    dx, dy, dz = way
+    t0 = 0.0
+    t1 = 1e30
+    for axis in range(3):
+        o = ox if axis == 0 else (oy if axis == 1 else oz)
+        d = dx if axis == 0 else (dy if axis == 1 else dz)
+        if d == 0.0:
+            if o < lo[axis] or o >= hi[axis]:
+                return 1.0, 0.0
+        else:
+            a = (lo[axis] - o) / d
+            b = (hi[axis] - o) / d
+            t0 = max(t0, min(a, b))
+            t1 = min(t1, max(a, b))
+    return t0, t1
+
+
+@body
+def cell_of(p, lo, cell, n):
+    """Index of the cell that holds coordinate p, clamped to the grid."""
+    return min(max(int((p - lo) / cell), 0), n - 1)
+
+
+@body
+def exit_distance(p, d, lo, cell, i, s):
+    """Distance along the ray to the face of the empty cube of half width s around cell i, on one axis."""
+    if d > 0.0:
+        return (lo + (i + s) * cell - p) / d
+    if d < 0.0:
+        return (lo + (i - s + 1) * cell - p) / d
+    return 1e30
+
+
+@body
+def next_sample(grid, origin, way, u0, u1, step, k):
+    """First k' >= k whose sample u0 + k' step of a straight line lies in an occupied cell, or -1 when there
+    is none before u1.
+
+    Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
+    the same.
+    """
+    dx, dy, dz = way
+    skip, lo, cell = grid.skip, grid.lo, grid.cell
+    nx, ny, nz = skip.shape
+    while True:
+        u = u0 + k * step
+        if u >= u1:
+            return -1
+        x, y, z = along(origin, way, u)
+        i = cell_of(x, lo[0], cell[0], nx)
+        j = cell_of(y, lo[1], cell[1], ny)
+        m = cell_of(z, lo[2], cell[2], nz)
+        s = int(skip[np.uint64(i), np.uint64(j), np.uint64(m)])
+        if s == 0:
+            return k
+        away = min(
+            exit_distance(x, dx, lo[0], cell[0], i, s),
+            min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
+        )
+        k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
+
+
+@body
+def occupied(grid, p):
+    """Whether a point lies in the grid's box, in a cell that is not empty."""
+    nx, ny, nz = grid.skip.shape
+    i = int(math.floor((p[0] - grid.lo[0]) / grid.cell[0]))
+    j = int(math.floor((p[1] - grid.lo[1]) / grid.cell[1]))
+    m = int(math.floor((p[2] - grid.lo[2]) / grid.cell[2]))
+    return 0 <= i < nx and 0 <= j < ny and 0 <= m < nz and grid.skip[i, j, m] == 0
+
+
+@body
+def sh_basis(count, d, out, base):
+    """The first `count` (1, 4, 9 or 16) real spherical harmonics of a unit direction into out[base:], orders l then m = -l..l, orthonormal on
+    the sphere.
+
+    Signs follow the habit of Plenoxels and 3D Gaussian splatting (Condon-Shortley phase kept).
+    """
+    x, y, z = d
+    out[base] = 0.28209479177387814
+    if count > 1:
+        out[base + 1] = -0.4886025119029199 * y
+        out[base + 2] = 0.4886025119029199 * z
+        out[base + 3] = -0.4886025119029199 * x
+    if count > 4:
+        out[base + 4] = 1.0925484305920792 * x * y
+        out[base + 5] = -1.0925484305920792 * y * z
+        out[base + 6] = 0.31539156525252005 * (2.0 * z * z - x * x - y * y)
+        out[base + 7] = -1.0925484305920792 * x * z
+        out[base + 8] = 0.5462742152960396 * (x * x - y * y)
+    if count > 9:
+        out[base + 9] = -0.5900435899266435 * y * (3.0 * x * x - y * y)
+        out[base + 10] = 2.890611442640554 * x * y * z
+        out[base + 11] = -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y)
+        out[base + 12] = 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
+        out[base + 13] = -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y)
+        out[base + 14] = 1.445305721320277 * z * (x * x - y * y)
+        out[base + 15] = -0.5900435899266435 * x * (x * x - 3.0 * y * y)
+
+
+@body
+def texel(params, u, n):
+    """Lower texel and fraction of unit coordinate u on an axis of n >= 2 texels, corners aligned."""
+    real = params.dtype.type
+    f = u * real(n - 1)
+    i = min(int(f), n - 2)
+    return i, f - real(i)
+
+
+@body
+def accumulate(out, i, value):
+    """out[i] += value, where others may be adding too."""
+    out[i] += value
+
+
+@body
+def compared(batch, i, colour, trans, count, loss):
+    """Gradients of the loss of a batch of rays (ComputedField.train_rays) in ray i's colour and in the
+    transmittance behind it; its colour error, opacity error and samples are added to `loss`.
+    """
+    target, background = batch.target, batch.background
+    red, green, blue = colour
+    e_r = red + trans * background[i, 0] - target[i, 0]
+    e_g = green + trans * background[i, 1] - target[i, 1]
+    e_b = blue + trans * background[i, 2] - target[i, 2]
+    e_a = (1.0 - trans) - target[i, 3]
+    accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
+    accumulate(loss, 1, e_a * e_a)
+    accumulate(loss, 2, count)
+    n = target.shape[0]
+    scale = 2.0 / (3.0 * n)
+    g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
+    behind = g_r * background[i, 0] + g_g * background[i, 1] + g_b * background[i, 2]
+    return (g_r, g_g, g_b), behind - 2.0 / n * batch.opacity_weight * e_a
+
+
+@body
+def add_scaled_8(out, o, weight, values, v):
+    """out[o : o + 8] += weight * values[v : v + 8].
+
+    All loads stand before all stores: only then may the compiler, which must fear that the arrays overlap,
+    use vectors.
+    """
+    e0 = out[o] + weight * values[v]
+    e1 = out[o + np.uint64(1)] + weight * values[v + np.uint64(1)]
+    e2 = out[o + np.uint64(2)] + weight * values[v + np.uint64(2)]
+    e3 = out[o + np.uint64(3)] + weight * values[v + np.uint64(3)]
+    e4 = out[o + np.uint64(4)] + weight * values[v + np.uint64(4)]
+    e5 = out[o + np.uint64(5)] + weight * values[v + np.uint64(5)]
+    e6 = out[o + np.uint64(6)] + weight * values[v + np.uint64(6)]
+    e7 = out[o + np.uint64(7)] + weight * values[v + np.uint64(7)]
+    store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7)
+
+
+@body
+def store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7):
+    """out[o : o + 8] = e0 .. e7."""
+    out[o] = e0
+    out[o + np.uint64(1)] = e1
+    out[o + np.uint64(2)] = e2
+    out[o + np.uint64(3)] = e3
+    out[o + np.uint64(4)] = e4
+    out[o + np.uint64(5)] = e5
+    out[o + np.uint64(6)] = e6
+    out[o + np.uint64(7)] = e7
+
+
+@body
+def add_scaled(count, out, o, weight, values, v):
+    """out[o : o + count] += weight * values[v : v + count]; the count is a multiple of 8."""
+    for tile in range(np.uint64(count // 8)):
+        at = tile * np.uint64(8)
+        add_scaled_8(out, o + at, weight, values, v + at)
+
+
+@body
+def scatter_8(out, o, weight, values, v):
+    """`add_scaled_8` to a place where others may be adding too; on the CPU each core has a row of its own."""
+    add_scaled_8(out, o, weight, values, v)
+
+
+@body
+def scatter(count, out, o, weight, values, v):
+    """`add_scaled` to a place where others may be adding too."""
+    for tile in range(np.uint64(count // 8)):
+        at = tile * np.uint64(8)
+        scatter_8(out, o + at, weight, values, v + at)
+
+
+@body
+def bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r):
+    """One component of a plane at four corners' offsets and weights."""
+    return w00 * params[o00 + r] + w01 * params[o01 + r] + w10 * params[o10 + r] + w11 * params[o11 + r]
+
+
+@body
+def linear(params, l0, l1, t, r):
+    """One component of a line between two texels."""
+    return params[l0 + r] + t * (params[l1 + r] - params[l0 + r])
+
+
+@body
+def softplus(f):
+    """log(1 + e^f) without overflow."""
+    if f > 15.0:
+        return f
+    return math.log1p(math.exp(f))
+
+
+@body
+def sigmoid(f):
+    """1 / (1 + e^-f)."""
+    return 1 / (1 + math.exp(-f))
+
+
+@body
+def adam_line(params, grads, moment1, moment2, rate, start, beta1, beta2, eps, correction1, correction2):
+    """`adam` of plain.py for the cache line that starts at entry `start`; one that no part touched costs one
+    read."""
+    real = params.dtype.type
+    one, zero = real(1), real(0)
+    touched = zero
+    for p in range(grads.shape[0]):
+        for i in range(np.uint64(LINE)):
+            touched += abs(grads[p, start + i])
+    if touched == zero:
+        return
+    for p in range(1, grads.shape[0]):
+        for i in range(np.uint64(LINE)):
+            grads[0, start + i] += grads[p, start + i]
+            grads[p, start + i] = zero
+    for i in range(np.uint64(LINE)):
+        g = grads[0, start + i]
+        m, v = moment1[start + i], moment2[start + i]
+        m_new = beta1 * m + (one - beta1) * g
+        v_new = beta2 * v + (one - beta2) * g * g
+        moment1[start + i] = m_new if g != zero else m
+        moment2[start + i] = v_new if g != zero else v
+        change = rate * (m_new * correction1) / (math.sqrt(v_new * correction2) + eps)
+        params[start + i] -= change if g != zero else zero
+        grads[0, start + i] = zero
+
+
+@body
+def pinhole_ray(pose, fl_x, fl_y, cx, cy, width, top, order, i, rays_o, rays_d):
+    """The ray of pixel order[i]; see `pinhole_rays` in plain.py."""
+    row, column = order[i] // width, order[i] % width
+    x, y = (column + 0.5 - cx) / fl_x, -(top + row + 0.5 - cy) / fl_y
+    dx = pose[0, 0] * x + pose[0, 1] * y - pose[0, 2]
+    dy = pose[1, 0] * x + pose[1, 1] * y - pose[1, 2]
+    dz = pose[2, 0] * x + pose[2, 1] * y - pose[2, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    rays_d[i, 0], rays_d[i, 1], rays_d[i, 2] = dx / length, dy / length, dz / length
+    rays_o[i, 0], rays_o[i, 1], rays_o[i, 2] = pose[0, 3], pose[1, 3], pose[2, 3]
+
+
+@body
+def sum_of_rows(values, base, width, start, source, weight, target, i, keep):
+    """Row target[i] of `values` (rows of a width, from `base` on) becomes, or with `keep` gains, the weighted
+    sum of the rows source[start[i]:start[i + 1]].
+    """
+    real = values.dtype.type
+    to = base + width * target[i]
+    for c in range(width):
+        total = values[to + c] if keep else real(0)
+        for e in range(start[i], start[i + 1]):
+            total += real(weight[e]) * values[base + width * source[e] + c]
+        values[to + c] = total

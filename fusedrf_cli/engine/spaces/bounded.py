@@ -1,0 +1,39 @@
+"""The space of a field in a finite box: coordinates are those of the field's frame.
+
+What every space has, as scalar functions that the loops of kernels/loops.py are compiled with. A ray is cut
+into PIECES; in each, positions are a straight line in the space's coordinates, and u is length along it.
+"""
+
+import numpy as np
+
+from fusedrf_cli.engine.kernels.parts import hit_box
+
+PIECES = 1  # of a ray, at most
+
+
+def point(p):
+    """Where a point of the field's frame lies in the space's coordinates."""
+    return p
+
+
+def piece(number, grid, o, d, near):
+    """(origin, direction, u0, u1, course) of a piece of the ray o + t d for t >= near: positions are
+    origin + u direction for u in [u0, u1), empty where u1 <= u0. `course` is what `distance` and `span`
+    need."""
+    t0, t1 = hit_box(o, d, grid.lo, grid.hi)
+    return o, d, max(t0, near), t1, 0.0
+
+
+def distance(course, u):
+    """The distance t along the ray, in the field's frame."""
+    return u
+
+
+def span(course, u, length):
+    """How much of t a length of u from `u` on stands for: densities are per t."""
+    return length
+
+
+def most_samples(aabb: np.ndarray, step: float) -> int:
+    """How many samples a ray through a field of a box (6,) can have."""
+    return int(float(np.linalg.norm(aabb[3:] - aabb[:3])) / step) + 2
