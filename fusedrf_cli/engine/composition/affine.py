@@ -82,3 +82,13 @@ class Placed:
         matrix = self.object_to_world.copy()
         matrix[:3, 3] -= offset
         return Placed(self.name, self.field, matrix)
+
+
+def rigid_motion(twist: torch.Tensor) -> torch.Tensor:
+    """(4, 4) motion of a twist (6,), differentiable: the turn about the axis twist[:3] by its length in
+    radians, and, where there is no turn, the shift twist[3:]; the matrix exponential of se(3)."""
+    x, y, z, *shift = twist.unbind()
+    zero = torch.zeros_like(x)
+    rows = [[zero, -z, y, shift[0]], [z, zero, -x, shift[1]], [-y, x, zero, shift[2]], [zero] * 4]
+    motion = torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows]))
+    return torch.cat([motion[:3], motion.new_tensor([[0, 0, 0, 1]])])  # not off by a rounding

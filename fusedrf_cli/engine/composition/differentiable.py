@@ -8,6 +8,7 @@ constant.
 from collections.abc import Mapping
 from functools import reduce
 
+import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition import composed
@@ -94,11 +95,14 @@ def placed_query(
 
 def structure(field: RadianceField, poses: Poses | None) -> RadianceField:
     """A composed field with its parts where `poses` place them now, without gradients: what marching
-    needs. Any other field as it is."""
+    needs. Any other field as it is, and that itself where nothing is elsewhere."""
     if not poses:
         return field
     host = torch.device("cpu")
-    return field.posed({name: exact(pose.detach(), host).numpy() for name, pose in poses.items()})
+    now = {name: exact(pose.detach(), host).numpy() for name, pose in poses.items()}
+    known = {p.name: p.object_to_world for p in field.placed}
+    same = all(name in known and np.array_equal(pose, known[name]) for name, pose in now.items())
+    return field if same else field.posed(now)
 
 
 def bounds(field: RadianceField, poses: Poses | None) -> torch.Tensor:
@@ -119,14 +123,20 @@ def bounds(field: RadianceField, poses: Poses | None) -> torch.Tensor:
     return box + same - same.detach()
 
 
-def numbers(field: RadianceField | Placed) -> list[torch.Tensor]:
-    """The `params` of a field, or of all the fields that it places, each once."""
+def parts(field: RadianceField | Placed) -> list[RadianceField]:
+    """The fields that a field places, each once; of one that places none, itself."""
     field = opened(field)
     if isinstance(field, Placed):
-        return numbers(field.field)
+        return parts(field.field)
     if not isinstance(field, ComposedField):
-        return [field.params] if hasattr(field, "params") else []
-    return list({id(p): p for placed in field.placed for p in numbers(placed)}.values())
+        return [field]
+    return list({id(part): part for placed in field.placed for part in parts(placed)}.values())
+
+
+def numbers(field: RadianceField | Placed) -> list[torch.Tensor]:
+    """The `params` of all the fields that a field places, or its own, each once."""
+    found = (part.params for part in parts(field) if hasattr(part, "params"))
+    return list({id(params): params for params in found}.values())
 
 
 def device_of(field: RadianceField | Placed) -> torch.device:

@@ -49,14 +49,20 @@ def query(
 def holding(field, params: torch.Tensor):
     """The field with numbers params (P,), of which those that follow from others do."""
     if params is field.params:
-        if params.requires_grad:  # an optimiser of torch may have moved them
-            field.settle()
+        settle(field)
         return field
     if not field.dependent():
         return field.with_params(params.detach())
     other = field.with_params(params.detach().clone())
     other.settle()
     return other
+
+
+def settle(field: RadianceField) -> None:
+    """Make those numbers follow that depend on others, where an optimiser of torch may have moved these."""
+    params = getattr(field, "params", None)
+    if params is not None and params.requires_grad and field.device_loops is not None:
+        field.settle()
 
 
 def by_kernels(

@@ -17,10 +17,12 @@ from fusedrf_cli.engine.composition.differentiable import (
     bounds,
     device_of,
     numbers,
+    parts,
     query,
     structure,
 )
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.differentiable import settle
 from fusedrf_cli.engine.kernels.reference import exact, interval
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -68,6 +70,8 @@ def render_rays(
     step = step or STEP_PER_VOXEL * known.voxel_size
     host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]
     if not needs_gradient(field, rays_o, rays_d, *(poses or {}).values()):
+        for part in parts(field):
+            settle(part)
         found = volume.render_rays(known, *host, near=near, step=step, early_stop=early_stop)
         return torch.from_numpy(found).to(device)
     volume.check_directions(host[1])
