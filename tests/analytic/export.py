@@ -15,7 +15,7 @@ from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, ColourNetwork, VMMLPField
+from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, VMMLPField, weight_shapes
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
 
 SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's tests too
@@ -86,17 +86,14 @@ def vm_mlp_field(
     write_colour_products(vm, texels(vm))
     features = 3 * shape.coefficients
     vm.sections(0)["colour_basis"].view(features, -1)[:4, :4] = torch.eye(4)
-    network = ColourNetwork(features, width=8)
+    weights = {name: torch.zeros(size) for name, size in weight_shapes(features, 8).items()}
     first = np.concatenate([np.asarray(tint.level)[:, None], tint.slope], 1)
-    with torch.no_grad():
-        for weights in network.parameters():
-            weights.zero_()
-        into = network.layers[0].weight
-        into[:3, :4], into[:3, features : features + 3] = map(torch.from_numpy, (first, tint.facing))
-        into[3:6] = -into[:3]
-        network.layers[1].weight[:6, :6] = torch.eye(6)
-        network.layers[2].weight[:, :6] = torch.cat([torch.eye(3), -torch.eye(3)], 1)
-    return VMMLPField(vm, network)
+    into = weights["0.weight"]
+    into[:3, :4], into[:3, features : features + 3] = map(torch.from_numpy, (first, tint.facing))
+    into[3:6] = -into[:3]
+    weights["1.weight"][:6, :6] = torch.eye(6)
+    weights["2.weight"][:, :6] = torch.cat([torch.eye(3), -torch.eye(3)], 1)
+    return VMMLPField(vm, weights)
 
 
 def sparse_field(field: AnalyticField, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3) -> SparseField:

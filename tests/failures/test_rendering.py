@@ -19,7 +19,7 @@ from click.testing import CliRunner
 from formats.images import read_image
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.fit import FitSettings, fit, occupancy_of
-from fusedrf_cli.engine.kinds.vm_mlp.field import ColourNetwork
+from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
@@ -55,9 +55,9 @@ def as_trained(field):
     """The field, its network one of the width that `train` makes: what is exact for it may not be for a
     narrower one, whose products round by their row.
     """
-    if hasattr(field, "network"):
-        inputs = field.network.layers[0].in_features // 5 - 3
-        field.network = ColourNetwork(inputs, generator=torch.Generator().manual_seed(1))
+    if isinstance(field, VMMLPField):
+        features, generator = 3 * field.shape.coefficients, torch.Generator().manual_seed(1)
+        return VMMLPField(field.factors, untrained(features, WIDTH, generator))
     return field
 
 
@@ -69,7 +69,7 @@ def kinds_and_scenes(kind: str, size: int = 48):
     scene = scenes.scene_of((FLOOR, affine(1.0, (0, 0, -0.6))), (cube.field, affine(turn(20), (0, 0, 0.2))))
     composed = scene.composed(kind)
     for placed in composed.placed:
-        as_trained(placed.field)
+        object.__setattr__(placed, "field", as_trained(placed.field))
     yield composed, framing_camera(composed.occupancy.tight_aabb(0), 0.7, 0.4, size, size)
 
 

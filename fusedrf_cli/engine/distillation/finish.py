@@ -9,9 +9,9 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.distillation.teacher import random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.rendering.volume import STEP_PER_VOXEL, render_rays
 
 RATE, RATE_DECAY = 3e-3, 0.1

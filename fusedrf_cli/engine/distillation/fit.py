@@ -11,7 +11,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.passes import PASSES, Batch
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds.vm.field import PROBES, VMField, VMShape
@@ -117,12 +117,11 @@ class FitRun:
     ):
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.optimiser = Adam.of(field)
-        self.rays_pass = PASSES[field.kind](field)
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
         self.found_matter, self.found_nothing = False, 0
-        self.guard = Guard(lambda: [*self.optimiser.numbers(), *self.rays_pass.numbers()])
+        self.guard = Guard(lambda: self.optimiser.numbers())
 
     @classmethod
     def start(
@@ -170,7 +169,6 @@ class FitRun:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
         arrays, metadata = self.field.state()
         arrays = {f"field.{name}": np.asarray(value) for name, value in arrays.items()}
-        arrays |= {f"pass.{name}": value for name, value in self.rays_pass.state().items()}
         arrays |= self.optimiser.state()
         arrays |= {
             "random": self.generator.get_state().numpy(),
@@ -197,8 +195,6 @@ class FitRun:
         """Take up a run that `checkpoint` saved, over the same pictures and settings."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
         self.field = self.field.to(self.settings.device)
-        self.rays_pass = PASSES[self.field.kind](self.field)
-        self.rays_pass.restore(part_of(arrays, "pass."))
         self.optimiser = Adam.of(self.field)
         self.optimiser.restore(arrays, state["adam_steps"])
         self.steps = state["steps"]
@@ -285,7 +281,9 @@ class FitRun:
             step,
             EARLY_STOP,
         )
-        sums = self.rays_pass.gradient(field, batch, self.optimiser.grads)
+        loss = np.zeros((self.optimiser.parts, 3))
+        field.train_rays(batch, self.optimiser.grads, loss)
+        sums = loss.sum(0)
         if self.guard.accepts(sums, self.optimiser):
             self.learn(sums, len(rays_o), RATE_DECAY**share * self.guard.rate)
         self.steps += 1
@@ -294,7 +292,6 @@ class FitRun:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
         of the next."""
         self.optimiser.step(RATE * decay)
-        self.rays_pass.step(decay)
         mse = sums[0] / rays
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
         per_ray = max(sums[2] / rays, 1.0)

@@ -1,162 +1,146 @@
-"""CUDA loops over the scalar bodies: one thread per item of work; the functions and their arguments are those
-of `cpu.py`.
+"""The loops on a GPU: the same functions, one thread per item of work.
 
-The bodies are compiled from the same source, with atomic sums where threads may add to the same place. Arrays
-may lie on the device or on the host: what is on the host is copied to the device and, where a function writes
-it, back. NUMBA_ENABLE_CUDASIM=1 runs all of this without a GPU.
+They are compiled from the same source, with atomic sums where threads may add to the same place. Arrays may
+lie on the device or on the host: what is on the host is copied to the device and, where a loop writes it,
+back. NUMBA_ENABLE_CUDASIM=1 runs all of this without a GPU.
 """
 
-from functools import lru_cache
-from types import FunctionType, SimpleNamespace
+from functools import cache, lru_cache
+from types import FunctionType, ModuleType, SimpleNamespace
 
 import numba
 import numpy as np
 from numba import cuda
 from numba.np.numpy_support import from_dtype
 
-from fusedrf_cli.engine.kernels import bodies, items
+from fusedrf_cli.engine.kernels import parts, specialise
+from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, Kept
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 THREADS = 1 if SIMULATED else 128  # the simulator's threads are Python's, one after the other
 RAYS_IN_FLIGHT = 1 << 14  # rays of a training pass that have scratch memory at the same time
+POINTS_IN_FLIGHT = 1 << 18
 
 device = cuda.jit(device=True, fastmath=True)
 
 
 @device
 def accumulate(out, i, value):
-    """`bodies.accumulate`, atomic."""
+    """`parts.accumulate`, atomic."""
     cuda.atomic.add(out, i, value)
 
 
 @device
 def scatter_8(out, o, weight, values, v):
-    """`bodies.scatter_8`, atomic."""
+    """`parts.scatter_8`, atomic."""
     for r in range(8):
         cuda.atomic.add(out, o + np.uint64(r), weight * values[v + np.uint64(r)])
 
 
 @device
-def prefetch_planes(ranks, vm, array, first, b, x, y, z):
+def ahead(field, array, held, p):
     """Nothing: while some threads wait for memory, others work."""
 
 
-@lru_cache(maxsize=1)
-def device_bodies() -> SimpleNamespace:
-    """Every body of bodies.py and items.py as a device function that calls device functions."""
-    names = {**vars(bodies), **vars(items)}
-    for name, value in list(names.items()):
-        if hasattr(value, "py_func"):
-            names[name] = device(FunctionType(value.py_func.__code__, names, name))
-    names |= {"accumulate": accumulate, "scatter_8": scatter_8, "prefetch_planes": prefetch_planes}
-    return SimpleNamespace(**names)
+REPLACED = {"accumulate": accumulate, "scatter_8": scatter_8, "ahead_density": ahead, "ahead_colour": ahead}
 
 
-@lru_cache
-def point_kernels(rank: int, colour_rank: int, kind: np.dtype) -> SimpleNamespace:
-    """Kernels over points and cells, for ranks and a float type: the sizes of a thread's own arrays."""
-    body, real = device_bodies(), from_dtype(kind)
-    width, wide, both = 3 * colour_rank, 9 * colour_rank, 2 * max(rank, colour_rank)
-    query_point, query_point_backward = body.query_point, body.query_point_backward
-    features_point, features_point_backward = body.features_point, body.features_point_backward
-    cell_density = body.cell_density
+def as_device_functions(names: dict) -> dict:
+    """The namespace with every function in it, compiled for the CPU or not at all, as one of the device."""
+    found = dict(names)
+    for name, value in names.items():
+        function = getattr(value, "py_func", None)
+        if function is not None:
+            found[name] = device(FunctionType(function.__code__, found, name, function.__defaults__))
+    found.update(REPLACED)
+    return found
+
+
+class Loops:
+    """The GPU's loops for the fields of a kind that share some sizes; see specialise.Loops."""
+
+    def __init__(self, bodies: ModuleType, sizes: dict[str, int], space: ModuleType):
+        _, names = specialise.specialised(bodies, sizes, space)
+        self.names = as_device_functions(names)
+        self.scratch, self.memory = max(sizes["SCRATCH"], 1), max(sizes["KEPT"], 1)
+        self.kernels = {}
+
+    def each(self, item: str, field, grid, asked, count: int, out, per_task: int = POINTS_PER_TASK):
+        """See specialise.Loops."""
+        kernel = self._kernel(each_kernel, item, field)
+        launch(kernel, count, (field, grid, asked, count), (out,))
+
+    def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
+        """See specialise.Loops; all is added to row 0 of grads and loss."""
+        kernel = self._kernel(sweep_kernel, item, field)
+        # as much for few rays as for many: their number changes from step to step, and memory is slow to be
+        # had
+        in_flight = RAYS_IN_FLIGHT if most > 1 else min(count, POINTS_IN_FLIGHT)
+        room = sweep_memory(most, in_flight, field.params.dtype) if count else ()
+        launch(kernel, min(count, in_flight), (field, grid, batch, count, *room), (grads, loss))
+
+    def _kernel(self, make, item: str, field):
+        """The kernel of an item, for the type of a field's numbers."""
+        key = make, item, field.params.dtype
+        if key not in self.kernels:
+            real = from_dtype(np.dtype(field.params.dtype))
+            self.kernels[key] = make(self.names[item], self.scratch, self.memory, real)
+        return self.kernels[key]
+
+
+def each_kernel(item, scratch_size: int, memory_size: int, real):
+    """`each` of loops.py, a thread for each item."""
 
     @cuda.jit(fastmath=True)
-    def query(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, sigma, rgb):
+    def each(field, grid, asked, count, out):
         i = cuda.grid(1)
-        if i < points.shape[0]:
-            features, basis = cuda.local.array(width, real), cuda.local.array(wide, real)
-            sh = cuda.local.array(16, real)
-            query_point(
-                ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, i, features, basis,
-                sh, sigma, rgb,
+        if i < count:
+            scratch, memory = cuda.local.array(scratch_size, real), cuda.local.array(memory_size, real)
+            item(field, grid, asked, i, scratch, memory, out)
+
+    return each
+
+
+def sweep_kernel(item, scratch_size: int, memory_size: int, real):
+    """`sweep` of loops.py: threads that share the items out, with memory for one shaded sample each."""
+
+    @cuda.jit(fastmath=True)
+    def sweep(field, grid, batch, count, wholes, reals, grads, loss):
+        thread, threads = cuda.grid(1), reals.shape[2]
+        scratch, memory = cuda.local.array(scratch_size, real), cuda.local.array(memory_size, real)
+        if thread < threads:
+            for r in range(scratch_size):
+                scratch[r] = 0
+            kept = Kept(
+                wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
+                wholes[4, :, thread], reals[0, :, thread], reals[1, :, thread], reals[2, :, thread],
+                reals[3:6, :, thread].T, memory,
             )  # fmt: skip
+            for i in range(thread, count, threads):
+                item(field, grid, batch, i, kept, scratch, grads[0], loss[0])
 
-    @cuda.jit(fastmath=True)
-    def query_backward(ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, grads):
-        i = cuda.grid(1)
-        if i < points.shape[0]:
-            features, basis = cuda.local.array(width, real), cuda.local.array(wide, real)
-            d_features, d_basis = cuda.local.array(width, real), cuda.local.array(wide, real)
-            sh, d_f = cuda.local.array(16, real), cuda.local.array(1, real)
-            scratch = cuda.local.array(both, real)
-            query_point_backward(
-                ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, i, features,
-                d_features, basis, d_basis, sh, d_f, scratch, grads[0],
-            )  # fmt: skip
-
-    @cuda.jit(fastmath=True)
-    def features(colour_ranks, vm, block, points, out):
-        i = cuda.grid(1)
-        if i < points.shape[0]:
-            features_point(colour_ranks, vm, block, points, i, out)
-
-    @cuda.jit(fastmath=True)
-    def features_backward(colour_ranks, vm, block, points, d_features, grads):
-        i = cuda.grid(1)
-        if i < points.shape[0]:
-            scratch = cuda.local.array(both, real)
-            features_point_backward(colour_ranks, vm, block, points, d_features, i, scratch, grads[0])
-
-    @cuda.jit(fastmath=True)
-    def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
-        i = cuda.grid(1)
-        if i < cells.shape[0]:
-            cell_density(ranks, vm, b, lo, cell, cells, i, offsets, out)
-
-    return SimpleNamespace(
-        query=query, query_backward=query_backward, features=features, features_backward=features_backward,
-        density_at_cells=density_at_cells,
-    )  # fmt: skip
+    return sweep
 
 
-@lru_cache
-def ray_kernels(rank: int, colour_rank: int, kind: np.dtype) -> SimpleNamespace:
-    """Kernels over rays, for ranks and a float type."""
-    body, real = device_bodies(), from_dtype(kind)
-    width, wide, both = 3 * colour_rank, 9 * colour_rank, 2 * max(rank, colour_rank)
-    render_ray, train_ray = body.render_ray, body.train_ray
+@lru_cache(maxsize=2)
+def sweep_memory(most: int, threads: int, kind: np.dtype) -> tuple:
+    """What the ways back of so many threads need: (5, most, threads) whole numbers and (6, ..) reals, a
+    thread's own next to its neighbours', as threads read them."""
+    shape = most, threads
+    return cuda.device_array((5, *shape), np.int32), cuda.device_array((6, *shape), kind)
 
-    @cuda.jit(fastmath=True)
-    def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, out):
-        i = cuda.grid(1)
-        if i < rays_o.shape[0]:
-            features, basis = cuda.local.array(width, real), cuda.local.array(wide, real)
-            sh = cuda.local.array(16, real)
-            render_ray(
-                ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, i,
-                features, basis, sh, out,
-            )  # fmt: skip
 
-    @cuda.jit(fastmath=True)
-    def train_rays(
-        ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-        background, opacity_weight, reals, wholes, grads, loss,
-    ):  # fmt: skip
-        thread = cuda.grid(1)
-        features, basis = cuda.local.array(width, real), cuda.local.array(wide, real)
-        d_features, d_basis = cuda.local.array(width, real), cuda.local.array(wide, real)
-        sh, d_f = cuda.local.array(16, real), cuda.local.array(1, real)
-        scratch = cuda.local.array(both, real)
-        if thread < reals.shape[2]:
-            for i in range(thread, rays_o.shape[0], reals.shape[2]):
-                train_ray(
-                    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step,
-                    early_stop, target, background, opacity_weight, i, reals[0, :, thread],
-                    reals[1, :, thread], reals[2, :, thread], reals[3, :, thread],
-                    reals[4:7, :, thread].T, wholes[0, :, thread], wholes[1, :, thread],
-                    wholes[2, :, thread], features, d_features, basis, d_basis, sh, d_f, scratch, grads[0],
-                    loss[0],
-                )  # fmt: skip
-
-    return SimpleNamespace(render=render, train_rays=train_rays)
+@cache
+def loops_for(bodies: ModuleType, sizes: tuple[tuple[str, int], ...], space: ModuleType) -> Loops:
+    """The loops of a kind for some sizes, made once."""
+    return Loops(bodies, dict(sizes), space)
 
 
 @lru_cache(maxsize=1)
 def plain_kernels() -> SimpleNamespace:
-    """Kernels that know nothing of ranks."""
-    body = device_bodies()
-    adam_line, march_ray, pinhole_ray, line = body.adam_line, body.march_ray, body.pinhole_ray, items.LINE
+    """Kernels that know no kind of field."""
+    names = as_device_functions(vars(parts))
+    adam_line, sum_of_rows, line = names["adam_line"], names["sum_of_rows"], parts.LINE
 
     @cuda.jit(fastmath=True)
     def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
@@ -168,26 +152,32 @@ def plain_kernels() -> SimpleNamespace:
             )  # fmt: skip
 
     @cuda.jit(fastmath=True)
-    def march(grid, rays_o, rays_d, near, jitter, step, alive, start, ts, counts):
+    def sums_of_rows(base, width, start, source, weight, target, keep, values):
         i = cuda.grid(1)
-        if i < rays_o.shape[0]:
-            march_ray(grid, rays_o, rays_d, near, jitter, step, alive, i, start, ts, counts)
+        if i < target.shape[0]:
+            sum_of_rows(values, base, width, start, source, weight, target, i, keep)
 
-    @cuda.jit(fastmath=True)
-    def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
-        i = cuda.grid(1)
-        if i < order.shape[0]:
-            pinhole_ray(pose, fl_x, fl_y, cx, cy, width, top, order, i, rays_o, rays_d)
-
-    return SimpleNamespace(adam=adam, march=march, pinhole_rays=pinhole_rays)
+    return SimpleNamespace(adam=adam, sums_of_rows=sums_of_rows)
 
 
-@lru_cache(maxsize=2)
-def training_scratch(max_samples: int, rays: int, kind: np.dtype) -> tuple:
-    """What the backward sweeps of so many rays need: (7, max_samples, rays) reals and (3, ..) whole numbers,
-    a ray's own next to its neighbours', as threads read them."""
-    shape = max_samples, rays
-    return cuda.device_array((7, *shape), kind), cuda.device_array((3, *shape), np.int32)
+def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
+    """See plain.adam."""
+    arrays = params, grads, moment1, moment2
+    placed = [on_device(array) for array in arrays]
+    rest = rate, low, high, beta1, beta2, eps, correction1, correction2
+    lines = -(-(high - low) // parts.LINE)
+    if lines > 0:
+        plain_kernels().adam[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
+    fetch(arrays, placed)
+
+
+def sums_of_rows(values, base, width, start, source, weight, target, keep):
+    """See plain.sums_of_rows."""
+    inputs = base, width, start, source, weight, target, keep
+    launch(plain_kernels().sums_of_rows, len(target), inputs, (values,))
+
+
+# -- numbers there and here ----------------------------------------------------------------------------------
 
 
 def shared(tensor):
@@ -202,96 +192,18 @@ def on_device(value):
     return type(value)(*map(on_device, value)) if hasattr(value, "_fields") else value
 
 
-def launch(kernel, items: int, inputs: tuple, outputs: tuple) -> None:
-    """Run a kernel, one thread per item; its last arguments are the arrays it writes."""
-    if items:
+def launch(kernel, threads: int, inputs: tuple, outputs: tuple) -> None:
+    """Run a kernel with so many threads; its last arguments are the arrays, or tuples of them, it writes."""
+    if threads:
         placed = [on_device(array) for array in outputs]
-        kernel[(items + THREADS - 1) // THREADS, THREADS](*map(on_device, inputs), *placed)
+        kernel[(threads + THREADS - 1) // THREADS, THREADS](*map(on_device, inputs), *placed)
         fetch(outputs, placed)
 
 
-def fetch(host: tuple, placed: list) -> None:
+def fetch(host: tuple, placed: tuple) -> None:
     """Copy what lies on the device back to those arrays that lie on the host."""
     for array, there in zip(host, placed, strict=True):
-        if there is not array:
+        if hasattr(array, "_fields"):
+            fetch(array, there)
+        elif there is not array:
             there.copy_to_host(array)
-
-
-# -- the functions of cpu.py -------------------------------------------------------------------------------
-
-
-def query(ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour, sigma, rgb):
-    """See cpu.query."""
-    kernel = point_kernels(len(ranks), len(colour_ranks), vm.params.dtype).query
-    inputs = ranks, colour_ranks, coefficients, vm, grid, points, dirs, with_colour
-    launch(kernel, len(points), inputs, (sigma, rgb))
-
-
-def query_backward(ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb, grads):
-    """See cpu.query_backward; all is added to row 0 of grads."""
-    kernel = point_kernels(len(ranks), len(colour_ranks), vm.params.dtype).query_backward
-    inputs = ranks, colour_ranks, coefficients, vm, grid, points, dirs, d_sigma, d_rgb
-    launch(kernel, len(points), inputs, (grads,))
-
-
-def features(colour_ranks, vm, block, points, out):
-    """See cpu.features."""
-    kernel = point_kernels(len(colour_ranks), len(colour_ranks), vm.params.dtype).features
-    launch(kernel, len(points), (colour_ranks, vm, block, points), (out,))
-
-
-def features_backward(colour_ranks, vm, block, points, d_features, grads):
-    """See cpu.features_backward; all is added to row 0 of grads."""
-    kernel = point_kernels(len(colour_ranks), len(colour_ranks), vm.params.dtype).features_backward
-    launch(kernel, len(points), (colour_ranks, vm, block, points, d_features), (grads,))
-
-
-def density_at_cells(ranks, vm, b, lo, cell, cells, offsets, out):
-    """See cpu.density_at_cells."""
-    kernel = point_kernels(len(ranks), len(ranks), vm.params.dtype).density_at_cells
-    launch(kernel, len(cells), (ranks, vm, b, lo, cell, cells, offsets), (out,))
-
-
-def render(ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop, out):
-    """See cpu.render."""
-    kernel = ray_kernels(len(ranks), len(colour_ranks), vm.params.dtype).render
-    inputs = ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, step, early_stop
-    launch(kernel, len(rays_o), inputs, (out,))
-
-
-def train_rays(
-    ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-    background, opacity_weight, max_samples, grads, loss,
-):  # fmt: skip
-    """See cpu.train_rays; all is added to row 0 of grads and loss."""
-    kernel = ray_kernels(len(ranks), len(colour_ranks), vm.params.dtype).train_rays
-    # as much for few rays as for many: their number changes from step to step, and memory is slow to be had
-    scratch = training_scratch(max_samples, RAYS_IN_FLIGHT, vm.params.dtype)
-    inputs = (
-        ranks, colour_ranks, coefficients, vm, grid, rays_o, rays_d, near, jitter, step, early_stop, target,
-        background, opacity_weight, *scratch,
-    )  # fmt: skip
-    launch(kernel, min(len(rays_o), RAYS_IN_FLIGHT), inputs, (grads, loss))
-
-
-def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
-    """See cpu.adam."""
-    inputs = params, grads, moment1, moment2
-    placed = [on_device(array) for array in inputs]
-    rest = rate, low, high, beta1, beta2, eps, correction1, correction2
-    lines = -(-(high - low) // items.LINE)
-    if lines > 0:
-        plain_kernels().adam[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
-    fetch(inputs, placed)
-
-
-def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
-    """See cpu.march."""
-    inputs = grid, rays_o, rays_d, near, jitter, step, alive
-    launch(plain_kernels().march, len(rays_o), inputs, (start, ts, counts))
-
-
-def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
-    """See cpu.pinhole_rays."""
-    inputs = pose, fl_x, fl_y, cx, cy, width, top, order
-    launch(plain_kernels().pinhole_rays, len(order), inputs, (rays_o, rays_d))

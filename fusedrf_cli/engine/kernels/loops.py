@@ -5,7 +5,8 @@ those of a space one namespace, compiled for the sizes of a field. So names that
 `density`, `piece` or SCRATCH, are the kind's, the space's and the field's.
 
 What a kind has in its bodies.py, with p the point in the space's coordinates, d the unit direction of the ray
-in the field's frame, `field` its Arrays, and `scratch` SCRATCH numbers of the field's type, 0 at first:
+in the field's frame, `field` its Arrays, and `scratch` SCRATCH numbers of the field's type, 0 at first where
+gradients are gathered:
     sizes(field)                       for Python: constants of the namespace by name; SCRATCH and KEPT, the
                                        numbers kept per shaded sample for the way back, are among them
     density(field, grid, k, p, d, scratch)
@@ -23,6 +24,7 @@ And what it may have, with the defaults below:
                                        `backward`: fold the direction into a basis; scatter its gradient, and
                                        leave 0 what has gathered it
     frame_of, keep, again, advance, known, unstretched, ahead_density, ahead_colour
+    COLOUR_FROM, LEARN_FROM, SHADING_COST among its sizes
 """
 
 import math
@@ -34,6 +36,8 @@ from numba import prange
 from fusedrf_cli.engine.kernels.parts import accumulate, along, compared, next_sample, occupied  # noqa: F401
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
+LEARN_FROM = COLOUR_FROM  # the same in training
+SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 SAMPLES_AHEAD = 2
 POINTS_PER_TASK = 2048
@@ -269,7 +273,7 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                 kept.k[count], kept.piece[count], kept.held[count], kept.steps[count] = k, number, held, steps
                 kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
                 waiting += weight
-                if waiting > COLOUR_FROM:
+                if waiting > LEARN_FROM:
                     if frame_of(place) != current:
                         current = frame_of(place)
                         begin(field, current, d, scratch)
@@ -286,7 +290,8 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                 count += 1
             k = advance(field, place, steps, k, p, way, u, u0, step)
             k = next_sample(grid, origin, way, u0, u1, step, k)
-    d_colour, d_trans = compared(batch, i, (red, green, blue), trans, count, loss)
+    work = count + SHADING_COST * shaded
+    d_colour, d_trans = compared(batch, i, (red, green, blue), trans, work, loss)
     if count > 0:
         taken = count, shaded, current
         train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad)

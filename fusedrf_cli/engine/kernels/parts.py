@@ -113,8 +113,8 @@ def occupied(grid, p):
 
 @body
 def sh_basis(count, d, out, base):
-    """The first `count` (1, 4, 9 or 16) real spherical harmonics of a unit direction into out[base:], orders l then m = -l..l, orthonormal on
-    the sphere.
+    """The first `count` (1, 4, 9 or 16) real spherical harmonics of a unit direction into out[base:], orders
+    l then m = -l..l, orthonormal on the sphere.
 
     Signs follow the habit of Plenoxels and 3D Gaussian splatting (Condon-Shortley phase kept).
     """
@@ -156,9 +156,9 @@ def accumulate(out, i, value):
 
 
 @body
-def compared(batch, i, colour, trans, count, loss):
+def compared(batch, i, colour, trans, work, loss):
     """Gradients of the loss of a batch of rays (ComputedField.train_rays) in ray i's colour and in the
-    transmittance behind it; its colour error, opacity error and samples are added to `loss`.
+    transmittance behind it; its colour error, opacity error and work are added to `loss`.
     """
     target, background = batch.target, batch.background
     red, green, blue = colour
@@ -168,7 +168,7 @@ def compared(batch, i, colour, trans, count, loss):
     e_a = (1.0 - trans) - target[i, 3]
     accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
     accumulate(loss, 1, e_a * e_a)
-    accumulate(loss, 2, count)
+    accumulate(loss, 2, work)
     n = target.shape[0]
     scale = 2.0 / (3.0 * n)
     g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
@@ -227,6 +227,49 @@ def scatter(count, out, o, weight, values, v):
     for tile in range(np.uint64(count // 8)):
         at = tile * np.uint64(8)
         scatter_8(out, o + at, weight, values, v + at)
+
+
+@body
+def dot(count, a, i, b, j):
+    """Σ_r a[i + r] b[j + r] of `count` numbers."""
+    total = a.dtype.type(0)
+    for r in range(np.uint64(count)):
+        total += a[i + r] * b[j + r]
+    return total
+
+
+@body
+def dense(inputs, outputs, params, weights, values, v, out, o):
+    """out[o : o + outputs] = b + Wᵀ x of a dense layer with x = values[v : v + inputs]: W (inputs, outputs)
+    and behind it b lie in params from `weights` on. The outputs are a multiple of 8."""
+    for r in range(np.uint64(outputs)):
+        out[o + r] = params[weights + np.uint64(inputs * outputs) + r]
+    for i in range(np.uint64(inputs)):
+        if values[v + i] != 0:
+            add_scaled(outputs, out, o, values[v + i], params, weights + i * np.uint64(outputs))
+
+
+@body
+def dense_backward(inputs, outputs, params, weights, values, v, rectified, d_out, o, d_in, n, grad):
+    """Adjoint of `dense` for d_out[o : o + outputs]: sets d_in[n : n + inputs] and adds to grad. Where x is
+    `rectified` its zeros send nothing back."""
+    one = params.dtype.type(1)
+    scatter(outputs, grad, weights + np.uint64(inputs * outputs), one, d_out, o)
+    for i in range(np.uint64(inputs)):
+        row = weights + i * np.uint64(outputs)
+        if values[v + i] != 0:
+            scatter(outputs, grad, row, values[v + i], d_out, o)
+        if rectified and values[v + i] == 0:
+            d_in[n + i] = 0
+        else:
+            d_in[n + i] = dot(outputs, params, row, d_out, o)
+
+
+@body
+def rectify(count, values, v):
+    """values[v : v + count] where they are above 0, else 0."""
+    for r in range(np.uint64(count)):
+        values[v + r] = max(values[v + r], values.dtype.type(0))
 
 
 @body

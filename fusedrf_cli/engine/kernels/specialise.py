@@ -7,7 +7,7 @@ captures functions again in every process.
 
 import hashlib
 import sys
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType
 
@@ -52,7 +52,7 @@ class Loops:
         return run
 
 
-@lru_cache(maxsize=None)
+@cache
 def loops_for(bodies: ModuleType | None, sizes: tuple[tuple[str, int], ...], space: ModuleType) -> Loops:
     """The loops of a kind for some sizes, made once."""
     return Loops(bodies, dict(sizes), space)

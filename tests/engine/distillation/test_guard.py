@@ -6,7 +6,6 @@ import torch
 
 from fusedrf_cli.engine.distillation.guard import ALLOWED, KEPT_EVERY, MOST_ROLL_BACKS, WINDOW, Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from tests.engine.conftest import THIRTY_TWO, random_vm
 
 FINE, BAD = np.array([1.0, 2.0, 3.0]), np.array([1.0, np.nan, 3.0])
@@ -49,7 +48,7 @@ def test_fine_steps_are_accepted_and_not_told(parts):
 
 def test_a_poisoned_factor_shows_in_the_basis():
     """An infinite colour factor: the loss may stay finite, the next step is refused all the same."""
-    from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
+    from fusedrf_cli.engine.fields.computed import Batch
     from tests.engine.conftest import BOX, rays_at
 
     field = random_vm(THIRTY_TWO, dtype=torch.float32)
@@ -58,7 +57,8 @@ def test_a_poisoned_factor_shows_in_the_basis():
     rays = rays_at(BOX, 64)
     zeros = np.zeros((64, 4), np.float32)
     batch = Batch(*rays, np.zeros(64), zeros, zeros[:, :3].copy(), 0.1, 0.0, 0.1, 1e-3)
-    sums = FusedPass(field).gradient(field, batch, optimiser.grads)
+    sums = np.zeros((2, 3))
+    field.train_rays(batch, optimiser.grads, sums)
     assert not np.isfinite(optimiser.grads).all()
     assert not (np.isfinite(sums).all() and optimiser.sound())
 
@@ -125,21 +125,3 @@ def test_a_restored_guard_counts_on(parts):
     other.keep()
     other.accepts(BAD, optimiser)
     assert other.figures() == {"skipped_steps": ALLOWED + 1, "roll_backs": 1}
-
-
-def test_a_networks_weights_and_moments_go_back_too():
-    from fusedrf_cli.engine.distillation.passes import PackedPass
-    from fusedrf_cli.engine.kinds.vm.field import VMShape
-    from tests.engine.conftest import BOX
-
-    field = VMMLPField.create(BOX, (5, 6, 7), VMShape(16, 8, 2), torch.Generator().manual_seed(0))
-    rays_pass = PackedPass(field)
-    guard = Guard(rays_pass.numbers)
-    guard.keep()
-    before = [values.clone() for values in rays_pass.numbers()]
-    for weight in field.network.parameters():
-        weight.grad = torch.ones_like(weight)
-    rays_pass.step(1.0)
-    assert not any(torch.equal(a, b) for a, b in zip(before, rays_pass.numbers(), strict=True))
-    guard.roll_back()
-    assert all(torch.equal(a, b) for a, b in zip(before, rays_pass.numbers(), strict=True))

@@ -3,10 +3,8 @@
 import os
 import subprocess
 import sys
-from types import ModuleType
 
 import numba
-import numpy as np
 import pytest
 import torch
 
@@ -24,13 +22,3 @@ def run_simulated(file: str) -> None:
         command, env=os.environ | {"NUMBA_ENABLE_CUDASIM": "1"}, capture_output=True, text=True
     )
     assert done.returncode == 0 and " passed" in done.stdout and "1 skipped" in done.stdout, done.stdout
-
-
-def both(loops: tuple[ModuleType, ...], name: str, inputs: tuple, outputs: tuple[tuple[int, ...], ...]):
-    """What the CPU's and the GPU's function of a name leave in zeroed outputs of the given shapes."""
-    found = []
-    for module in loops:
-        arrays = [np.zeros(shape) for shape in outputs]
-        getattr(module, name)(*inputs, *arrays)
-        found.append(arrays)
-    return zip(*found, strict=True)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.computed import Batch
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor

@@ -1,6 +1,7 @@
-"""The CUDA loops against the CPU's: on a GPU where there is one, and always in numba's simulator.
+"""The loops on a GPU against the CPU's, for fields of every kind: on a GPU where there is one, and always in
+numba's simulator.
 
-The simulator runs the bodies as plain Python, so the cases are few and small.
+The simulator runs the functions as plain Python, so the cases are few and small.
 """
 
 import numpy as np
@@ -9,24 +10,26 @@ import torch
 
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.passes import Batch, FusedPass
+from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, tile_order
+from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image
-from tests.engine.conftest import BOX, SIXTY_FOUR, points_in, random_vm, rays_at, unit
+from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, rays_at, unit
 from tests.engine.kernels.simulated import (
     EXACT,
     HERE,
     SIMULATED,
     beside_the_simulator,
-    both,
     on_a_device,
     run_simulated,
 )
 from tests.engine.kernels.test_cpu import two_blocks
+from tests.engine.kinds.sparse_cases import random_sparse
 
 if HERE:
     from fusedrf_cli.engine.kernels import cuda
+
+TURNED = np.array([[0.0, -0.9, 0.0, 0.2], [0.7, 0.0, 0.0, -0.1], [0.0, 0.0, 1.1, 0.3], [0, 0, 0, 1]])
 
 
 @beside_the_simulator
@@ -34,103 +37,147 @@ def test_the_simulator_agrees():
     run_simulated(__file__)
 
 
-def fields():
-    """One block under a grid, and two blocks that overlap."""
-    turned = np.array([[0.0, -0.9, 0.0, 0.2], [0.7, 0.0, 0.0, -0.1], [0.0, 0.0, 1.1, 0.3], [0, 0, 0, 1]])
-    return [random_vm(cells=3), two_blocks(turned)]
+def vm(dtype: torch.dtype) -> ComputedField:
+    """One tensor under an occupancy grid."""
+    return random_vm(SIXTY_FOUR if dtype == torch.float64 else THIRTY_TWO, dtype=dtype, cells=3)
 
 
-def both_of(name: str, field, inputs: tuple, outputs: tuple[tuple[int, ...], ...]):
-    """`both` of a function that reads a VM field."""
-    return both((cpu, cuda), name, (*field.kernel_shape, field.arrays, field.grid, *inputs), outputs)
+FIELDS = {
+    "vm": vm,
+    "vm of two blocks": lambda dtype: two_blocks(TURNED).with_params(two_blocks(TURNED).params.to(dtype)),
+    "sparse": lambda dtype: random_sparse(1, dtype=dtype),
+    "sparse without bands": lambda dtype: random_sparse(0, dtype=dtype),
+}
+CASES = [(name, torch.float64) for name in FIELDS] + [("vm", torch.float32), ("sparse", torch.float32)]
+every_field = pytest.mark.parametrize(
+    "name, dtype", CASES, ids=[f"{name}, {str(dtype).removeprefix('torch.')}" for name, dtype in CASES]
+)
+
+
+def twice(field: ComputedField, work):
+    """Pairs of what work(field) returns with the field's numbers here and there."""
+    wanted = work(field)
+    with pytest.MonkeyPatch.context() as patch:
+        if SIMULATED:
+            patch.setattr(kernels, "device_loops", lambda _: cuda)
+            found = work(field.with_params(field.params.clone()))
+        else:
+            found = work(field.to("cuda"))
+    return zip(wanted, found, strict=True)
+
+
+def check(found, wanted, dtype=torch.float64) -> None:
+    """Equal but for the order of sums; a float32 number is off by a share of the largest."""
+    close = EXACT if dtype == torch.float64 else dict(rtol=1e-3, atol=2e-5 * np.abs(wanted).max(initial=0))
+    np.testing.assert_allclose(found, wanted, **close)
 
 
 @on_a_device
-@pytest.mark.parametrize("case", [0, 1])
+@every_field
 @pytest.mark.parametrize("count", [0, 1, 24])
-def test_query_and_its_gradient(case, count):
-    field = fields()[case]
-    points = points_in(field.aabb, count, margin=0.1)
-    dirs = unit(np.random.default_rng(1).normal(size=(count, 3)))
-    for wanted, found in both_of("query", field, (points, dirs, True), ((count,), (count, 3))):
-        np.testing.assert_allclose(found, wanted, **EXACT)
+def test_query_and_its_gradient(name, dtype, count):
+    field = FIELDS[name](dtype)
+    points = torch.from_numpy(points_in(field.aabb, count, margin=0.1))
+    dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(count, 3))))
+    for wanted, found in twice(field, lambda f: f.query(points, dirs)):
+        check(found, wanted.numpy(), dtype)
         assert count < 2 or wanted.any()
-    d_sigma, d_rgb = np.linspace(-1, 1, count), np.linspace(1, -1, 3 * count).reshape(count, 3)
-    size = field.params.numel()
-    for wanted, found in both_of("query_backward", field, (points, dirs, d_sigma, d_rgb), ((1, size),)):
-        np.testing.assert_allclose(found, wanted, **EXACT)
+    d_sigma, d_rgb = torch.linspace(-1, 1, count), torch.linspace(1, -1, 3 * count).view(count, 3)
+
+    def gradient(field):
+        grads = np.zeros((1, field.params.numel()), field.real)
+        field.query_backward(points, dirs, d_sigma, d_rgb, grads)
+        return (grads,)
+
+    for wanted, found in twice(field, gradient):
+        check(found, wanted, dtype)
+        assert count < 2 or wanted.any()
 
 
 @on_a_device
-@pytest.mark.parametrize("case", [0, 1])
-def test_render(case):
-    field = fields()[case]
+@every_field
+def test_render(name, dtype):
+    field = FIELDS[name](dtype)
     rays_o, rays_d = rays_at(field.aabb, 4)
     rays_d[0] = [0.0, 0.0, -1.0]  # along an axis
-    inputs = rays_o, rays_d, 0.0, 0.2, 1e-3
-    for wanted, found in both_of("render", field, inputs, ((4, 5),)):
-        np.testing.assert_allclose(found, wanted, **EXACT)
+
+    def picture(field):
+        out = np.zeros((4, 5))
+        field.render_rays(rays_o, rays_d, 0.0, 0.1, 1e-3, out)
+        return (out,)
+
+    for wanted, found in twice(field, picture):
+        check(found, wanted, dtype)
         assert wanted[:, 3].max() > 0.1
 
 
+def trained(rays_o, rays_d, step):
+    """Work for `twice`: gradient, losses and samples of rays with random targets."""
+    n, rng = len(rays_o), np.random.default_rng(2)
+    jitter, target, background = rng.random(n), rng.random((n, 4)), rng.random((n, 3))
+
+    def gradient(field):
+        grads, loss = np.zeros((1, field.params.numel()), field.real), np.zeros((1, 3))
+        field.train_rays(Batch(rays_o, rays_d, jitter, target, background, 0.3, 0.0, step, 1e-3), grads, loss)
+        return grads, loss
+
+    return gradient
+
+
 @on_a_device
-@pytest.mark.parametrize("case", [0, 1])
-def test_train_rays(case, monkeypatch):
-    """More rays than have scratch at a time, and more shaded samples than have a slot for their features."""
-    field = [random_vm(), fields()[1]][case]
-    n = 3
-    rays_o, rays_d = rays_at(field.aabb, n)
-    rng = np.random.default_rng(2)
-    target, background = rng.random((n, 4)), rng.random((n, 3))
-    inputs = rays_o, rays_d, 0.0, rng.random(n), 0.4, 1e-3, target, background, 0.3, 40
+@every_field
+def test_train_rays(name, dtype, monkeypatch):
+    """More rays than have memory at a time, and more shaded samples than have a slot for what they keep."""
+    field = FIELDS[name](dtype)
     monkeypatch.setattr(cuda, "RAYS_IN_FLIGHT", 2)
-    for wanted, found in both_of("train_rays", field, inputs, ((1, field.params.numel()), (1, 3))):
-        np.testing.assert_allclose(found, wanted, **EXACT)
-    assert wanted[0, 2] > n  # samples
+    for wanted, found in twice(field, trained(*rays_at(field.aabb, 3), 0.1)):
+        check(found, wanted, dtype)
+    assert wanted[0, 2] > 3  # samples
 
 
 @on_a_device
-def test_features_and_their_gradient():
-    field = random_vm()
-    points = points_in(BOX, 9, margin=0.1)
-    ranks, width = field.kernel_shape[1], 3 * SIXTY_FOUR.colour_rank
-    d_out = np.linspace(-1, 1, 9 * width)
+@pytest.mark.parametrize("away", [0.0, 1000.0])
+def test_bricks_are_trained_from_far_away(away):
+    """The way back finds every sample where the way there had it, however far the ray has come: a distance
+    kept in float32 would put it beside its voxel, in one that is not active, or into no brick at all."""
+    field = random_sparse(0, dtype=torch.float32, scale=0.3)
+    rays_o, rays_d = rays_at(field.aabb, 8)
+    for wanted, found in twice(field, trained(rays_o - away * rays_d, rays_d, 0.05)):
+        check(found, wanted, torch.float32)
+
+
+@on_a_device
+def test_peaks():
+    cells, probes = np.argwhere(np.ones((2, 2, 2), bool)), np.array([[0.25] * 3, [0.75] * 3])
+    asked = BOX[:3], (BOX[3:] - BOX[:3]) / 2, cells, probes
+    for frame in (0, 1):
+        for wanted, found in twice(two_blocks(TURNED), lambda f, b=frame: (f.peaks(*asked, b),)):
+            check(found, wanted)
+
+
+@on_a_device
+def test_exposed():
+    field = random_sparse(0, depth=1)
+    low, high = (field.fine.places[field.fine.corners[:12, q]] for q in (0, 7))
+    for wanted, found in twice(field, lambda f: f.exposed(low, high, np.eye(3), 3.0, 0.01)):
+        check(found, wanted)
+        assert wanted.any()
+
+
+@on_a_device
+@pytest.mark.parametrize("keep", [False, True])
+def test_sums_of_rows(keep):
+    field = random_sparse(1)
+    lattice = field.fine
+    *edges, target = lattice.gathering if keep else lattice.spreading
+    some = target[:20]
     results = []
     for loops in (cpu, cuda):
-        out, grads = np.zeros(9 * width), np.zeros((1, field.params.numel()))
-        loops.features(ranks, field.arrays, 0, points, out)
-        loops.features_backward(ranks, field.arrays, 0, points, d_out, grads)
-        results.append((out, grads))
-    for wanted, found in zip(*results, strict=True):
-        np.testing.assert_allclose(found, wanted, **EXACT)
-
-
-@on_a_device
-def test_density_at_cells():
-    field = random_vm()
-    cells = np.argwhere(np.ones((2, 2, 2), bool))
-    cell, probes = (BOX[3:] - BOX[:3]) / 2, np.array([[0.25] * 3, [0.75] * 3])
-    results = [np.zeros(8), np.zeros(8)]
-    for loops, out in zip((cpu, cuda), results, strict=True):
-        grid = BOX[:3].copy(), cell, cells
-        loops.density_at_cells(field.kernel_shape[0], field.arrays, 0, *grid, probes, out)
-    np.testing.assert_allclose(results[1], results[0], **EXACT)
-
-
-@on_a_device
-def test_march():
-    field = random_vm(cells=6)
-    rays_o, rays_d = rays_at(BOX, 20)
-    alive = np.arange(20) % 5 != 0
-    results = []
-    for loops in (cpu, cuda):
-        start, ts, counts = np.zeros(20, np.int64), np.zeros((20, 4)), np.zeros(20, np.int64)
-        for _ in range(2):
-            loops.march(field.grid, rays_o, rays_d, 0.0, np.full(20, 0.5), 0.05, start, alive, ts, counts)
-        results.append((start, ts, counts))
-    for wanted, found in zip(*results, strict=True):
-        np.testing.assert_allclose(found, wanted, **EXACT)
-    assert results[0][2].any()
+        values = np.arange(float(field.size))
+        loops.sums_of_rows(values, 0, 4, edges[0][:21], *edges[1:], some, keep)
+        results.append(values)
+    check(results[1], results[0])
+    assert (results[0] != np.arange(float(field.size))).any()
 
 
 @on_a_device
@@ -147,39 +194,27 @@ def test_adam(rng):
             loops.adam(*arrays, *rest)
         results.append(arrays)
     for wanted, found in zip(*results, strict=True):
-        np.testing.assert_allclose(found, wanted, **EXACT)
+        check(found, wanted)
 
 
 @on_a_device
-def test_a_field_there_learns_and_renders_as_here(monkeypatch):
+@pytest.mark.parametrize("name", ["vm", "sparse"])
+def test_a_field_there_learns_and_renders_as_here(name):
     """One step of training and one picture by the engine's own classes."""
-    rays_o, rays_d = rays_at(BOX, 2)
-    batch = Batch(rays_o, rays_d, np.full(2, 0.5), np.ones((2, 4)), np.zeros((2, 3)), 0.1, 0.0, 0.4, 1e-3)
-    camera = framing_camera(BOX, 0.9, 0.45, 2, 2)
-    found = []
-    for device in ("cpu", "cuda"):
-        if SIMULATED:
-            monkeypatch.setattr(kernels, "loops", lambda _, device=device: cuda if device == "cuda" else cpu)
-        field = random_vm(dtype=torch.float64).to("cpu" if SIMULATED else device)
-        optimiser = Adam(field, 1)
-        sums = FusedPass(field).gradient(field, batch, optimiser.grads)
+    field = FIELDS[name](torch.float64)
+    rays_o, rays_d = rays_at(field.aabb, 2)
+    batch = Batch(rays_o, rays_d, np.full(2, 0.5), np.ones((2, 4)), np.zeros((2, 3)), 0.1, 0.0, 0.2, 1e-3)
+    camera = framing_camera(field.aabb, 0.9, 0.45, 2, 2)
+
+    def learn(field):
+        field = field.with_params(field.params.clone())
+        optimiser, loss = Adam(field, 1), np.zeros((1, 3))
+        field.train_rays(batch, optimiser.grads, loss)
         assert optimiser.sound()
         optimiser.step(0.01)
-        shot = render_image(field, camera, step=0.4)
-        found.append((sums, field.params.cpu().numpy(), shot.rgb, shot.opacity))
-    for wanted, other in zip(*found, strict=True):
+        shot = render_image(field, camera, step=0.2)
+        return loss, field.params.cpu().numpy(), shot.rgb, shot.opacity
+
+    for wanted, other in twice(field, learn):
         np.testing.assert_allclose(other, wanted, rtol=1e-6, atol=1e-7)
         assert wanted.any()
-
-
-@on_a_device
-def test_pinhole_rays():
-    pose = np.eye(4)
-    pose[:3] = np.random.default_rng(3).normal(size=(3, 4))
-    camera = Camera(pose, 20.0, 21.0, 3.5, 4.5, 9, 5)
-    order = tile_order(9, 3)
-    wanted = camera.rays(slice(2, 5), order)
-    found = np.zeros((27, 3)), np.zeros((27, 3))
-    cuda.pinhole_rays(pose, 20.0, 21.0, 3.5, 4.5, 9, 2, order, *found)
-    for one, other in zip(wanted, found, strict=True):
-        np.testing.assert_allclose(other, one, **EXACT)

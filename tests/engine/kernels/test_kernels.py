@@ -1,6 +1,5 @@
 """Where compiled kernels are kept."""
 
-import hashlib
 import os
 import stat
 import subprocess
@@ -14,17 +13,22 @@ import pytest
 from fusedrf_cli.engine import kernels
 
 
-def test_cache_is_the_users_and_named_for_the_bodies(tmp_path, monkeypatch):
-    """numba does not notice that an inlined function of another file changed: new bodies need another
+def test_cache_is_the_users_and_named_for_what_is_inlined(tmp_path, monkeypatch):
+    """numba does not notice that an inlined function of another file changed: new text needs another
     folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    files = ("bodies.py", "prefetch.py", "items.py", "sparse_bodies.py")
-    inlined = [Path(kernels.__file__).with_name(name).read_bytes() for name in files]
     folder = kernels.kernel_cache()
     assert folder.is_dir() and folder.is_relative_to(tmp_path / "fusedrf")
-    assert hashlib.sha256(b"".join(inlined)).hexdigest().startswith(folder.name)
-    monkeypatch.setattr(Path, "read_bytes", lambda path: b"#")
-    assert kernels.kernel_cache() != folder
+    read, engine = Path.read_bytes, Path(kernels.__file__).parent.parent
+    changed = [
+        *("kernels/parts.py", "kernels/loops.py", "kernels/prefetch.py", "spaces/bounded.py"),
+        *(f"kinds/{kind}/bodies.py" for kind in ("vm", "sparse", "vm_mlp")),
+    ]
+    folders = {folder}
+    for name in changed:
+        monkeypatch.setattr(Path, "read_bytes", lambda p, n=name: b"#" if p == engine / n else read(p))
+        folders.add(kernels.kernel_cache())
+    assert len(folders) == len(changed) + 1
 
 
 def test_compilation_is_told_once_and_what_is_kept_is_not_compiled(tmp_path):

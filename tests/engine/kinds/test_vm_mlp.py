@@ -4,57 +4,45 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation import passes
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, fit
-from fusedrf_cli.engine.distillation.passes import Batch, PackedPass, composite
+from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import autograd, bodies
+from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.vm_mlp.field import ColourNetwork, Encoding, VMMLPField
+from fusedrf_cli.engine.kinds.vm.reference import vm_products
+from fusedrf_cli.engine.kinds.vm_mlp import bodies
+from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untrained
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.rendering.volume import render_image, render_rays
+from fusedrf_cli.engine.rendering.volume import render_image
 
-from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
-
-
-def random_field(
-    dtype=torch.float64, seed=0, cells=None, matrix=None, shape=SIXTY_FOUR, width=8
-) -> VMMLPField:
-    """A vm-mlp field of random numbers whose colours differ."""
-    shape = type(shape)(shape.density_rank, shape.colour_rank, 2)
-    generator = torch.Generator().manual_seed(seed)
-    factors = random_vm(shape, dtype=dtype, seed=seed, cells=cells, matrix=matrix)
-    return VMMLPField(factors, ColourNetwork(27, width, generator).to(dtype))
+from ..conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
+from .cases import random_vm_mlp as random_field
 
 
 def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """rgb (3,) at one point, one neuron after the other."""
-    products = autograd.features(field, field.params, torch.from_numpy(point[None]))[0].numpy()
+    placement, box = field.blocks[0].object_to_field, field.tensors[0].aabb
+    inside = (np.linalg.solve(placement, [*point, 1.0])[:3] - box[:3]) / (box[3:] - box[:3])
+    sections = field.factors.sections(0)
+    products = vm_products(sections, "colour", torch.from_numpy(inside[None]))[0].numpy()
     x = [float(row @ products) for row in field.basis.numpy()]
     local = field.arrays.to_object[0] @ direction
     local = local / np.linalg.norm(local)
     x = [*x, *local]
     values = x + [np.sin(f * v) for f in (1, 2) for v in x] + [np.cos(f * v) for f in (1, 2) for v in x]
-    for i, layer in enumerate(field.network.layers):
-        weights, bias = layer.weight.detach().numpy(), layer.bias.detach().numpy()
+    for i in range(3):
+        weights, bias = field.weights[f"{i}.weight"].numpy(), field.weights[f"{i}.bias"].numpy()
         values = [float(np.dot(w, values) + b) for w, b in zip(weights, bias, strict=True)]
         values = [max(v, 0.0) for v in values] if i < 2 else values
     return 1 / (1 + np.exp(-np.array(values)))
 
 
-def test_is_a_stored_field_kind_without_a_fused_renderer():
+def test_is_a_stored_field_kind():
     assert field_kinds()["vm-mlp"] is VMMLPField
     assert isinstance(random_field(), RadianceField)
-    assert not hasattr(VMMLPField, "render_rays")
-
-
-def test_encoding_and_its_gradient():
-    x = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1), requires_grad=True)
-    expected = torch.cat([x, x.sin(), (2 * x).sin(), x.cos(), (2 * x).cos()], 1)
-    torch.testing.assert_close(Encoding.apply(x), expected)
-    assert torch.autograd.gradcheck(Encoding.apply, x)
 
 
 @pytest.mark.parametrize("matrix", [None, np.diag([2.0, -1.5, 0.5, 1.0])])
@@ -65,14 +53,14 @@ def test_query_equals_a_slow_loop(matrix):
         BOX[3:] * np.diag(field.blocks[0].object_to_field)[:3],
     )
     box = np.concatenate([np.minimum(low, high), np.maximum(low, high)])
-    field = VMMLPField(field.factors, field.network)
     field.factors.occupancy = OccupancyGrid.full(box)
     points, dirs = (
         points_in(box, 20, margin=0.05),
         unit(points_in(np.array([-1.0] * 3 + [1.0] * 3), 20, seed=5)),
     )
     sigma, rgb = field.query(torch.from_numpy(points), torch.from_numpy(dirs))
-    assert torch.equal(sigma, field.factors.query(torch.from_numpy(points), torch.from_numpy(dirs))[0])
+    alone = field.factors.query(torch.from_numpy(points), torch.from_numpy(dirs))[0]
+    torch.testing.assert_close(sigma, alone, rtol=1e-12, atol=0)
     for i in range(20):
         expected = slow_colour(field, points[i], dirs[i]) if sigma[i] > 0 else np.zeros(3)
         np.testing.assert_allclose(rgb[i], expected, atol=1e-9)
@@ -88,8 +76,7 @@ def test_state_round_trip():
     dirs = torch.from_numpy(unit(points_in(BOX, 200, seed=2)))
     for a, b in zip(field.query(points, dirs), again.query(points, dirs), strict=True):
         assert torch.equal(a, b) and (a > 0).any() and (a == 0).any()
-    for a, b in zip(field.network.parameters(), again.network.parameters(), strict=True):
-        assert torch.equal(a, b)
+    assert all(map(torch.equal, field.weights.values(), again.weights.values()))
 
 
 @pytest.mark.parametrize(
@@ -107,26 +94,28 @@ def test_several_blocks_are_refused():
     field = random_vm()
     field.blocks = field.blocks * 2
     with pytest.raises(ValueError, match="one block, found 2"):
-        VMMLPField(field, ColourNetwork(27))
+        VMMLPField(field, untrained(27, 8, torch.Generator()))
 
 
 def test_resampling_keeps_the_network_and_the_basis():
     field = random_field(torch.float32)
     box = BOX + np.array([0.1, 0.1, 0.1, -0.1, -0.1, -0.1])
     new = field.resampled(box, (9, 10, 11))
-    assert new.network is field.network and torch.equal(new.basis, field.basis)
-    assert new.tensors[0].resolution == (9, 10, 11)
-    assert new.with_occupancy(OccupancyGrid.full(box)).network is field.network
+    assert new.tensors[0].resolution == (9, 10, 11) and torch.equal(new.basis, field.basis)
+    for other in (new, new.with_occupancy(OccupancyGrid.full(box))):
+        assert all(map(torch.equal, field.weights.values(), other.weights.values()))
 
 
 def test_rendering_equals_a_slow_loop():
+    """Samples too light to be shaded take the colour of the next that is."""
     field = random_field(cells=4)
     rays_o, rays_d = rays_at(BOX, 12)
     step = 0.07
-    found = render_rays(field, rays_o, rays_d, step=step, early_stop=0.0)
-    assert np.isfinite(found).all() and found[:, 3].max() > 0.5
+    found = np.zeros((12, 5))
+    field.render_rays(rays_o, rays_d, 0.0, step, 0.0, found)
+    assert found[:, 3].max() > 0.5
     for ray in range(12):
-        o, d, trans, rgb = rays_o[ray], rays_d[ray], 1.0, np.zeros(3)
+        o, d, trans, rgb, waiting = rays_o[ray], rays_d[ray], 1.0, np.zeros(3), 0.0
         faces = np.stack([(BOX[:3] - o) / d, (BOX[3:] - o) / d])
         start, end = faces.min(0).max(), faces.max(0).min()
         for t in np.arange(start + 0.5 * step, end, step):
@@ -134,34 +123,11 @@ def test_rendering_equals_a_slow_loop():
             sigma, colour = field.query(point, torch.from_numpy(d[None]))
             weight = trans * (1 - np.exp(-float(sigma[0]) * step))
             trans -= weight
-            rgb += weight * colour[0].numpy() * (weight > bodies.COLOUR_FROM)
-        np.testing.assert_allclose(found[ray, :4], [*rgb, 1 - trans], atol=2e-5)
-
-
-def test_composite_of_packed_samples_equals_a_loop_and_its_gradient():
-    ray = torch.tensor([0, 0, 0, 2, 2, 4])
-    depth = torch.tensor([0.1, 2.0, 0.0, 30.0, 1.0, 0.5], dtype=torch.float64, requires_grad=True)
-    weights, opacity = composite(depth.detach(), ray, 5)
-    trans = torch.ones(5, dtype=torch.float64)
-    for i, r in enumerate(ray):
-        assert float(weights[i]) == pytest.approx(
-            float(trans[r] * (1 - torch.exp(-depth.detach()[i]))), abs=1e-14
-        )
-        trans[r] *= torch.exp(-depth[i].detach())
-    np.testing.assert_allclose(opacity, 1 - trans, atol=1e-14)
-    assert torch.autograd.gradcheck(lambda x: composite(x, ray, 5), depth)
-
-
-def test_thinned_samples_stand_for_all():
-    generator = torch.Generator().manual_seed(2)
-    weights = torch.rand(20_000, generator=generator) ** 6 / 20
-    ray, jitter = torch.arange(20_000) // 10, torch.rand(2000, generator=generator, dtype=torch.float64)
-    seen, share = passes.shaded_samples(weights, ray, jitter)
-    assert set(torch.nonzero(weights > 1.001 * passes.THIN_BELOW)[:, 0].tolist()) <= set(seen.tolist())
-    assert len(seen) < 0.5 * int((weights > bodies.COLOUR_FROM).sum())
-    values = torch.rand(20_000, generator=generator)
-    found = ((weights[seen] / share) * values[seen]).sum() / (weights * values).sum()
-    assert float(found) == pytest.approx(1, abs=0.03)
+            waiting += weight
+            if waiting > loops.COLOUR_FROM:
+                rgb += waiting * colour[0].numpy()
+                waiting = 0.0
+        np.testing.assert_allclose(found[ray, :4], [*rgb, 1 - trans], rtol=1e-9, atol=1e-12)
 
 
 def batch_at(field, count=24) -> Batch:
@@ -172,44 +138,95 @@ def batch_at(field, count=24) -> Batch:
     return Batch(rays_o, rays_d, rng.random(count), target, background, 0.3, 0.0, 0.11, -1.0)
 
 
-def loss_of(field, batch) -> float:
-    sums = PackedPass(field).gradient(field, batch, np.zeros((2, field.params.numel())))
-    return (sums[0] + batch.opacity_weight * sums[1]) / len(batch.rays_o)
+def trained(field, batch) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient (P,) and sums (3,) of a batch."""
+    grads, loss = np.zeros((2, field.params.numel()), field.real), np.zeros((2, 3))
+    field.train_rays(batch, grads, loss)
+    return grads.sum(0), loss.sum(0)
+
+
+@pytest.fixture
+def every_sample(monkeypatch):
+    """All samples are shaded: the loss jumps where a weight crosses the threshold."""
+    sizes = bodies.sizes
+    monkeypatch.setattr(bodies, "sizes", lambda field: sizes(field) | {"LEARN_FROM": 0.0})
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_whole_pass_s_gradient_against_finite_differences(seed, monkeypatch):
-    monkeypatch.setattr(bodies, "COLOUR_FROM", 0.0)  # the loss jumps where a sample crosses it
-    monkeypatch.setattr(passes, "THIN_BELOW", 0.0)
+def test_gradients_of_pictures_are_finite_differences(seed, every_sample):
     field = random_field(seed=seed, cells=4)
     batch = batch_at(field)
-    rows = np.zeros((2, field.params.numel()))
-    PackedPass(field).gradient(field, batch, rows)
+    gradient, _ = trained(field, batch)
+    gradient = torch.from_numpy(gradient)
     generator = torch.Generator().manual_seed(seed)
-    weights = list(field.network.parameters())
-    for values, gradient in [(field.params, torch.from_numpy(rows.sum(0)))] + [
-        (w.data, w.grad.clone()) for w in weights
-    ]:
-        along = torch.randn(values.shape, generator=generator, dtype=torch.float64)
+
+    def loss() -> float:
+        sums = trained(field, batch)[1]
+        return (sums[0] + batch.opacity_weight * sums[1]) / len(batch.rays_o)
+
+    for group in field.groups():
+        values, sent = field.params[group.low : group.high], gradient[group.low : group.high]
+        along = torch.randn(values.shape, generator=generator, dtype=torch.float64) * (sent != 0)
         step, losses = 1e-6, []
         for sign in (1, -2):
             values += sign * step * along
-            losses.append(loss_of(field, batch))
+            losses.append(loss())
         values += step * along
-        assert float((gradient * along).sum()) == pytest.approx(
+        assert float((sent * along).sum()) == pytest.approx(
             (losses[0] - losses[1]) / (2 * step), rel=1e-4, abs=1e-7
         )
 
 
-def test_a_pass_over_rays_that_hit_nothing():
+def test_gradients_of_answers_are_finite_differences():
+    field = random_field(cells=4)
+    rng = np.random.default_rng(3)
+    points, dirs = torch.from_numpy(points_in(BOX, 40)), torch.from_numpy(unit(rng.normal(size=(40, 3))))
+    d_sigma, d_rgb = torch.from_numpy(rng.normal(size=40)), torch.from_numpy(rng.normal(size=(40, 3)))
+    grads = np.zeros((2, field.params.numel()))
+    field.query_backward(points, dirs, d_sigma, d_rgb, grads)
+    along = torch.from_numpy(rng.normal(size=field.params.numel()) * (grads.sum(0) != 0))
+    values = []
+    for sign in (1, -2):
+        field.params += sign * 1e-6 * along
+        sigma, rgb = field.query(points, dirs)
+        values.append(float((sigma * d_sigma).sum() + (rgb * d_rgb).sum()))
+    assert float(torch.from_numpy(grads.sum(0)) @ along) == pytest.approx(
+        (values[0] - values[1]) / 2e-6, rel=1e-5
+    )
+
+
+def test_what_fills_a_layer_up_stays_zero():
+    """A width that is no multiple of 8: training moves the weights and nothing beside them."""
+    field = random_field(torch.float32, width=5)
+    views = list(field.weights.values())
+    inside = torch.zeros_like(field.params)
+    other = field.with_params(inside)
+    for view in other.weights.values():
+        view += 1
+    start = field.factors.params.numel()
+    assert sum(view.numel() for view in views) == int(inside[start:].sum())
+    optimiser, before = Adam(field, 2), field.params.clone()
+    batch = batch_at(field)
+    for _ in range(3):
+        field.train_rays(batch, optimiser.grads, np.zeros((2, 3)))
+        optimiser.step(0.1)
+    assert (field.params != before)[start:].float().mean() > 0.3
+    assert not field.params[start:][inside[start:] == 0].any()
+
+
+def test_the_network_learns_at_a_rate_of_its_own():
+    field = random_field(torch.float32)
+    *others, network = field.groups()
+    assert [g.rate for g in others] == [1.0, 0.05] and network.rate == NETWORK_RATE
+    assert network.low == field.factors.params.numel() == others[-1].high
+    assert network.high == field.params.numel() and network.low % 16 == network.high % 16 == 0
+
+
+def test_rays_that_meet_nothing_teach_nothing():
     field = random_field(torch.float32)
     batch = batch_at(field)._replace(rays_d=-batch_at(field).rays_d)
-    batch = batch._replace(
-        target=batch.target.astype(np.float32), background=batch.background.astype(np.float32)
-    )
-    rows = np.zeros((2, field.params.numel()), np.float32)
-    sums = PackedPass(field).gradient(field, batch, rows)
-    assert np.isfinite(sums).all() and sums[2] == 0 and not rows.any()
+    gradient, sums = trained(field, batch)
+    assert np.isfinite(sums).all() and sums[2] == 0 and not gradient.any()
 
 
 def pictures_of_a_ball(count: int, size: int):
@@ -245,6 +262,6 @@ def test_a_fit_taken_up_from_a_checkpoint_goes_on_as_before():
     for run in (whole, again):
         run.step(0.1)
     expected, found = whole.checkpoint()[0], again.checkpoint()[0]
-    assert expected.keys() == found.keys() and "pass.0.exp_avg" in found
+    assert expected.keys() == found.keys()
     for name in expected.keys() - {"random", "random_of_order"}:
         np.testing.assert_array_equal(found[name], expected[name], name)

@@ -24,7 +24,15 @@ from typing import NamedTuple
 import numpy as np
 
 from fusedrf_cli.engine.kernels.parts import (
-    FACE_TOLERANCE, accumulate, add_scaled, along, exit_distance, scatter, sh_basis, sigmoid, softplus,
+    FACE_TOLERANCE,
+    accumulate,
+    add_scaled,
+    along,
+    exit_distance,
+    scatter,
+    sh_basis,
+    sigmoid,
+    softplus,
 )  # fmt: skip
 
 SIDE = 4  # voxels of a brick along an axis

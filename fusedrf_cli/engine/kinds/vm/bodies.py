@@ -18,7 +18,16 @@ from typing import NamedTuple
 import numpy as np
 
 from fusedrf_cli.engine.kernels.parts import (
-    add_scaled, bilinear, cell_of, linear, scatter, sh_basis, sigmoid, softplus, store_8, texel,
+    add_scaled,
+    bilinear,
+    cell_of,
+    linear,
+    scatter,
+    sh_basis,
+    sigmoid,
+    softplus,
+    store_8,
+    texel,
 )  # fmt: skip
 from fusedrf_cli.engine.kernels.prefetch import prefetch_plane
 
@@ -350,11 +359,17 @@ def colour(field, place, p, d, scratch, memory, at):
 
 def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """Adjoint of `density` and, where shaded, of `colour`; the basis gathers its gradient until `end`."""
+    if shaded:
+        u, v, w, _ = unit_point(field, place, p)
+        d_logits(rgb, d_rgb, scratch, memory, at)
+        scatter_colour(field, grad, field.tensor[place], u, v, w, scratch)
+    density_backward(field, place, p, d, pre, d_sigma, scratch, grad)
+
+
+def density_backward(field, place, p, d, pre, d_sigma, scratch, grad):
+    """Adjoint of `density`."""
     u, v, w, _ = unit_point(field, place, p)
     t = field.tensor[place]
-    if shaded:
-        d_logits(rgb, d_rgb, scratch, memory, at)
-        scatter_colour(field, grad, t, u, v, w, scratch)
     slope = object_direction(field, place, d)[3] * field.activation[t, 0]
     scratch[ONE] = d_sigma * slope * sigmoid(pre + field.activation[t, 1])
     if scratch[ONE] != 0:

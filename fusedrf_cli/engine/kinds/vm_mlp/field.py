@@ -5,87 +5,46 @@ basis (3, 9, 3 rank), read as the (27, 3 rank) matrix B, makes the features f = 
 """
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields.computed import ComputedField, Group
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kinds.vm.bodies import Arrays as VMArrays
-from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, VMField, VMShape, VMTensor, aligned
+from fusedrf_cli.engine.kinds.vm_mlp import bodies, reference
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
-# Shaded in whole runs of 512 rows, at most 12 of them, a point has the same colour in any company: products
-# of a few rows round otherwise, and so do sines and sigmoids where a piece that torch hands to a thread (one
-# per 32,768 numbers, here six at most) does not end on a whole vector.
-ROWS_PADDED = 512
-POINTS_AT_ONCE = 12 * ROWS_PADDED
+LAYERS = 3
+NETWORK_RATE = 0.05  # TensoRF: 1e-3 where factors learn at 2e-2
 
 
-class ColourNetwork(torch.nn.Module):
-    """x = [f, d] -> [x, sin x, sin 2x, cos x, cos 2x] -> width -> width -> 3, ReLU, sigmoid at the end.
+class VMMLPField(ComputedField):
+    """One VM tensor and a colour network: x = [f, d] -> [x, sin x, sin 2x, cos x, cos 2x] -> width -> width
+    -> 3, ReLU, sigmoid at the end, with d the unit direction in the object's frame.
 
-    TensoRF's inputs, in blocks as wide as x, where TensoRF interleaves frequencies and keeps f and d
-    apart: an importer permutes the columns of the first layer.
+    The inputs are TensoRF's, in blocks as wide as x, where TensoRF interleaves frequencies and keeps f and d
+    apart: an importer permutes the columns of the first layer. `params` are the factors' and behind them the
+    network's, each layer transposed and filled up to whole runs of 8 (bodies.py).
     """
 
-    def __init__(self, features: int, width: int = WIDTH, generator: torch.Generator | None = None):
-        """Weights uniform as a linear layer's, the last bias 0."""
-        super().__init__()
-        inputs = (features + 3) * 5
-        sizes = ((inputs, width), (width, width), (width, 3))
-        self.layers = torch.nn.ModuleList(torch.nn.utils.skip_init(torch.nn.Linear, a, b) for a, b in sizes)
-        with torch.no_grad():
-            for layer in self.layers:
-                bound = layer.in_features**-0.5
-                layer.weight.uniform_(-bound, bound, generator=generator)
-                layer.bias.uniform_(-bound, bound, generator=generator)
-            self.layers[-1].bias.zero_()
+    kind, bodies = "vm-mlp", bodies
 
-    def forward(self, features: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
-        """rgb (N, 3) in [0, 1] from features (N, F) and unit directions (N, 3) of the object's frame."""
-        first, second, last = self.layers
-        x = Encoding.apply(torch.cat([features, dirs], 1))
-        return torch.sigmoid(last(torch.relu_(second(torch.relu_(first(x))))))
-
-
-class Encoding(torch.autograd.Function):
-    """(N, 5 D) blocks x, sin x, sin 2x, cos x, cos 2x of x (N, D), by one sine and one cosine for each x."""
-
-    @staticmethod
-    def forward(ctx, x):
-        sin, cos = x.sin(), x.cos()
-        out = torch.cat([x, sin, 2 * sin * cos, cos, 1 - 2 * sin * sin], 1)
-        ctx.save_for_backward(out)
-        return out
-
-    @staticmethod
-    def backward(ctx, d_out):
-        (out,) = ctx.saved_tensors
-        _, sin, sin2, cos, cos2 = out.chunk(5, 1)
-        d_x, d_sin, d_sin2, d_cos, d_cos2 = d_out.chunk(5, 1)
-        return (
-            torch.addcmul(d_x, d_sin, cos)
-            .addcmul_(d_cos, sin, value=-1)
-            .addcmul_(d_sin2, cos2, value=2)
-            .addcmul_(d_cos2, sin2, value=-2)
-        )
-
-
-class VMMLPField:
-    """One VM tensor and a colour network; immutable but for the factors' `params` and the network's weights.
-
-    It has no `render_rays`: shading is batched matrix products, which the renderer's general path feeds well.
-    """
-
-    kind = "vm-mlp"
-
-    def __init__(self, factors: VMField, network: ColourNetwork):
+    def __init__(self, factors: VMField, weights: dict[str, torch.Tensor]):
+        """weights are the network's by name: `<layer>.weight` (out, in) and `<layer>.bias` (out,)."""
         if len(factors.blocks) != 1:
             raise ValueError(f"a vm-mlp field has one block, found {len(factors.blocks)}")
-        self.factors, self.network = factors, network
+        self.width, self.factors = len(weights["0.bias"]), factors
+        packed = factors.params.new_zeros(self.network_size)
+        self._place(torch.cat([factors.params, packed]))
+        for name, view in self.weights.items():
+            view.copy_(weights[name])
+
+    def _place(self, params: torch.Tensor) -> None:
+        """Take other numbers, of which the factors hold a view."""
+        self.params = params
+        self.factors = self.factors.with_params(params[: self.factors.params.numel()])
 
     # -- making ----------------------------------------------------------------------------------------------
 
@@ -102,17 +61,25 @@ class VMMLPField:
         """An untrained field of the shape's ranks; its SH degree is not used."""
         shape = replace(shape, sh_degree=FEATURE_DEGREE)
         factors = VMField.create(aabb, resolution, shape, generator, name)
-        return cls(factors, ColourNetwork(3 * shape.coefficients, width, generator))
+        return cls(factors, untrained(3 * shape.coefficients, width, generator))
+
+    def with_params(self, params: torch.Tensor) -> "VMMLPField":
+        """The same field with other numbers."""
+        other = super().with_params(params)
+        other._place(params)
+        return other
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "VMMLPField":
         """The same numbers under another occupancy grid."""
-        return VMMLPField(self.factors.with_occupancy(occupancy), self.network)
+        other = super().with_params(self.params)
+        other.factors = self.factors.with_occupancy(occupancy)
+        return other
 
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMMLPField":
         """The field on another box and resolution, with the same network."""
-        return VMMLPField(self.factors.resampled(aabb, resolution), self.network)
+        return VMMLPField(self.factors.resampled(aabb, resolution), self.weights)
 
-    # -- reading: the factors' -------------------------------------------------------------------------------
+    # -- reading ---------------------------------------------------------------------------------------------
 
     @property
     def shape(self) -> VMShape:
@@ -125,24 +92,14 @@ class VMMLPField:
         return self.factors.tensors
 
     @property
-    def blocks(self) -> tuple[Block, ...]:
+    def blocks(self) -> tuple:
         """The one block."""
         return self.factors.blocks
-
-    @property
-    def params(self) -> torch.Tensor:
-        """(P,) factors and colour basis; the network's weights are not among them."""
-        return self.factors.params
 
     @property
     def occupancy(self) -> OccupancyGrid:
         """The factors' grid."""
         return self.factors.occupancy
-
-    @property
-    def aabb(self) -> np.ndarray:
-        """(6,) float64 box in the field's frame."""
-        return self.factors.aabb
 
     @property
     def voxel_size(self) -> float:
@@ -151,27 +108,8 @@ class VMMLPField:
 
     @property
     def layout(self) -> np.ndarray:
-        """(1, 13) int64 offsets of the sections in params."""
+        """(1, 13) int64 offsets of the factors' sections in params."""
         return self.factors.layout
-
-    def parameter_groups(self) -> list[tuple[int, int, bool]]:
-        """(low, high, whether it is a colour basis) of every group of `params`, in order."""
-        return self.factors.parameter_groups()
-
-    @property
-    def kernel_shape(self) -> tuple[tuple[int, ...], ...]:
-        """Ranks as the kernels take them."""
-        return self.factors.kernel_shape
-
-    @property
-    def arrays(self) -> VMArrays:
-        """What kernels read; `params` is shared, not copied."""
-        return self.factors.arrays
-
-    @property
-    def grid(self) -> GridArrays:
-        """The occupancy's arrays."""
-        return self.factors.grid
 
     @property
     def basis(self) -> torch.Tensor:
@@ -179,44 +117,58 @@ class VMMLPField:
         return self.factors.sections(0)["colour_basis"].flatten(0, 1)
 
     @property
-    def loops(self) -> ModuleType:
-        """The compiled loops of the factors' device."""
-        return self.factors.loops
+    def wide(self) -> int:
+        """Outputs of a layer in memory."""
+        return -(-self.width // 8) * 8
 
-    def to(self, device: str | torch.device) -> "VMMLPField":
-        """The field itself on the CPU. Raises ValueError for any other device."""
-        if torch.device(device).type != "cpu":
-            raise ValueError(f"a vm-mlp field is computed on the CPU only, found device '{device}'")
-        return self
+    @property
+    def layers(self) -> list[tuple[int, int, int, int]]:
+        """(inputs, outputs, and both as they lie in memory) of every layer."""
+        inputs = 5 * (3 * self.shape.coefficients + 3)
+        return [
+            (inputs, self.width, inputs, self.wide),
+            (self.width, self.width, self.wide, self.wide),
+            (self.width, 3, self.wide, bodies.OUTPUTS),
+        ]
 
-    # -- answering -------------------------------------------------------------------------------------------
+    @property
+    def network_size(self) -> int:
+        """Floats of the network in memory."""
+        return aligned(sum((rows + 1) * columns for _, _, rows, columns in self.layers))
 
-    def query(
-        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    @property
+    def weights(self) -> dict[str, torch.Tensor]:
+        """Views of the network's numbers by name: `<layer>.weight` (out, in) and `<layer>.bias` (out,)."""
+        found, start = {}, self.params.numel() - self.network_size
+        for i, (inputs, outputs, rows, columns) in enumerate(self.layers):
+            both = self.params[start : start + (rows + 1) * columns].view(rows + 1, columns)
+            found[f"{i}.weight"], found[f"{i}.bias"] = both[:inputs, :outputs].T, both[rows, :outputs]
+            start += both.numel()
+        return found
+
+    def kernel_arrays(self, params: object) -> bodies.Arrays:
+        """See ComputedField."""
+        factors = self.factors.kernel_arrays(params)
+        return bodies.Arrays(*factors, self.factors.params.numel())
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3); 0 in empty cells. No gradient."""
-        sigma, rgb = self.factors.query(points, dirs, with_colour=False)
-        if with_colour:
-            with torch.no_grad():
-                for some in torch.nonzero(sigma > 0)[:, 0].split(POINTS_AT_ONCE):
-                    some = torch.cat([some, some[-1:].expand(-len(some) % ROWS_PADDED)])
-                    products = autograd.features(self, self.params, points[some])
-                    rgb[some] = self.shade(products, dirs[some], self.basis)
-        return sigma, rgb
+        """See ComputedField and vm_mlp/reference.py."""
+        return reference.query(self, params, points, dirs)
 
-    def shade(self, products: torch.Tensor, dirs: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
-        """rgb (N, 3) from colour products (N, 3 rank) and unit dirs (N, 3), field's frame; differentiable."""
-        to_object = torch.from_numpy(self.arrays.to_object[0])
-        local = torch.nn.functional.normalize(dirs.double() @ to_object.T, dim=1).to(products.dtype)
-        return self.network(products @ basis.T, local)
+    def groups(self) -> list[Group]:
+        """The factors' groups, and the network."""
+        start = self.factors.params.numel()
+        return [*self.factors.groups(), Group(start, self.params.numel(), NETWORK_RATE)]
 
     # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """The factors' arrays and metadata, and the network's weights."""
         arrays, metadata = self.factors.state()
-        weights = {name: values.detach().numpy() for name, values in named_weights(self.network)}
-        return arrays | weights, metadata
+        weights = {f"network.{name}": view.detach().cpu() for name, view in self.weights.items()}
+        return arrays | {name: np.ascontiguousarray(w.numpy()) for name, w in weights.items()}, metadata
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMMLPField":
@@ -225,33 +177,44 @@ class VMMLPField:
         width = arrays.get("network.0.bias")
         if width is None or width.ndim != 1:
             raise ValueError("array 'network.0.bias' is missing or not a vector")
-        network = ColourNetwork(3 * factors.shape.coefficients, len(width))
-        with torch.no_grad():
-            for name, values in named_weights(network):
-                found = arrays.get(name)
-                if found is None or found.shape != tuple(values.shape):
-                    have = "nothing" if found is None else list(found.shape)
-                    raise ValueError(f"array '{name}' should have shape {list(values.shape)}, found {have}")
-                values.copy_(torch.from_numpy(np.ascontiguousarray(found, np.float32)))
-        check_network(network)
-        return cls(factors, network)
+        weights = {}
+        for name, shape in weight_shapes(3 * factors.shape.coefficients, len(width)).items():
+            found = arrays.get(f"network.{name}")
+            if found is None or found.shape != shape:
+                have = "nothing" if found is None else list(found.shape)
+                raise ValueError(f"array 'network.{name}' should have shape {list(shape)}, found {have}")
+            weights[name] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
+        check_network(weights)
+        return cls(factors, weights)
 
 
-def check_network(network: ColourNetwork) -> None:
+def weight_shapes(features: int, width: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network's weights, (out, in), and biases, (out,)."""
+    sizes = (5 * (features + 3), width, width, 3)
+    shapes = {}
+    for i in range(LAYERS):
+        shapes[f"{i}.weight"], shapes[f"{i}.bias"] = (sizes[i + 1], sizes[i]), (sizes[i + 1],)
+    return shapes
+
+
+def untrained(features: int, width: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    """Weights uniform as a linear layer's, the last bias 0."""
+    found = {}
+    for name, shape in weight_shapes(features, width).items():
+        bound = (shape[1] if len(shape) == 2 else found[f"{name[0]}.weight"].shape[1]) ** -0.5
+        found[name] = torch.empty(shape).uniform_(-bound, bound, generator=generator)
+    found[f"{LAYERS - 1}.bias"].zero_()
+    return found
+
+
+def check_network(weights: dict[str, torch.Tensor]) -> None:
     """Raise ValueError where inputs of size 1 could grow past float32 on their way through the network: the
     product of its layers' largest row sums bounds them."""
     largest = 1.0
-    for layer in network.layers:
-        rows = layer.weight.detach().double().abs().sum(1) * largest + layer.bias.detach().double().abs()
-        largest = float(rows.max())
+    for i in range(LAYERS):
+        weight, bias = weights[f"{i}.weight"].double(), weights[f"{i}.bias"].double()
+        largest = float((weight.abs().sum(1) * largest + bias.abs()).max())
     if not largest <= MAX_ANSWER:
         raise ValueError(
             f"arrays 'network.*' multiply to {largest:.3g}, which should be at most {MAX_ANSWER:g}"
         )
-
-
-def named_weights(network: ColourNetwork) -> list[tuple[str, torch.nn.Parameter]]:
-    """The network's weights by name: `network.<layer>.weight` (out, in) and `.bias` (out,)."""
-    return [
-        (f"network.{name.removeprefix('layers.')}", values) for name, values in network.named_parameters()
-    ]

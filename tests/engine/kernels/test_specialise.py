@@ -1,0 +1,110 @@
+"""One set of loops for all kinds: names that tell compiled code apart, and code that is found again."""
+
+import os
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+
+from fusedrf_cli.engine.kernels import loops, specialise
+from fusedrf_cli.engine.kinds.sparse import bodies as sparse
+from fusedrf_cli.engine.kinds.vm import bodies as vm
+from fusedrf_cli.engine.kinds.vm_mlp import bodies as vm_mlp
+from fusedrf_cli.engine.spaces import bounded
+
+SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
+
+SCRIPT = """
+import numpy as np, sys, torch
+from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.kernels.loops import Answers, Points
+from fusedrf_cli.engine.kernels.specialise import Loops
+from fusedrf_cli.engine.spaces import bounded
+sys.path.insert(0, {folder!r})
+import toy
+told = []
+field, grid = toy.Arrays(np.ones(4)), kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), *np.eye(3))
+grid = grid._replace(lo=np.zeros(3), hi=np.ones(3), cell=np.ones(3))
+with kernels.telling_of_compilation(lambda: told.append(1)):
+    for rank in map(int, sys.argv[1:]):
+        found = Answers(np.zeros(1), np.zeros((1, 3)))
+        asked = Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
+        loops = Loops(toy, {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}, bounded)
+        loops.each("query_point", field, grid, asked, 1, found)
+        print(found.sigma[0], found.rgb[0, 0])
+print(len(told))
+"""
+
+TOY = """
+from typing import NamedTuple
+from fusedrf_cli.engine.kernels.parts import sigmoid
+class Arrays(NamedTuple):
+    params: object
+def sizes(field):
+    return {}
+def density(field, grid, k, p, d, scratch):
+    return RANK * field.params[0], 0.0, 1, 0
+def colour(field, place, p, d, scratch, memory, at):
+    return SHOWN
+def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
+    pass
+""".replace("SHOWN", "0.25, 0.5, 0.75")
+
+
+@pytest.fixture
+def ask(tmp_path):
+    """What a process of its own answers for fields of some sizes, and whether it compiled anything."""
+    (tmp_path / "toy.py").write_text(TOY)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+
+    def run(*ranks: int) -> list[str]:
+        command = [sys.executable, "-c", SCRIPT.format(folder=str(tmp_path)), *map(str, ranks)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split("\n")[:-1]
+
+    run.folder = tmp_path
+    return run
+
+
+def test_sizes_have_code_of_their_own_and_a_second_process_compiles_nothing(ask):
+    """Two sizes of one kind, in one cache: without a name of its own one would load the other's code."""
+    assert ask(8, 16) == ["8.0 0.25", "16.0 0.25", "1"]
+    assert ask(16, 8) == ["16.0 0.25", "8.0 0.25", "0"]
+
+
+def test_a_changed_file_of_a_plug_in_is_compiled_anew(ask):
+    """Its functions are inlined into loops of another file, where numba looks for no change."""
+    assert ask(8) == ["8.0 0.25", "1"]
+    (ask.folder / "toy.py").write_text(TOY.replace("0.25, 0.5", "0.35, 0.5"))
+    assert ask(8) == ["8.0 0.35", "1"]
+
+
+def tag(bodies: ModuleType = vm, sizes: dict = SIZES, space: ModuleType = bounded) -> str:
+    return specialise.specialised(bodies, sizes, space)[0]
+
+
+def test_kinds_sizes_and_spaces_have_names_of_their_own():
+    other_space = ModuleType("elsewhere")
+    other_space.__dict__.update({k: v for k, v in vars(bounded).items() if k != "__name__"})
+    tags = [tag(), tag(sparse), tag(vm_mlp), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
+    assert len(set(tags)) == len(tags) and tag() == tags[0]
+
+
+def test_every_function_carries_the_name():
+    name, names = specialise.specialised(vm, SIZES, bounded)
+    for function in ("density", "colour", "query_point", "train_ray", "piece", "march"):
+        assert names[function].py_func.__qualname__ == f"{function}_{name}"
+    runs = specialise.Loops(vm, SIZES, bounded)
+    runs = [runs._over("each", item) for item in ("query_point", "render_ray")]
+    assert len({run.py_func.__qualname__ for run in runs}) == 2
+
+
+def test_what_a_kind_leaves_out_has_a_default_and_what_it_takes_from_another_is_that():
+    _, names = specialise.specialised(sparse, SIZES, bounded)
+    assert names["end"].py_func.__code__ is loops.end.__code__
+    assert names["advance"].py_func.__code__ is sparse.advance.__code__
+    _, names = specialise.specialised(vm_mlp, SIZES, bounded)
+    assert names["density"].py_func.__code__ is vm.density.__code__
+    assert names["colour"].py_func.__code__ is vm_mlp.colour.__code__
