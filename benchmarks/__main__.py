@@ -24,6 +24,7 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu, reference
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.spaces import bounded
@@ -121,10 +122,10 @@ def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> 
 
     def theirs():
         if with_colour:
-            sigma, rgb = reference.vm_query(sections, unit, ways, tensor.scale, tensor.shift)
+            sigma, rgb = vm_query(sections, unit, ways, tensor.scale, tensor.shift)
             (sigma.sum() + rgb.sum()).backward()
         else:
-            feature = reference.vm_density_feature(sections, unit)
+            feature = vm_density_feature(sections, unit)
             reference.density(feature, tensor.scale, tensor.shift).sum().backward()
 
     # the kernels evaluate again in the backward pass what they did not keep
@@ -207,7 +208,7 @@ def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, ray
     def theirs():
         other.zero_grad()
         unit, ways = ((points[chosen] + 1) / 2).float(), dirs[chosen].float()
-        sigma, rgb = reference.vm_query(sections, unit, ways, tensor.scale, tensor.shift)
+        sigma, rgb = vm_query(sections, unit, ways, tensor.scale, tensor.shift)
         depth = torch.log1p(10 * STEP * sigma) - torch.log1p(10 * STEP * asked[0][chosen])
         ((depth**2).mean() + 2 * ((rgb - 0.5) ** 2).mean()).backward()
         other.step()

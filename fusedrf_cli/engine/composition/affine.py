@@ -15,6 +15,7 @@ import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.kernels.reference import exact
 
 CONDITION_LIMIT = 1e6  # a flatter placement cannot be inverted to float32's accuracy
 
@@ -58,18 +59,36 @@ class Placed:
         )
 
     def to_object(
-        self, points: torch.Tensor, dirs: torch.Tensor
+        self, points: torch.Tensor, dirs: torch.Tensor, pose: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """World points and unit dirs (N, 3) to the object's frame: points, unit dirs, and |M^-1 d| (N,); all
-        float64.
+        float64 where the device has it. Differentiable, also in another placement `pose` (4, 4), where one is
+        given in place of the field's own.
         """
-        matrix = torch.from_numpy(self.world_to_object)
-        v = dirs.double() @ matrix[:3, :3].T
+        device = points.device
+        if pose is None:
+            matrix = exact(self.world_to_object, device)
+            linear, shift = matrix[:3, :3], matrix[:3, 3]
+        else:
+            pose = exact(pose, device)
+            linear = torch.linalg.inv(pose[:3, :3])
+            shift = -linear @ pose[:3, 3]
+        v = exact(dirs, device) @ linear.T
         stretch = v.norm(dim=1)
-        return points.double() @ matrix[:3, :3].T + matrix[:3, 3], v / stretch[:, None], stretch
+        return exact(points, device) @ linear.T + shift, v / stretch[:, None], stretch
 
     def moved(self, offset: np.ndarray) -> "Placed":
         """The same placement seen from a frame whose origin is at `offset` (3,)."""
         matrix = self.object_to_world.copy()
         matrix[:3, 3] -= offset
         return Placed(self.name, self.field, matrix)
+
+
+def rigid_motion(twist: torch.Tensor) -> torch.Tensor:
+    """(4, 4) motion of a twist (6,), differentiable: the turn about the axis twist[:3] by its length in
+    radians, and, where there is no turn, the shift twist[3:]; the matrix exponential of se(3)."""
+    x, y, z, *shift = twist.unbind()
+    zero = torch.zeros_like(x)
+    rows = [[zero, -z, y, shift[0]], [z, zero, -x, shift[1]], [-y, x, zero, shift[2]], [zero] * 4]
+    motion = torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows]))
+    return torch.cat([motion[:3], motion.new_tensor([[0, 0, 0, 1]])])  # not off by a rounding

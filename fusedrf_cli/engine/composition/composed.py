@@ -1,5 +1,8 @@
 """A composed scene: several placed fields that together are one radiance field."""
 
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -36,6 +39,20 @@ class ComposedField:
         boxes = np.stack([p.aabb for p in placed])
         self.origin = (boxes[:, :3].min(0) + boxes[:, 3:].max(0)) / 2
         self.placed, self.rule = [p.moved(self.origin) for p in placed], rule
+
+    def posed(self, poses: Mapping[str, np.ndarray]) -> "ComposedField":
+        """The same fields in the same frame, those named placed otherwise: (4, 4) object to this frame.
+        Raises ValueError for a name that is not there, or a placement that cannot be inverted."""
+        unknown = sorted(poses.keys() - {p.name for p in self.placed})
+        if unknown:
+            known = ", ".join(f"'{p.name}'" for p in self.placed)
+            raise ValueError(f"there is no '{unknown[0]}' to place; this scene places {known}")
+        other = copy(self)
+        other.__dict__.pop("occupancy", None)
+        other.placed = [
+            replace(p, object_to_world=poses[p.name]) if p.name in poses else p for p in self.placed
+        ]
+        return other
 
     @cached_property
     def occupancy(self) -> OccupancyGrid:

@@ -75,10 +75,19 @@ class ComputedField:
     def collect(self, grads: np.ndarray) -> None:
         """Hand on the gradients, rows (parts, P), of numbers that follow from others."""
 
-    def reference(self) -> "ComputedField":
-        """A field of the same answers for devices that have no compiled loops; it has `query`. Raises
-        ValueError where the kind has none."""
-        raise ValueError(f"{self.kind} fields are computed on 'cpu' and 'cuda', found '{self.params.device}'")
+    def dependent(self) -> list[tuple[int, int]]:
+        """(low, high) of the runs of `params` that `settle` makes follow from the others."""
+        return []
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `query`, with numbers params (P,), in plain torch: on any device, and differentiable in all
+        three. Raises ValueError where the kind has no reference."""
+        raise ValueError(
+            f"fields of kind '{self.kind}' have no reference in torch: they are computed on 'cpu' and 'cuda' "
+            "only, and cannot be differentiated in points or directions; convert them to another kind"
+        )
 
     # -- the same field otherwise ------------------------------------------------------------------------
 
@@ -158,7 +167,10 @@ class ComputedField:
         """σ (N,) per unit of length and rgb (N, 3) at points (N, 3), seen along unit dirs (N, 3); 0 where the
         field is empty. Not differentiable."""
         if self.device_loops is None:
-            return self.reference().query(points, dirs, with_colour)
+            with torch.no_grad():
+                device = self.params.device
+                found = self.reference(self.params, points.to(device), dirs.to(device))
+                return tuple(answer.cpu() for answer in found)
         asked = Points(exact(points), exact(dirs), bool(with_colour))
         found = Answers(np.empty(len(points), self.real), np.empty((len(points), 3), self.real))
         self.loops.each("query_point", self.arrays, self.grid, asked, len(points), found)

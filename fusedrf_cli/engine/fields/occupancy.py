@@ -151,7 +151,11 @@ def marked_cells(
 
 def transformed_aabb(aabb: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """(6,) box around a box's eight corners after a (4, 4) affine."""
-    lo, hi = aabb[:3], aabb[3:]
-    corners = np.stack(np.meshgrid(*zip(lo, hi, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    moved = corners @ matrix[:3, :3].T + matrix[:3, 3]
+    moved = box_corners(aabb) @ matrix[:3, :3].T + matrix[:3, 3]
     return np.concatenate([moved.min(0), moved.max(0)])
+
+
+def box_corners(aabb: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of a box (6,)."""
+    sides = zip(aabb[:3], aabb[3:], strict=True)
+    return np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)

@@ -52,12 +52,11 @@ def render_rays(
     done at once; MemoryError (or torch's own) when even that does not help. Raises ValueError for a direction
     of no length, along which there is no end, or one that is not finite.
     """
-    lengths = np.einsum("ni,ni->n", rays_d, rays_d)
-    if not ((lengths > 0) & (lengths < np.inf)).all():
-        raise ValueError(f"ray {np.argmax(~((lengths > 0) & (lengths < np.inf)))} has no direction")
+    check_directions(rays_d)
     step = step or STEP_PER_VOXEL * field.voxel_size
     out = np.zeros((len(rays_o), 5), np.float32)
-    fast = getattr(field, "render_rays", None)
+    compiled = getattr(field, "device_loops", True) is not None
+    fast = getattr(field, "render_rays", None) if compiled else None
 
     def render(part: slice) -> None:
         if fast is not None:
@@ -69,6 +68,14 @@ def render_rays(
     for start in range(0, len(rays_o), at_once):
         in_halves(render, start, min(start + at_once, len(rays_o)))
     return out
+
+
+def check_directions(rays_d: np.ndarray) -> None:
+    """Raise ValueError for directions (N, 3) of no length, or that are not finite."""
+    lengths = np.einsum("ni,ni->n", rays_d, rays_d)
+    sound = (lengths > 0) & (lengths < np.inf)
+    if not sound.all():
+        raise ValueError(f"ray {np.argmax(~sound)} has no direction")
 
 
 def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: int = HALVINGS) -> None:

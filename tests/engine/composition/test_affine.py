@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.composition.affine import CONDITION_LIMIT, Placed
+from fusedrf_cli.engine.composition.affine import CONDITION_LIMIT, Placed, rigid_motion
 from fusedrf_cli.engine.composition.composed import ComposedField
 from tests.analytic.fields import BOX, AnalyticField, Gaussian
 from tests.analytic.rays import DIRECTIONS_26, SHEAR, affine, rays_at, turn, unit
@@ -107,3 +107,17 @@ def test_moved_shifts_only_the_frame():
     np.testing.assert_allclose(moved.aabb, placed.aabb - [1, 2, 3, 1, 2, 3])
     assert np.array_equal(moved.object_to_world[:3, :3], placed.object_to_world[:3, :3])
     assert placed.object_to_world[0, 3] == 0.3  # the original stays
+
+
+def test_a_twist_turns_and_shifts():
+    """By Rodrigues' formula; a turn and its opposite are none; differentiable at 0 too."""
+    axis, shift = np.array([1.0, 2.0, -0.5]), [0.3, -0.2, 0.1]
+    twist = np.concatenate([np.radians(40) * axis / np.linalg.norm(axis), np.zeros(3)])
+    np.testing.assert_allclose(rigid_motion(torch.from_numpy(twist)), affine(turn(40), (0, 0, 0)), atol=1e-14)
+    moved = torch.tensor([0.0, 0, 0, *shift], dtype=torch.float64, requires_grad=True)
+    np.testing.assert_allclose(rigid_motion(moved).detach(), affine(1, shift), atol=1e-15)
+    both = torch.tensor([0.4, -1.0, 0.2, *shift], dtype=torch.float64, requires_grad=True)
+    np.testing.assert_allclose((rigid_motion(both) @ rigid_motion(-both)).detach(), np.eye(4), atol=1e-14)
+    assert rigid_motion(both)[3].tolist() == [0, 0, 0, 1]
+    for at in (moved, both, torch.zeros(6, dtype=torch.float64, requires_grad=True)):
+        assert torch.autograd.gradcheck(rigid_motion, at)

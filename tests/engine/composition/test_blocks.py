@@ -16,6 +16,7 @@ from fusedrf_cli.engine.kinds.vm.blocks import (
     without,
 )
 from fusedrf_cli.engine.kinds.vm.field import VMShape
+from fusedrf_cli.engine.kinds.vm.reference import vm_query
 from tests.analytic.rays import SHEAR, affine, turn
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Gaussian, points_in, random_vm, unit
 

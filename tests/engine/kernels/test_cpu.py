@@ -12,6 +12,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
 from fusedrf_cli.engine.spaces import bounded
 from tests.engine.conftest import (
     BOX,
@@ -42,7 +43,7 @@ def query(field: VMField, points: np.ndarray, dirs: np.ndarray, **options) -> tu
 
 def expected(field: VMField, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tuple(
-        a.numpy() for a in reference.field_query(field, torch.from_numpy(points), torch.from_numpy(dirs))
+        a.numpy() for a in field.reference(field.params, torch.from_numpy(points), torch.from_numpy(dirs))
     )
 
 
@@ -165,7 +166,7 @@ def by_the_max_rule(field: VMField, x: np.ndarray, d: np.ndarray) -> tuple[float
         inverse = np.linalg.inv(block.object_to_field)
         v = inverse[:3, :3] @ d
         at = (inverse[:3, :3] @ x + inverse[:3, 3] - tensor.aabb[:3]) / (tensor.aabb[3:] - tensor.aabb[:3])
-        sigma, rgb = reference.vm_query(
+        sigma, rgb = vm_query(
             field.sections(block.tensor),
             torch.from_numpy(at[None]),
             torch.from_numpy(v[None] / np.linalg.norm(v)),
@@ -259,9 +260,7 @@ def test_query_backward_is_autograd():
     d_sigma, d_rgb = rng.normal(size=80), rng.normal(size=(80, 3))
     found = backward(field, points, dirs, d_sigma, d_rgb)
     params = field.params.clone().requires_grad_()
-    outputs = reference.field_query(
-        with_params(field, params), torch.from_numpy(points), torch.from_numpy(dirs)
-    )
+    outputs = field.reference(params, torch.from_numpy(points), torch.from_numpy(dirs))
     torch.autograd.backward(outputs, (torch.from_numpy(d_sigma), torch.from_numpy(d_rgb)))
     np.testing.assert_allclose(found, params.grad.numpy(), rtol=1e-10, atol=1e-12)
 
@@ -563,7 +562,7 @@ def test_peaks_are_the_largest_of_the_probes():
     wanted = []
     for offset in offsets:
         at = torch.from_numpy((cells + offset) / grid.occupied.shape)
-        feature = reference.vm_density_feature(field.sections(0), at)
+        feature = vm_density_feature(field.sections(0), at)
         wanted.append(reference.density(feature, tensor.scale, tensor.shift).numpy())
     np.testing.assert_allclose(out, np.max(wanted, 0), rtol=1e-6)
 

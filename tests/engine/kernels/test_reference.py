@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.kernels import reference
+from fusedrf_cli.engine.kinds.vm.reference import vm_query
 from tests.engine.conftest import DIRECTIONS_26, SIXTY_FOUR, random_vm, unit
 
 
@@ -73,7 +74,7 @@ def test_query_is_differentiable():
     names, values = zip(*field.sections(0).items(), strict=True)
 
     def query(*values):
-        return reference.vm_query(dict(zip(names, values, strict=True)), at, dirs, 3.0, -1.0)
+        return vm_query(dict(zip(names, values, strict=True)), at, dirs, 3.0, -1.0)
 
     leaves = tuple(v.clone().requires_grad_() for v in values)
     assert torch.autograd.gradcheck(query, leaves, fast_mode=True)

@@ -9,8 +9,9 @@ from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import loops, reference
+from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm.reference import vm_products
 from fusedrf_cli.engine.kinds.vm_mlp import bodies
 from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untrained
 from fusedrf_cli.engine.rendering.cameras import orbit
@@ -18,18 +19,8 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from tests.analytic.export import way_of
 
-from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
-
-
-def random_field(
-    dtype=torch.float64, seed=0, cells=None, matrix=None, shape=SIXTY_FOUR, width=8
-) -> VMMLPField:
-    """A vm-mlp field of random numbers whose colours differ."""
-    shape = type(shape)(shape.density_rank, shape.colour_rank, 2)
-    generator = torch.Generator().manual_seed(seed)
-    factors = random_vm(shape, dtype=dtype, seed=seed, cells=cells, matrix=matrix)
-    weights = untrained(27, width, generator)
-    return VMMLPField(factors, {name: view.to(dtype) for name, view in weights.items()})
+from ..conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
+from .cases import random_vm_mlp as random_field
 
 
 def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -37,7 +28,7 @@ def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
     placement, box = field.blocks[0].object_to_field, field.tensors[0].aabb
     inside = (np.linalg.solve(placement, [*point, 1.0])[:3] - box[:3]) / (box[3:] - box[:3])
     sections = field.factors.sections(0)
-    products = reference.vm_products(sections, "colour", torch.from_numpy(inside[None]))[0].numpy()
+    products = vm_products(sections, "colour", torch.from_numpy(inside[None]))[0].numpy()
     x = [float(row @ products) for row in field.basis.numpy()]
     local = field.arrays.to_object[0] @ direction
     local = local / np.linalg.norm(local)

@@ -17,7 +17,7 @@ import torch
 from fusedrf_cli.engine.fields.computed import ComputedField, exact
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.parts import LINE
-from fusedrf_cli.engine.kinds.sparse import bodies, training
+from fusedrf_cli.engine.kinds.sparse import bodies, reference, training
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
 
@@ -197,6 +197,12 @@ class SparseField(ComputedField):
         self.loops.each("expose_voxel", self.arrays, self.grid, light, len(low), found)
         return found.clearest, found.facing
 
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ComputedField and sparse/reference.py."""
+        return reference.query(self, params, points, dirs)
+
     # -- learning --------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
@@ -205,6 +211,13 @@ class SparseField(ComputedField):
             if lattice.spread.shape[0]:
                 *edges, target = lattice.spreading
                 self.device_loops.sums_of_rows(self.arrays.params, base, width, *edges, target, False)
+
+    def dependent(self) -> list[tuple[int, int]]:
+        """(low, high) of the runs of `params` that `settle` makes follow from the others: hanging rows."""
+        return [
+            (base + width * lattice.free, base + width * len(lattice.vertices))
+            for lattice, base, width in self._lattices()
+        ]
 
     def collect(self, grads: np.ndarray) -> None:
         """Hand the gradients of hanging rows on to what they hang on; their own no longer count."""

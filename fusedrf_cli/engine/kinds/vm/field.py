@@ -23,12 +23,12 @@ from fusedrf_cli.engine.fields.occupancy import (
     transformed_aabb,
 )
 from fusedrf_cli.engine.kernels.parts import LINE
-from fusedrf_cli.engine.kinds.vm import bodies
+from fusedrf_cli.engine.kinds.vm import bodies, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
+from fusedrf_cli.engine.kinds.vm.reference import MODES
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
-MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 MAX_STRIDE = 64
 MAX_TEXELS = 8192  # per axis, in a stored field
@@ -305,6 +305,12 @@ class VMField(ComputedField):
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
         )
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ComputedField and vm/reference.py."""
+        return reference.query(self, params, points, dirs)
 
     def groups(self) -> list[Group]:
         """Each tensor's factors and its colour basis."""

@@ -12,7 +12,7 @@ import torch
 from fusedrf_cli.engine.fields.computed import ComputedField, Group
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, VMField, VMShape, VMTensor, aligned
-from fusedrf_cli.engine.kinds.vm_mlp import bodies
+from fusedrf_cli.engine.kinds.vm_mlp import bodies, reference
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
@@ -159,6 +159,12 @@ class VMMLPField(ComputedField):
         """See ComputedField."""
         factors = self.factors.kernel_arrays(params)
         return bodies.Arrays(*factors, self.factors.params.numel())
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ComputedField and vm_mlp/reference.py."""
+        return reference.query(self, params, points, dirs)
 
     def groups(self) -> list[Group]:
         """The factors' groups, and the network."""

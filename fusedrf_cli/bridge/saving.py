@@ -1,0 +1,56 @@
+"""A scene of fields that another program changed, back to a bundle."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from formats.bundle import BundleWriter, is_bundle, read_headers
+from formats.records import FieldRecord
+from formats.scene import Node, SceneGraph, make_node
+from fusedrf_cli import __version__
+from fusedrf_cli.bridge.scene import LoadedScene
+from fusedrf_cli.engine.fields.base import StoredField
+
+
+def save_scene(
+    output: str | Path,
+    scene: LoadedScene,
+    fields: Mapping[str, StoredField],
+    placements: Mapping[str, np.ndarray],
+    *,
+    precision: str,
+    overwrite: bool,
+) -> int:
+    """Write a scene with the fields and placements (4, 4), object to world, of its nodes' names as they are
+    now, as one bundle; returns its bytes. Fields that several nodes share are stored once.
+
+    What else the scene's own bundle holds (kept sources, its history, keys of later versions) stays. Raises
+    what `BundleWriter.write` and `make_node` raise.
+    """
+    writer, members, nodes = BundleWriter(), {}, []
+    for source in scene.fields:
+        name = source.placed.name
+        field = fields[name]
+        if id(field) not in members:
+            members[id(field)] = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
+        nodes.append(placed_node(name, members[id(field)], placements[name], source.background))
+    history = ()
+    if scene.path is not None and is_bundle(scene.path):
+        history = scene.graph.history
+        shown = {source.member for source in scene.fields}
+        for member in read_headers(scene.path)[1].keys() - shown:
+            writer.copy_field(scene.path, member)
+    graph = SceneGraph(
+        tuple(nodes), scene.composition, history, f"fusedrf {__version__}", extras=scene.graph.extras
+    )
+    writer.write(output, graph, overwrite=overwrite)
+    return Path(output).stat().st_size
+
+
+def placed_node(name: str, member: str, object_to_world: np.ndarray, background: bool) -> Node:
+    """A node that holds a field; one that is only moved says so, which edits of a fused field ask for."""
+    only_moved = np.array_equal(object_to_world[:3, :3], np.eye(3))
+    shift = object_to_world[:3, 3] if object_to_world[:3, 3].any() else None
+    place = {"translation": shift} if only_moved else {"matrix": object_to_world}
+    return make_node(name, field=member, background=background, **place)

@@ -1,0 +1,149 @@
+"""Placed and composed fields as functions of torch, differentiable also in where the fields are placed.
+
+`poses` are placements (4, 4) by name, object to the frame of the composed field, that take the place of its
+own: σ_world(x, d) = σ_object(M⁻¹ x) |M⁻¹ d| is differentiated as it stands. Which field is densest is a
+constant.
+"""
+
+from collections.abc import Mapping
+from functools import reduce
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition import composed
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields import differentiable
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.occupancy import box_corners
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kernels.reference import exact
+
+Poses = Mapping[str, torch.Tensor]
+
+
+def query(
+    field: RadianceField | Placed,
+    points: torch.Tensor,
+    dirs: torch.Tensor,
+    poses: Poses | None = None,
+    with_colour: bool = True,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """σ (N,) and rgb (N, 3) of a field, placed or composed or neither, at points (N, 3) along unit dirs
+    (N, 3) of its frame, as `fields.differentiable.query`; differentiable in `poses` too."""
+    if isinstance(field, ComposedField):
+        return composed_query(field, points, dirs, poses or {}, with_colour)
+    if isinstance(field, Placed):
+        return placed_query(field, points, dirs, (poses or {}).get(field.name), with_colour)
+    return differentiable.query(field, points, dirs, with_colour=with_colour)
+
+
+def composed_query(
+    field: ComposedField, points: torch.Tensor, dirs: torch.Tensor, poses: Poses, with_colour: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """σ (N,) and rgb (N, 3) of a composed field, by its rule."""
+    device, kind = device_of(field), float_type(field)
+    points, dirs = exact(points, device), exact(dirs, device)
+    parts = [(p, poses.get(p.name)) for p in structure(field, poses).placed]
+    sigma = torch.zeros(len(points), dtype=points.dtype, device=device)
+    rgb = torch.zeros(len(points), 3, dtype=points.dtype, device=device)
+    if field.rule == "max":
+        asked = densest(parts, points, dirs)
+    else:
+        asked = [(p, pose, reached(p, points)) for p, pose in parts]
+    for placed, pose, own in asked:  # also where a part is asked nothing: so its gradient is 0, not unknown
+        found, colour = placed_query(placed, points[own], dirs[own], pose, with_colour)
+        found, colour = found.to(sigma.dtype), colour.to(rgb.dtype)
+        share = 1 if field.rule == "max" else found[:, None]
+        sigma, rgb = sigma.index_add(0, own, found), rgb.index_add(0, own, share * colour)
+    if field.rule == "add":
+        rgb = rgb / sigma.clamp_min(1e-30)[:, None]
+    return sigma.to(kind), rgb.to(kind)
+
+
+@torch.no_grad()
+def densest(parts: list, points: torch.Tensor, dirs: torch.Tensor) -> list:
+    """(placed field, its pose or None, indices of the points (N, 3) at which it is the densest) of every
+    part; the earlier one in a tie, none where nothing is."""
+    best = torch.zeros(len(points), dtype=points.dtype, device=points.device)
+    winner = torch.full((len(points),), -1, device=points.device)
+    for i, (placed, pose) in enumerate(parts):
+        own = reached(placed, points)
+        if len(own):
+            found, _ = placed_query(placed, points[own], dirs[own], pose, with_colour=False)
+            denser = found > best[own]
+            best[own[denser]], winner[own[denser]] = found[denser].to(best.dtype), i
+    return [(*part, torch.nonzero(winner == i)[:, 0]) for i, part in enumerate(parts)]
+
+
+def reached(placed: Placed, points: torch.Tensor) -> torch.Tensor:
+    """Indices of the points (N, 3) that lie in a placed field's box."""
+    box = exact(placed.aabb, points.device)
+    return torch.nonzero(((points >= box[:3]) & (points <= box[3:])).all(1))[:, 0]
+
+
+def placed_query(
+    placed: Placed, points: torch.Tensor, dirs: torch.Tensor, pose: torch.Tensor | None, with_colour: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """σ (N,) and rgb (N, 3) of a placed field in the frame it is placed in."""
+    device = device_of(placed.field)
+    x, d, stretch = placed.to_object(exact(points, device), dirs.to(device), pose)
+    sigma, rgb = query(opened(placed.field), x, d, with_colour=with_colour)
+    return (exact(sigma, device) * stretch).to(sigma.dtype), rgb
+
+
+def structure(field: RadianceField, poses: Poses | None) -> RadianceField:
+    """A composed field with its parts where `poses` place them now, without gradients: what marching
+    needs. Any other field as it is, and that itself where nothing is elsewhere."""
+    if not poses:
+        return field
+    host = torch.device("cpu")
+    now = {name: exact(pose.detach(), host).numpy() for name, pose in poses.items()}
+    known = {p.name: p.object_to_world for p in field.placed}
+    same = all(name in known and np.array_equal(pose, known[name]) for name, pose in now.items())
+    return field if same else field.posed(now)
+
+
+def bounds(field: RadianceField, poses: Poses | None) -> torch.Tensor:
+    """(6,) the box of a field, on its device and differentiable in `poses`."""
+    device = device_of(field)
+    box = exact(structure(field, poses).aabb, device)
+    if not poses:
+        return box
+    corners = []
+    for placed in field.placed:
+        matrix = exact(poses.get(placed.name, placed.object_to_world), device)
+        inner = exact(box_corners(opened(placed.field).occupancy.tight_aabb(0)), device)
+        corners.append(inner @ matrix[:3, :3].T + matrix[:3, 3])
+    corners = torch.stack(corners)
+    low, high = corners.amin((0, 1)), corners.amax((0, 1))
+    margin = (high - low).max() / composed.OCCUPANCY_CELLS  # as `occupancy.placed_cells` has it
+    same = torch.cat([low - margin, high + margin])
+    return box + same - same.detach()
+
+
+def parts(field: RadianceField | Placed) -> list[RadianceField]:
+    """The fields that a field places, each once; of one that places none, itself."""
+    field = opened(field)
+    if isinstance(field, Placed):
+        return parts(field.field)
+    if not isinstance(field, ComposedField):
+        return [field]
+    return list({id(part): part for placed in field.placed for part in parts(placed)}.values())
+
+
+def numbers(field: RadianceField | Placed) -> list[torch.Tensor]:
+    """The `params` of all the fields that a field places, or its own, each once."""
+    found = (part.params for part in parts(field) if hasattr(part, "params"))
+    return list({id(params): params for params in found}.values())
+
+
+def device_of(field: RadianceField | Placed) -> torch.device:
+    """Where a field's numbers lie, of a composed one those of its first part; the CPU for one without."""
+    return next((p.device for p in numbers(field)), torch.device("cpu"))
+
+
+def float_type(field: RadianceField | Placed) -> torch.dtype:
+    """The widest float type of a field's numbers; float32 for one without."""
+    return reduce(torch.promote_types, (p.dtype for p in numbers(field)), torch.float32)

@@ -1,0 +1,176 @@
+"""Rendering as a function of torch, differentiable in fields' numbers, rays, cameras' poses and placements.
+
+Samples are found by the compiled march and lie where those of `volume.render_rays` lie; how far along a ray
+they lie is differentiated too, since a ray's first sample depends on where it enters the box. Which samples
+there are is a constant.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.differentiable import (
+    Poses,
+    bounds,
+    device_of,
+    numbers,
+    parts,
+    query,
+    structure,
+)
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.differentiable import settle
+from fusedrf_cli.engine.kernels.reference import exact, interval
+from fusedrf_cli.engine.rendering import volume
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.volume import EARLY_STOP, STEP_PER_VOXEL, waves, weights_from_sigma
+
+
+class Picture(NamedTuple):
+    """One view as tensors on the field's device."""
+
+    rgb: torch.Tensor
+    """(H, W, 3), premultiplied by the opacity."""
+    opacity: torch.Tensor
+    """(H, W) in [0, 1]."""
+    depth: torch.Tensor
+    """(H, W) mean distance along the ray in world units; inf where nothing is hit."""
+
+    def over(self, background: tuple[float, float, float]) -> torch.Tensor:
+        """(H, W, 3) composited over a colour, in [0, 1]."""
+        return self.rgb + (1 - self.opacity[..., None]) * self.rgb.new_tensor(background)
+
+
+def render_rays(
+    field: RadianceField | Placed,
+    rays_o: torch.Tensor,
+    rays_d: torch.Tensor,
+    *,
+    poses: Poses | None = None,
+    near: float = 0.0,
+    step: float | None = None,
+    early_stop: float = EARLY_STOP,
+) -> torch.Tensor:
+    """Render rays (N, 3), directions of unit length, of the frame of a field, placed or composed or neither:
+    (N, 5) premultiplied rgb, opacity and Σ w t, on the field's device.
+
+    Differentiable in the fields' numbers, rays_o, rays_d and `poses` (composition/differentiable.py). Where
+    nothing needs a gradient it is `volume.render_rays`, which is faster: it leaves out the colour of the
+    lightest samples, and samples coarse blocks and bricks less often. Samples behind which less than
+    `early_stop` of the light is left are not asked. step None: half the field's finest voxel. Raises
+    ValueError for a direction of no length.
+    """
+    if isinstance(field, Placed):
+        field, origin = ComposedField([field]), exact(ComposedField([field]).origin, rays_o.device)
+        poses, rays_o = shifted(poses, origin), rays_o - origin
+    known, device = structure(field, poses), device_of(field)
+    step = step or STEP_PER_VOXEL * known.voxel_size
+    host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]
+    if not needs_gradient(field, rays_o, rays_d, *(poses or {}).values()):
+        for part in parts(field):
+            settle(part)
+        found = volume.render_rays(known, *host, near=near, step=step, early_stop=early_stop)
+        return torch.from_numpy(found).to(device)
+    volume.check_directions(host[1])
+    ray, ts = visible_samples(known, *host, near, step, early_stop)
+    ray, ts = torch.from_numpy(ray).to(device), exact(ts, device)
+    rays_o, rays_d = exact(rays_o, device), exact(rays_d, device)
+    start, _ = interval(rays_o, rays_d, bounds(field, poses), near)
+    ts = ts + (start - start.detach())[ray]
+    dirs = rays_d[ray]
+    sigma, rgb = query(field, rays_o[ray] + ts[:, None] * dirs, dirs, poses)
+    weights = composite(sigma * step, ray, len(rays_o))
+    columns = torch.cat([rgb, torch.ones_like(sigma)[:, None], ts.to(sigma.dtype)[:, None]], 1)
+    return sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
+
+
+def needs_gradient(field: RadianceField, *inputs: torch.Tensor) -> bool:
+    """Whether a gradient is wanted of anything that a rendering follows from."""
+    if not torch.is_grad_enabled():
+        return False
+    return any(x.requires_grad for x in inputs) or any(p.requires_grad for p in numbers(field))
+
+
+def shifted(poses: Poses | None, origin: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Placements seen from a frame whose origin is at `origin` (3,)."""
+    offset = torch.nn.functional.pad(origin[:, None], (3, 0, 0, 1))
+    return {name: pose - offset.to(pose) for name, pose in (poses or {}).items()}
+
+
+@torch.no_grad()
+def visible_samples(
+    field: RadianceField,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    near: float,
+    step: float,
+    early_stop: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (S,) int64, ascending, and distances (S,) of the samples up to where a ray is opaque, in order."""
+    trans = np.ones(len(rays_o))
+    rays, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
+    middle = np.full(len(rays_o), 0.5)
+    for ray, ts, counts in waves(field, rays_o, rays_d, near, middle, step, lambda: trans > early_stop):
+        row, slot = np.nonzero(np.arange(ts.shape[1]) < counts[:, None])
+        dirs = rays_d[ray[row]]
+        points = rays_o[ray[row]] + ts[row, slot, None] * dirs
+        sigma = np.zeros(ts.shape)
+        found, _ = query(field, torch.from_numpy(points), torch.from_numpy(dirs), with_colour=False)
+        sigma[row, slot] = found.cpu().numpy()
+        weights, after = weights_from_sigma(sigma, step, trans[ray])
+        before = trans[ray, None] - (np.cumsum(weights, 1) - weights)
+        kept = before[row, slot] > early_stop
+        trans[ray] = after
+        rays.append(ray[row[kept]])
+        distances.append(ts[row[kept], slot[kept]])
+    ray, ts = np.concatenate(rays), np.concatenate(distances)
+    order = np.argsort(ray, kind="stable")
+    return ray[order], ts[order]
+
+
+def composite(depth: torch.Tensor, ray: torch.Tensor, n: int) -> torch.Tensor:
+    """Weights (S,) of packed samples of optical depths (S,) on n rays; the samples' rays (S,) ascend.
+
+    The depth before a sample is the running sum over all less its value at the ray's first, hence float64.
+    """
+    deep = exact(depth, depth.device)
+    before = deep.cumsum(0) - deep
+    counts = torch.bincount(ray, minlength=n)
+    first = (counts.cumsum(0) - counts)[ray]
+    return (torch.exp(before[first] - before) * -torch.expm1(-deep)).to(depth.dtype)
+
+
+def camera_rays(camera: Camera, pose: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    """rays_o and rays_d, each (H W, 3) float64 in world space, rays_d of unit length, row by row, of a camera
+    at `pose` (4, 4), camera to world; None: its own. Differentiable in `pose`."""
+    pose = torch.from_numpy(np.asarray(camera.camera_to_world, np.float64)) if pose is None else pose
+    pose = exact(pose, pose.device)
+    dirs = exact(camera.local_directions().reshape(-1, 3), pose.device) @ pose[:3, :3].T
+    return pose[:3, 3].expand_as(dirs), torch.nn.functional.normalize(dirs, dim=1)
+
+
+def render_image(
+    field: RadianceField | Placed,
+    camera: Camera,
+    *,
+    pose: torch.Tensor | None = None,
+    poses: Poses | None = None,
+    origin: np.ndarray | None = None,
+    near: float = 0.0,
+    step: float | None = None,
+    early_stop: float = EARLY_STOP,
+) -> Picture:
+    """Render one view from `pose` (4, 4), camera to world, in place of the camera's own; origin (3,) is the
+    world position of the field's frame origin. Differentiable as `render_rays`, and in `pose`."""
+    rays_o, rays_d = camera_rays(camera, pose)
+    if origin is not None:
+        rays_o = rays_o - exact(origin, rays_o.device)
+    found = render_rays(field, rays_o, rays_d, poses=poses, near=near, step=step, early_stop=early_stop).view(
+        camera.height, camera.width, 5
+    )
+    opacity = found[..., 3]
+    depth = torch.where(opacity > 1e-3, found[..., 4] / opacity.clamp_min(1e-3), torch.inf)
+    return Picture(found[..., :3], opacity, depth)
