@@ -53,20 +53,23 @@ class Adam:
         rest = [np.float32(x) for x in (BETA1, BETA2, EPS, correction1, correction2)]
         moved = self.field.arrays.params, self.grads, self.moment1, self.moment2
         for group in self.field.groups():
-            self.field.device_loops.adam(
-                *moved, np.float32(rate * group.rate), group.low, group.high, *rest
-            )
+            own = np.float32(rate * group.rate)
+            if group.lines is None:
+                self.field.device_loops.adam(*moved, own, group.low, group.high, *rest)
+            else:
+                self.field.device_loops.adam_lines(*moved, own, group.lines, *rest)
         self.field.settle()
 
     def sound(self) -> bool:
         """Whether the gradients are finite, judged by those of the slower groups, some thousand numbers that
-        all samples share, or by all where a field has none.
+        all samples share, or by all where a field has none; those of which a step looks at few lines only are
+        left out.
 
         Every shaded sample adds to its colour basis what it sends back, times its features: a gradient or a
         colour factor that is not finite shows there. What only a density factor could hide, an infinite σ, is
         left to the guard's look at all numbers.
         """
-        groups = self.field.groups()
+        groups = [group for group in self.field.groups() if group.lines is None]
         looked_at = [group for group in groups if group.rate < 1] or groups
         parts = [row[group.low : group.high] for group in looked_at for row in self.gradient]
         return all(bool(torch.dot(part, part).isfinite()) for part in parts)

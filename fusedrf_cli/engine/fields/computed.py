@@ -39,6 +39,8 @@ class Group:
     high: int
     rate: float = 1.0
     """Relative to the optimiser's."""
+    lines: np.ndarray | None = None
+    """(L,) int64, where the cache lines begin in which a sample can reach any number; None: all of them."""
 
 
 class ComputedField:

@@ -152,12 +152,21 @@ def plain_kernels() -> SimpleNamespace:
             )  # fmt: skip
 
     @cuda.jit(fastmath=True)
+    def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2):
+        i = cuda.grid(1)
+        if i < lines.shape[0]:
+            adam_line(
+                params, grads, moment1, moment2, rate, np.uint64(lines[i]), beta1, beta2, eps, correction1,
+                correction2,
+            )  # fmt: skip
+
+    @cuda.jit(fastmath=True)
     def sums_of_rows(base, width, start, source, weight, target, keep, values):
         i = cuda.grid(1)
         if i < target.shape[0]:
             sum_of_rows(values, base, width, start, source, weight, target, i, keep)
 
-    return SimpleNamespace(adam=adam, sums_of_rows=sums_of_rows)
+    return SimpleNamespace(adam=adam, adam_lines=adam_lines, sums_of_rows=sums_of_rows)
 
 
 def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
@@ -168,6 +177,16 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     lines = -(-(high - low) // parts.LINE)
     if lines > 0:
         plain_kernels().adam[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
+    fetch(arrays, placed)
+
+
+def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2):
+    """See plain.adam_lines."""
+    arrays = params, grads, moment1, moment2
+    placed = [on_device(array) for array in arrays]
+    rest = rate, on_device(lines), beta1, beta2, eps, correction1, correction2
+    if len(lines):
+        plain_kernels().adam_lines[(len(lines) + THREADS - 1) // THREADS, THREADS](*placed, *rest)
     fetch(arrays, placed)
 
 

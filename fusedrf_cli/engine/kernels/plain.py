@@ -16,6 +16,7 @@ task = njit(**FLAGS, _nrt=False)
 
 RAYS_PER_TASK = 2048
 ENTRIES_PER_TASK = 1 << 16
+LINES_PER_TASK = ENTRIES_PER_TASK // LINE
 
 
 @task
@@ -42,6 +43,29 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
         end = min(high, start + ENTRIES_PER_TASK)
         adam_task(
             params, grads, moment1, moment2, rate, start, end, beta1, beta2, eps, correction1, correction2
+        )
+
+
+@task
+def adam_lines_task(
+    params, grads, moment1, moment2, rate, lines, part, beta1, beta2, eps, correction1, correction2
+):
+    """`adam_lines` for the part-th of them."""
+    low, high = part * LINES_PER_TASK, min(len(lines), (part + 1) * LINES_PER_TASK)
+    for i in range(low, high):
+        adam_line(
+            params, grads, moment1, moment2, rate, np.uint64(lines[i]), beta1, beta2, eps, correction1,
+            correction2,
+        )  # fmt: skip
+
+
+@loop
+def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2):
+    """`adam` on the cache lines that begin at lines (L,) alone: of a large field most are never touched, and
+    looking at them would cost more than the rest of a step."""
+    for part in prange((len(lines) + LINES_PER_TASK - 1) // LINES_PER_TASK):
+        adam_lines_task(
+            params, grads, moment1, moment2, rate, lines, part, beta1, beta2, eps, correction1, correction2
         )
 
 

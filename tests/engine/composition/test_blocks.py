@@ -6,7 +6,6 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.kernels.reference import vm_query
 from fusedrf_cli.engine.kinds.vm.blocks import (
     MAX_BLOCKS,
     blocks_of,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, untrained
 from tests.analytic.rays import affine, turn
 

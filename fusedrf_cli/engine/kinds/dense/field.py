@@ -3,12 +3,15 @@ et al. CVPR 2022; DVGO, Sun et al. CVPR 2022), interpolated before the activatio
 
 Vertices that touch no occupied cell say nothing and are not stored."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import BoxField, Part
+from fusedrf_cli.engine.fields.box import LINE, BoxField, Part
+from fusedrf_cli.engine.fields.computed import Group
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.dense import bodies, reference
 
 DENSITY_RATE, COLOUR_RATE = 5.0, 2.0  # DVGO: 0.1 for both, where factors of a decomposition take 0.02
@@ -61,6 +64,25 @@ class DenseField(BoxField):
     def reference(self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor):
         """See reference.py."""
         return reference.query(self, params, points, dirs)
+
+    # -- learning: only vertices that are asked -------------------------------------------------------------
+
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "DenseField":
+        """See ComputedField."""
+        return super().with_occupancy(occupancy)._afresh("lines")
+
+    @cached_property
+    def lines(self) -> list[np.ndarray]:
+        """Of density and of rows: where the cache lines of the used vertices begin."""
+        vertices, width = np.flatnonzero(self.used), self.shape.width
+        rows = vertices[:, None] * width + np.arange(0, width, LINE)
+        return [np.unique(at // LINE) * LINE for at in (vertices, rows.ravel())]
+
+    def groups(self) -> list[Group]:
+        """See ComputedField."""
+        density, rows, *rest = super().groups()
+        reached = zip((density, rows), self.lines, strict=True)
+        return [*(replace(group, lines=group.low + lines) for group, lines in reached), *rest]
 
     # -- storing: only vertices that are asked --------------------------------------------------------------
 
