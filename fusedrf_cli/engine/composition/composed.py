@@ -42,11 +42,7 @@ class ComposedField:
 
     def posed(self, poses: Mapping[str, np.ndarray]) -> "ComposedField":
         """The same fields in the same frame, those named placed otherwise: (4, 4) object to this frame.
-        Raises ValueError for a name that is not there, or a placement that cannot be inverted."""
-        unknown = sorted(poses.keys() - {p.name for p in self.placed})
-        if unknown:
-            known = ", ".join(f"'{p.name}'" for p in self.placed)
-            raise ValueError(f"there is no '{unknown[0]}' to place; this scene places {known}")
+        Raises ValueError for a placement that cannot be inverted."""
         other = copy(self)
         other.__dict__.pop("occupancy", None)
         other.placed = [

@@ -31,12 +31,23 @@ def query(
     with_colour: bool = True,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """σ (N,) and rgb (N, 3) of a field, placed or composed or neither, at points (N, 3) along unit dirs
-    (N, 3) of its frame, as `fields.differentiable.query`; differentiable in `poses` too."""
+    (N, 3) of its frame, as `fields.differentiable.query`; differentiable in `poses` too. Raises ValueError
+    for a pose of what the field does not place."""
+    check_names(field, poses)
     if isinstance(field, ComposedField):
         return composed_query(field, points, dirs, poses or {}, with_colour)
     if isinstance(field, Placed):
         return placed_query(field, points, dirs, (poses or {}).get(field.name), with_colour)
     return differentiable.query(field, points, dirs, with_colour=with_colour)
+
+
+def check_names(field: RadianceField | Placed, poses: Poses | None) -> None:
+    """Raise ValueError for a pose of what a field does not place."""
+    placed = [field] if isinstance(field, Placed) else getattr(field, "placed", [])
+    unknown = sorted((poses or {}).keys() - {p.name for p in placed})
+    if unknown:
+        known = ", ".join(f"'{p.name}'" for p in placed) or "nothing"
+        raise ValueError(f"there is no '{unknown[0]}' to place; this scene places {known}")
 
 
 def composed_query(
@@ -96,12 +107,13 @@ def placed_query(
 def structure(field: RadianceField, poses: Poses | None) -> RadianceField:
     """A composed field with its parts where `poses` place them now, without gradients: what marching
     needs. Any other field as it is, and that itself where nothing is elsewhere."""
+    check_names(field, poses)
     if not poses:
         return field
     host = torch.device("cpu")
     now = {name: exact(pose.detach(), host).numpy() for name, pose in poses.items()}
     known = {p.name: p.object_to_world for p in field.placed}
-    same = all(name in known and np.array_equal(pose, known[name]) for name, pose in now.items())
+    same = all(np.array_equal(pose, known[name]) for name, pose in now.items())
     return field if same else field.posed(now)
 
 

@@ -40,7 +40,8 @@ def query(
     params = asked[-1]
     points, dirs = exact(points, params.device), exact(dirs, params.device)
     if field.device_loops is None:
-        return field.reference(params, points, dirs)
+        sigma, rgb = field.reference(params, points, dirs)
+        return sigma, rgb if with_colour else torch.zeros_like(rgb)
     if not wanted:
         return by_kernels(holding(field, params), points, dirs, with_colour)
     return _Query.apply(field, params, points, dirs, with_colour)
