@@ -160,7 +160,15 @@ class BadIntrinsics(FormatError):
 
 
 class UnsupportedCamera(FormatError):
-    """A camera that is no pinhole with OpenCV distortion."""
+    """A camera whose lens is neither a pinhole nor a fisheye with OpenCV's distortion."""
+
+
+class BadModel(FormatError):
+    """A table of cameras, poses or points whose bytes are not what its format says."""
+
+
+class BadMask(FormatError):
+    """A mask that does not fit its photo."""
 
 
 class MixedSizes(FormatError):

@@ -2,7 +2,7 @@
 
 `camera_to_world` is (4,4) float64, OpenGL axes: +x right, +y up, looking along -z. A camera-frame point (x,
 y, z) with z < 0 lands on pixel (cx + fl_x * u, cy + fl_y * v), where (u, v) is (x / -z, -y / -z) bent by the
-distortion. Pixel coordinates grow right and down, and the centre of the top left pixel is (0.5, 0.5).
+distortion, or for a fisheye (x, -y) * r(a) / |(x, y)|, a the angle from -z. Pixel coordinates grow right and down, and the centre of the top left pixel is (0.5, 0.5).
 """
 
 from dataclasses import dataclass, replace
@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadPose, NoViews
+from formats.frame import SceneFrame
+from formats.points import Points
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 ORTHONORMAL_TOLERANCE = 1e-3
@@ -28,9 +30,20 @@ class View:
     cy: float
     width: int
     height: int
-    distortion: tuple[float, float, float, float, float] = NO_DISTORTION
-    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them."""
+    distortion: tuple[float, ...] = NO_DISTORTION
+    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them, and where it needs more k4, d1, d2, d3:
+    r² = u² + v² is scaled by (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) / (1 + d1 r² + d2 r⁴ + d3 r⁶). Of a fisheye k1,
+    k2, k3, k4: r(a) = a (1 + k1 a² + k2 a⁴ + k3 a⁶ + k4 a⁸)."""
+    fisheye: bool = False
     image_path: Path | None = None
+    orientation: int = 1
+    """How the photo's stored pixels are turned into this camera's, as EXIF counts it; 1: they are its own."""
+    mask_path: Path | None = None
+    """A picture of the photo's shape, black where the photo is not to be looked at."""
+    near: float | None = None
+    far: float | None = None
+    """Depths (along -z, world units) between which what it sees of the scene's sparse points lies, but for one
+    in a thousand on each side."""
     pixels: np.ndarray | None = None
     """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
 
@@ -39,6 +52,13 @@ class View:
         x, y = width / self.width, height / self.height
         focal = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **focal)
+
+    def corners(self, depth: float) -> np.ndarray:
+        """(4, 3) world points at a depth behind the picture's corners, as a pinhole sees them."""
+        x = np.array([0, self.width, 0, self.width]) - self.cx
+        y = np.array([0, 0, self.height, self.height]) - self.cy
+        local = np.stack([x / self.fl_x, -y / self.fl_y, -np.ones(4)], 1) * depth
+        return local @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3]
 
     def reframed(self, width: int, height: int) -> "View":
         """The same camera at another size: its horizontal field of view stays, rows are cut or added."""
@@ -54,15 +74,21 @@ class Capture:
 
     path: Path
     kind: str
-    """"blender", "transforms" or "mesh"."""
+    """"blender", "transforms", "colmap", "llff", "polycam" or "mesh"."""
     train: tuple[View, ...]
     test: tuple[View, ...]
     aabb: np.ndarray
     """(6,) float64 [xmin ymin zmin xmax ymax zmax] in world units: where the subject is taken to be."""
     opaque: bool
     """No picture has an alpha channel."""
-    missing: int = 0
-    """Frames that the file lists without a picture on disk; they are left out."""
+    missing: tuple[str, ...] = ()
+    """The photos that are listed without being on disk; their frames are left out."""
+    points: Points | None = None
+    """Sparse points on surfaces, where structure from motion left them."""
+    frame: SceneFrame | None = None
+    """How the cameras stand around what they look at, of a capture whose box follows from that."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what was chosen in reading."""
 
 
 def hold_out(capture: Capture, every: int) -> Capture:
@@ -106,16 +132,3 @@ def _check_rotation(rotation: np.ndarray, where: str) -> None:
         )
     if np.linalg.det(rotation) < 0:
         raise BadPose(f"{where}: the camera pose is mirrored (determinant -1); check the exporter's axes")
-
-
-def cameras_aabb(views: tuple[View, ...]) -> np.ndarray:
-    """(6,) float64 cube around the point nearest to all optical axes, out to the median camera distance."""
-    poses = np.array([view.camera_to_world for view in views])
-    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    middle = eyes.mean(0)
-    # About the cameras' middle, so that axes which never meet leave the point there, not at infinity.
-    offset = np.einsum("nij,nj->i", across, eyes - middle)
-    centre = middle + np.linalg.lstsq(across.sum(0), offset, rcond=1e-6)[0]
-    half = float(np.median(np.linalg.norm(eyes - centre, axis=1))) or 1.0
-    return np.concatenate([centre - half, centre + half])

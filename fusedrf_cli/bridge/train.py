@@ -68,7 +68,7 @@ def train(
             else read_capture(source)
         )
         if capture.missing:
-            progress.warn(f"{source}: {capture.missing} frames have no photo and were left out")
+            progress.warn(f"{source}: {len(capture.missing)} frames have no photo and were left out")
         if holdout:
             capture = hold_out(capture, holdout)
         box = np.asarray(aabb if aabb is not None else capture.aabb, np.float64)
@@ -197,6 +197,7 @@ def camera_of(view: View) -> Camera:
         view.height,
         tuple(view.distortion),
         view.name,
+        view.fisheye,
     )
 
 
