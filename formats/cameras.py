@@ -80,7 +80,7 @@ def frame_file(frame: dict) -> str:
 
 
 def written_path(keys: dict, key: str) -> str:
-    """A path that a file holds, with forward slashes and without a leading "./"; empty where there is none."""
+    """A path that a file states, with forward slashes and without a leading "./"; empty without one."""
     written = keys.get(key)
     return str(PurePosixPath(written.replace("\\", "/"))) if isinstance(written, str) and written else ""
 
@@ -199,9 +199,11 @@ def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ..
     """
     model = str(next((source["camera_model"] for source in sources if "camera_model" in source), "")).upper()
     said = {key: _number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
-    if model in FISHEYE or any(source.get("is_fisheye") is True for source in sources):
+    if model in FISHEYE or any(source.get("is_fisheye") for source in sources):
         if said["p1"] or said["p2"]:
-            raise UnsupportedCamera(f"{where}: a fisheye with p1 or p2, expected k1 to k4; undistort the photos")
+            raise UnsupportedCamera(
+                f"{where}: a fisheye with p1 or p2, expected k1 to k4; undistort the photos"
+            )
         return True, tuple(said[key] for key in ("k1", "k2", "k3", "k4"))
     if model not in PERSPECTIVE | {RATIONAL}:
         raise UnsupportedCamera(

@@ -1,8 +1,8 @@
 """Captures on disk: posed photos as Blender, instant-ngp, nerfstudio, COLMAP, LLFF and Polycam lay them out.
 
-What a folder is follows from what it holds, in this order: `transforms_train.json` (Blender), `transforms.json`
-(instant-ngp, nerfstudio), a COLMAP model, `poses_bounds.npy` (LLFF), `keyframes` (Polycam). World axes and units
-stay as the file has them: nothing is recentred, turned or scaled.
+What a folder is follows from what it holds, in this order: `transforms_train.json` (Blender),
+`transforms.json` (instant-ngp, nerfstudio), a COLMAP model, `poses_bounds.npy` (LLFF), `keyframes` (Polycam).
+World axes and units stay as the file has them: nothing is recentred, turned or scaled.
 """
 
 import json
@@ -172,11 +172,11 @@ def _model_photos(folder: Path, base: Path, names: list[str]) -> tuple[list[Path
         files = pictures(place)
         if len(files) == len(names):
             ranked = dict(zip(sorted(names), files, strict=True))
-            note = f"{folder}: names none of the photos in {place.name}; they are matched in the order of names"
+            note = f"{folder}: names no photo of {place.name}; they are matched in the order of their names"
             return [ranked[name] for name in names], [note]
     raise MissingFile(
-        f"{folder}: names {len(names)} photos such as {names[0]}, but none of them is in {base / 'images'}; put "
-        "the photos there"
+        f"{folder}: names {len(names)} photos such as {names[0]}, but {base / 'images'} has none of them; "
+        "put the photos there"
     )
 
 
@@ -193,10 +193,10 @@ def _read_llff(path: Path) -> Capture:
     counts = {place: pictures(place) for place in (images, *reduced(images))}
     suited = [files for files in counts.values() if len(files) == len(rows) > 0]
     if not suited:
-        found = ", ".join(f"{place.name} {len(files)}" for place, files in counts.items()) or "no folder images"
+        found = ", ".join(f"{len(files)} in {place.name}" for place, files in counts.items())
         raise BadModel(
-            f"{path}: has {len(rows)} poses, one per photo in the order of their names, but found are: {found}; "
-            "put all photos back, or make the poses anew"
+            f"{path}: has {len(rows)} poses, one per photo by the order of names, but found are {found}; put "
+            "all photos back, or make the poses anew"
         )
     headers = [read_image_header(files[0]) for files in suited]
     small = [max(header.width, header.height) <= LONGEST for header in headers]

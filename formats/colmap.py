@@ -1,7 +1,7 @@
 """COLMAP's sparse models: cameras, posed images and points, from the binary files or the text ones.
 
-Binary files are little endian; images say world-to-camera as a quaternion (w, x, y, z) and a translation, with
-x right, y down, z forward. Files `rigs` and `frames` of newer versions stand beside these and are not needed.
+Binary files are little endian; images say world-to-camera as a quaternion (w, x, y, z) and a translation,
+with x right, y down, z forward. Files `rigs` and `frames` of newer versions are not needed.
 """
 
 import math
@@ -38,7 +38,16 @@ MODELS = {
 """Parameters of the models that can be rendered, in COLMAP's order. FULL_OPENCV's last three are OpenCV's k4,
 k5 and k6."""
 NUMBERS = [
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *(
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
+        "FOV",
+    ),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 ]
@@ -101,7 +110,9 @@ def read_model(folder: Path) -> Model:
     images = []
     for where, name, quaternion, translation, camera, seen in listed:
         if camera not in cameras:
-            raise BadModel(f"{where}: is of camera {camera}, which the cameras file does not list; export again")
+            raise BadModel(
+                f"{where}: is of camera {camera}, which the cameras file does not list; export again"
+            )
         pose = _pose(quaternion, translation, where)
         near, far = _depths(pose, ids, points, seen)
         view = replace(cameras[camera], camera_to_world=pose, near=near, far=far)
@@ -133,9 +144,12 @@ def _read(folder: Path, name: str, parsers: dict, limit: int):
 def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
     """(4, 4) camera-to-world, OpenGL axes, of a world-to-camera rotation and translation."""
     numbers = np.array([*quaternion, *translation], np.float64)
-    length = float(np.linalg.norm(numbers[:4])) if np.isfinite(numbers).all() else 0.0
-    if not 1e-3 < length < 1e3 or np.abs(numbers[4:]).max() > 1e15:
-        raise BadPose(f"{where}: its pose is no rotation and finite translation; drop the image, or map again")
+    usable = np.abs(numbers).max() < 1e15  # False for NaN too
+    length = float(np.linalg.norm(numbers[:4])) if usable else 0.0
+    if not 1e-3 < length < 1e3:
+        raise BadPose(
+            f"{where}: its pose is no rotation and finite translation; drop the image, or map again"
+        )
     w, x, y, z = numbers[:4] / length
     rotation = np.array(
         [
@@ -166,7 +180,9 @@ def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
     """A camera with the pose of the world."""
     names = MODELS[model].split()
     if len(numbers) != len(names):
-        raise BadModel(f"{where}: {model} has {len(numbers)} parameters, expected {len(names)}: {MODELS[model]}")
+        raise BadModel(
+            f"{where}: {model} has {len(numbers)} parameters, expected {len(names)}: {MODELS[model]}"
+        )
     if not all(abs(number) < 1e30 for number in numbers):
         raise BadIntrinsics(f"{where}: a parameter is no finite number; export the model again")
     said = dict(zip(names, map(float, numbers), strict=True))
@@ -185,8 +201,8 @@ def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
 def _known(where: str, model: str) -> str:
     if model not in MODELS:
         raise UnsupportedCamera(
-            f"{where}: a camera of the model {model[:40]}, expected one of {', '.join(MODELS)}; undistort the "
-            "photos with COLMAP's image_undistorter"
+            f"{where}: a camera of the model {model[:40]}, expected one of {', '.join(MODELS)}; undistort "
+            "the photos with COLMAP's image_undistorter"
         )
     return model
 

@@ -52,7 +52,7 @@ def scene_frame(poses: np.ndarray, depth: float | None = None) -> SceneFrame:
     if spread < FORWARD:
         return _forward(eyes, looks, points[ahead], spread, depth, extent)
     if ahead.sum() * 2 < len(ahead) or not ahead.any():
-        focus = np.median(eyes, 0)
+        focus = eyes.mean(0)
         return SceneFrame("outward", focus, extent or depth or 1.0, spread)
     focus = np.median(points[ahead], 0)
     distance = float(np.median(np.linalg.norm(eyes - focus, axis=1)))

@@ -1,7 +1,8 @@
 """LLFF's `poses_bounds.npy`: a row per photo, in the order of the photos' names.
 
-A row holds 3 x 5 numbers, a camera-to-world matrix with the axes down, right and back, beside a column of height,
-width and focal length of the full-size photos, and then the nearest and the farthest depth of what is seen.
+A row holds 3 x 5 numbers, a camera-to-world matrix with the axes down, right and back beside a column of
+height, width and focal length of the full-size photos, and then the nearest and the farthest depth of what is
+seen.
 """
 
 import io
@@ -34,7 +35,9 @@ def _table(path: Path) -> np.ndarray:
     file = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
         shape, fortran, kind = read(file, max_header_size=10_000)
     except (ValueError, TypeError, SyntaxError, EOFError, UnicodeError) as error:
         raise BadModel(f"{path}: is no table saved by numpy; export it again") from error
@@ -56,7 +59,9 @@ def _view(where: str, row: np.ndarray) -> View:
     if not focal > 0 or max(height, width, focal) > 1e9:
         raise BadIntrinsics(f"{where}: focal length of {focal:g} pixels, expected a positive one")
     if not 0 < near < far:
-        raise BadIntrinsics(f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth")
+        raise BadIntrinsics(
+            f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth"
+        )
     width, height = checked_size(round(width), round(height), where)
     down, right, back, eye = matrix[:, :4].T
     pose = checked_pose(np.column_stack([right, -down, back, eye]), where)

@@ -125,8 +125,8 @@ def on_photo(view: View, photo: Path, header: Header, where: str, mask: Path | N
     found = read_image_header(mask)
     if (found.width, found.height) not in (size, (view.width, view.height)):
         raise BadMask(
-            f"{where}: the mask {mask} is {found.width}x{found.height}, but {photo.name} is {size[0]}x{size[1]}; "
-            "make masks of the photo's size"
+            f"{where}: the mask {mask} is {found.width}x{found.height}, but {photo.name} is {size[0]}x"
+            f"{size[1]}; make masks of the photo's size"
         )
     return replace(fitted, mask_path=mask)
 
@@ -193,8 +193,8 @@ def load_images(views: Sequence[View]) -> np.ndarray:
     for view in views:
         if (view.width, view.height) != (views[0].width, views[0].height):
             raise MixedSizes(
-                f"{_named(views[0])} is {views[0].width}x{views[0].height} but {_named(view)} is {view.width}x"
-                f"{view.height}; bring all photos of a capture to one size"
+                f"{_named(views[0])} is {views[0].width}x{views[0].height} but {_named(view)} is "
+                f"{view.width}x{view.height}; bring all photos of a capture to one size"
             )
     photos = load_photos([replace(view, mask_path=None) for view in views])
     return photos.pixels.reshape(len(views), views[0].height, views[0].width, 4)

@@ -87,7 +87,9 @@ def _header(path: Path | str, lines: list[str]) -> tuple[str, int, list[tuple[st
             coding = words[1]
         elif words[:1] == ["element"] and len(words) == 3:
             if element == "" and words[1] != "vertex":
-                raise BadModel(f"{path}: begins with {words[1][:40]!r}, expected points as its vertices first")
+                raise BadModel(
+                    f"{path}: begins with {words[1][:40]!r}, expected points as its vertices first"
+                )
             element = words[1]
             count = _count(path, words[2]) if element == "vertex" else count
         elif words[:1] == ["property"] and element == "vertex":
@@ -118,11 +120,13 @@ def _text_table(path: Path | str, data: bytes, count: int, width: int) -> np.nda
         return np.empty((0, width))
     lines = data.split(b"\n", count)[:count]
     try:
-        table = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
+        table = np.loadtxt(lines, np.float64, comments=None, ndmin=2) if all(lines) else np.empty((0, 0))
     except ValueError:
         table = np.empty((0, 0))
     if table.shape != (count, width):
-        raise BadModel(f"{path}: expected {count:,} lines of {width} numbers after the header; export it again")
+        raise BadModel(
+            f"{path}: expected {count:,} lines of {width} numbers after the header; export it again"
+        )
     return table
 
 

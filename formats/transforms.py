@@ -157,7 +157,9 @@ def stated_aabb(path: Path, document: dict) -> np.ndarray | None:
     return np.concatenate([centre - half, centre + half])
 
 
-def sparse_points(path: Path, document: dict, views: tuple[View, ...]) -> tuple[Points | None, tuple[str, ...]]:
+def sparse_points(
+    path: Path, document: dict, views: tuple[View, ...]
+) -> tuple[Points | None, tuple[str, ...]]:
     """The points that `ply_file_path` names, or else those of the COLMAP model that the capture was made
     from, in the frame of the poses; and a note where they were to be there but are not."""
     written = written_path(document, "ply_file_path")

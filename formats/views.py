@@ -1,8 +1,9 @@
 """Posed pictures: a `View` is one camera and what it saw, a `Capture` is all views of one subject.
 
 `camera_to_world` is (4,4) float64, OpenGL axes: +x right, +y up, looking along -z. A camera-frame point (x,
-y, z) with z < 0 lands on pixel (cx + fl_x * u, cy + fl_y * v), where (u, v) is (x / -z, -y / -z) bent by the
-distortion, or for a fisheye (x, -y) * r(a) / |(x, y)|, a the angle from -z. Pixel coordinates grow right and down, and the centre of the top left pixel is (0.5, 0.5).
+y, z) lands on pixel (cx + fl_x * u, cy + fl_y * v), where (u, v) is (x / -z, -y / -z), z < 0, bent by the
+distortion, or for a fisheye (x, -y) * r(a) / |(x, y)| with a the angle from -z. Pixel coordinates grow right
+and down, and the centre of the top left pixel is (0.5, 0.5).
 """
 
 from dataclasses import dataclass, replace
@@ -31,9 +32,9 @@ class View:
     width: int
     height: int
     distortion: tuple[float, ...] = NO_DISTORTION
-    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them, and where it needs more k4, d1, d2, d3:
-    r² = u² + v² is scaled by (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) / (1 + d1 r² + d2 r⁴ + d3 r⁶). Of a fisheye k1,
-    k2, k3, k4: r(a) = a (1 + k1 a² + k2 a⁴ + k3 a⁶ + k4 a⁸)."""
+    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them, and where it needs more k4, d1, d2,
+    d3: the radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) / (1 + d1 r² + d2 r⁴ + d3 r⁶). Of a fisheye
+    k1, k2, k3, k4: r(a) = a (1 + k1 a² + k2 a⁴ + k3 a⁶ + k4 a⁸)."""
     fisheye: bool = False
     image_path: Path | None = None
     orientation: int = 1
@@ -42,8 +43,8 @@ class View:
     """A picture of the photo's shape, black where the photo is not to be looked at."""
     near: float | None = None
     far: float | None = None
-    """Depths (along -z, world units) between which what it sees of the scene's sparse points lies, but for one
-    in a thousand on each side."""
+    """Depths (along -z, world units) between which lies what it sees of the scene's sparse points, but for
+    one in a thousand on each side."""
     pixels: np.ndarray | None = None
     """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
 
