@@ -297,10 +297,11 @@ def _binary_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
     rows, at = [], 8
     for _ in range(count):
         row = head.unpack_from(data, at)
-        at += head.size + 8 * row[-1]
+        at += head.size
+        if row[-1] > (len(data) - at) // 8:
+            raise BadModel(f"{path}: ends within point {row[0]}; copy or export it again")
+        at += 8 * row[-1]
         rows.append(row[:7])
-    if at > len(data):
-        raise BadModel(f"{path}: ends within its last point; copy or export it again")
     return _sorted_points(rows)
 
 

@@ -33,6 +33,7 @@ TRANSLATION = -TO_CAMERA @ [4.0, 1.0, 2.0]
 QUATERNION = (0.5, 0.5, 0.5, -0.5)
 NAMES = ("b/2.png", "a.png", "10.png")
 POINTS = {7: (0.0, 2.0, 3.0), 3: (1.0, 1.0, 2.0), 900: (-96.0, 1.0, 2.0)}
+PLACES = list(POINTS.values())
 
 
 def rotation(quaternion) -> np.ndarray:
@@ -502,7 +503,7 @@ def test_masks_that_do_not_fit(tmp_path):
         read_capture(tmp_path)
 
 
-def cloud(path: Path, coding: str = "ascii", points=tuple(POINTS.values()), colour: str = "uchar") -> None:
+def cloud(path: Path, coding: str = "ascii", points=PLACES, colour: str = "uchar") -> None:
     fields = [("x", "float"), ("y", "double"), ("z", "float"), ("nx", "short")]
     fields += [(name, colour) for name in ("red", "green", "blue")]
     said = "".join(f"property {kind} {name}\n" for name, kind in fields)
