@@ -17,7 +17,7 @@ from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews
-from formats.frame import default_box, scene_frame, shown_box, subject_box
+from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
 from formats.images import read_image_header, write_png
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
@@ -29,6 +29,7 @@ from formats.photos import (
     load_images,
     load_photos,
     natural,
+    object_boxes,
     on_photo,
     photo_folder,
     pictures,
@@ -165,14 +166,14 @@ def _model_photos(folder: Path, base: Path, names: list[str]) -> tuple[list[Path
     for root in (base / "images", base / "input", base):
         chosen = photo_folder(root, names)
         if chosen is not None:
-            note = f"{folder}: photos are read from {chosen.name} beside {root.name}, the size that suits"
+            note = f"{folder}: photos are read from {chosen.name}"
             return [find_photo(chosen, name) for name in names], [note] if chosen != root else []
-    # Smaller copies of LLFF's scenes have names of their own, in the order of the full-size photos' names.
+    # The smaller copies of LLFF's scenes have other names, in the same order as the full-size photos.
     for place in (base / "images", *reduced(base / "images")):
         files = pictures(place)
         if len(files) == len(names):
             ranked = dict(zip(sorted(names), files, strict=True))
-            note = f"{folder}: names no photo of {place.name}; they are matched in the order of their names"
+            note = f"{folder}: photos of {place.name} have other names and are matched by order"
             return [ranked[name] for name in names], [note]
     raise MissingFile(
         f"{folder}: names {len(names)} photos such as {names[0]}, but {base / 'images'} has none of them; "
@@ -195,8 +196,8 @@ def _read_llff(path: Path) -> Capture:
     if not suited:
         found = ", ".join(f"{len(files)} in {place.name}" for place, files in counts.items())
         raise BadModel(
-            f"{path}: has {len(rows)} poses, one per photo by the order of names, but found are {found}; put "
-            "all photos back, or make the poses anew"
+            f"{path}: has {len(rows)} poses, one per photo by the order of names, but there are {found}; "
+            "restore all photos, or estimate the poses again"
         )
     headers = [read_image_header(files[0]) for files in suited]
     small = [max(header.width, header.height) <= LONGEST for header in headers]
@@ -207,7 +208,7 @@ def _read_llff(path: Path) -> Capture:
         views.append(on_photo(replace(view, name=photo.stem), photo, header, f"{where} ({photo.name})"))
         alpha |= header.alpha
     folder = photos[0].parent
-    notes = () if folder == images else (f"{path}: photos are read from {folder.name}, the size that suits",)
+    notes = () if folder == images else (f"{path}: photos are read from {folder.name}",)
     return _capture(path, "llff", Part(tuple(views), alpha, (), notes), Part(), None)
 
 
@@ -255,6 +256,9 @@ def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | N
     """The frame of photos that show a subject and all around it, and a box large enough for that."""
     depths = [math.sqrt(view.near * view.far) for view in views if view.near and view.far]
     frame = scene_frame(poses, float(np.median(depths)) if depths else None)
+    if (kept := object_boxes(views)) is not None:
+        corners = [view.corners(1.0, box) for view, box in zip(views, kept, strict=True)]
+        return frame, object_box(poses[:, :3, 3], np.array(corners))
     if frame.layout != "forward-facing":
         return frame, default_box(frame, poses, None if points is None else points.positions)
     seen = [(view, view.near or 0.5 * frame.distance, view.far or 4 * frame.distance) for view in views]

@@ -1,6 +1,6 @@
 """COLMAP's sparse models: cameras, posed images and points, from the binary files or the text ones.
 
-Binary files are little endian; images say world-to-camera as a quaternion (w, x, y, z) and a translation,
+Binary files are little endian; images hold world-to-camera as a quaternion (w, x, y, z) and a translation,
 with x right, y down, z forward. Files `rigs` and `frames` of newer versions are not needed.
 """
 
@@ -64,12 +64,12 @@ class Image:
     where: str
     """How errors name it."""
     view: View
-    """Its camera at the size that the model states."""
+    """Its camera, for a photo of the size given in the model."""
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a folder like `sparse/0` says."""
+    """The content of a folder like `sparse/0`."""
 
     folder: Path
     images: tuple[Image, ...]
@@ -77,7 +77,7 @@ class Model:
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder of a model that `path` is, or that lies where COLMAP or nerfstudio put it; None if none."""
+    """The folder of a model at `path`, or below it where COLMAP and nerfstudio store it; None without one."""
     places = [path / part for part in ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")]
     found = next((place for place in places if _has(place, "cameras") and _has(place, "images")), None)
     if found is None and (path / "sparse").is_dir():
@@ -105,7 +105,7 @@ def read_model(folder: Path) -> Model:
     cameras = _read(folder, "cameras", {"bin": _binary_cameras, "txt": _text_cameras}, MAX_CAMERAS_BYTES)
     listed = list(_read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES))
     if not listed:
-        raise BadModel(f"{folder}: its images file lists no image; export the model again")
+        raise BadModel(f"{folder}: its images file is empty; export the model again")
     ids, points = _points(folder)
     images = []
     for where, name, quaternion, translation, camera, seen in listed:
@@ -138,7 +138,7 @@ def _read(folder: Path, name: str, parsers: dict, limit: int):
     try:
         return parsers[ending](path, data)
     except struct.error:
-        raise BadModel(f"{path}: ends before what it announces; copy or export it again") from None
+        raise BadModel(f"{path}: the file is truncated; copy or export it again") from None
 
 
 def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
@@ -148,7 +148,7 @@ def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.nda
     length = float(np.linalg.norm(numbers[:4])) if usable else 0.0
     if not 1e-3 < length < 1e3:
         raise BadPose(
-            f"{where}: its pose is no rotation and finite translation; drop the image, or map again"
+            f"{where}: its pose is not a rotation with a finite translation; remove the image, or map again"
         )
     w, x, y, z = numbers[:4] / length
     rotation = np.array(
@@ -177,14 +177,14 @@ def _depths(pose: np.ndarray, ids: np.ndarray, points: Points | None, seen: np.n
 
 
 def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
-    """A camera with the pose of the world."""
+    """A camera with the identity as pose."""
     names = MODELS[model].split()
     if len(numbers) != len(names):
         raise BadModel(
             f"{where}: {model} has {len(numbers)} parameters, expected {len(names)}: {MODELS[model]}"
         )
     if not all(abs(number) < 1e30 for number in numbers):
-        raise BadIntrinsics(f"{where}: a parameter is no finite number; export the model again")
+        raise BadIntrinsics(f"{where}: a parameter is not a finite number; export the model again")
     said = dict(zip(names, map(float, numbers), strict=True))
     fl_x, fl_y = (said.get(key, said.get("f", 0.0)) for key in ("fx", "fy"))
     if not min(fl_x, fl_y) > 0:
@@ -249,12 +249,12 @@ def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
         image, *numbers, camera = struct.unpack_from("<I7dI", data, at)
         end = data.find(b"\0", at + 64, at + 64 + MAX_NAME)
         if end < 0:
-            raise BadModel(f"{path}: image {image} has a name without an end; copy or export it again")
+            raise BadModel(f"{path}: image {image} has no complete name; copy or export it again")
         name = data[at + 64 : end].decode("utf-8", "replace")
         (observed,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9
         if observed > (len(data) - at) // 24:
-            raise BadModel(f"{path}: ends within image {image}; copy or export it again")
+            raise BadModel(f"{path}: the file is truncated in image {image}; copy or export it again")
         seen = np.frombuffer(data, "<u8", 3 * observed, at)[2::3]
         at += 24 * observed
         where = f"{path}: image {image} ({name})"
@@ -299,7 +299,7 @@ def _binary_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
         row = head.unpack_from(data, at)
         at += head.size
         if row[-1] > (len(data) - at) // 8:
-            raise BadModel(f"{path}: ends within point {row[0]}; copy or export it again")
+            raise BadModel(f"{path}: the file is truncated in point {row[0]}; copy or export it again")
         at += 8 * row[-1]
         rows.append(row[:7])
     return _sorted_points(rows)
@@ -334,11 +334,11 @@ def _sorted_points(rows: list[tuple]) -> tuple[np.ndarray, Points]:
 
 def _check_count(path: Path, count: int, length: int, smallest: int) -> None:
     if count > length // smallest:
-        raise BadModel(f"{path}: announces {count:,} records in {length:,} bytes; copy or export it again")
+        raise BadModel(f"{path}: {count:,} records do not fit into {length:,} bytes; copy or export it again")
 
 
 def _lines(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each line that is no comment."""
+    """Number and words of each line that is not a comment."""
     for i, line in enumerate(data.decode("utf-8", "replace").split("\n"), 1):
         if not line.startswith("#"):
             yield i, line.split()

@@ -160,15 +160,15 @@ class BadIntrinsics(FormatError):
 
 
 class UnsupportedCamera(FormatError):
-    """A camera whose lens is neither a pinhole nor a fisheye with OpenCV's distortion."""
+    """A camera that is neither a pinhole nor a fisheye camera with OpenCV distortion."""
 
 
 class BadModel(FormatError):
-    """A table of cameras, poses or points whose bytes are not what its format says."""
+    """A file of cameras, poses or points that does not follow its format."""
 
 
 class BadMask(FormatError):
-    """A mask that does not fit its photo."""
+    """A mask whose size differs from that of its photo."""
 
 
 class MixedSizes(FormatError):

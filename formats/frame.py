@@ -1,4 +1,4 @@
-"""How cameras stand around what they look at, and how large a box holds what their photos show.
+"""The layout of a capture's cameras, and a box large enough for what their photos show.
 
 Poses are (N, 4, 4) float64, camera-to-world, looking along -z. World axes, units and origin stay as they are.
 """
@@ -8,21 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 
 PAIRS_FROM = 200
-"""Cameras that pairs are made of at most, evenly picked."""
+"""At most so many cameras, evenly spaced in the list, are paired with each other."""
 PARALLEL = np.radians(3)
-"""Optical axes that cross at a smaller angle say little about where they meet."""
+"""Pairs of optical axes that cross at a smaller angle are not used."""
 FORWARD = np.radians(30)
 """Captures whose axes all lie within this of their mean are called forward-facing."""
 REACH = 5.0
-"""Half the side of a default box in distances between cameras and focus, where no sparse points tell it."""
+"""Half the side of a default box in distances between cameras and focus, where there are no sparse points."""
 REACHES = (3.0, 15.0)
-"""The least and the most of the same, where they do."""
+"""The least and the greatest value of the same where it follows from sparse points."""
 SHOWN = 0.98
 """Share of the sparse points that a default box holds."""
 OUTLIERS = 0.001
 """Share of a view's points that may lie nearer than its `near`, and farther than its `far`."""
 MARGIN = 1.25
-"""What is not among the sparse points reaches a little farther than they do."""
+"""Factor on the extent of the sparse points, since other parts of the scene may reach farther."""
+OBJECT_MARGIN = 1.05
+"""Factor on the extent of an object that masks cut out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ def scene_frame(poses: np.ndarray, depth: float | None = None) -> SceneFrame:
 
 
 def _forward(eyes, looks, points, spread: float, depth: float | None, extent: float) -> SceneFrame:
-    """Axes that hardly cross: what is known of the depths goes before where they do."""
+    """Axes that hardly cross: known depths are preferred to their crossings."""
     middle, look = np.median(eyes, 0), looks.mean(0) / np.linalg.norm(looks.mean(0))
     if depth is None and len(points):
         depth = float(np.median((points - middle) @ look))
@@ -127,6 +129,21 @@ def default_box(frame: SceneFrame, poses: np.ndarray, points: np.ndarray | None)
         far = np.quantile(np.abs(points - frame.focus).max(1), SHOWN) / unit
         reach = float(np.clip(MARGIN * far, *REACHES))
     return np.concatenate([frame.focus - reach * unit, frame.focus + reach * unit])
+
+
+def object_box(eyes: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(6,) cube around an object that (N, 3) eyes see between the rays through (N, 4, 3) points.
+
+    The centre is nearest to the rays through the middles of those; the cube holds the largest of the spheres
+    around it that reach out to a view's rays, except for outliers.
+    """
+    rays = corners - eyes[:, None]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    middle = rays.mean(1) / np.linalg.norm(rays.mean(1), axis=1, keepdims=True)
+    centre = nearest_point(eyes, middle)
+    away = np.linalg.norm(np.cross(centre - eyes[:, None], rays), axis=2).max(1)
+    half = OBJECT_MARGIN * float(np.quantile(away, 0.95))
+    return np.concatenate([centre - half, centre + half])
 
 
 def shown_box(corners: np.ndarray) -> np.ndarray:

@@ -34,14 +34,14 @@ DECODING_ERRORS = (
 
 
 class Header(NamedTuple):
-    """What a picture says of itself before it is decoded."""
+    """What the header of a picture file states."""
 
     width: int
     height: int
     """As stored, whatever the orientation."""
     alpha: bool
     orientation: int
-    """EXIF's, 1 to 8: how the stored pixels are to be turned to stand upright; 1 where it is not said."""
+    """The EXIF orientation, 1 to 8: how to turn the stored pixels upright; 1 where none is given."""
 
 
 def read_image(path: Path | str, orientation: int = 1) -> np.ndarray:
@@ -56,10 +56,10 @@ def read_image(path: Path | str, orientation: int = 1) -> np.ndarray:
 
 
 def read_mask(path: Path | str) -> np.ndarray:
-    """(H, W) bool of a mask's picture: True where it is bright, which is what to keep.
+    """(H, W) bool of a mask picture: True where it is bright, that is, where the photo is used.
 
-    Bright is more than half of the mask's brightest, so that 0 and 1 serve as well as 0 and 255. Raises as
-    `read_image`.
+    Bright means above half of the mask's maximum, so masks of 0 and 1 work as well as masks of 0 and 255.
+    Raises as `read_image`.
     """
     with _opened(path) as image:
         levels = np.array(image.convert("L"))
@@ -74,7 +74,7 @@ def read_image_header(path: Path | str) -> Header:
 
 def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """(H, W, ...) stored pixels turned and mirrored as an EXIF orientation from 1 to 8 says."""
-    if orientation >= 5:  # the first stored row is a column of the picture
+    if orientation >= 5:  # stored rows are columns of the picture
         pixels = pixels.swapaxes(0, 1)
     across, down = orientation in (2, 3, 6, 7), orientation in (3, 4, 7, 8)
     return pixels[:: -1 if down else 1, :: -1 if across else 1]
@@ -83,7 +83,7 @@ def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
 def _orientation(image) -> int:
     try:
         found = image.getexif().get(EXIF_ORIENTATION)
-    except DECODING_ERRORS:  # broken notes beside pixels that may well be sound
+    except DECODING_ERRORS:  # broken metadata; the pixels may be intact
         return 1
     return found if isinstance(found, int) and 1 <= found <= 8 else 1
 

@@ -1,4 +1,4 @@
-"""LLFF's `poses_bounds.npy`: a row per photo, in the order of the photos' names.
+"""LLFF's `poses_bounds.npy`: one row per photo, in the order of the file names.
 
 A row holds 3 x 5 numbers, a camera-to-world matrix with the axes down, right and back beside a column of
 height, width and focal length of the full-size photos, and then the nearest and the farthest depth of what is
@@ -40,7 +40,7 @@ def _table(path: Path) -> np.ndarray:
         )
         shape, fortran, kind = read(file, max_header_size=10_000)
     except (ValueError, TypeError, SyntaxError, EOFError, UnicodeError) as error:
-        raise BadModel(f"{path}: is no table saved by numpy; export it again") from error
+        raise BadModel(f"{path}: not an array saved by numpy; export it again") from error
     if len(shape) != 2 or shape[1] != COLUMNS or kind.kind != "f":
         size = "x".join(map(str, shape)) or "one"
         raise BadModel(f"{path}: holds {size} numbers of type {kind}, expected rows of {COLUMNS} floats")

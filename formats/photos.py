@@ -1,8 +1,8 @@
-"""Photos of a capture: found on disk, fitted to their cameras, and decoded with their masks.
+"""Photos of a capture: finding them, scaling cameras to them, and decoding them with their masks.
 
-A camera is stated for photos of one size. What lies on disk may be a smaller copy in a folder `images_2`,
-`images_4` or `images_8` beside `images`, with another extension, or stored on its side with an EXIF note; the
-camera is scaled to the photo that is read.
+A camera is given for photos of a certain size. The photos on disk may be smaller copies in a folder
+`images_2`, `images_4` or `images_8` beside `images`, have another extension, or be stored sideways with an
+EXIF orientation; the camera is scaled to the photo that is read.
 """
 
 import re
@@ -22,11 +22,13 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff",
 LONGEST = 1024
 """Pixels of a photo's longer side past which a smaller copy is taken where there is one."""
 MAX_ASPECT_ERROR = 0.02
-"""How far a photo's width / height may be from the file's: a small copy rounds, a turned one is wrong."""
+"""Relative difference allowed between the aspect ratios of a photo and its camera, for rounded sizes."""
 SAMPLED = 6
-"""Photos that are looked at to see whether they have a plain background."""
+"""Number of photos that are examined for a plain background."""
 PLAIN = 3
 """Levels of 255 by which a plain background may vary."""
+BORDER_KEPT = 0.3
+"""Masks that keep less than this share of the photos' borders cut out an object; others hide passers-by."""
 DIGITS = re.compile(r"(\d+)")
 
 
@@ -64,7 +66,7 @@ def find_photo(folder: Path, name: str) -> Path | None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file stands there; False for a name that no disk could hold."""
+    """Whether this is a file; False for names that the file system cannot hold."""
     try:
         return path.is_file()
     except (OSError, ValueError):  # too long, or with a NUL in it
@@ -86,8 +88,8 @@ def _escaped(name: str) -> str:
 
 
 def photo_folder(folder: Path, names: Iterable[str]) -> Path | None:
-    """`folder`, or the copy of it whose photos are the largest of at most LONGEST pixels a side, or else the
-    smallest there is; None where none of the names is found."""
+    """`folder`, or the copy of it with the largest photos of at most LONGEST pixels a side, or else with the
+    smallest photos; None where none of the names is found."""
     last = None
     for place in (folder, *reduced(folder)):
         photo = next((found for name in names if (found := find_photo(place, name))), None)
@@ -106,9 +108,9 @@ def photo_folder(folder: Path, names: Iterable[str]) -> Path | None:
 def on_photo(view: View, photo: Path, header: Header, where: str, mask: Path | None = None) -> View:
     """The view with its camera scaled to the photo on disk.
 
-    Poses are estimated from pixels as stored or as turned by EXIF, and tools disagree: taken is the one whose
-    width and height have the camera's shape, as stored where both have. Raises BadIntrinsics where neither
-    has, and BadMask where the mask is of another size than both photo and camera.
+    Tools disagree on whether poses refer to the pixels as stored or as turned by EXIF: the orientation whose
+    aspect ratio equals the camera's is used, and the pixels as stored where both do. Raises BadIntrinsics
+    where neither does, and BadMask where the mask has neither the photo's nor the camera's size.
     """
     for orientation in (1, header.orientation):
         size = (header.width, header.height)[:: -1 if orientation >= 5 else 1]
@@ -132,7 +134,7 @@ def on_photo(view: View, photo: Path, header: Header, where: str, mask: Path | N
 
 
 def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether two sizes are of one shape, as far as a small copy can keep it."""
+    """Whether two sizes have the same aspect ratio, up to rounding."""
     return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= MAX_ASPECT_ERROR
 
 
@@ -148,7 +150,7 @@ class Photos:
     first: np.ndarray
     """(n + 1,) int64: photo i has the pixels first[i] to first[i + 1]."""
     ignored: np.ndarray | None
-    """(P,) bool: pixels that a mask leaves out; None where no photo has a mask."""
+    """(P,) bool: pixels that a mask excludes; None where no photo has a mask."""
 
     def photo(self, i: int, view: View) -> np.ndarray:
         """(H, W, 4) of photo i, which is `view`'s."""
@@ -188,7 +190,7 @@ def load_photos(views: Sequence[View]) -> Photos:
 def load_images(views: Sequence[View]) -> np.ndarray:
     """(n, H, W, 4) uint8, straight alpha (255 for opaque photos), in the order of `views`.
 
-    Raises MixedSizes before anything is decoded, otherwise as `load_photos`; masks are not looked at.
+    Raises MixedSizes before anything is decoded, otherwise as `load_photos`; masks are not read.
     """
     for view in views:
         if (view.width, view.height) != (views[0].width, views[0].height):
@@ -201,8 +203,8 @@ def load_images(views: Sequence[View]) -> np.ndarray:
 
 
 def load_ignored(view: View) -> np.ndarray | None:
-    """(H, W) bool, True where the view's mask is dark; None where it has none. A mask of the size that the
-    camera was stated for is read at the photo's pixel centres. Raises BadMask, BadImage, MissingFile."""
+    """(H, W) bool, True where the view's mask is dark; None where it has none. A larger mask is sampled at
+    the photo's pixel centres. Raises BadMask, BadImage, MissingFile."""
     if view.mask_path is None:
         return None
     kept = read_mask(view.mask_path)
@@ -217,8 +219,8 @@ def load_ignored(view: View) -> np.ndarray | None:
 
 
 def plain_background(views: Sequence[View]) -> bool:
-    """Whether some of the photos, evenly picked, all have one colour along their borders, as pictures of a
-    single object without its surroundings have."""
+    """Whether SAMPLED of the photos all have one and the same colour along their borders, as pictures of an
+    object without surroundings do."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
     lowest, highest = np.full(3, 255), np.zeros(3, int)
     for view in chosen:
@@ -228,6 +230,28 @@ def plain_background(views: Sequence[View]) -> bool:
         if (highest - lowest > PLAIN).any():
             return False
     return True
+
+
+def object_boxes(views: Sequence[View]) -> list[tuple[int, int, int, int]] | None:
+    """Left, top, right, bottom of what the mask of each view keeps, where masks cut out an object: all views
+    have one, and most of the border of the photos is ignored. None otherwise."""
+    if not all(view.mask_path for view in views):
+        return None
+    with ThreadPoolExecutor() as threads:
+        found = list(threads.map(_kept_box, views))
+    if np.mean([share for _, share in found]) > BORDER_KEPT:
+        return None
+    return [box for box, _ in found]
+
+
+def _kept_box(view: View) -> tuple[tuple[int, int, int, int], float]:
+    """Bounds of what a mask keeps, all of the photo where that is nothing, and the kept share of its border."""
+    kept = ~load_ignored(view)
+    border = float(np.mean(np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])))
+    if not kept.any():
+        return (0, 0, view.width, view.height), border
+    rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
+    return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1), border
 
 
 def _named(view: View) -> Path | str:

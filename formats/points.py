@@ -1,4 +1,4 @@
-"""Sparse points of structure from motion: positions with colours, from a .ply of any common writing."""
+"""Sparse points of structure from motion: positions with colours, read from a .ply file."""
 
 import re
 from dataclasses import dataclass
@@ -48,24 +48,24 @@ class Points:
 
 
 def finite(positions: np.ndarray, colours: np.ndarray) -> Points:
-    """Points without those that are NaN, infinite or too far to be reckoned with."""
+    """Points without those that are NaN, infinite or beyond 1e30."""
     sound = (np.abs(positions) < 1e30).all(1)
     return Points(positions[sound], colours[sound])
 
 
 def read_ply_points(path: Path | str) -> Points:
-    """The vertices of a .ply, text or binary; what it holds besides is not read.
+    """The vertices of a .ply, text or binary; other elements are ignored.
 
     Raises BadModel, LimitExceeded (before anything is allocated), MissingFile.
     """
     data = read_input(path, MAX_BYTES)
     end = ENDS.search(data, 0, MAX_HEADER)
     if not data.startswith(b"ply") or end is None:
-        raise BadModel(f"{path}: expected points as a .ply, which begins with a header; export them again")
+        raise BadModel(f"{path}: not a .ply file with a complete header; export the points again")
     coding, count, fields = _header(path, data[: end.start()].decode("latin-1").split("\n"))
     names = [name for name, _ in fields]
     if not {"x", "y", "z"} <= set(names):
-        raise BadModel(f"{path}: its vertices have no x, y and z; export the points again")
+        raise BadModel(f"{path}: its vertices lack x, y or z; export the points again")
     if coding == "ascii":
         table = _text_table(path, data[end.end() :], count, len(fields))
         columns = {name: table[:, i] for i, name in enumerate(names)}
@@ -95,12 +95,12 @@ def _header(path: Path | str, lines: list[str]) -> tuple[str, int, list[tuple[st
         elif words[:1] == ["property"] and element == "vertex":
             if len(words) != 3 or words[1] not in TYPES:
                 raise BadModel(
-                    f"{path}: a vertex property {' '.join(words[1:])[:40]!r} that is no plain number; export "
-                    "the points again"
+                    f"{path}: a vertex property {' '.join(words[1:])[:40]!r} that is not a single number; "
+                    "export the points again"
                 )
             fields.append((words[2], TYPES[words[1]]))
     if coding not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise BadModel(f"{path}: a .ply coded as {coding[:40]!r}, expected ascii or binary")
+        raise BadModel(f"{path}: unknown .ply format {coding[:40]!r}, expected ascii or binary")
     if len({name for name, _ in fields}) < len(fields):
         raise BadModel(f"{path}: two properties of its vertices share a name; export the points again")
     return coding, count, fields
@@ -109,7 +109,7 @@ def _header(path: Path | str, lines: list[str]) -> tuple[str, int, list[tuple[st
 def _count(path: Path | str, digits: str) -> int:
     count = int(digits) if digits.isdecimal() and len(digits) < 16 else -1
     if count < 0:
-        raise BadModel(f"{path}: {digits[:40]!r} vertices, expected a number of them")
+        raise BadModel(f"{path}: the vertex count is {digits[:40]!r}, expected a whole number")
     if count > MAX_POINTS:
         raise LimitExceeded(f"{path}: {count:,} points, at most {MAX_POINTS:,} are read; thin them out")
     return count

@@ -1,6 +1,6 @@
 """Polycam's raw export: a folder `keyframes` with a JSON per photo.
 
-Its world has y up; rows are cycled so that z is up, as everybody who reads these files has it.
+Its world has y up; rows are cycled so that z is up, as nerfstudio does.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ from formats.errors import BadIntrinsics, BadPose
 from formats.views import View, checked_pose
 
 FOLDERS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
-"""Photos and cameras, those after Polycam's own adjustment first."""
+"""Folders of photos and cameras; those that Polycam has optimised come first."""
 ROWS = (2, 0, 1)
 
 

@@ -27,13 +27,13 @@ from formats.views import View
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 MAX_PROJECTED = 20_000
-"""Points that are projected into every view, evenly picked."""
+"""At most so many points are projected into each view."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """The views of one split, whether any has alpha, which photos are missing, and where photos came from
-    where it is not where the file says."""
+    """The views of one split, whether any has alpha, the missing photos, and notes on where photos are read
+    from."""
 
     views: tuple[View, ...] = ()
     alpha: bool = False
@@ -77,7 +77,7 @@ def _views(path: Path, document: dict, frames: list[tuple[int, dict]]) -> Part:
 
 
 def _rooted(file: str) -> tuple[str, str]:
-    """A photo's path cut behind its last folder `images`, else behind all folders."""
+    """A photo's path split after its last folder `images`, or else before the file name."""
     parts = PurePosixPath(file).parts
     folders = parts[:-1]
     cut = len(folders) - folders[::-1].index("images") if "images" in folders else len(folders)
@@ -85,7 +85,7 @@ def _rooted(file: str) -> tuple[str, str]:
 
 
 def _folders(path: Path, files: Iterable[str]) -> dict[str, Path]:
-    """For each folder that the file names, the one whose photos are read: itself or a smaller copy."""
+    """For each folder of photos in the file, the one that is read: itself or a smaller copy."""
     named: dict[str, list[str]] = {}
     for root, name in map(_rooted, filter(None, files)):
         named.setdefault(root, []).append(name)
@@ -101,7 +101,7 @@ def _photo(path: Path, folders: dict[str, Path], file: str) -> Path | None:
 def _notes(path: Path, folders: dict[str, Path]) -> Iterable[str]:
     for root, folder in folders.items():
         if folder != path.parent / root:
-            yield f"{path}: photos are read from {folder.name} beside {root}, the size that suits"
+            yield f"{path}: photos are read from {folder.name} instead of {root}"
 
 
 def _mask(path: Path, folders: dict[str, Path], frame: dict, where: str) -> Path | None:
@@ -114,7 +114,7 @@ def _mask(path: Path, folders: dict[str, Path], frame: dict, where: str) -> Path
     reduced = mask.parent.with_name(mask.parent.name + copy) / mask.name if mask.parent.name else mask
     found = next((file for file in (reduced, mask) if is_file(file)), None)
     if found is None:
-        raise MissingFile(f"{where}: its mask {mask} is not there; put it there, or drop mask_path")
+        raise MissingFile(f"{where}: its mask {mask} does not exist; add it, or remove mask_path")
     return found
 
 
@@ -168,11 +168,11 @@ def sparse_points(
     elif (model := colmap.model_folder(path.parent)) is not None and "applied_transform" in document:
         points = colmap.read_points(model)
     else:
-        note = f"{path}: its sparse points {written} are not there and were left out"
+        note = f"{path}: its sparse points {written} do not exist and are not used"
         return None, (note,) if written else ()
     if points is None or not len(points.positions) or not views:
         return None, ()
-    # Some writers of these files applied the transform to the points, some left that to the reader.
+    # Depending on the version of nerfstudio the file holds points before or after the transform.
     candidates = [points, *(points.moved(matrix) for matrix in _applied(path, document))]
     return max(candidates, key=lambda moved: _seen_share(moved, views)), ()
 

@@ -38,13 +38,13 @@ class View:
     fisheye: bool = False
     image_path: Path | None = None
     orientation: int = 1
-    """How the photo's stored pixels are turned into this camera's, as EXIF counts it; 1: they are its own."""
+    """EXIF orientation to apply to the photo's stored pixels to get this camera's; 1 for none."""
     mask_path: Path | None = None
-    """A picture of the photo's shape, black where the photo is not to be looked at."""
+    """A picture of the same aspect ratio, black where the photo must be ignored."""
     near: float | None = None
     far: float | None = None
-    """Depths (along -z, world units) between which lies what it sees of the scene's sparse points, but for
-    one in a thousand on each side."""
+    """Depths (along -z, world units) between which lie the sparse points that it sees, except for one in a
+    thousand on each side."""
     pixels: np.ndarray | None = None
     """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
 
@@ -54,10 +54,12 @@ class View:
         focal = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **focal)
 
-    def corners(self, depth: float) -> np.ndarray:
-        """(4, 3) world points at a depth behind the picture's corners, as a pinhole sees them."""
-        x = np.array([0, self.width, 0, self.width]) - self.cx
-        y = np.array([0, 0, self.height, self.height]) - self.cy
+    def corners(self, depth: float, box: tuple[int, int, int, int] | None = None) -> np.ndarray:
+        """(4, 3) world points at a depth behind the corners of the picture, or of a box (left, top, right,
+        bottom) in it; distortion is neglected."""
+        left, top, right, bottom = box or (0, 0, self.width, self.height)
+        x = np.array([left, right, left, right]) - self.cx
+        y = np.array([top, top, bottom, bottom]) - self.cy
         local = np.stack([x / self.fl_x, -y / self.fl_y, -np.ones(4)], 1) * depth
         return local @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3]
 
@@ -83,13 +85,26 @@ class Capture:
     opaque: bool
     """No picture has an alpha channel."""
     missing: tuple[str, ...] = ()
-    """The photos that are listed without being on disk; their frames are left out."""
+    """Photos that are listed but do not exist; their frames are left out."""
     points: Points | None = None
-    """Sparse points on surfaces, where structure from motion left them."""
+    """Sparse points from structure from motion, where the capture has them."""
     frame: SceneFrame | None = None
-    """How the cameras stand around what they look at, of a capture whose box follows from that."""
+    """The layout of the cameras, where the box follows from it."""
     notes: tuple[str, ...] = ()
-    """Sentences on what was chosen in reading."""
+    """Sentences about choices made while reading."""
+
+    def summary(self) -> dict:
+        """What was read and chosen, for a report."""
+        views = self.train + self.test
+        facts = {"kind": self.kind, "missing": len(self.missing)}
+        if self.points is not None:
+            facts["sparse_points"] = len(self.points.positions)
+        if masked := sum(view.mask_path is not None for view in views):
+            facts["masked"] = masked
+        if self.frame is not None:
+            frame = self.frame
+            facts |= {"layout": frame.layout, "focus": frame.focus.tolist(), "distance": frame.distance}
+        return {**facts, "notes": list(self.notes)} if self.notes else facts
 
 
 def hold_out(capture: Capture, every: int) -> Capture:

@@ -106,6 +106,8 @@ def train(
         "bytes": size,
         "kind": field.kind,
         "views": len(capture.train),
+        "capture": capture.summary(),
+        "aabb": box.tolist(),
         "steps": run.steps,
         "resolution": list(field.tensors[0].resolution),
         "seconds": {"training": seconds},

@@ -250,7 +250,7 @@ def test_counts_are_held_against_the_file(tmp_path):
         path = tmp_path / f"{name}.bin"
         data = path.read_bytes()
         path.write_bytes(struct.pack("<Q", 2**62) + data[8:])
-        with pytest.raises(BadModel, match=r"announces 4,611,686,018,427,387,904 records"):
+        with pytest.raises(BadModel, match=r"4,611,686,018,427,387,904 records do not fit"):
             colmap.read_model(tmp_path)
         path.write_bytes(data)
 
@@ -270,7 +270,7 @@ BAD_TEXT = {
     "no rotation": ("images.txt", "1 0 0 0 0 0 0 0 5 a.png", BadPose, r"image 1 \(a.png\)"),
     "half a line": ("images.txt", "1 1 0 0 0 0 0 0", BadModel, "line 1"),
     "observations of words": ("images.txt", "1 1 0 0 0 0 0 0 5 a.png\n1 1 x", BadModel, "line 2"),
-    "no images": ("images.txt", "# none", BadModel, "lists no image"),
+    "no images": ("images.txt", "# none", BadModel, "images file is empty"),
     "a short point": ("points3D.txt", "1 0 0 0", BadModel, "line 1"),
 }
 
@@ -712,6 +712,26 @@ def test_photos_that_all_look_one_way(tmp_path):
     # At depth 30 a picture of 400 x 320 pixels at f = 320 shows +-18.75 by +-15, from x = -2 to 2.
     expected = np.array([-20.75, -15, -30, 20.75, 15, -3])
     assert capture.aabb == pytest.approx(expected + 0.02 * 41.5 * np.array([-1] * 3 + [1] * 3))
+
+
+@pytest.mark.parametrize("border", [0, 2])
+def test_a_box_around_what_masks_cut_out(tmp_path, border):
+    """Cameras at 4 from a ball of radius 0.5, whose masks are squares that just hold it; or squares to the
+    very border, which tell nothing of an object."""
+    noisy(tmp_path / "a.png")
+    reach = 80 * 0.5 / np.sqrt(16 - 0.25)
+    levels = np.zeros((2 * round(reach + border),) * 2, np.uint8)
+    levels[border : len(levels) - border, border : len(levels) - border] = 255
+    Pillow.fromarray(levels).save(tmp_path / "mask.png")
+    Pillow.fromarray(np.tile(np.arange(len(levels), dtype=np.uint8), (len(levels), 1))).save(
+        tmp_path / "a.png"
+    )
+    centre = np.array([3.0, -2, 1])
+    frames = [frame("a.png", mask_path="mask.png", transform_matrix=pose) for pose in ring(9, 4, centre)]
+    write(tmp_path, frames=frames, fl_x=80)
+    half = (read_capture(tmp_path).aabb[3:] - centre).max()
+    # Rays through the corners of a square pass its centre at root 2 times the half side, nearly.
+    assert half == (pytest.approx(20) if border == 0 else pytest.approx(0.5 * np.sqrt(2) * 1.05, rel=0.03))
 
 
 # --- real captures ------------------------------------------------------------------------------------------
