@@ -245,7 +245,7 @@ def object_boxes(views: Sequence[View]) -> list[tuple[int, int, int, int]] | Non
 
 
 def _kept_box(view: View) -> tuple[tuple[int, int, int, int], float]:
-    """Bounds of what a mask keeps, or of the photo where that is nothing, and the kept share of the border."""
+    """Bounds of what a mask keeps (of the photo, if nothing), and the kept share of the border."""
     kept = ~load_ignored(view)
     border = float(np.mean(np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])))
     if not kept.any():
