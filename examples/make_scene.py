@@ -1,9 +1,9 @@
 """Make the example scene from nothing: python examples/make_scene.py OUT_FOLDER
 
 Writes ground.glb, tower.glb, arch.glb and ball.glb: upright (along +y, which is up in glTF, and +z after
-`fusedrf train`), centred on the vertical axis, foot at height 0, about one unit tall (the ground is a disc four
-units wide). Colours are baked into the vertices, light included, and no object is its own mirror image, so that
-a flipped axis shows. The same bytes come out every time.
+`fusedrf train`), centred on the vertical axis, foot at height 0, about one unit tall (the ground is a disc
+four units wide). Colours are baked into the vertices, light included, and no object is its own mirror
+image, so that a flipped axis shows. The same bytes come out every time.
 """
 
 import itertools
