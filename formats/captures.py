@@ -93,7 +93,7 @@ def read_capture(path: Path | str) -> Capture:
     path = Path(path)
     if not path.exists():
         raise MissingFile(
-            f"{path}: no such file or folder; name a capture's folder, its transforms.json, or a mesh"
+            f"{path}: no such file or folder; give a capture's folder, its transforms.json, or a mesh"
         )
     if is_mesh(path):
         return mesh_capture(path)

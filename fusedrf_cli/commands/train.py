@@ -54,7 +54,8 @@ from fusedrf_cli import options
 def command(source, output, **words):
     """Learn one field from photos or a mesh.
 
-    SOURCE is a capture's folder, its transforms.json, or a .glb, .gltf, .obj or .ply mesh.
+    SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF or Polycam), its
+    transforms.json, or a .glb, .gltf, .obj or .ply mesh.
 
     \b
     Example:
