@@ -17,7 +17,7 @@ from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews
-from formats.frame import default_box, scene_frame, shown_box, subject_box
+from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
 from formats.images import read_image_header, write_png
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
@@ -29,6 +29,7 @@ from formats.photos import (
     load_images,
     load_photos,
     natural,
+    object_boxes,
     on_photo,
     photo_folder,
     pictures,
@@ -255,6 +256,9 @@ def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | N
     """The frame of photos that show a subject and all around it, and a box large enough for that."""
     depths = [math.sqrt(view.near * view.far) for view in views if view.near and view.far]
     frame = scene_frame(poses, float(np.median(depths)) if depths else None)
+    if (kept := object_boxes(views)) is not None:
+        corners = [view.corners(1.0, box) for view, box in zip(views, kept, strict=True)]
+        return frame, object_box(poses[:, :3, 3], np.array(corners))
     if frame.layout != "forward-facing":
         return frame, default_box(frame, poses, None if points is None else points.positions)
     seen = [(view, view.near or 0.5 * frame.distance, view.far or 4 * frame.distance) for view in views]

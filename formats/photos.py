@@ -27,6 +27,8 @@ SAMPLED = 6
 """Number of photos that are examined for a plain background."""
 PLAIN = 3
 """Levels of 255 by which a plain background may vary."""
+BORDER_KEPT = 0.3
+"""Masks that keep less than this share of the photos' borders cut out an object; others hide passers-by."""
 DIGITS = re.compile(r"(\d+)")
 
 
@@ -228,6 +230,28 @@ def plain_background(views: Sequence[View]) -> bool:
         if (highest - lowest > PLAIN).any():
             return False
     return True
+
+
+def object_boxes(views: Sequence[View]) -> list[tuple[int, int, int, int]] | None:
+    """Left, top, right, bottom of what the mask of each view keeps, where masks cut out an object: all views
+    have one, and most of the border of the photos is ignored. None otherwise."""
+    if not all(view.mask_path for view in views):
+        return None
+    with ThreadPoolExecutor() as threads:
+        found = list(threads.map(_kept_box, views))
+    if np.mean([share for _, share in found]) > BORDER_KEPT:
+        return None
+    return [box for box, _ in found]
+
+
+def _kept_box(view: View) -> tuple[tuple[int, int, int, int], float]:
+    """Bounds of what a mask keeps (of the photo, if nothing), and the kept share of the border."""
+    kept = ~load_ignored(view)
+    border = float(np.mean(np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])))
+    if not kept.any():
+        return (0, 0, view.width, view.height), border
+    rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
+    return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1), border
 
 
 def _named(view: View) -> Path | str:

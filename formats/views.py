@@ -54,10 +54,12 @@ class View:
         focal = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **focal)
 
-    def corners(self, depth: float) -> np.ndarray:
-        """(4, 3) world points at a depth behind the picture's corners; distortion is neglected."""
-        x = np.array([0, self.width, 0, self.width]) - self.cx
-        y = np.array([0, 0, self.height, self.height]) - self.cy
+    def corners(self, depth: float, box: tuple[int, int, int, int] | None = None) -> np.ndarray:
+        """(4, 3) world points at a depth behind the corners of the picture, or of a box (left, top, right,
+        bottom) in it; distortion is neglected."""
+        left, top, right, bottom = box or (0, 0, self.width, self.height)
+        x = np.array([left, right, left, right]) - self.cx
+        y = np.array([top, top, bottom, bottom]) - self.cy
         local = np.stack([x / self.fl_x, -y / self.fl_y, -np.ones(4)], 1) * depth
         return local @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3]
 

@@ -714,6 +714,26 @@ def test_photos_that_all_look_one_way(tmp_path):
     assert capture.aabb == pytest.approx(expected + 0.02 * 41.5 * np.array([-1] * 3 + [1] * 3))
 
 
+@pytest.mark.parametrize("border", [0, 2])
+def test_a_box_around_what_masks_cut_out(tmp_path, border):
+    """Cameras at 4 from a ball of radius 0.5, whose masks are squares that just hold it; or squares to the
+    very border, which tell nothing of an object."""
+    noisy(tmp_path / "a.png")
+    reach = 80 * 0.5 / np.sqrt(16 - 0.25)
+    levels = np.zeros((2 * round(reach + border),) * 2, np.uint8)
+    levels[border : len(levels) - border, border : len(levels) - border] = 255
+    Pillow.fromarray(levels).save(tmp_path / "mask.png")
+    Pillow.fromarray(np.tile(np.arange(len(levels), dtype=np.uint8), (len(levels), 1))).save(
+        tmp_path / "a.png"
+    )
+    centre = np.array([3.0, -2, 1])
+    frames = [frame("a.png", mask_path="mask.png", transform_matrix=pose) for pose in ring(9, 4, centre)]
+    write(tmp_path, frames=frames, fl_x=80)
+    half = (read_capture(tmp_path).aabb[3:] - centre).max()
+    # Rays through the corners of a square pass its centre at root 2 times the half side, nearly.
+    assert half == (pytest.approx(20) if border == 0 else pytest.approx(0.5 * np.sqrt(2) * 1.05, rel=0.03))
+
+
 # --- real captures ------------------------------------------------------------------------------------------
 
 
