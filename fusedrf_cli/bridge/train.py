@@ -8,19 +8,19 @@ import numpy as np
 import torch
 
 from formats.atomic import check_space
-from formats.captures import hold_out, is_mesh, load_images, read_capture
+from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_photos, read_capture
 from formats.meshes import mesh_capture
 from formats.records import coded_bytes
 from formats.views import Capture, View
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.running import checkpoint_path, engine, load_checkpoint, resumable
 from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, texels
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures, texels
 from fusedrf_cli.engine.kinds.vm.field import VMShape
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.errors import QualityNotReached, UsageProblem
+from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 
 QUALITY = {
@@ -91,8 +91,11 @@ def train(
         budget.expect(
             fit_memory(capture, box, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
-        cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
-        run = FitRun.start(cameras, images, box, settings, Path(source).resolve().stem)
+        loaded = load_photos(capture.train)
+        if loaded.ignored is not None and loaded.ignored.all():
+            raise InvalidInput(f"{source}: the masks exclude every pixel; masks are black where to ignore")
+        cameras, pictures = [camera_of(v) for v in capture.train], Pictures(loaded.pixels, loaded.ignored)
+        run = FitRun.start(cameras, pictures, box, settings, Path(source).resolve().stem)
         if saved:
             run.restore(*saved)
         field, seconds = _run(run, output, progress)
@@ -127,10 +130,10 @@ def train(
 
 def fit_memory(capture: Capture, box: np.ndarray, settings: FitSettings) -> dict[str, float]:
     """What a fit to a capture's photos over a box (6,) needs."""
-    width, height = capture.train[0].width, capture.train[0].height
+    pixels = max(view.width * view.height for view in capture.train)
     cameras = len({camera_of(v).intrinsics for v in capture.train})
     return {
-        **photos(len(capture.train), width, height, cameras),
+        **photos(len(capture.train), pixels, 1, cameras),
         **fitting(settings, box, torch.get_num_threads()),
     }
 
@@ -204,14 +207,19 @@ def camera_of(view: View) -> Camera:
 
 
 def measure(field, capture: Capture) -> dict:
-    """Mean PSNR and SSIM of the held-out views over white."""
-    truth = over_white(load_images(capture.test))
-    shots = [render_image(field, camera_of(v)).over(WHITE) for v in capture.test]
-    return {
-        "psnr": float(np.mean([psnr(a, b) for a, b in zip(shots, truth, strict=True)])),
-        "ssim": float(np.mean([ssim(a, b) for a, b in zip(shots, truth, strict=True)])),
-        "views": len(shots),
-    }
+    """Mean PSNR and SSIM of the held-out views over white, of the pixels that masks do not exclude."""
+    figures = []
+    for view in capture.test:
+        truth = over_white(load_images([view]))[0]
+        shot = render_image(field, camera_of(view)).over(WHITE)
+        ignored = load_ignored(view)
+        kept = slice(None) if ignored is None else ~ignored
+        if ignored is not None:
+            shot[ignored] = truth[ignored]
+        if ignored is None or not ignored.all():
+            figures.append((psnr(shot[kept], truth[kept]), ssim(shot, truth)))
+    mean = np.mean(figures, 0) if figures else (float("nan"), float("nan"))
+    return {"psnr": float(mean[0]), "ssim": float(mean[1]), "views": len(figures)}
 
 
 def over_white(images: np.ndarray) -> np.ndarray:
