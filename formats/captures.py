@@ -7,7 +7,7 @@ World axes and units stay as the file has them: nothing is recentred, turned or 
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -248,8 +248,16 @@ def _capture(
     frame, box = None, subject_box(poses) if stated is None else stated.copy()
     if opaque and not plain_background(views):
         frame, box = _surroundings(views, poses, points)
-    notes = tuple(dict.fromkeys(train.notes + test.notes + notes))
+    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_doubts(path, poses))))
     return Capture(path, kind, train.views, test.views, box, opaque, missing, points, frame, notes)
+
+
+def _doubts(path: Path, poses: np.ndarray) -> Iterator[str]:
+    """Sentences about poses from which no depth follows."""
+    if len(poses) < 3:
+        yield f"{path}: has {len(poses)} photos; depth needs at least three from different places"
+    elif np.ptp(poses[:, :3, 3], axis=0).max() == 0:
+        yield f"{path}: all cameras are at one point, from which no depth follows; move between photos"
 
 
 def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | None) -> tuple:

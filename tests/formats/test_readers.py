@@ -92,7 +92,7 @@ def test_colmap_pixel(tmp_path, write_model, place):
     assert is_capture(tmp_path)
     for named in (tmp_path, tmp_path / place):
         capture = read_capture(named)
-        assert (capture.kind, capture.missing, capture.notes) == ("colmap", (), ())
+        assert (capture.kind, capture.missing) == ("colmap", ())
         assert [view.name for view in capture.train] == ["10", "a", "2"]
         for view in capture.train:
             assert view.camera_to_world == pytest.approx(np.array(POSE), abs=1e-12)
@@ -695,6 +695,16 @@ def test_a_room_seen_from_its_middle(tmp_path):
     capture = read_capture(tmp_path)
     assert capture.frame.layout == "outward"
     assert capture.aabb == pytest.approx([-9] * 3 + [11] * 3)
+
+
+def test_poses_without_depth_are_noted(tmp_path):
+    noisy(tmp_path / "a.png")
+    turning = ring(9, 0, np.zeros(3), inward=False)
+    for poses, said in ((turning, "one point"), (ring(9, 4, np.zeros(3))[:2], "2 photos")):
+        write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in poses], fl_x=80)
+        capture = read_capture(tmp_path)
+        assert said in capture.notes[-1] and (capture.aabb[3:] > capture.aabb[:3]).all()
+        assert capture.summary()["notes"] == list(capture.notes)
 
 
 def test_photos_that_all_look_one_way(tmp_path):
