@@ -248,8 +248,12 @@ def _capture(
     frame, box = None, subject_box(poses) if stated is None else stated.copy()
     if opaque and not plain_background(views):
         frame, box = _surroundings(views, poses, points)
+    cut_out = None
+    if (kept := object_boxes(views)) is not None:
+        corners = [view.corners(1.0, bounds) for view, bounds in zip(views, kept, strict=True)]
+        cut_out = object_box(poses[:, :3, 3], np.array(corners))
     notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_doubts(path, poses))))
-    return Capture(path, kind, train.views, test.views, box, opaque, missing, points, frame, notes)
+    return Capture(path, kind, train.views, test.views, box, opaque, cut_out, missing, points, frame, notes)
 
 
 def _doubts(path: Path, poses: np.ndarray) -> Iterator[str]:
@@ -264,9 +268,6 @@ def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | N
     """The frame of photos that show a subject and all around it, and a box large enough for that."""
     depths = [math.sqrt(view.near * view.far) for view in views if view.near and view.far]
     frame = scene_frame(poses, float(np.median(depths)) if depths else None)
-    if (kept := object_boxes(views)) is not None:
-        corners = [view.corners(1.0, box) for view, box in zip(views, kept, strict=True)]
-        return frame, object_box(poses[:, :3, 3], np.array(corners))
     if frame.layout != "forward-facing":
         return frame, default_box(frame, poses, None if points is None else points.positions)
     seen = [(view, view.near or 0.5 * frame.distance, view.far or 4 * frame.distance) for view in views]

@@ -157,8 +157,10 @@ class Photos:
         return self.pixels[self.first[i] : self.first[i + 1]].reshape(view.height, view.width, 4)
 
 
-def load_photos(views: Sequence[View]) -> Photos:
+def load_photos(views: Sequence[View], masks: str = "ignore") -> Photos:
     """The photos of views, which may differ in size, in their order.
+
+    What masks exclude is marked as ignored, or with `masks` "alpha" made transparent.
 
     Raises NoViews, BadImage, BadMask, LimitExceeded, MissingFile, MixedSizes (a photo changed since its
     capture was read), ResourceError (memory).
@@ -184,6 +186,9 @@ def load_photos(views: Sequence[View]) -> Photos:
     with ThreadPoolExecutor() as threads:
         for _ in threads.map(load, views, pairwise(first.tolist())):
             pass
+    if masks == "alpha" and ignored is not None:
+        pixels[ignored, 3] = 0
+        ignored = None
     return Photos(pixels, first, ignored)
 
 

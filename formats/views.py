@@ -84,6 +84,8 @@ class Capture:
     """(6,) float64 [xmin ymin zmin xmax ymax zmax] in world units: where the subject is taken to be."""
     opaque: bool
     """No picture has an alpha channel."""
+    object_aabb: np.ndarray | None = None
+    """(6,) the box of the object that the masks cut out, where they do."""
     missing: tuple[str, ...] = ()
     """Photos that are listed but do not exist; their frames are left out."""
     points: Points | None = None

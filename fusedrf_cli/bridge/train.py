@@ -48,6 +48,7 @@ def train(
     memory: int | None,
     precision: str,
     aabb: tuple[float, ...] | None,
+    masks: str,
     resume: bool,
     overwrite: bool,
     seed: int,
@@ -71,7 +72,9 @@ def train(
             progress.warn(f"{source}: {len(capture.missing)} frames have no photo and were left out")
         if holdout:
             capture = hold_out(capture, holdout)
-        box = np.asarray(aabb if aabb is not None else capture.aabb, np.float64)
+        cut_out = masks == "alpha" and any(view.mask_path for view in capture.train)
+        default = capture.aabb if not cut_out or capture.object_aabb is None else capture.object_aabb
+        box = np.asarray(aabb if aabb is not None else default, np.float64)
         shape = VMShape(sh_degree=2 if colour == "mlp" else sh_degree)
         settings = replace(
             QUALITY[quality],
@@ -80,7 +83,7 @@ def train(
             time_budget=time_budget,
             colour=colour,
             target_psnr=target_psnr,
-            opacity_weight=0.0 if capture.opaque else 0.1,
+            opacity_weight=0.0 if capture.opaque and not cut_out else 0.1,
             near=0.0,
             device=place,
         )
@@ -91,7 +94,7 @@ def train(
         budget.expect(
             fit_memory(capture, box, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
-        loaded = load_photos(capture.train)
+        loaded = load_photos(capture.train, masks)
         if loaded.ignored is not None and loaded.ignored.all():
             raise InvalidInput(f"{source}: the masks exclude every pixel; masks are black where to ignore")
         cameras, pictures = [camera_of(v) for v in capture.train], Pictures(loaded.pixels, loaded.ignored)

@@ -46,6 +46,13 @@ from fusedrf_cli import options
 )
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
+@click.option(
+    "--masks",
+    type=click.Choice(["ignore", "alpha"]),
+    default="ignore",
+    show_default=True,
+    help="Leave what masks exclude out of training, or learn it as transparent.",
+)
 @options.memory
 @options.precision
 @options.resume

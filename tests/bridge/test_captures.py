@@ -65,10 +65,18 @@ def masked(folder):
 
 
 def test_what_masks_exclude_is_neither_learnt_nor_measured(report, masked):
-    said = report("train", "wall", "-o", "out.rfpack", "--holdout", "3", *DRAFT)
+    box = ("--aabb", "-2,-2,-2,2,2,2")
+    said = report("train", "wall", "-o", "out.rfpack", "--holdout", "3", *box, *DRAFT)
     assert said["capture"]["masked"] == 6 and said["holdout"]["views"] == 2
     # Noise that covers half of a picture keeps it under 14 dB.
     assert said["training_psnr"] > 18 and said["holdout"]["psnr"] > 15
+
+
+def test_masks_as_alpha_make_a_box_for_the_object(report, masked):
+    said = report("train", "wall", "-o", "out.rfpack", "--masks", "alpha", *DRAFT)
+    low, high = np.split(np.array(said["aabb"]), 2)
+    # The squares reach 8 pixels from the middle at f = 20 and a distance of 4.1.
+    assert (high - low < 6).all() and (low < 0).all() and (high > 0).all()
 
 
 def test_masks_that_exclude_everything(run, masked):

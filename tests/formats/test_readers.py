@@ -470,6 +470,8 @@ def test_masks(tmp_path):
         assert (load_ignored(views[i]) == expected).all()
     assert not loaded.ignored[24000:].any() and load_ignored(views[3]) is None
     assert load_photos(views[3:]).ignored is None
+    clear = load_photos(views, masks="alpha")
+    assert clear.ignored is None and (clear.pixels[..., 3] == np.where(loaded.ignored, 0, 255)).all()
     with pytest.raises(MixedSizes):
         load_images(views)
 
@@ -739,9 +741,14 @@ def test_a_box_around_what_masks_cut_out(tmp_path, border):
     centre = np.array([3.0, -2, 1])
     frames = [frame("a.png", mask_path="mask.png", transform_matrix=pose) for pose in ring(9, 4, centre)]
     write(tmp_path, frames=frames, fl_x=80)
-    half = (read_capture(tmp_path).aabb[3:] - centre).max()
-    # Rays through the corners of a square pass its centre at root 2 times the half side, nearly.
-    assert half == (pytest.approx(20) if border == 0 else pytest.approx(0.5 * np.sqrt(2) * 1.05, rel=0.03))
+    capture = read_capture(tmp_path)
+    assert capture.aabb == pytest.approx([*(centre - 20), *(centre + 20)])
+    if border == 0:
+        assert capture.object_aabb is None
+    else:
+        # Rays through the corners of a square pass its centre at root 2 times the half side, nearly.
+        half = 0.5 * np.sqrt(2) * 1.05
+        assert capture.object_aabb == pytest.approx([*(centre - half), *(centre + half)], abs=0.03)
 
 
 # --- real captures ------------------------------------------------------------------------------------------
