@@ -1,7 +1,8 @@
 """The outer layer of a bundle: a ZIP of stored, aligned members, every byte fixed by names and contents.
 
-A reader takes names, sizes and checksums from the directory, lays out the headers they call for, and compares
-bytes: so nothing hides in a gap, and any ZIP tool can still list and extract the members.
+A reader takes names, sizes and checksums from the directory, builds the headers that follow from them, and
+compares these with the file byte by byte. So no data can be hidden between members, and any ZIP tool can
+still list and extract them.
 """
 
 import mmap
@@ -65,7 +66,8 @@ class Member:
 
 
 def write_archive(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
-    """Write `members` in the given order to `file`, one held at a time. Raises LimitExceeded at 4 GiB."""
+    """Write `members` to `file` in the given order, holding one at a time in memory. Raises LimitExceeded at
+    4 GiB."""
     directory, offset = [], 0
     for name, data in members:
         member = Member(name.encode("ascii"), zlib.crc32(data), len(data), offset)
@@ -89,7 +91,7 @@ def read_archive(path: Path | str, *, verify: bool = True) -> dict[str, memoryvi
         if magic != MAGIC:
             raise NotABundle(f"{path}: begins with {magic!r}, expected an .rfpack bundle ({MAGIC!r})")
         if size > MAX_ARCHIVE:
-            raise LimitExceeded(f"{path}: {size:,} bytes, a bundle has less than 4 GiB")
+            raise LimitExceeded(f"{path}: has {size:,} bytes, but a bundle is smaller than 4 GiB")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     return parse_archive(memoryview(data), str(path), verify=verify)
 
@@ -113,17 +115,17 @@ def parse_archive(data: memoryview, where: str, *, verify: bool = True) -> dict[
 
 
 def _members(data: memoryview, where: str) -> tuple[list[Member], int]:
-    """What the directory claims, with offsets recomputed; and where the directory begins."""
+    """The members that the directory lists, with offsets recomputed, and where the directory begins."""
     end = data[-END.size :]
     if len(data) < END.size or end[:4] != b"PK\x05\x06":
-        raise TruncatedBundle(f"{where}: has no ZIP end record: cut short or added to, copy it again")
+        raise TruncatedBundle(f"{where}: has no ZIP end record: cut short or appended to; copy it again")
     count, length, begin = END.unpack(end)[4:7]
     if not 0 < count <= MAX_MEMBERS:
-        raise LimitExceeded(f"{where}: {count:,} members, expected 1 to {MAX_MEMBERS:,}")
+        raise LimitExceeded(f"{where}: has {count:,} members, expected 1 to {MAX_MEMBERS:,}")
     if begin + length + END.size != len(data):
-        told = begin + length + END.size
+        expected = begin + length + END.size
         raise TruncatedBundle(
-            f"{where}: {len(data):,} bytes, its end record tells of {told:,}; copy it again"
+            f"{where}: has {len(data):,} bytes, but its end record says {expected:,}; copy it again"
         )
     members, at, offset = [], begin, 0
     for _ in range(count):
@@ -145,7 +147,7 @@ def _member(entry: memoryview, offset: int, where: str) -> Member:
     fields = CENTRAL.unpack(entry[: CENTRAL.size])
     name = bytes(entry[CENTRAL.size : CENTRAL.size + fields[10]])
     if not NAME.fullmatch(name) or len(name) > 255:
-        raise BadHeader(f"{where}: member name {name[:80]!r} is not one of a bundle; {REWRITTEN}")
+        raise BadHeader(f"{where}: member name {name[:80]!r} is not allowed in a bundle; {REWRITTEN}")
     if fields[4] != 0:
         raise BadHeader(f"{where}: member {name.decode()} is compressed, expected stored; {REWRITTEN}")
     return Member(name, fields[7], fields[9], offset)

@@ -1,4 +1,4 @@
-"""Outputs that appear whole or not at all: a sibling temporary, flushed, then renamed."""
+"""Outputs that appear whole or not at all: written to a temporary file beside them, flushed, then renamed."""
 
 import contextlib
 import errno
@@ -23,10 +23,10 @@ CAUSES = {
     errno.EDQUOT: "the disk quota is used up; free some space or choose another folder",
     errno.EACCES: "permission is missing; choose a folder that you may write to",
     errno.EPERM: "permission is missing; choose a folder that you may write to",
-    errno.EROFS: "the place is read-only; choose another folder",
+    errno.EROFS: "the file system is read-only; choose another folder",
     errno.EISDIR: "a folder of that name is in the way; choose another name",
     errno.EFBIG: "the file is larger than the disk's format allows",
-    errno.EIO: "the disk reports an error; choose another one",
+    errno.EIO: "the disk reports an error; use another disk",
 }
 
 
@@ -115,9 +115,9 @@ def hidden_sibling(target: Path, ending: str) -> Path:
 
 
 def remove_leftovers(path: Path | str) -> None:
-    """Remove the temporaries that killed writers of `path` left; only for who holds its lock."""
+    """Remove the temporaries that killed writers of `path` left. The caller must hold its lock."""
     target = Path(os.path.realpath(path))
-    # An old folder that had moved aside may be all there is: it goes only when its successor stands.
+    # A folder that was moved aside may be the only copy: it is removed only when the new one is in place.
     endings = "tmp|old" if target.exists() else "tmp"
     leftover = re.compile(re.escape(_hidden_stem(target)) + rf"\.[0-9a-f]{{12}}\.({endings})")
     for place in target.parent.iterdir():
@@ -150,7 +150,7 @@ def _reserve(descriptor: int, size: int) -> None:
 def _keep_mode(target: Path, temporary: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
         mode = target.stat().st_mode
-        if stat.S_IFMT(mode) == stat.S_IFMT(temporary.stat().st_mode):  # not a file's for a folder
+        if stat.S_IFMT(mode) == stat.S_IFMT(temporary.stat().st_mode):  # a folder does not take a file's mode
             os.chmod(temporary, stat.S_IMODE(mode))
 
 
@@ -179,7 +179,7 @@ def _swap_in(temporary: Path, target: Path) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Whether two names changed places, in one step that nobody can see the middle of (Linux)."""
+    """Whether two names changed places, in one atomic step (Linux)."""
     import ctypes
 
     try:
@@ -197,7 +197,7 @@ def _remove(path: Path) -> None:
 
 
 def _explain(error: BaseException, path: Path | str, temporary: Path, target: Path) -> None:
-    """Turn a failed write of this output into a sentence; an error about some other file is none of ours."""
+    """Turn a failed write of this output into a sentence; an error about another file is left as it is."""
     if not isinstance(error, OSError) or isinstance(error, FormatError) or error.errno not in CAUSES:
         return
     if error.filename is None or str(error.filename).startswith((str(temporary), str(target))):
@@ -217,7 +217,7 @@ def _sync_tree(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the rename itself survive a power loss; where that cannot be, the file is whole either way."""
+    """Make the rename itself survive a power loss; where this is not possible, the file is still complete."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -7,10 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from formats.archive import MAGIC, parse_archive, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
+from formats.contents import objects_in, world_aabb
 from formats.errors import BadHeader, ChecksumMismatch, FormatError, MissingMember, UnknownMember
 from formats.inputs import open_input
 from formats.records import FieldHeader, FieldRecord, decode_field, decode_header, encode_field
@@ -110,8 +109,8 @@ def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
 
 
 def read_headers(path: Path | str, *, verify: bool = True) -> tuple[SceneGraph, dict[str, FieldHeader]]:
-    """The scene of the bundle at `path` and what each of its fields says of itself, by member; no array is
-    decoded, but with `verify` every byte is checked. Raises as `read_bundle`.
+    """The scene of the bundle at `path` and the headers of its fields, by member; no array is decoded, but
+    with `verify` every byte is checked. Raises as `read_bundle`.
     """
     return _headers(read_archive(path, verify=verify), str(path), verify)
 
@@ -120,7 +119,7 @@ def read_field(path: Path | str, member: str) -> FieldRecord:
     """One field of a bundle whose bytes were checked before. Raises MissingMember, and as `read_bundle`."""
     views = read_archive(path, verify=False)
     if member not in views:
-        raise MissingMember(f"{path}: holds no member {member!r} any more; was it replaced meanwhile?")
+        raise MissingMember(f"{path}: no longer holds {member!r}; was the file replaced meanwhile?")
     return decode_field(views[member], f"{path}: {member}")
 
 
@@ -130,9 +129,10 @@ def parse_bundle(data: bytes | memoryview, where: str) -> Bundle:
 
 
 def read_summary(path: Path | str) -> dict:
-    """What `info` tells of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
+    """What `info` reports of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
 
     Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
+    `objects` are what a fused field was made of (formats/contents.py); a plain scene has nodes alone.
     """
     if _is_json(path):
         summary = _scene_summary(read_scene(path), {})
@@ -143,7 +143,7 @@ def read_summary(path: Path | str) -> dict:
     return {
         "path": str(path),
         "format": FORMAT,
-        # Of the file that was mapped: another may stand under its name by now.
+        # The size of the file that was mapped: the path may name another file by now.
         "bytes": len(views[SCENE].obj),
         **_scene_summary(scene, headers),
         "fields": fields,
@@ -170,7 +170,9 @@ def check_fields(scene: SceneGraph, members: Iterable[str], where: str) -> None:
     """Every field that a node names is among `members`; MissingMember otherwise."""
     for leaf in scene.leaves():
         if leaf.field is not None and leaf.field not in members:
-            raise MissingMember(f"{where}: node {leaf.name!r} names {leaf.field!r}, no member of this bundle")
+            raise MissingMember(
+                f"{where}: node {leaf.name!r} names {leaf.field!r}, which is not a member of this bundle"
+            )
 
 
 def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
@@ -197,7 +199,7 @@ def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:
 
 
 def _checked_members(views: dict[str, memoryview], where: str, verify: bool) -> dict[str, memoryview]:
-    """The fields among a bundle's members: names of the format, in order, and true to their content."""
+    """A bundle's fields by member; their names are checked, their order and, with `verify`, their SHA-256."""
     names = [name for name in views if name != SCENE]
     for name in names:
         if not re.fullmatch(MEMBER, name):
@@ -241,16 +243,9 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
         "generator": scene.generator,
         "composition": scene.composition,
         "nodes": nodes,
+        "objects": objects_in(scene, headers),
         "history": list(scene.history),
     }
-
-
-def world_aabb(aabb: list[float], object_to_world: np.ndarray) -> list[float]:
-    """(6,) box in the world around the eight corners of a (6,) box in the object's frame."""
-    low, high = np.array(aabb[:3]), np.array(aabb[3:])
-    centre = object_to_world[:3, :3] @ (low + high) / 2 + object_to_world[:3, 3]
-    half = np.abs(object_to_world[:3, :3]) @ (high - low) / 2
-    return [*(centre - half).tolist(), *(centre + half).tolist()]
 
 
 def _field_summary(name: str, header: FieldHeader) -> dict:

@@ -31,14 +31,14 @@ class FormatError(Exception):
 
 
 class FormatWarning(UserWarning):
-    """The file was read, but something in it deserves a look."""
+    """The file was read, but something in it needs attention."""
 
 
 # --- files --------------------------------------------------------------------------------------------------
 
 
 class MissingFile(FormatError):
-    """A file that something names is not there."""
+    """A file that was named does not exist."""
 
 
 class NotAFile(FormatError):
@@ -60,7 +60,7 @@ class OutputExists(FormatError):
 
 
 class ResourceError(FormatError):
-    """The disk is full, the place is read-only, or permission is missing."""
+    """The disk is full, the file system is read-only, or permission is missing."""
 
     exit_code = 5
 
@@ -77,7 +77,7 @@ class TruncatedBundle(FormatError):
 
 
 class BadHeader(FormatError):
-    """A ZIP or safetensors header does not say what the bytes are."""
+    """A ZIP or safetensors header does not match the bytes that it describes."""
 
 
 class ChecksumMismatch(FormatError):
@@ -93,7 +93,7 @@ class MissingMember(FormatError):
 
 
 class NewerVersion(FormatError):
-    """The file asks for a newer reader."""
+    """The file needs a newer version of fusedrf."""
 
     exit_code = 4
 
@@ -110,14 +110,14 @@ class BadArray(FormatError):
 
 
 class NotFinite(FormatError):
-    """NaN or infinity among numbers, or a number too large for the asked precision."""
+    """NaN or infinity among numbers, or a number too large for the precision it is stored in."""
 
 
 # --- scenes -------------------------------------------------------------------------------------------------
 
 
 class BadJson(FormatError):
-    """Not strict JSON: syntax, encoding, duplicate keys, or numbers that are none."""
+    """Not strict JSON: syntax, encoding, duplicate keys, or values that are not JSON numbers."""
 
 
 class BadSchema(FormatError):
@@ -148,11 +148,11 @@ class NoPoses(FormatError):
 
 
 class NoViews(FormatError):
-    """A capture or a film in which not a single view is left."""
+    """A capture or a film without any view."""
 
 
 class BadPose(FormatError):
-    """A camera pose that is no rigid motion."""
+    """A camera pose that is not a rigid motion."""
 
 
 class BadIntrinsics(FormatError):

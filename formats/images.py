@@ -1,18 +1,15 @@
-"""Pictures and films: 8-bit sRGB in, PNG, GIF and MP4 out, each whole or not at all."""
+"""Pictures: 8-bit sRGB in, PNG out, whole or not at all."""
 
-import itertools
-import os
 import struct
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from formats.atomic import atomic_writer
-from formats.errors import BadImage, LimitExceeded, MissingExtra, NoViews
+from formats.errors import BadImage, LimitExceeded
 from formats.inputs import open_input
 from formats.png import png_writer
 
@@ -127,61 +124,3 @@ def write_png(path: Path | str, pixels: np.ndarray) -> None:
     height, width, channels = pixels.shape
     with png_writer(path, width, height, channels) as write:
         write(pixels)
-
-
-def check_film(path: Path | str) -> None:
-    """Before any work: can a film of this name be written here? Raises BadImage or MissingExtra."""
-    if Path(path).suffix.lower() not in (".gif", ".mp4"):
-        raise BadImage(f"{path}: no film is written under this ending; name it .gif or .mp4")
-    if Path(path).suffix.lower() == ".mp4":
-        _ffmpeg(path)
-
-
-def write_film(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Frames (H, W, 3) uint8 of one size, taken one at a time, to a .gif (looping) or .mp4.
-
-    GIF counts in hundredths of a second, so frames last as near to 1/fps as those allow. An odd side of an
-    .mp4 gets its last row or column twice. Raises BadImage, MissingExtra, NoViews, ResourceError.
-    """
-    check_film(path)
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
-        raise NoViews(f"{path}: a film needs at least one frame")
-    write = _write_gif if Path(path).suffix.lower() == ".gif" else _write_mp4
-    with atomic_writer(path) as file:
-        write(path, file, itertools.chain([first], frames), fps)
-
-
-def _write_gif(path: Path | str, file, frames: Iterator[np.ndarray], fps: float) -> None:
-    from PIL import Image
-
-    pictures = (Image.fromarray(frame).quantize(256, dither=Image.Dither.FLOYDSTEINBERG) for frame in frames)
-    duration = 10 * max(1, round(100 / fps))
-    next(pictures).save(file, "GIF", save_all=True, append_images=pictures, duration=duration, loop=0)
-
-
-def _write_mp4(path: Path | str, file, frames: Iterator[np.ndarray], fps: float) -> None:
-    even = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames)
-    first = next(even)
-    # ffmpeg opens the temporary by its name, which does not end in .mp4: it must seek in what it writes.
-    size = first.shape[1::-1]
-    writer = _ffmpeg(path).write_frames(
-        file.name, size, fps=fps, macro_block_size=1, output_params=["-f", "mp4"]
-    )
-    writer.send(None)
-    try:
-        for frame in itertools.chain([first], even):
-            writer.send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
-    if os.path.getsize(file.name) == 0:
-        raise BadImage(f"{path}: ffmpeg wrote nothing; try a .gif")
-
-
-def _ffmpeg(path: Path | str):
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingExtra(f'{path}: films as .mp4 need an extra: pip install "fusedrf[video]"') from error
-    return imageio_ffmpeg

@@ -1,4 +1,4 @@
-"""Hostile input: regular files opened safely, and JSON read strictly."""
+"""Untrusted input: regular files are opened safely, and JSON is read strictly."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ MAX_INTEGER = 2**63 - 1
 # Commas and opening brackets of a document, and its colons: what bounds the time and memory of parsing it.
 MAX_VALUES = 500_000
 MAX_KEYS = 200_000
-# A scene of 64 levels has 130; what recurses over a document has room for this many.
+# A scene of 64 levels has 130; recursion over a document of this many is safe.
 MAX_NESTING = 200
 
 
@@ -48,20 +48,20 @@ def read_input(path: Path | str, limit: int) -> bytes:
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
-            raise LimitExceeded(f"{path}: {size:,} bytes, a file of this sort has at most {limit:,}")
+            raise LimitExceeded(f"{path}: has {size:,} bytes, but at most {limit:,} are read")
         return file.read(limit)
 
 
 def parse_json(data: bytes, where: str):
     """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise.
 
-    Raises LimitExceeded, before parsing, where there is more of it than a second's work.
+    Raises LimitExceeded, before parsing, where parsing would take more than about a second.
     """
     data = bytes(data)
     values, keys = sum(map(data.count, (b",", b"[", b"{"))), data.count(b":")
     if values > MAX_VALUES or keys > MAX_KEYS:
         raise LimitExceeded(
-            f"{where}: JSON of about {values:,} values and {keys:,} keys, at most {MAX_VALUES:,} and "
+            f"{where}: JSON of about {values:,} values and {keys:,} keys, but at most {MAX_VALUES:,} and "
             f"{MAX_KEYS:,} are read"
         )
     try:

@@ -1,4 +1,4 @@
-"""One writer per output: a lock beside it, held from reading to writing, which ends with its holder."""
+"""One writer per output: a lock file beside it, held from reading to writing, which ends with its process."""
 
 import contextlib
 import errno
@@ -16,7 +16,7 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)
 
 @contextlib.contextmanager
 def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Be the only one, in this block, that writes `path`; what killed writers left of it is removed.
+    """In this block no other fusedrf writes `path`; temporaries that killed writers left are removed.
 
     Another writer makes this one wait, after a call of `waiting` with a sentence, or without `waiting` raises
     ResourceError. The lock is the kernel's (flock) on a hidden file beside `path`: a killed holder leaves the
@@ -31,14 +31,16 @@ def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) 
         _acquire(lock, waiting, path)
     except Timeout as error:
         raise ResourceError(
-            f"{path}: another fusedrf is writing it; wait for its end, or choose another name"
+            f"{path}: another fusedrf is writing it; wait until it has finished, or choose another name"
         ) from error
     except PermissionError as error:
-        raise ResourceError(f"{path}: {beside} is another user's; wait until it is gone") from error
+        raise ResourceError(
+            f"{path}: the lock {beside} belongs to another user; wait until it is removed"
+        ) from error
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
-        text = f"{path}: its file system has no locks; see that nobody else writes it meanwhile"
+        text = f"{path}: its file system has no locks; make sure that nothing else writes it now"
         warnings.warn(text, FormatWarning, 3)
         yield
         return
@@ -46,7 +48,7 @@ def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) 
         remove_leftovers(target)
         yield
     finally:
-        # Before the release: whoever waits on this file sees that its name is gone, and makes a new one.
+        # Before the release: a process waiting for the lock sees that the file is gone, and makes a new one.
         with contextlib.suppress(OSError):
             beside.unlink()
         lock.release()

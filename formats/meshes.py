@@ -30,7 +30,7 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def is_mesh(path: Path | str) -> bool:
-    """By content for .glb and .ply (splats and point clouds are none), by name for .obj and .gltf."""
+    """By content for .glb and .ply (splats and point clouds are not meshes), by name for .obj and .gltf."""
     return mesh_type(path) is not None
 
 
@@ -60,8 +60,7 @@ def mesh_capture(
     samples_per_pixel: int = 16,
     seed: int = 0,
 ) -> Capture:
-    """Square views from a Fibonacci sphere of cameras, rendered in memory, from which the whole mesh is in
-    sight.
+    """Square views from a Fibonacci sphere of cameras, rendered in memory; each shows the whole mesh.
 
     `samples_per_pixel` is a square number. Straight alpha is the share of a pixel's rays that hit, colour the
     mean over those. `seed` turns the spheres of train and test cameras. aabb: the mesh's bounds and 2% of
@@ -144,16 +143,16 @@ def _placed_geometries(path: Path | str) -> list[tuple]:
     """(trimesh geometry, geometry_to_world) for every placed surface with faces."""
     import trimesh
 
-    open_input(path).close()  # a path that leads nowhere gets its own sentence
+    open_input(path).close()  # a missing file gets its own error
     kind = mesh_type(path)
     if kind is None:
-        raise BadMesh(f"{path}: no mesh that can be read; expected .glb, .gltf, .obj or .ply with faces")
+        raise BadMesh(f"{path}: not a mesh that can be read; expected .glb, .gltf, .obj or .ply with faces")
     try:
         # Unprocessed: merging equal positions would merge their colours.
         scene = trimesh.load_scene(str(path), file_type=kind, process=False)
         nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
         placed = [(scene.geometry[name], to_world) for to_world, name in nodes]
-    except Exception as error:  # the loaders raise whatever a broken file makes them stumble over
+    except Exception as error:  # the loaders raise errors of any class on broken files
         raise BadMesh(
             f"{path}: the mesh cannot be loaded ({type(error).__name__}: {error}); export it again"
         ) from error
@@ -162,7 +161,7 @@ def _placed_geometries(path: Path | str) -> list[tuple]:
         raise BadMesh(f"{path}: the mesh has no faces, expected a surface of triangles")
     for geometry, _ in placed:
         if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
-            raise BadMesh(f"{path}: a face names a vertex that is not there; export the mesh again")
+            raise BadMesh(f"{path}: a face refers to a vertex that does not exist; export the mesh again")
     return [(g, UPRIGHT @ m) for g, m in placed] if kind in GLTF else placed
 
 
@@ -213,7 +212,7 @@ def _unit(colours: np.ndarray) -> np.ndarray:
 
 
 def _around(mesh: _Mesh, n: int, size: int, prefix: str, random: np.random.Generator) -> list[View]:
-    """`n` cameras spread evenly over a sphere, turned at random, whose views just hold the mesh's sphere."""
+    """`n` cameras spread evenly over a sphere, turned at random, whose views just frame the mesh's sphere."""
     distance = (1 + MARGIN) * mesh.radius / math.sin(FIELD_OF_VIEW / 2)
     focal = 0.5 * size / math.tan(FIELD_OF_VIEW / 2)
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]

@@ -53,7 +53,7 @@ def _chunk(file: BinaryIO, kind: bytes, data: bytes) -> None:
 
 
 class _Rows:
-    """Filters and compresses rows as they come."""
+    """Filters and compresses rows as they are written."""
 
     def __init__(self, file: BinaryIO, width: int, height: int, channels: int, bits: int):
         self.file, self.missing, self.shape = file, height, (width, channels)
@@ -98,8 +98,9 @@ def depth_png_writer(
     """A function that takes rows (n, width) of distances in world units, and a report that is filled in when
     the block ends: {"path", "scale"}, a distance being its grey level times `scale`.
 
-    Levels are 16-bit grey; 0, and whatever is not finite, stands for nothing there. The scale follows from
-    the farthest distance, so the rows wait in an unnamed file beside the picture.
+    Levels are 16-bit grey; 0 means that nothing was hit, and so does a distance that is 0 or not finite. The
+    scale follows from the farthest distance, so until then the rows are kept in an unnamed file beside the
+    picture.
     """
     report = {"path": str(path)}
     farthest = 0.0

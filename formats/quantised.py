@@ -7,7 +7,7 @@ An array of three dimensions (na, nb, R) is cut into blocks of 8 x 8 x 1, one of
 
 computed in float32, the product first: it is exact, so that code L gives back the scale itself. A block whose
 scale is 0 is all zero and stores no codes. Encoding what was decoded gives the same scales and codes, because
-every other block has a number of code L or -L, which tells its scale.
+every other block has a number of code L or -L, from which its scale follows.
 """
 
 import math
@@ -20,8 +20,8 @@ from formats.errors import BadArray, NotFinite
 BLOCKS = {2: (64, 1), 3: (8, 8, 1)}  # by an array's dimensions
 LEAST = {2: 65536, 3: 4096}  # numbers of an array that a writer codes; smaller ones stay float16
 LEVELS = {8: 127, 4: 7}  # the largest code, by bits
-# Of a block's largest number: the scales that are tried for the least squared error. Eight bits have no use
-# for cutting the largest off; none may be above 1, or no code would reach L.
+# Of a block's largest number: the scales that are tried for the least squared error. With eight bits,
+# cutting off the largest number gains nothing. None may be above 1, or no code would reach L.
 FACTORS = {8: (1.0,), 4: (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.65)}
 NUMBERS_AT_ONCE = 1 << 17  # of an array, so that what is made of them stays in the cache
 
@@ -37,7 +37,7 @@ def scales_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def code_bytes(numbers: int, bits: int) -> int:
-    """Bytes of so many codes."""
+    """Bytes that this many codes take."""
     return -(-numbers * bits // 8)
 
 
@@ -64,12 +64,12 @@ def dequantised(
     """float32 numbers of `shape` from what `quantised` gave; `scales` have the shape that `shape` asks for.
 
     `where` leads error sentences. Before the numbers are allocated, raises NotFinite (scales) and BadArray
-    (negative scales, codes that are none, too many or too few of them).
+    (negative scales, invalid codes, too many or too few of them).
     """
     levels, kept_numbers = LEVELS[bits], check_scales(scales, shape, where)
     if codes.size != code_bytes(kept_numbers, bits):
         raise BadArray(
-            f"{where}: {codes.size:,} bytes of codes where its scales ask for "
+            f"{where}: {codes.size:,} bytes of codes, but its scales need "
             f"{code_bytes(kept_numbers, bits):,}; make the file again"
         )
     if bits == 4:
@@ -94,10 +94,10 @@ def dequantised(
 
 
 def check_scales(scales: np.ndarray, shape: tuple[int, ...], where: str) -> int:
-    """How many numbers of an array of `shape` have codes. Raises NotFinite and BadArray for scales that are
-    none."""
+    """How many numbers of an array of `shape` have codes. Raises NotFinite and BadArray for invalid
+    scales."""
     if not np.isfinite(scales).all():
-        raise NotFinite(f"{where}: has scales NaN or infinite; make the file again")
+        raise NotFinite(f"{where}: has scales that are NaN or infinite; make the file again")
     if np.signbit(scales).any():
         raise BadArray(f"{where}: has negative scales; make the file again")
     return _numbers_kept(scales > 0, shape)
@@ -112,7 +112,7 @@ def exact_code_bytes(array: np.ndarray, bits: int) -> int:
 
 
 def _numbers_kept(kept: np.ndarray, shape: tuple[int, ...]) -> int:
-    """Numbers in those blocks."""
+    """How many numbers lie in the blocks that are kept."""
     counts = kept.astype(np.int64)
     for axis, (n, b) in enumerate(zip(shape, BLOCKS[len(shape)], strict=True)):
         lengths = np.minimum(b, n - b * np.arange(kept.shape[axis]))

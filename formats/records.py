@@ -30,11 +30,11 @@ from formats.quantised import (
 )
 
 KEY = "fusedrf"
-VERSION = 2  # written where arrays are coded; fields without such are of version 1
+VERSION = 2  # of fields with coded arrays; others have version 1
 MAX_HEADER = 1 << 20
 MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30
-MAX_DECODED_BYTES = 8 << 30  # of a field: what a whole pack of F16 comes to
+MAX_DECODED_BYTES = 8 << 30  # of a field: a bundle of 4 GiB that is all F16, as float32
 MAX_RANK = 5
 MAX_DIMENSION = 2**31 - 1
 DTYPES = {"F16": np.dtype("<f2"), "F32": np.dtype("<f4"), "U8": np.dtype("u1"), "I32": np.dtype("<i4")}
@@ -68,7 +68,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class CodedSpec:
-    """An array that is stored as codes of so many bits and their scales."""
+    """An array that is stored as codes of 8 or 4 bits and their scales."""
 
     bits: int
     shape: tuple[int, ...]
@@ -76,7 +76,7 @@ class CodedSpec:
 
 @dataclass(frozen=True)
 class FieldHeader:
-    """What a field says of itself before any array is read."""
+    """A field's description, which is read without its arrays."""
 
     kind: str
     metadata: dict
@@ -101,7 +101,7 @@ class FieldHeader:
 
     @property
     def precision(self) -> str:
-        """The one of PRECISIONS that it was written with, told from its arrays: the most exact of them, where
+        """The one of PRECISIONS that it was written with, as its arrays show: the most exact one where
         another program mixed several.
         """
         if any(self.specs[name].dtype == DTYPES["F32"] for name in self.plain):
@@ -202,7 +202,7 @@ def decode_header(data: bytes | memoryview, where: str) -> FieldHeader:
     found = FieldHeader(kind, metadata, specs, coded, size)
     if found.decoded_size > MAX_DECODED_BYTES:
         raise LimitExceeded(
-            f"{where}: decodes to {found.decoded_size:,} bytes, the most is {MAX_DECODED_BYTES:,}"
+            f"{where}: decodes to {found.decoded_size:,} bytes, but at most {MAX_DECODED_BYTES:,} are read"
         )
     return found
 
@@ -215,7 +215,7 @@ def coded_parts(name: str) -> tuple[str, str]:
 def _plain(value: object) -> object:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    raise TypeError(f"{type(value).__name__} is no JSON value")
+    raise TypeError(f"{type(value).__name__} is not a JSON value")
 
 
 def _mapped(data: bytes | memoryview, spec: ArraySpec) -> np.ndarray:
@@ -226,18 +226,18 @@ def _mapped(data: bytes | memoryview, spec: ArraySpec) -> np.ndarray:
 def _stored_arrays(
     arrays: dict[str, np.ndarray], precision: str, where: str
 ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
-    """Arrays by the names under which they are stored, and what the metadata say of coded ones."""
+    """Arrays by the names under which they are stored, and the metadata's entries for coded ones."""
     stored, coded = {}, {}
     for name, array in arrays.items():
         shape = np.shape(array)
         if precision in BITS and np.asarray(array).dtype.kind == "f" and is_coded(shape):
-            _cast(name, array, precision, where)  # what float16 cannot hold no scale can
+            _cast(name, array, precision, where)  # a scale is a float16 too
             parts = dict(zip(coded_parts(name), quantised(array, BITS[precision]), strict=True))
             coded[name] = {"bits": BITS[precision], "shape": list(shape)}
         else:
             parts = {name: _stored(name, array, precision, where)}
         if twice := parts.keys() & stored.keys():
-            raise BadArray(f"{where}: array {min(twice)!r} would be there twice; rename it")
+            raise BadArray(f"{where}: two arrays would be stored as {min(twice)!r}; rename one of them")
         stored |= parts
     return stored, coded
 
@@ -269,7 +269,9 @@ def _check_finite(name: str, array: np.ndarray, where: str, what: str = "NaN or 
 
 def _content(entry: object, where: str) -> tuple[str, dict, dict]:
     if not isinstance(entry, dict) or set(entry) != {KEY} or not isinstance(entry[KEY], str):
-        raise BadHeader(f"{where}: expected one metadata key {KEY!r} holding a string; no field of fusedrf")
+        raise BadHeader(
+            f"{where}: expected one metadata key {KEY!r} holding a string; this is not a field of fusedrf"
+        )
     content = parse_json(entry[KEY].encode(), where)
     if not isinstance(content, dict) or type(content.get("version")) is not int:
         raise BadSchema(f"{where}: expected metadata with an integer 'version'")
@@ -283,7 +285,7 @@ def _content(entry: object, where: str) -> tuple[str, dict, dict]:
             f"{where}: expected {', '.join(sorted(expected))} in version {version}, found {sorted(content)}"
         )
     if not isinstance(coded, dict) or (version == VERSION and not coded):
-        raise BadSchema(f"{where}: 'coded' should name the arrays that are")
+        raise BadSchema(f"{where}: 'coded' should be an object that names the coded arrays")
     if not isinstance(kind, str) or not KIND.fullmatch(kind):
         raise BadSchema(f"{where}: kind {kind!r} is not a lower-case word")
     if "aabb" in metadata:
@@ -301,16 +303,18 @@ def _spec(name: str, entry: object, base: int, where: str) -> ArraySpec:
     if not NAME.fullmatch(name):
         raise BadArray(f"{where}: array name {name[:80]!r} is not 1 to 64 letters, digits, '_', '.' or '-'")
     if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:
-        raise BadHeader(f"{where}: array {name!r} does not state dtype, shape and data_offsets alone")
+        raise BadHeader(f"{where}: array {name!r} should state dtype, shape and data_offsets only")
     if not isinstance(entry["dtype"], str) or entry["dtype"] not in DTYPES:
         raise BadArray(f"{where}: array {name!r} is of {entry['dtype']!r}, expected {', '.join(DTYPES)}")
     shape, offsets = entry["shape"], entry["data_offsets"]
     if not _counts(shape) or len(shape) > MAX_RANK or any(n > MAX_DIMENSION for n in shape):
-        raise BadArray(f"{where}: array {name!r} has shape {shape!r}, expected {MAX_RANK} sizes at most")
+        raise BadArray(f"{where}: array {name!r} has shape {shape!r}, expected at most {MAX_RANK} sizes")
     dtype = DTYPES[entry["dtype"]]
     size = math.prod(shape) * dtype.itemsize
     if size > MAX_ARRAY_BYTES:
-        raise LimitExceeded(f"{where}: array {name!r} has {size:,} bytes, the most is {MAX_ARRAY_BYTES:,}")
+        raise LimitExceeded(
+            f"{where}: array {name!r} has {size:,} bytes, but at most {MAX_ARRAY_BYTES:,} are read"
+        )
     if not _counts(offsets) or len(offsets) != 2 or offsets[1] - offsets[0] != size:
         raise BadHeader(f"{where}: array {name!r} lies at {offsets!r}, expected offsets {size} bytes apart")
     return ArraySpec(dtype, tuple(shape), base + offsets[0], base + offsets[1])
@@ -318,9 +322,9 @@ def _spec(name: str, entry: object, base: int, where: str) -> ArraySpec:
 
 def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: str) -> CodedSpec:
     if not NAME.fullmatch(name) or name in specs:
-        raise BadArray(f"{where}: coded array {name[:80]!r} has no name of its own; make the file again")
+        raise BadArray(f"{where}: coded array {name[:80]!r} has a wrong or taken name; make the file again")
     if not isinstance(entry, dict) or set(entry) != {"bits", "shape"}:
-        raise BadSchema(f"{where}: coded array {name!r} does not state bits and shape alone")
+        raise BadSchema(f"{where}: coded array {name!r} should state bits and shape only")
     bits, shape = entry["bits"], entry["shape"]
     if type(bits) is not int or bits not in LEVELS:
         raise BadSchema(f"{where}: array {name!r} is coded in {bits!r} bits, expected 4 or 8")
@@ -329,7 +333,8 @@ def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: st
     numbers, least = math.prod(shape), scales_shape(shape)
     if 4 * numbers > MAX_ARRAY_BYTES:
         raise LimitExceeded(
-            f"{where}: array {name!r} decodes to {4 * numbers:,} bytes, the most is {MAX_ARRAY_BYTES:,}"
+            f"{where}: array {name!r} decodes to {4 * numbers:,} bytes, but at most "
+            f"{MAX_ARRAY_BYTES:,} are read"
         )
     scales, codes = (specs.get(part) for part in coded_parts(name))
     if scales is None or codes is None:
@@ -350,7 +355,7 @@ def _counts(values: object) -> bool:
 
 
 def _check_cover(specs: dict[str, ArraySpec], start: int, size: int, where: str) -> None:
-    """The arrays follow each other without gap or overlap to the last byte, so nothing hides between them."""
+    """The arrays follow each other without gap or overlap to the last byte: no data hides between."""
     for name, spec in sorted(specs.items(), key=lambda item: (item[1].start, item[1].stop)):
         if spec.start != start:
             raise BadHeader(f"{where}: array {name!r} begins at byte {spec.start}, expected {start}")

@@ -93,7 +93,7 @@ SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history
 
 @dataclass(frozen=True)
 class Node:
-    """A placed object or group; `node_to_parent` (4, 4) follows from `placement`, kept as it was spelled."""
+    """A placed object or group; `node_to_parent` (4, 4) follows from `placement`, kept as it was written."""
 
     name: str
     field: str | None = None
@@ -116,7 +116,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Leaf:
-    """A node that holds something: `object_to_world` is (4, 4) float64."""
+    """A node with a field or a source; `object_to_world` is (4, 4) float64."""
 
     name: str
     field: str | None
@@ -208,7 +208,9 @@ def parse_scene(data: bytes, where: str) -> SceneGraph:
     LimitExceeded; warns (FormatWarning) about a newer minor version, whose unknown keys are kept.
     """
     if len(data) > MAX_SCENE_BYTES:
-        raise LimitExceeded(f"{where}: a scene of {len(data):,} bytes, at most {MAX_SCENE_BYTES:,} are read")
+        raise LimitExceeded(
+            f"{where}: a scene of {len(data):,} bytes, but at most {MAX_SCENE_BYTES:,} are read"
+        )
     content = parse_json(data, where)
     newer = _check_version(content, where)
     nodes = content.get("nodes")
@@ -259,7 +261,7 @@ def write_scene(path: Path | str, scene: SceneGraph, *, overwrite: bool = False)
 
 
 def is_scene(path: Path | str) -> bool:
-    """Whether the file's content, not its name, is a scene graph; other JSON, broken or not, is none."""
+    """Whether the file's content, not its name, is a scene graph; False for other JSON, valid or not."""
     try:
         data = read_input(path, MAX_SCENE_BYTES)
         content = parse_json(data, str(path)) if data.lstrip()[:1] == b"{" else None
@@ -277,7 +279,7 @@ def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = Fa
     folder = Path(scene_path).parent
     plain = unicodedata.normalize("NFKC", source)
     if not source or not source.isprintable():
-        raise BadName(f"{scene_path}: source {source!r} is no path; expected printable characters")
+        raise BadName(f"{scene_path}: source {source!r} is not a path; expected printable characters")
     parts = re.split(r"[/\\]", plain)
     drive = re.match(r"[A-Za-z][A-Za-z0-9+.\-]*:", plain)
     path = folder / source
@@ -285,7 +287,7 @@ def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = Fa
     if not allow_outside and (".." in parts or parts[0] == "" or drive or not inside):
         raise _outside(scene_path, source)
     if not os.path.exists(path):
-        raise MissingFile(f"{scene_path}: source {source!r} is not there, looked for at {path}")
+        raise MissingFile(f"{scene_path}: source {source!r} does not exist (looked for at {path})")
     return path
 
 
@@ -294,14 +296,14 @@ def expand_scene(path: Path | str, allow_outside: bool = False) -> SceneGraph:
 
     Inner names become `outer/inner`; inner sources become relative to the folder of `path`. Raises what
     `read_scene` and `resolve_source` raise, CyclicScene where a scene leads back to itself, BadSchema where
-    an inner scene composes by another rule.
+    an inner scene has another composition.
     """
     scene = read_scene(path)
     return inline_scenes(scene, path, allow_outside)
 
 
 def inline_scenes(scene: SceneGraph, path: Path | str, allow_outside: bool = False) -> SceneGraph:
-    """As `expand_scene`, of a `scene` already read from `path` (a bundle's, say)."""
+    """As `expand_scene`, of a `scene` already read from `path`, which may be a bundle."""
     expansion = _Expansion(Path(path).parent, scene.composition, allow_outside)
     nodes = expansion.nodes(scene.nodes, Path(path), "", (os.path.realpath(path),))
     try:
@@ -321,7 +323,7 @@ def scene_schema() -> dict:
 
 @dataclass
 class _Expansion:
-    """One run of `inline_scenes`; `count` bounds what scenes that name each other twice would unfold to."""
+    """One run of `inline_scenes`; `count` bounds its result, which doubles with every scene named twice."""
 
     folder: Path
     composition: str
@@ -348,8 +350,8 @@ class _Expansion:
             loop = " -> ".join(Path(step).name for step in (*trail[trail.index(real) :], real))
             raise CyclicScene(f"{target}: leads back to itself ({loop}); remove one of these sources")
         if inner.composition != self.composition:
-            rules = f"{inner.composition!r}, the scene around it by {self.composition!r}"
-            raise BadSchema(f"{target}: composes by {rules}; give both one rule")
+            rules = f"{inner.composition!r}, but the scene that names it {self.composition!r}"
+            raise BadSchema(f"{target}: its composition is {rules}; give both the same")
         nested = self.nodes(inner.nodes, target, node.name + "/", (*trail, real))
         if node.background:
             nested = tuple(replace(child, background=True) for child in nested)
@@ -376,12 +378,13 @@ def _check_name(name: str) -> None:
     if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
         raise BadName(f"node name {str(name)[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes")
     if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in BIDIRECTIONAL for c in name):
-        raise BadName(f"node name {name!r} holds control characters; use letters that print")
+        raise BadName(f"node name {name!r} holds control characters; use printable ones")
 
 
 def _placement_matrix(placement: dict, name: str) -> np.ndarray:
     if set(placement) - set(PLACEMENT_KEYS):
-        raise BadSchema(f"node {name!r}: placed by {sorted(placement)}, expected {', '.join(PLACEMENT_KEYS)}")
+        expected = ", ".join(PLACEMENT_KEYS)
+        raise BadSchema(f"node {name!r}: has the placement {sorted(placement)}, expected {expected}")
     if "matrix" in placement:
         if len(placement) > 1:
             raise BadSchema(f"node {name!r}: has a matrix and {sorted(placement)[-1]}, expected one of them")
@@ -402,7 +405,7 @@ def _numbers(values, shape: tuple[int, ...], name: str, word: str) -> np.ndarray
     try:
         array = np.array(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise BadSchema(f"node {name!r}: {word} is not made of numbers") from error
+        raise BadSchema(f"node {name!r}: {word} should be a list of numbers") from error
     if array.shape != shape:
         raise BadSchema(f"node {name!r}: {word} has shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():
@@ -418,11 +421,13 @@ def _unit(quaternion: np.ndarray, name: str) -> np.ndarray:
 
 
 def _check_affine(matrix: np.ndarray, who: str) -> None:
-    """Refuse what cannot be inverted to float64 accuracy; warn where sigma would be stretched past sense."""
+    """Refuse what cannot be inverted to float64 accuracy; warn where an object is stretched extremely."""
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise BadSchema(f"{who}: last row {matrix[3].tolist()}, expected [0, 0, 0, 1]; columns act on points")
     if np.abs(matrix[:3, 3]).max() > MAX_TRANSLATION:
-        raise LimitExceeded(f"{who}: translation {matrix[:3, 3].tolist()} passes {MAX_TRANSLATION:g} units")
+        raise LimitExceeded(
+            f"{who}: translation {matrix[:3, 3].tolist()} is beyond {MAX_TRANSLATION:g} units"
+        )
     high, _, low = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     smallest, largest = SINGULAR_VALUES
     # The slack lets a scale of exactly the limit through the rounding of the decomposition.
@@ -432,13 +437,14 @@ def _check_affine(matrix: np.ndarray, who: str) -> None:
             f"with a ratio of at most {MAX_CONDITION:g}"
         )
     if high / low > WARN_CONDITION:
-        warnings.warn(f"{who}: stretched {high / low:.0f} times more one way than another", FormatWarning, 2)
+        text = f"{who}: stretched {high / low:.0f} times more along one axis than along another"
+        warnings.warn(text, FormatWarning, 2)
 
 
 def _check_version(content: object, where: str) -> bool:
     """Whether a minor version newer than ours wrote `content`."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise BadSchema(f'{where}: no scene graph; expected a JSON object with "format": "{FORMAT}"')
+        raise BadSchema(f'{where}: not a scene graph; expected a JSON object with "format": "{FORMAT}"')
     found = content.get("version")
     match = re.fullmatch(r"([0-9]{1,4})\.([0-9]{1,4})", found) if isinstance(found, str) else None
     if match is None:
@@ -447,7 +453,9 @@ def _check_version(content: object, where: str) -> bool:
     if int(match[1]) != major:
         raise NewerVersion(f"{where}: version {found}, but this fusedrf reads {major}.x; update fusedrf")
     if content.get("requires"):
-        raise NewerVersion(f"{where}: requires {content['requires']!r}, unknown here; update fusedrf")
+        raise NewerVersion(
+            f"{where}: requires {content['requires']!r}, which this version does not know; update fusedrf"
+        )
     newer = int(match[2]) > minor
     if newer:
         text = f"{where}: version {found} is newer than {VERSION}; what is new is ignored"

@@ -1,4 +1,4 @@
-"""What can go wrong outside the files themselves; `formats.errors` has the ways a file can be wrong.
+"""Errors that are not about the content of a file; those are in `formats.errors`.
 
 `str(error)` is the one sentence a person reads; `exit_code` is what the process returns.
 """
@@ -15,7 +15,7 @@ class FusedRFError(Exception):
 
 
 class UsageProblem(FusedRFError):
-    """Options that do not go together."""
+    """Options that cannot be combined."""
 
     exit_code = 2
 
@@ -45,7 +45,7 @@ class NumericFailure(FusedRFError):
 
 
 class QualityNotReached(FusedRFError):
-    """A quality that was asked for (`--target-psnr`) and not reached."""
+    """The requested quality (`--target-psnr`) was not reached."""
 
     exit_code = 7
 
@@ -53,8 +53,8 @@ class QualityNotReached(FusedRFError):
 class Interrupted(KeyboardInterrupt):
     """SIGINT or SIGTERM, raised in the main thread.
 
-    A KeyboardInterrupt, so that no `except Exception` swallows it on its way. Whoever leaves a checkpoint
-    may set `sentence` to say so and raise it again.
+    A KeyboardInterrupt, so that no `except Exception` swallows it on its way. Code that left
+    a checkpoint may set `sentence` to say so and raise it again.
     """
 
     def __init__(self, signal_number: int = 2):

@@ -24,7 +24,7 @@ _MISSING_INPUT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 
 class LazyGroup(click.Group):
-    """Imports a subcommand's module only when it is asked for, and is the one place where errors end."""
+    """Imports a subcommand's module only when it is asked for, and handles the errors of all commands."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -51,17 +51,17 @@ class LazyGroup(click.Group):
         except (Exception, KeyboardInterrupt) as error:
             if ctx is not None and ctx.meta.get(options.DEBUG):
                 traceback.print_exc()
-            code = _tell(error)
+            code = _report_error(error)
         sys.exit(code)
 
 
-def _tell(error: BaseException) -> int:
-    """Say on stderr, in one line, what went wrong; the exit code."""
+def _report_error(error: BaseException) -> int:
+    """Print one line on stderr that says what went wrong; returns the exit code."""
     if isinstance(error, NoArgsIsHelpError):
         click.echo(error.format_message(), err=True)
         return error.exit_code
-    if isinstance(error, BrokenPipeError):  # the reader, `head` say, has had enough: nothing to tell
-        return 128 + signal.SIGPIPE  # what a shell sees of a tool that the signal ended
+    if isinstance(error, BrokenPipeError):  # the reader (`head`, for example) has closed the pipe
+        return 128 + signal.SIGPIPE  # as a shell reports a process that this signal ended
     sentence, code = _sentence(error)
     click.echo(f"Error: {printable(sentence)}", err=True)
     return code
@@ -105,9 +105,9 @@ def cli() -> None:
       4  input of another version
       5  resources: disk, memory, permission, device
       6  numeric failure
-      7  an asked quality was not reached
+      7  the requested quality was not reached
       130, 143  interrupted (SIGINT, SIGTERM)
-      141  the reader of stdout has left (SIGPIPE)
+      141  the reader of stdout has closed it (SIGPIPE)
 
     \b
     Example:
@@ -119,7 +119,7 @@ def cli() -> None:
 def main() -> None:
     """The entry point of the process."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # under nohup, say
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, _interrupt)
     try:
         cli.main()
@@ -132,7 +132,7 @@ def _interrupt(number: int, frame: object) -> None:
 
 
 def _seal_stdout() -> None:
-    """Keep the interpreter's own last flush from failing again, with noise and code 120."""
+    """Keep the interpreter's last flush from failing again, which would print an error and exit with 120."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -1,4 +1,4 @@
-"""Where an object stands, from the words of the command line to those of a scene's node."""
+"""An object's placement: from the options of the command line to the keywords of a scene's node."""
 
 import math
 
@@ -10,9 +10,9 @@ Vector = tuple[float, float, float]
 def node_words(
     translate: Vector | None, rotate: Vector | None, scale: Vector | None, matrix: tuple | None
 ) -> dict[str, tuple]:
-    """Keywords of `formats.scene.make_node`: scaled, then turned, then moved; or `matrix` does it all.
+    """Keywords of `formats.scene.make_node`: scaled, then turned, then moved; or placed by `matrix` alone.
 
-    Raises UsageProblem where `matrix` comes with another word.
+    Raises UsageProblem where `matrix` comes with another option.
     """
     words = {
         "translation": translate,
@@ -22,7 +22,7 @@ def node_words(
     }
     given = {word: value for word, value in words.items() if value is not None}
     if matrix is not None and len(given) > 1:
-        raise UsageProblem("--matrix says it all; leave out -t, -r and -s, or leave out --matrix")
+        raise UsageProblem("--matrix replaces -t, -r and -s; leave out these, or leave out --matrix")
     return given
 
 

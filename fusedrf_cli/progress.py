@@ -1,4 +1,4 @@
-"""How far a command is, on stderr: a live line on a terminal, one final line anywhere else."""
+"""A command's progress on stderr: a live line on a terminal, one final line anywhere else."""
 
 import sys
 import time
@@ -9,7 +9,7 @@ from formats.errors import printable
 
 
 class NullProgress:
-    """Shows nothing, but keeps the warnings; what the library uses when nobody watches."""
+    """Shows nothing, but keeps the warnings; for use as a library."""
 
     def __init__(self) -> None:
         self.warnings: list[str] = []
@@ -25,7 +25,7 @@ class NullProgress:
         self.warnings.append(text)
 
     def tell(self, text: str) -> None:
-        """One line that explains a wait."""
+        """One line that explains why the command waits."""
 
     def note(self, text: str) -> None:
         """One line for those who asked for more (-v)."""
@@ -41,7 +41,7 @@ class NullProgress:
 
 
 class Progress(NullProgress):
-    """Progress on stderr. `live` draws a bar with the time left and needs a terminal; None: find out."""
+    """Progress on stderr. `live` draws a bar with the time left, on a terminal; None: where stderr is one."""
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False, live: bool | None = None):
         super().__init__()
@@ -79,7 +79,7 @@ class Progress(NullProgress):
         self._started = []
 
     def __exit__(self, kind: object, *exception: object) -> None:
-        if kind is not None:  # what follows is an error; "done" would be a lie
+        if kind is not None:  # an error follows, so the command is not done
             self._started = []
         self.close()
 

@@ -1,4 +1,4 @@
-"""What a command tells when it is done: a dict, for people or as one JSON object."""
+"""Printing the report of a finished command, a dict: as text for people or as one JSON object."""
 
 import json
 import math
@@ -13,21 +13,21 @@ _LONGEST_LIST = 12
 
 
 def emit(report: dict, *, as_json: bool, quiet: bool = False) -> None:
-    """Print `report` on stdout. With `quiet`, people are not told what was written, only what they asked."""
+    """Print `report` on stdout. With `quiet`, text about an output that was written is left out."""
     if as_json:
-        click.echo(_unmoving(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False)))
+        click.echo(_escaped(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False)))
     elif not (quiet and "output" in report):
         for line in lines(report):
             click.echo(printable(line))
 
 
-def _unmoving(text: str) -> str:
-    """The same JSON, whose strings, some from hostile files, no longer move a terminal's cursor."""
+def _escaped(text: str) -> str:
+    """The same JSON with control characters escaped: strings from hostile files must not move the cursor."""
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 def lines(report: dict) -> Iterator[str]:
-    """The report for people, one fact per line. Warnings are left out: stderr has had them."""
+    """The report for people, one fact per line. Warnings are left out: they were printed on stderr."""
     facts = {key: value for key, value in _plain(report, strict=False).items() if key != "warnings"}
     if "output" in facts:
         size = f" ({readable_size(facts.pop('bytes'))})" if "bytes" in facts else ""
@@ -51,7 +51,7 @@ def _lines(facts: dict, indent: str) -> Iterator[str]:
 
 
 def _phrase(key: str, value: object) -> str:
-    """One value on one line; `key` tells its unit."""
+    """One value on one line, with the unit that follows from its `key`."""
     if isinstance(value, dict):
         parts = ((name.replace("_", " "), _phrase(f"{key} {name}", part)) for name, part in value.items())
         return ", ".join(f"{name} {phrase}" for name, phrase in parts)
@@ -70,7 +70,7 @@ def _phrase(key: str, value: object) -> str:
 
 
 def readable_size(count: int) -> str:
-    """25 MB, say."""
+    """A count of bytes for people, such as 25 MB."""
     for scale, unit in _UNITS:
         if count >= scale:
             return f"{count / scale:.3g} {unit}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from formats.atomic import atomic_folder
 from formats.captures import read_cameras
-from formats.images import check_film, write_film
+from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
 from fusedrf_cli.bridge.memory import Memory, picture, sources
 from fusedrf_cli.bridge.running import engine
@@ -22,7 +22,6 @@ from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, ren
 from fusedrf_cli.errors import UsageProblem
 
 DEFAULT_SIZE = (800, 800)
-FILMS = (".gif", ".mp4")
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 

@@ -1,4 +1,4 @@
-"""`fusedrf completion`: what a shell needs to complete fusedrf's words."""
+"""`fusedrf completion`: the script by which a shell completes fusedrf's command lines."""
 
 import click
 from click.shell_completion import get_completion_class

@@ -1,4 +1,4 @@
-"""`fusedrf compose`: bundles and where they stand, to a scene graph; nothing is optimised or copied."""
+"""`fusedrf compose`: writes a scene graph that places bundles; nothing is optimised or copied."""
 
 import os
 from pathlib import Path
@@ -25,7 +25,7 @@ class PlacedOption(click.Option):
             state.opts.setdefault(self.name, []).append(placed)
             state.order.append(self)
 
-        for flag in self.opts:  # click tells an option its value, but not where in the line it stood
+        for flag in self.opts:  # click gives an option its value, but not its position in the line
             known[flag].process = process
 
     def type_cast_value(self, ctx, value):
@@ -37,7 +37,7 @@ class PlacedOption(click.Option):
 
 
 def _placed_options(command):
-    """The words that each input may be followed by."""
+    """The options that each input may be followed by."""
     flags = {
         **options.PLACEMENT,
         ("--name",): {"help": "The node's name; default: the file's stem."},
@@ -64,9 +64,9 @@ def _placed_options(command):
 def command(inputs, output, overwrite, composition, allow_outside, progress, **placed):
     """Place bundles and scenes in one scene graph.
 
-    Each INPUT, a bundle or a scene.json, is followed by the words that place it: it is scaled, then turned,
-    then moved, in whatever order they are given. Nothing is optimised. Sources are written relative to the
-    scene's folder.
+    Each INPUT, a bundle or a scene.json, is followed by the options that place it: it is scaled, then
+    turned, then moved, in whatever order these are given. Nothing is optimised. Sources are written relative
+    to the scene's folder.
 
     \b
     Example:
@@ -94,7 +94,7 @@ def command(inputs, output, overwrite, composition, allow_outside, progress, **p
 
 
 def _by_input(inputs: tuple[str, ...], placed: dict[str, tuple]) -> list[dict]:
-    """The words of each input, from those of each option."""
+    """The options of each input, from the values of each option."""
     words = [dict.fromkeys(placed) for _ in inputs]
     for option, pairs in placed.items():
         for index, value in pairs or ():
@@ -130,7 +130,7 @@ def _names(inputs: tuple[str, ...], given: list[str | None]) -> list[str]:
 
 
 def _relative(path: str, output: str) -> str:
-    """`path` as the scene at `output` names it. Folders are real ones: `..` of a link leads elsewhere."""
+    """`path` as the scene at `output` names it. Links are resolved, as from a link `..` leads elsewhere."""
     folder = os.path.realpath(os.path.dirname(output))
     real = os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
     return Path(os.path.relpath(real, folder)).as_posix()

@@ -21,21 +21,40 @@ def _brief(summary: dict) -> dict:
     shown = ("member", "kind", "precision", "bytes", "parameters")
     fields = [{key: field[key] for key in shown} for field in summary["fields"]]
     history = [_scalars(event) for event in summary["history"]]
-    return {**summary, "nodes": nodes, "fields": fields, "history": history}
+    return {**summary, "nodes": nodes, "objects": _inside(summary), "fields": fields, "history": history}
+
+
+def _inside(summary: dict) -> list[dict]:
+    """The objects of fused fields; nothing where they are just the nodes, which are listed already."""
+    if {part["name"] for part in summary["objects"]} <= {node["name"] for node in summary["nodes"]}:
+        return []
+    return [
+        {
+            "name": part["name"],
+            "kind": part["kind"],
+            "at": [row[3] for row in part["object_to_world"][:3]],
+            "size": part["size"],
+            "bytes": part["bytes"],
+            "shared_by": part["shared_by"] if (part["shared_by"] or 1) > 1 else None,
+        }
+        for part in summary["objects"]
+    ]
 
 
 def _scalars(event: dict) -> dict:
-    return {key: part for key, part in event.items() if not isinstance(part, dict | list)}
+    """An event on one line: names are listed, whatever else has parts is for `--json`."""
+    return {key: part for key, part in event.items() if key == "names" or not isinstance(part, dict | list)}
 
 
 @click.command("info")
 @click.argument("scene", type=options.SCENE)
 @options.reporting(brief=_brief)
 def command(scene, progress):
-    """Tell what a bundle or scene holds.
+    """List what a bundle or scene holds.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. Damage is found, but arrays are not decoded,
-    so the answer is quick.
+    SCENE is a bundle, a scene.json, or - for a scene on stdin. Of a fused bundle the objects are listed with
+    kind, place, size in the world and bytes; an object that was distilled into one field with others has no
+    bytes of its own. Damage is found, but arrays are not decoded, so the answer is quick.
 
     \b
     Example:
@@ -47,7 +66,7 @@ def command(scene, progress):
 
 
 def _of_stdin() -> dict:
-    """As `formats.bundle.read_summary` tells of a scene.json."""
+    """The same as `formats.bundle.read_summary` gives for a scene.json."""
     scene, data = options.stdin_scene()
     nodes = [
         {
@@ -71,5 +90,6 @@ def _of_stdin() -> dict:
         **facts,
         "nodes": nodes,
         "history": list(scene.history),
+        "objects": [],
         "fields": [],
     }

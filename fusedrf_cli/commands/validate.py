@@ -1,4 +1,4 @@
-"""`fusedrf validate`: is every byte of a bundle, or of a scene and all that it names, as it should be."""
+"""`fusedrf validate`: checks every byte of a bundle, or of a scene and all that it names."""
 
 import os
 

@@ -1,6 +1,11 @@
+"""`info`: what a bundle or a scene holds, for people and as JSON."""
+
 import json
 
-from formats.bundle import read_summary
+import numpy as np
+
+from formats.bundle import read_summary, single_field_bundle
+from formats.records import FieldRecord
 
 
 def test_info_as_json_is_the_summary(run):
@@ -39,3 +44,32 @@ def test_info_of_rubbish_is_one_line(run, folder):
     result = run("info", "rubbish")
     assert result.exit_code == 3 and result.stderr.count("\n") == 1
     assert run("info", "-", stdin="{").exit_code == 3
+
+
+def test_info_lists_the_objects_of_a_fused_bundle(run, folder):
+    """Names and bytes of blocks, the place of what was distilled; --json has the same in full."""
+    place = [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    nodes = [{"name": n, "object_to_world": place, "aabb": [0, 0, 0, 1, 2, 3]} for n in ("cup", "jug")]
+    history = ({"event": "fused", "nodes": nodes}, {"event": "deleted", "names": ["jug"]})
+    arrays = {"tensor_0.plane": np.ones((4, 4), np.float32), "plane": np.ones((4, 4), np.float32)}
+    block = {"name": "cup", "tensor": 0, "object_to_field": place}
+    for name, metadata in (("blocks", {"blocks": [block]}), ("distilled", {})):
+        record = FieldRecord("lamp", arrays, {"aabb": [0, 0, 0, 9, 9, 9], **metadata})
+        single_field_bundle(record, "fused", history=history).write(folder / f"{name}.rfpack")
+    lines = run("info", "blocks.rfpack").stdout.splitlines()
+    start = lines.index("objects:")
+    assert [line.split() for line in lines[start + 1 : start + 3]] == [
+        ["name", "kind", "at", "bytes"],
+        ["cup", "lamp", "2.5", "0", "0", "32", "bytes"],
+    ]
+    assert "  deleted  jug" in lines
+    lines = run("info", "distilled.rfpack").stdout.splitlines()
+    assert lines[lines.index("objects:") + 2].split() == ["cup", "lamp", "2.5", "0", "0", "1", "2", "3"]
+    (cup,) = json.loads(run("info", "distilled.rfpack", "--json").stdout)["objects"]
+    assert (cup["name"], cup["bytes"], cup["size"]) == ("cup", None, [1, 2, 3])
+
+
+def test_info_does_not_tell_a_trained_field_twice(run):
+    assert "objects:" not in run("info", "chair.rfpack").stdout
+    (chair,) = json.loads(run("info", "chair.rfpack", "--json").stdout)["objects"]
+    assert chair["name"] == "chair" and chair["bytes"] > 0

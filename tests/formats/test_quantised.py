@@ -228,7 +228,7 @@ def test_scales_beyond_float16_are_refused(value):
 def test_names_that_coding_would_give_twice():
     twice = {"a": np.ones((16, 16, 16)), "a.codes": np.ones(3)}
     for names in (("a", "a.codes"), ("a.codes", "a")):
-        with pytest.raises(errors.BadArray, match=r"'a\.codes' would be there twice; rename it"):
+        with pytest.raises(errors.BadArray, match=r"two arrays would be stored as 'a\.codes'"):
             encode_field(FieldRecord("dense", {name: twice[name] for name in names}), "int8")
 
 
@@ -236,16 +236,16 @@ def test_names_that_coding_would_give_twice():
 
 SCALES, CODES = np.array([[1], [0.5]], np.float16), np.full(65, 7, np.uint8)
 HOSTILE = {
-    "scale nan": (np.array([[np.nan], [1]]), CODES, 8, errors.NotFinite, "scales NaN or infinite"),
-    "scale infinite": (np.array([[np.inf], [1]]), CODES, 8, errors.NotFinite, "scales NaN or infinite"),
+    "scale nan": (np.array([[np.nan], [1]]), CODES, 8, errors.NotFinite, "scales that are NaN"),
+    "scale infinite": (np.array([[np.inf], [1]]), CODES, 8, errors.NotFinite, "scales that are NaN"),
     "scale negative": (np.array([[-1], [1]]), CODES, 8, errors.BadArray, "negative scales"),
     "scale minus zero": (np.array([[-0.0], [1]]), CODES[:1], 8, errors.BadArray, "negative scales"),
     "code 0": (SCALES, np.arange(65, dtype=np.uint8), 8, errors.BadArray, "a code 0, expected 1 to 255"),
     "code 0 of 4 bits": (SCALES, np.full(33, 0x0F, np.uint8), 4, errors.BadArray, "code 0, expected 1 to 15"),
     "half a byte": (SCALES, np.full(33, 0x77, np.uint8), 4, errors.BadArray, "last half byte should be 0"),
-    "too few": (SCALES, CODES[:64], 8, errors.BadArray, "64 bytes of codes where its scales ask for 65"),
-    "too many": (0 * SCALES, CODES, 8, errors.BadArray, "65 bytes of codes where its scales ask for 0"),
-    "of a zero block": (SCALES * [[1], [0]], CODES, 8, errors.BadArray, "its scales ask for 64"),
+    "too few": (SCALES, CODES[:64], 8, errors.BadArray, "64 bytes of codes, but its scales need 65"),
+    "too many": (0 * SCALES, CODES, 8, errors.BadArray, "65 bytes of codes, but its scales need 0"),
+    "of a zero block": (SCALES * [[1], [0]], CODES, 8, errors.BadArray, "its scales need 64"),
 }
 
 

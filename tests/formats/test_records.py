@@ -107,13 +107,14 @@ A_CODES = {"dtype": "U8", "shape": [3], "data_offsets": [4, 7]}
 ONE = b"\0\x3c\0\0" + b"\x80" * 3  # a scale of 1, one of 0, three codes of 0
 
 
-def coded(told, scales=A_SCALES, codes=A_CODES, data=ONE, **others) -> bytes:
-    """A field of version 2 with that word about its coded arrays, of which 'a' is there."""
+def coded(coded_as, scales=A_SCALES, codes=A_CODES, data=ONE, **others) -> bytes:
+    """A field of version 2 whose metadata has this for coded arrays; array "a" is stored."""
     arrays = {"a.scales": scales, "a.codes": codes, **others}
-    return raw(field({k: v for k, v in arrays.items() if v}, CONTENT | {"version": 2, "coded": told}), data)
+    content = CONTENT | {"version": 2, "coded": coded_as}
+    return raw(field({k: v for k, v in arrays.items() if v}, content), data)
 
 
-def told(**words) -> dict:
+def entry(**words) -> dict:
     return {"a": A_CODED | words}
 
 
@@ -160,39 +161,39 @@ HOSTILE = {
     "coded name": (coded({"../x": A_CODED}), errors.BadArray),
     "coded twice": (coded({"a": A_CODED, "a.scales": A_CODED}), errors.BadArray),
     "coded without bits": (coded({"a": {"shape": [3, 1, 2]}}), errors.BadSchema),
-    "coded with more": (coded(told(scale=1)), errors.BadSchema),
+    "coded with more": (coded(entry(scale=1)), errors.BadSchema),
     "coded no object": (coded({"a": [8]}), errors.BadSchema),
-    "coded 5 bits": (coded(told(bits=5)), errors.BadSchema),
-    "coded 8.0 bits": (coded(told(bits=8.0)), errors.BadSchema),
-    "coded true bits": (coded(told(bits=True)), errors.BadSchema),
-    "coded list of bits": (coded(told(bits=[8])), errors.BadSchema),
-    "coded vector": (coded(told(shape=[6])), errors.BadArray),
-    "coded in 4 dimensions": (coded(told(shape=[3, 1, 2, 1])), errors.BadArray),
-    "coded nowhere": (coded(told(shape=[0, 1, 2])), errors.BadArray),
-    "coded shape of text": (coded(told(shape="312")), errors.BadArray),
-    "coded negative": (coded(told(shape=[-3, 1, 2])), errors.BadArray),
-    "coded too wide": (coded(told(shape=[2**31, 1, 2])), errors.BadArray),
-    "coded too large": (coded(told(shape=[2**30, 2**30, 2])), errors.LimitExceeded),
-    "coded of another shape": (coded(told(shape=[9, 1, 2])), errors.BadArray),
-    "coded on its side": (coded(told(shape=[3, 2, 1])), errors.BadArray),
-    "scales missing": (coded(told(), None, A_CODES | {"data_offsets": [0, 3]}, ONE[4:]), errors.BadArray),
-    "codes missing": (coded(told(), codes=None, data=ONE[:4]), errors.BadArray),
+    "coded 5 bits": (coded(entry(bits=5)), errors.BadSchema),
+    "coded 8.0 bits": (coded(entry(bits=8.0)), errors.BadSchema),
+    "coded true bits": (coded(entry(bits=True)), errors.BadSchema),
+    "coded list of bits": (coded(entry(bits=[8])), errors.BadSchema),
+    "coded vector": (coded(entry(shape=[6])), errors.BadArray),
+    "coded in 4 dimensions": (coded(entry(shape=[3, 1, 2, 1])), errors.BadArray),
+    "coded nowhere": (coded(entry(shape=[0, 1, 2])), errors.BadArray),
+    "coded shape of text": (coded(entry(shape="312")), errors.BadArray),
+    "coded negative": (coded(entry(shape=[-3, 1, 2])), errors.BadArray),
+    "coded too wide": (coded(entry(shape=[2**31, 1, 2])), errors.BadArray),
+    "coded too large": (coded(entry(shape=[2**30, 2**30, 2])), errors.LimitExceeded),
+    "coded of another shape": (coded(entry(shape=[9, 1, 2])), errors.BadArray),
+    "coded on its side": (coded(entry(shape=[3, 2, 1])), errors.BadArray),
+    "scales missing": (coded(entry(), None, A_CODES | {"data_offsets": [0, 3]}, ONE[4:]), errors.BadArray),
+    "codes missing": (coded(entry(), codes=None, data=ONE[:4]), errors.BadArray),
     "scales of bytes": (
-        coded(told(), {"dtype": "U8", "shape": [1, 1, 4], "data_offsets": [0, 4]}),
+        coded(entry(), {"dtype": "U8", "shape": [1, 1, 4], "data_offsets": [0, 4]}),
         errors.BadArray,
     ),
-    "codes in a square": (coded(told(), codes=A_CODES | {"shape": [3, 1]}), errors.BadArray),
+    "codes in a square": (coded(entry(), codes=A_CODES | {"shape": [3, 1]}), errors.BadArray),
     "codes for more": (
-        coded(told(), codes=A_CODES | {"shape": [7], "data_offsets": [4, 11]}, data=ONE + ONE[-4:]),
+        coded(entry(), codes=A_CODES | {"shape": [7], "data_offsets": [4, 11]}, data=ONE + ONE[-4:]),
         errors.BadArray,
     ),
     "codes for fewer": (
-        coded(told(), codes=A_CODES | {"shape": [2], "data_offsets": [4, 6]}, data=ONE[:-1]),
+        coded(entry(), codes=A_CODES | {"shape": [2], "data_offsets": [4, 6]}, data=ONE[:-1]),
         errors.BadArray,
     ),
-    "code 0": (coded(told(), data=ONE[:-1] + b"\0"), errors.BadArray),
-    "scale negative": (coded(told(), data=b"\0\xbc" + ONE[2:]), errors.BadArray),
-    "scale infinite": (coded(told(), data=b"\0\x7c" + ONE[2:]), errors.NotFinite),
+    "code 0": (coded(entry(), data=ONE[:-1] + b"\0"), errors.BadArray),
+    "scale negative": (coded(entry(), data=b"\0\xbc" + ONE[2:]), errors.BadArray),
+    "scale infinite": (coded(entry(), data=b"\0\x7c" + ONE[2:]), errors.NotFinite),
     "too many coded": (coded({f"a{i}": A_CODED for i in range(4097)}), errors.LimitExceeded),
 }
 
@@ -207,17 +208,17 @@ def test_hostile_bytes(data, error):
 
 def test_a_coded_field_without_a_fault_is_taken():
     """So that each of the hostile ones has its own."""
-    record = decode_field(coded(told()), "here")
+    record = decode_field(coded(entry()), "here")
     np.testing.assert_array_equal(record.arrays["a"], np.zeros((3, 1, 2), np.float32))
     assert list(record.arrays) == ["a"]
 
 
 def test_what_all_arrays_decode_to_is_bounded(monkeypatch):
     """P14: a scale alone may stand for 64 numbers."""
-    assert decode_header(coded(told()), "here").decoded_size == 24
+    assert decode_header(coded(entry()), "here").decoded_size == 24
     monkeypatch.setattr(records, "MAX_DECODED_BYTES", 23)
-    with pytest.raises(errors.LimitExceeded, match="here: decodes to 24 bytes, the most is 23"):
-        decode_header(coded(told()), "here")
+    with pytest.raises(errors.LimitExceeded, match="here: decodes to 24 bytes, but at most 23 are read"):
+        decode_header(coded(entry()), "here")
 
 
 def test_as_many_arrays_are_read_whether_they_are_coded_or_not():

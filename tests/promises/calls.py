@@ -1,4 +1,4 @@
-"""The system calls by which outputs are written: to be told of, to fail, to be killed at."""
+"""The system calls by which outputs are written: to be watched, to fail, to be killed at."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -43,8 +43,8 @@ def watched(before: Callable) -> Iterator[None]:
     """In this block `before(name, *arguments)` runs ahead of each call by which `formats.atomic` writes."""
     with pytest.MonkeyPatch.context() as patch:
         for name in filter(partial(hasattr, os), OS_CALLS):
-            patch.setattr(os, name, _told(name, getattr(os, name), before))
-        patch.setattr(atomic, "_exchange", _told("exchange", atomic._exchange, before))
+            patch.setattr(os, name, _watched(name, getattr(os, name), before))
+        patch.setattr(atomic, "_exchange", _watched("exchange", atomic._exchange, before))
         real = open
 
         def opened(*words, **options):
@@ -55,12 +55,12 @@ def watched(before: Callable) -> Iterator[None]:
         yield
 
 
-def _told(name: str, call: Callable, before: Callable) -> Callable:
-    def told(*words, **options):
+def _watched(name: str, call: Callable, before: Callable) -> Callable:
+    def watched(*words, **options):
         before(name, *words)
         return call(*words, **options)
 
-    return told
+    return watched
 
 
 class At:

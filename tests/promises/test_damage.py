@@ -143,7 +143,7 @@ def test_every_length_is_the_wrong_one_but_its_own(tmp_path):
 
 
 def test_info_sees_damage_too(tmp_path):
-    """P4: what is told of a pack comes from bytes that were checked."""
+    """P4: what is reported of a pack comes from bytes that were checked."""
     at = PAIR.index(b'"translation": [0.1') + len(b'"translation": [0.')
     (tmp_path / "a").write_bytes(PAIR[:at] + b"7" + PAIR[at + 1 :])
     with pytest.raises(errors.ChecksumMismatch):

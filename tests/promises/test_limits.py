@@ -85,7 +85,7 @@ def sealed_field(data: bytes) -> bytes:
 
 
 def header_of(count: int) -> bytes:
-    """A field whose header tells of many empty arrays."""
+    """A field whose header has many empty arrays."""
     entry = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     text = json.dumps({f"a{i}": entry for i in range(count)}).encode()
     return len(text).to_bytes(8, "little") + text

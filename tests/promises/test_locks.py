@@ -85,8 +85,8 @@ def readers_beside(path: Path, writer: tuple, count: int, opens: int) -> tuple[i
     words = (*PACKS, "read", str(path), str(opens))
     with running(*writer, str(path)), contextlib.ExitStack() as stack:
         readers = [stack.enter_context(running(*words, stderr=subprocess.DEVNULL)) for _ in range(count)]
-        told = [reader.communicate(timeout=600)[0] for reader in readers]
-    return sum(reader.returncode != 0 for reader in readers), sum(int(text or 0) for text in told)
+        outputs = [reader.communicate(timeout=600)[0] for reader in readers]
+    return sum(reader.returncode != 0 for reader in readers), sum(int(text or 0) for text in outputs)
 
 
 @pytest.mark.parametrize(
@@ -121,16 +121,16 @@ def edited(path: Path, code: str, count: int) -> tuple[set[str], list[str]]:
             )
             for i in range(count)
         ]
-        told = [edit.communicate(timeout=300)[1] for edit in edits]
-    assert [edit.returncode for edit in edits] == [0] * count, told
-    return {node.name for node in read_bundle(path).scene.nodes if node.name.startswith("new-")}, told
+        messages = [edit.communicate(timeout=300)[1] for edit in edits]
+    assert [edit.returncode for edit in edits] == [0] * count, messages
+    return {node.name for node in read_bundle(path).scene.nodes if node.name.startswith("new-")}, messages
 
 
 def test_sixteen_edits_at_once_are_all_there(tmp_path):
     """P8."""
-    found, told = edited(tmp_path / "out", EDITING, 16)
+    found, messages = edited(tmp_path / "out", EDITING, 16)
     assert len(found) == 16 and os.listdir(tmp_path) == ["out"]
-    assert all(text == "" or "waiting for another fusedrf" in text for text in told)
+    assert all(text == "" or "waiting for another fusedrf" in text for text in messages)
 
 
 def test_without_the_lock_edits_are_lost(tmp_path):
@@ -215,12 +215,12 @@ def test_a_lock_of_another_user_is_a_sentence(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(filelock.FileLock, "acquire", denied)
-    with pytest.raises(ResourceError, match="another user's"), output_lock(tmp_path / "out"):
+    with pytest.raises(ResourceError, match="belongs to another user"), output_lock(tmp_path / "out"):
         pass
 
 
 def test_a_pack_that_was_edited_says_so_in_one_generation(tmp_path):
-    """P7: what `info` tells of size and content is of one file, even if the name moves on meanwhile."""
+    """P7: the size and content that `info` reports are of one file, even if it is replaced meanwhile."""
     path = tmp_path / "out"
     write_generation(path, 1)
     code = (

@@ -59,8 +59,8 @@ def run(*words) -> dict:
         text=True,
         timeout=60,
     )
-    *said, told = done.stderr.splitlines()
-    return {**json.loads(told), "said": said}
+    *said, report = done.stderr.splitlines()
+    return {**json.loads(report), "said": said}
 
 
 def scene_of(folder: Path, source: str) -> Path:
@@ -69,33 +69,33 @@ def scene_of(folder: Path, source: str) -> Path:
     return path
 
 
-def strangers(told: dict, folder: Path) -> list[str]:
+def paths_outside(report: dict, folder: Path) -> list[str]:
     """Paths opened beside the folder, or opened to write."""
-    near = [(path, writing) for path, writing in told["opened"] if path.startswith(str(folder.parent))]
+    near = [(path, writing) for path, writing in report["opened"] if path.startswith(str(folder.parent))]
     return [path for path, writing in near if writing or not Path(path).is_relative_to(folder)]
 
 
 @pytest.mark.parametrize("source", CORPUS)
 def test_a_source_that_leads_out_is_refused_unopened(folder, source):
     """P9: judged as a name, and through links; pipes and devices are not waited for."""
-    told = run("validate", scene_of(folder, source))
-    assert told["code"] == 3 and strangers(told, folder) == [], told
-    assert "/dev/zero" not in dict(told["opened"]) and len(told["said"]) == 1
+    report = run("validate", scene_of(folder, source))
+    assert report["code"] == 3 and paths_outside(report, folder) == [], report
+    assert "/dev/zero" not in dict(report["opened"]) and len(report["said"]) == 1
 
 
 @pytest.mark.parametrize("source", ["../secret.rfpack", "link.rfpack"])
 def test_without_the_judgement_it_is_opened(folder, source):
     """P9 with its defence removed, as users may: --allow-outside."""
-    told = run("validate", scene_of(folder, source), "--allow-outside")
-    assert told["code"] == 0 and strangers(told, folder)
+    report = run("validate", scene_of(folder, source), "--allow-outside")
+    assert report["code"] == 0 and paths_outside(report, folder)
 
 
 def test_names_within_a_pack_are_no_paths(folder):
     """P9: a pack's members are looked up in it, and nowhere else; nothing is written."""
-    told = run("validate", GOLDEN / "pair.rfpack")
-    assert told["code"] == 0
-    paths = [path for path, _ in told["opened"] if path.endswith(".rfpack")]
-    assert set(paths) == {str(GOLDEN / "pair.rfpack")} and not any(writing for _, writing in told["opened"])
+    report = run("validate", GOLDEN / "pair.rfpack")
+    assert report["code"] == 0
+    paths = [path for path, _ in report["opened"] if path.endswith(".rfpack")]
+    assert set(paths) == {str(GOLDEN / "pair.rfpack")} and not any(writing for _, writing in report["opened"])
 
 
 def test_a_hard_link_is_a_file_like_any_other(folder):

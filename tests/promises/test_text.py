@@ -90,7 +90,7 @@ def test_without_the_escapes_they_reach_the_terminal(tmp_path, monkeypatch):
         patch.setattr(report, "printable", lambda text: text)
         assert not moves_nothing(said("info", path)[1])
     with monkeypatch.context() as patch:
-        patch.setattr(report, "_unmoving", lambda text: text)
+        patch.setattr(report, "_escaped", lambda text: text)
         assert not moves_nothing(said("info", path, "--json")[1])
     monkeypatch.setattr(format_errors, "printable", lambda text, limit=0: text)
     assert not moves_nothing(str(format_errors.BadName("a\x1b[2J")))
