@@ -1,8 +1,9 @@
 """Make the example scene from nothing: python examples/make_scene.py OUT_FOLDER
 
-Writes ground.glb, tower.glb, arch.glb and ball.glb: z up, centred on the z axis, foot at z = 0, about one
-unit tall (the ground is a disc four units wide). Colours are baked into the vertices, light included, and no
-object is its own mirror image, so that a flipped axis shows. The same bytes come out every time.
+Writes ground.glb, tower.glb, arch.glb and ball.glb: upright (along +y, which is up in glTF, and +z after
+`fusedrf train`), centred on the vertical axis, foot at height 0, about one unit tall (the ground is a disc
+four units wide). Colours are baked into the vertices, light included, and no object is its own mirror
+image, so that a flipped axis shows. The same bytes come out every time.
 """
 
 import itertools
@@ -183,6 +184,13 @@ def ball() -> trimesh.Trimesh:
     return trimesh.util.concatenate([lathe(*part, 0.012, 180, paint_ball) for part in (stand, sphere)])
 
 
+def write_gltf(mesh: trimesh.Trimesh, path: Path) -> None:
+    """A mesh whose +z is up as a .glb, in which +y is."""
+    turned = mesh.copy()
+    turned.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    turned.export(path)
+
+
 def main(arguments: list[str]) -> None:
     if arguments in (["-h"], ["--help"]):
         return print(__doc__)
@@ -191,7 +199,7 @@ def main(arguments: list[str]) -> None:
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
     for make in (ground, tower, arch, ball):
-        make().export(folder / f"{make.__name__}.glb")
+        write_gltf(make(), folder / f"{make.__name__}.glb")
         print(folder / f"{make.__name__}.glb")
 
 

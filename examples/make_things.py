@@ -1,7 +1,7 @@
 """Make things that are all different: python examples/make_things.py OUT_FOLDER COUNT
 
-Writes thing_00.glb, thing_01.glb, ...: z up, foot at z = 0, at most one unit tall and 0.8 wide. Shape and
-colours follow from the number, so the same bytes come out every time, whatever COUNT is.
+Writes thing_00.glb, thing_01.glb, ...: upright, foot at height 0, at most one unit tall and 0.8 wide. Shape
+and colours follow from the number, so the same bytes come out every time, whatever COUNT is.
 """
 
 import colorsys
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from make_scene import block, lathe, where
+from make_scene import block, lathe, where, write_gltf
 
 MOST = 1000
 
@@ -88,7 +88,7 @@ def main(arguments: list[str]) -> None:
     folder = Path(arguments[0])
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(int(arguments[1])):
-        thing(number).export(folder / f"thing_{number:02d}.glb")
+        write_gltf(thing(number), folder / f"thing_{number:02d}.glb")
     print(f"{arguments[1]} things in {folder}")
 
 

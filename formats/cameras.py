@@ -14,11 +14,15 @@ from pathlib import Path, PurePosixPath
 from formats.errors import BadIntrinsics, BadJson, BadSchema, NoViews, UnsupportedCamera
 from formats.images import MAX_SIDE, read_image_header
 from formats.inputs import read_input
+from formats.photos import EXTENSIONS, find_photo
 from formats.views import View, checked_pose
 
 MAX_JSON = 256 * 2**20
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".PNG", ".JPG", ".JPEG")
 PERSPECTIVE = {"", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV"}
+RATIONAL = "FULL_OPENCV"
+FISHEYE = {"FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
+BENDS = ("k1", "k2", "k3", "p1", "p2")
+RATIONAL_BENDS = ("k4", "k5", "k6")
 JSON_TOKEN = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
 
 
@@ -66,23 +70,18 @@ def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
 
 
 def frame_photo(path: Path, frame: dict) -> Path | None:
-    """The frame's photo, an extension added where the file leaves it out; None if it is not on disk."""
-    written = frame_file(frame)
-    exact = path.parent / written
-    candidates = [exact, *(exact.with_name(exact.name + ending) for ending in EXTENSIONS)] if written else []
-    return next((candidate for candidate in candidates if _is_file(candidate)), None)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a name too long for the disk, or with a NUL in it
-        return False
+    """The frame's photo, under the extension it has on disk; None if it is not there."""
+    return find_photo(path.parent, frame_file(frame))
 
 
 def frame_file(frame: dict) -> str:
     """The frame's `file_path` with forward slashes and without a leading "./"; empty where there is none."""
-    written = frame.get("file_path")
+    return written_path(frame, "file_path")
+
+
+def written_path(keys: dict, key: str) -> str:
+    """A path that a file states, with forward slashes and without a leading "./"; empty without one."""
+    written = keys.get(key)
     return str(PurePosixPath(written.replace("\\", "/"))) if isinstance(written, str) and written else ""
 
 
@@ -104,7 +103,7 @@ def frame_names(frames: list[dict]) -> list[str]:
 def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[int, int] | None) -> View:
     """The camera of one frame at the size that the file states, else at `size` (width, height)."""
     sources = (frame, document)
-    _check_model(sources, where)
+    fisheye, distortion = _lens(sources, where)
     width, height = _size(sources, size, where)
     x, y = _focal(sources, "x", width, where), _focal(sources, "y", height, where)
     if not (x or y):
@@ -120,7 +119,8 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
         cy=_number(sources, "cy", where, height / 2),
         width=width,
         height=height,
-        distortion=tuple(_number(sources, key, where, 0.0) for key in ("k1", "k2", "k3", "p1", "p2")),
+        distortion=distortion,
+        fisheye=fisheye,
     )
 
 
@@ -191,17 +191,29 @@ def _number(sources: tuple[dict, ...], key: str, where: str, default: float | No
     return float(found)
 
 
-def _check_model(sources: tuple[dict, dict], where: str) -> None:
-    model = next((source["camera_model"] for source in sources if "camera_model" in source), "")
-    if any(source.get("is_fisheye") for source in sources):
-        model = "fisheye"
-    if _number(sources, "k4", where, 0.0):
-        model = "k4"
-    if str(model).upper() not in PERSPECTIVE:
+def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ...]]:
+    """Whether it is a fisheye, and its distortion, as a View has them.
+
+    k4 is the factor of r⁸, as nerfstudio and Metashape mean it, except beside k5 or k6 or in a FULL_OPENCV,
+    where it divides.
+    """
+    model = str(next((source["camera_model"] for source in sources if "camera_model" in source), "")).upper()
+    said = {key: _number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
+    if model in FISHEYE or any(source.get("is_fisheye") for source in sources):
+        if said["p1"] or said["p2"]:
+            raise UnsupportedCamera(
+                f"{where}: a fisheye with p1 or p2, expected k1 to k4; undistort the photos"
+            )
+        return True, tuple(said[key] for key in ("k1", "k2", "k3", "k4"))
+    if model not in PERSPECTIVE | {RATIONAL}:
         raise UnsupportedCamera(
-            f"{where}: a camera with {str(model)[:40]}, expected a pinhole with k1 k2 k3 p1 p2; "
+            f"{where}: a camera with {model[:40]}, expected a pinhole or a fisheye with OpenCV's distortion; "
             "undistort the photos first"
         )
+    plain = tuple(said[key] for key in BENDS)
+    if model == RATIONAL or said["k5"] or said["k6"]:
+        return False, (*plain, 0.0, *(said[key] for key in RATIONAL_BENDS))
+    return False, (*plain, said["k4"]) if said["k4"] else plain
 
 
 # --- camera_path.json ---------------------------------------------------------------------------------------

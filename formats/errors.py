@@ -160,7 +160,15 @@ class BadIntrinsics(FormatError):
 
 
 class UnsupportedCamera(FormatError):
-    """A camera that is not a pinhole camera with OpenCV distortion."""
+    """A camera that is neither a pinhole nor a fisheye camera with OpenCV distortion."""
+
+
+class BadModel(FormatError):
+    """A file of cameras, poses or points that does not follow its format."""
+
+
+class BadMask(FormatError):
+    """A mask whose size differs from that of its photo."""
 
 
 class MixedSizes(FormatError):

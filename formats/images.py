@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from formats.inputs import open_input
 from formats.png import png_writer
 
 MAX_SIDE = 16384
+EXIF_ORIENTATION = 0x0112
 DEEP_MODES = ("I", "F")
 """Pillow's modes with 16 bits or more, which it would clip to 8, not scale."""
 DECODING_ERRORS = (
@@ -28,20 +30,59 @@ DECODING_ERRORS = (
 """What Pillow's decoders are known to raise on broken files."""
 
 
-def read_image(path: Path | str) -> np.ndarray:
+class Header(NamedTuple):
+    """What the header of a picture file states."""
+
+    width: int
+    height: int
+    """As stored, whatever the orientation."""
+    alpha: bool
+    orientation: int
+    """The EXIF orientation, 1 to 8: how to turn the stored pixels upright; 1 where none is given."""
+
+
+def read_image(path: Path | str, orientation: int = 1) -> np.ndarray:
     """(H, W, 4) uint8, straight alpha, 255 where the file has none.
 
     The pixels stand as stored: an EXIF rotation is not applied, as the tools that estimate poses ignore it
-    too. Raises BadImage, LimitExceeded (before decoding), MissingFile.
+    too, unless `orientation` (as EXIF counts them) asks for one. Raises BadImage, LimitExceeded (before
+    decoding), MissingFile.
     """
     with _opened(path) as image:
-        return np.array(image.convert("RGBA"))
+        return oriented(np.array(image.convert("RGBA")), orientation)
 
 
-def read_image_header(path: Path | str) -> tuple[int, int, bool]:
-    """Width, height and whether there is alpha, without decoding. Raises as `read_image`."""
+def read_mask(path: Path | str) -> np.ndarray:
+    """(H, W) bool of a mask picture: True where it is bright, that is, where the photo is used.
+
+    Bright means above half of the mask's maximum, so masks of 0 and 1 work as well as masks of 0 and 255.
+    Raises as `read_image`.
+    """
     with _opened(path) as image:
-        return *image.size, image.has_transparency_data
+        levels = np.array(image.convert("L"))
+    return levels > levels.max(initial=0) / 2
+
+
+def read_image_header(path: Path | str) -> Header:
+    """Size, alpha and orientation, without decoding. Raises as `read_image`."""
+    with _opened(path) as image:
+        return Header(*image.size, image.has_transparency_data, _orientation(image))
+
+
+def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """(H, W, ...) stored pixels turned and mirrored as an EXIF orientation from 1 to 8 says."""
+    if orientation >= 5:  # stored rows are columns of the picture
+        pixels = pixels.swapaxes(0, 1)
+    across, down = orientation in (2, 3, 6, 7), orientation in (3, 4, 7, 8)
+    return pixels[:: -1 if down else 1, :: -1 if across else 1]
+
+
+def _orientation(image) -> int:
+    try:
+        found = image.getexif().get(EXIF_ORIENTATION)
+    except DECODING_ERRORS:  # broken metadata; the pixels may be intact
+        return 1
+    return found if isinstance(found, int) and 1 <= found <= 8 else 1
 
 
 @contextmanager

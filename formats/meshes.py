@@ -17,11 +17,15 @@ from formats.errors import BadMesh, FormatError
 from formats.inputs import open_input
 from formats.views import Capture, View
 
+GLTF = ("glb", "gltf")
 FIELD_OF_VIEW = math.radians(40)
 MARGIN = 0.02
 """Of the mesh's size, added to its box on every side and to the sphere that the cameras frame."""
 ROWS = 32
 """Pixel rows cast at once, which bounds memory."""
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""glTF's world, in which +y is up, to one in which +z is."""
+UPRIGHT_NOTE = "glTF has +y up: the mesh was turned about x so that +z is up"
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -70,7 +74,8 @@ def mesh_capture(
     with ThreadPoolExecutor() as threads:
         pixels = list(threads.map(lambda view: render_mesh(mesh, view, samples_per_pixel), train + test))
     seen = tuple(replace(view, pixels=picture) for view, picture in zip(train + test, pixels, strict=True))
-    return Capture(Path(path), "mesh", seen[:n_train], seen[n_train:], mesh.aabb, opaque=False)
+    notes = (f"{path}: {UPRIGHT_NOTE}",) if mesh_type(path) in GLTF else ()
+    return Capture(Path(path), "mesh", seen[:n_train], seen[n_train:], mesh.aabb, opaque=False, notes=notes)
 
 
 # --- loading ------------------------------------------------------------------------------------------------
@@ -119,7 +124,7 @@ def _load(path: Path | str) -> _Mesh:
     for geometry, to_world in placed:
         first_vertices.append(sum(len(v) for v in vertices))
         vertices.append(geometry.vertices @ to_world[:3, :3].T + to_world[:3, 3])
-    linear = mesh_type(path) in ("glb", "gltf")
+    linear = mesh_type(path) in GLTF
     surfaces = [_surface(geometry, linear) for geometry, _ in placed]
     faces = np.concatenate([s.faces + first for s, first in zip(surfaces, first_vertices, strict=True)])
     first_faces = np.cumsum([0, *(len(s.faces) for s in surfaces[:-1])])
@@ -157,7 +162,7 @@ def _placed_geometries(path: Path | str) -> list[tuple]:
     for geometry, _ in placed:
         if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
             raise BadMesh(f"{path}: a face refers to a vertex that does not exist; export the mesh again")
-    return placed
+    return [(g, UPRIGHT @ m) for g, m in placed] if kind in GLTF else placed
 
 
 def _embree(vertices: np.ndarray, faces: np.ndarray):

@@ -1,8 +1,9 @@
 """Posed pictures: a `View` is one camera and what it saw, a `Capture` is all views of one subject.
 
 `camera_to_world` is (4,4) float64, OpenGL axes: +x right, +y up, looking along -z. A camera-frame point (x,
-y, z) with z < 0 lands on pixel (cx + fl_x * u, cy + fl_y * v), where (u, v) is (x / -z, -y / -z) bent by the
-distortion. Pixel coordinates grow right and down, and the centre of the top left pixel is (0.5, 0.5).
+y, z) lands on pixel (cx + fl_x * u, cy + fl_y * v), where (u, v) is (x / -z, -y / -z), z < 0, bent by the
+distortion, or for a fisheye (x, -y) * r(a) / |(x, y)| with a the angle from -z. Pixel coordinates grow right
+and down, and the centre of the top left pixel is (0.5, 0.5).
 """
 
 from dataclasses import dataclass, replace
@@ -11,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadPose, NoViews
+from formats.frame import SceneFrame
+from formats.points import Points
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 ORTHONORMAL_TOLERANCE = 1e-3
@@ -28,9 +31,20 @@ class View:
     cy: float
     width: int
     height: int
-    distortion: tuple[float, float, float, float, float] = NO_DISTORTION
-    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them."""
+    distortion: tuple[float, ...] = NO_DISTORTION
+    """k1, k2, k3 (radial), p1, p2 (tangential), as OpenCV defines them, and where it needs more k4, d1, d2,
+    d3: the radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) / (1 + d1 r² + d2 r⁴ + d3 r⁶). Of a fisheye
+    k1, k2, k3, k4: r(a) = a (1 + k1 a² + k2 a⁴ + k3 a⁶ + k4 a⁸)."""
+    fisheye: bool = False
     image_path: Path | None = None
+    orientation: int = 1
+    """EXIF orientation to apply to the photo's stored pixels to get this camera's; 1 for none."""
+    mask_path: Path | None = None
+    """A picture of the same aspect ratio, black where the photo must be ignored."""
+    near: float | None = None
+    far: float | None = None
+    """Depths (along -z, world units) between which lie the sparse points that it sees, except for one in a
+    thousand on each side."""
     pixels: np.ndarray | None = None
     """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
 
@@ -39,6 +53,15 @@ class View:
         x, y = width / self.width, height / self.height
         focal = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **focal)
+
+    def corners(self, depth: float, box: tuple[int, int, int, int] | None = None) -> np.ndarray:
+        """(4, 3) world points at a depth behind the corners of the picture, or of a box (left, top, right,
+        bottom) in it; distortion is neglected."""
+        left, top, right, bottom = box or (0, 0, self.width, self.height)
+        x = np.array([left, right, left, right]) - self.cx
+        y = np.array([top, top, bottom, bottom]) - self.cy
+        local = np.stack([x / self.fl_x, -y / self.fl_y, -np.ones(4)], 1) * depth
+        return local @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3]
 
     def reframed(self, width: int, height: int) -> "View":
         """The same camera at another size: its horizontal field of view stays, rows are cut or added."""
@@ -54,15 +77,36 @@ class Capture:
 
     path: Path
     kind: str
-    """"blender", "transforms" or "mesh"."""
+    """"blender", "transforms", "colmap", "llff", "polycam" or "mesh"."""
     train: tuple[View, ...]
     test: tuple[View, ...]
     aabb: np.ndarray
     """(6,) float64 [xmin ymin zmin xmax ymax zmax] in world units: where the subject is taken to be."""
     opaque: bool
     """No picture has an alpha channel."""
-    missing: int = 0
-    """Frames that the file lists without a picture on disk; they are left out."""
+    object_aabb: np.ndarray | None = None
+    """(6,) the box of the object that the masks cut out, where they do."""
+    missing: tuple[str, ...] = ()
+    """Photos that are listed but do not exist; their frames are left out."""
+    points: Points | None = None
+    """Sparse points from structure from motion, where the capture has them."""
+    frame: SceneFrame | None = None
+    """The layout of the cameras, where the box follows from it."""
+    notes: tuple[str, ...] = ()
+    """Sentences about choices made while reading."""
+
+    def summary(self) -> dict:
+        """What was read and chosen, for a report."""
+        views = self.train + self.test
+        facts = {"kind": self.kind, "missing": len(self.missing)}
+        if self.points is not None:
+            facts["sparse_points"] = len(self.points.positions)
+        if masked := sum(view.mask_path is not None for view in views):
+            facts["masked"] = masked
+        if self.frame is not None:
+            frame = self.frame
+            facts |= {"layout": frame.layout, "focus": frame.focus.tolist(), "distance": frame.distance}
+        return {**facts, "notes": list(self.notes)} if self.notes else facts
 
 
 def hold_out(capture: Capture, every: int) -> Capture:
@@ -106,16 +150,3 @@ def _check_rotation(rotation: np.ndarray, where: str) -> None:
         )
     if np.linalg.det(rotation) < 0:
         raise BadPose(f"{where}: the camera pose is mirrored (determinant -1); check the exporter's axes")
-
-
-def cameras_aabb(views: tuple[View, ...]) -> np.ndarray:
-    """(6,) float64 cube around the point nearest to all optical axes, out to the median camera distance."""
-    poses = np.array([view.camera_to_world for view in views])
-    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    middle = eyes.mean(0)
-    # About the cameras' middle, so that axes which never meet leave the point there, not at infinity.
-    offset = np.einsum("nij,nj->i", across, eyes - middle)
-    centre = middle + np.linalg.lstsq(across.sum(0), offset, rcond=1e-6)[0]
-    half = float(np.median(np.linalg.norm(eyes - centre, axis=1))) or 1.0
-    return np.concatenate([centre - half, centre + half])

@@ -43,6 +43,8 @@ class TrainRequest(Learning):
     views: int
     size: int
     aabb: tuple[float, ...] | None
+    masks: str
+    """What the pixels mean that masks exclude: "ignore" or "alpha"."""
     memory: int | None
     resume: bool
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from formats.atomic import check_space
-from formats.captures import hold_out, is_mesh, load_images, read_capture
+from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_photos, read_capture
 from formats.meshes import mesh_capture
 from formats.views import Capture, View
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
@@ -21,7 +21,7 @@ from fusedrf_cli.bridge.running import (
 )
 from fusedrf_cli.bridge.scene import refuse_options, unusable_kind, write_field
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
@@ -29,7 +29,7 @@ from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.errors import QualityNotReached, UsageProblem
+from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
 
@@ -50,15 +50,15 @@ def train(request: TrainRequest, progress) -> dict:
         kind = trained_kind(request)
         progress.phase("reading", None)
         capture = read_views(request, progress)
-        box = np.asarray(request.aabb if request.aabb is not None else capture.aabb, np.float64)
+        box = box_of(request, capture)
         settings = fit_settings(request, kind, capture, box, place)
         plan = kind.untrained(box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision))
         memory.expect(
             fit_memory(capture, plan, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
-        cameras, images = [camera_of(v) for v in capture.train], load_images(capture.train)
-        run = FitRun.start(cameras, images, box, settings, Path(request.source).resolve().stem)
+        cameras, pictures = [camera_of(v) for v in capture.train], pictures_of(request, capture)
+        run = FitRun.start(cameras, pictures, box, settings, Path(request.source).resolve().stem)
         if saved:
             if saved[1].get("kind") != kind.name:
                 raise checkpoint_mismatch(request.output)
@@ -79,6 +79,8 @@ def train(request: TrainRequest, progress) -> dict:
         "bytes": size,
         "kind": field.kind,
         "views": len(capture.train),
+        "capture": capture.summary(),
+        "aabb": box.tolist(),
         "steps": run.steps,
         **kind.describe(field),
         "seconds": {"training": seconds},
@@ -122,8 +124,29 @@ def read_views(request: TrainRequest, progress) -> Capture:
         else read_capture(source)
     )
     if capture.missing:
-        progress.warn(f"{source}: {capture.missing} frames have no photo and were left out")
+        progress.warn(f"{source}: {len(capture.missing)} frames have no photo and were left out")
     return hold_out(capture, request.holdout) if request.holdout else capture
+
+
+def cuts_out(request: TrainRequest, capture: Capture) -> bool:
+    """Whether masks cut an object out of its photos."""
+    return request.masks == "alpha" and any(view.mask_path for view in capture.train)
+
+
+def box_of(request: TrainRequest, capture: Capture) -> np.ndarray:
+    """(6,) the box to learn: the one that was given, that of an object which masks cut out, or the
+    capture's."""
+    default = capture.object_aabb if cuts_out(request, capture) else None
+    chosen = next(box for box in (request.aabb, default, capture.aabb) if box is not None)
+    return np.asarray(chosen, np.float64)
+
+
+def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
+    """The photos to learn from; InvalidInput where masks leave nothing of them."""
+    loaded = load_photos(capture.train, request.masks)
+    if loaded.ignored is not None and loaded.ignored.all():
+        raise InvalidInput(f"{request.source}: the masks exclude every pixel; masks are black where to ignore")
+    return Pictures(loaded.pixels, loaded.ignored)
 
 
 def fit_settings(
@@ -137,7 +160,7 @@ def fit_settings(
         seed=request.seed,
         time_budget=request.time_budget,
         target_psnr=request.target_psnr,
-        opacity_weight=0.0 if capture.opaque else 0.1,
+        opacity_weight=0.0 if capture.opaque and not cuts_out(request, capture) else 0.1,
         near=0.0,
         device=place,
     )
@@ -149,10 +172,10 @@ def fit_settings(
 
 def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:
     """What a fit to a capture's photos needs."""
-    width, height = capture.train[0].width, capture.train[0].height
+    pixels = max(view.width * view.height for view in capture.train)
     cameras = len({camera_of(v).intrinsics for v in capture.train})
     return {
-        **photos(len(capture.train), width, height, cameras),
+        **photos(len(capture.train), pixels, 1, cameras),
         **fitting(plan, settings.longest, torch.get_num_threads()),
     }
 
@@ -224,18 +247,24 @@ def camera_of(view: View) -> Camera:
         view.height,
         tuple(view.distortion),
         view.name,
+        view.fisheye,
     )
 
 
 def measure(field, capture: Capture) -> dict:
-    """Mean PSNR and SSIM of the held-out views over white."""
-    truth = over_white(load_images(capture.test))
-    shots = [render_image(field, camera_of(v)).over(WHITE) for v in capture.test]
-    return {
-        "psnr": float(np.mean([psnr(a, b) for a, b in zip(shots, truth, strict=True)])),
-        "ssim": float(np.mean([ssim(a, b) for a, b in zip(shots, truth, strict=True)])),
-        "views": len(shots),
-    }
+    """Mean PSNR and SSIM of the held-out views over white, of the pixels that masks do not exclude."""
+    figures = []
+    for view in capture.test:
+        truth = over_white(load_images([view]))[0]
+        shot = render_image(field, camera_of(view)).over(WHITE)
+        ignored = load_ignored(view)
+        kept = slice(None) if ignored is None else ~ignored
+        if ignored is not None:
+            shot[ignored] = truth[ignored]
+        if ignored is None or not ignored.all():
+            figures.append((psnr(shot[kept], truth[kept]), ssim(shot, truth)))
+    mean = np.mean(figures, 0) if figures else (float("nan"), float("nan"))
+    return {"psnr": float(mean[0]), "ssim": float(mean[1]), "views": len(figures)}
 
 
 def over_white(images: np.ndarray) -> np.ndarray:

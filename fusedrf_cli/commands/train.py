@@ -34,6 +34,13 @@ from fusedrf_cli.requests import TrainRequest
 )
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
+@click.option(
+    "--masks",
+    type=click.Choice(["ignore", "alpha"]),
+    default="ignore",
+    show_default=True,
+    help="Leave what masks exclude out of training, or learn it as transparent.",
+)
 @options.memory
 @options.precision
 @options.resume
@@ -42,7 +49,8 @@ from fusedrf_cli.requests import TrainRequest
 def command(source, output, progress, **words):
     """Learn one field from photos or a mesh.
 
-    SOURCE is a capture's folder, its transforms.json, or a .glb, .gltf, .obj or .ply mesh.
+    SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF or Polycam), its
+    transforms.json, or a .glb, .gltf, .obj or .ply mesh.
 
     \b
     Example:

@@ -201,7 +201,8 @@ def test_missing_photos_are_counted(tmp_path):
     photo(tmp_path / "a.png")
     write(tmp_path, frames=[frame("gone.png"), frame("a.png"), frame("x" * 5000), frame("\0")], fl_x=80)
     capture = read_capture(tmp_path)
-    assert (len(capture.train), capture.missing) == (1, 3)
+    assert len(capture.train) == 1
+    assert sorted(capture.missing) == ["\0", "gone.png", "x" * 5000]
 
 
 def test_splits_by_name(tmp_path):
@@ -342,10 +343,45 @@ def test_turned_photo(tmp_path):
         read_capture(folder_with(tmp_path, w=80, h=100))
 
 
-@pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}, {"k4": 0.1}])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"camera_model": "EQUIRECTANGULAR"},
+        {"camera_model": "THIN_PRISM_FISHEYE"},
+        {"is_fisheye": True, "p1": 0.1},
+    ],
+)
 def test_unsupported_camera(tmp_path, keys):
-    with pytest.raises(UnsupportedCamera, match="undistort"):
+    with pytest.raises(UnsupportedCamera, match=r"transforms\.json: frame 0 \(a\.png\).*undistort"):
         read_capture(folder_with(tmp_path, **keys))
+
+
+LENSES = {
+    "instant-ngp fisheye": ({"is_fisheye": True, "k1": 0.1, "k4": 0.4}, True, (0.1, 0, 0, 0.4)),
+    "nerfstudio fisheye": ({"camera_model": "OPENCV_FISHEYE", "k2": 0.2}, True, (0, 0.2, 0, 0)),
+    "eighth power": ({"k1": 0.1, "p2": 0.3, "k4": 0.4}, False, (0.1, 0, 0, 0, 0.3, 0.4)),
+    "rational": (
+        {"camera_model": "FULL_OPENCV", "k3": 0.3, "k4": 0.4, "k6": 0.6},
+        False,
+        (0, 0, 0.3, 0, 0, 0, 0.4, 0, 0.6),
+    ),
+    "rational by its keys": ({"k4": 0.4, "k5": 0.5}, False, (0, 0, 0, 0, 0, 0, 0.4, 0.5, 0)),
+}
+
+
+@pytest.mark.parametrize("keys, fisheye, distortion", LENSES.values(), ids=LENSES)
+def test_lenses(tmp_path, keys, fisheye, distortion):
+    (view,) = read_capture(folder_with(tmp_path, **keys)).train
+    assert (view.fisheye, view.distortion) == (fisheye, distortion)
+
+
+def test_a_frames_lens_goes_before_the_files(tmp_path):
+    for name in "ab":
+        photo(tmp_path / f"{name}.png")
+    frames = [frame("a.png", camera_model="OPENCV_FISHEYE", k1=0.5), frame("b.png")]
+    write(tmp_path, frames=frames, fl_x=80, k1=0.1, camera_model="OPENCV")
+    a, b = read_capture(tmp_path).train
+    assert (a.fisheye, a.distortion, b.fisheye, b.distortion[0]) == (True, (0.5, 0, 0, 0), False, 0.1)
 
 
 def test_photos_without_poses(tmp_path):
@@ -442,15 +478,34 @@ def test_hold_out(tmp_path):
         hold_out(capture, 1)
 
 
-def test_written_captures_come_back(tmp_path):
+WRITTEN = {
+    "pinholes": [
+        (80, 80, (0.0,) * 5, False),
+        (81, 80, (0.1, 0, 0, 0, 0), False),
+        (80, 79, (0.0,) * 5, False),
+    ],
+    "all lenses": [
+        (80, 80, (0.1, 0.2, 0.3, 0.4), True),
+        (80, 80, (0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.6, 0.7, 0.8), False),
+        (80, 80, (0.0, 0.0, 0.0, 0.0, 0.0, 0.6), False),
+    ],
+    "a fisheye among pinholes": [
+        (80, 80, (0.1, 0, 0, 0, 0), False),
+        (80, 80, (0.0,) * 4, True),
+        (80, 80, (0.0,) * 5, False),
+    ],
+}
+
+
+@pytest.mark.parametrize("lenses", WRITTEN.values(), ids=WRITTEN)
+def test_written_captures_come_back(tmp_path, lenses):
     random = np.random.default_rng(1)
     pixels = random.integers(0, 256, (3, 8, 10, 4), np.uint8)
-    lenses = [(80, 80, (0.0,) * 5), (81, 80, (0.1, 0, 0, 0, 0)), (80, 79, (0.0,) * 5)]
     poses = np.array([POSE] * 3, float)
     poses[:, :3, 3] = random.normal(size=(3, 3))
     views = [
-        View(f"r_{i}", p, x, y, 4.5, 4.0, 10, 8, k)
-        for i, (p, (x, y, k)) in enumerate(zip(poses, lenses, strict=True))
+        View(f"r_{i}", p, x, y, 4.5, 4.0, 10, 8, k, fisheye)
+        for i, (p, (x, y, k, fisheye)) in enumerate(zip(poses, lenses, strict=True))
     ]
     write_capture(tmp_path / "new", views, pixels)
     write_capture(tmp_path / "new", views[:1], pixels[:1], "test")
@@ -459,7 +514,7 @@ def test_written_captures_come_back(tmp_path):
     assert (load_images(capture.test) == pixels[:1]).all()
     for view, back in zip(views, capture.train, strict=True):
         assert (back.camera_to_world == view.camera_to_world).all()
-        for key in ("name", "fl_x", "fl_y", "cx", "cy", "width", "height", "distortion"):
+        for key in ("name", "fl_x", "fl_y", "cx", "cy", "width", "height", "distortion", "fisheye"):
             assert getattr(back, key) == getattr(view, key)
 
 
@@ -485,7 +540,8 @@ def test_chair():
 
 def test_fox():
     capture = read_capture(real("fox"))
-    assert (len(capture.train), capture.missing, capture.opaque) == (50, 17, True)
+    assert (len(capture.train), len(capture.missing), capture.opaque) == (50, 17, True)
+    assert capture.missing[0] == "images/0005.jpg"
     assert capture.train[0].distortion[:2] == (0.0578421, -0.0805099)
     assert load_images(capture.train[:2]).shape == (2, 480, 270, 4)
     with pytest.raises(FormatError):

@@ -21,7 +21,7 @@ def test_png_round_trip(tmp_path, size, channels):
     back = read_image(tmp_path / "a.png")
     assert (back[..., :channels] == pixels).all()
     assert (back[..., 3] == 255).all() or channels == 4
-    assert read_image_header(tmp_path / "a.png") == (size[1], size[0], channels == 4)
+    assert read_image_header(tmp_path / "a.png") == (size[1], size[0], channels == 4, 1)
 
 
 @pytest.mark.parametrize(

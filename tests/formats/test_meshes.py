@@ -141,7 +141,10 @@ def test_scene_of_several_materials(tmp_path):
     scene.export(tmp_path / "scene.glb")
     # The linear bytes of trimesh's glTF are a few sRGB steps apart where it is dark.
     assert near(colours_seen(tmp_path / "scene.glb"), [RED, BLUE, GREEN], 4)
-    assert mesh_capture(tmp_path / "scene.glb", **FEW).aabb[3:] == pytest.approx([6.64, 5.64, 0.64])
+    capture = mesh_capture(tmp_path / "scene.glb", **FEW)
+    # Moved up, that is along glTF's +y, the first box stands higher than the others.
+    assert capture.aabb[3:] == pytest.approx([6.64, 0.64, 5.64])
+    assert "+z is up" in capture.notes[0]
 
 
 def test_obj_material(tmp_path):
@@ -250,9 +253,24 @@ def test_example_scene(tmp_path, capsys):
     assert first == {path.name: path.read_bytes() for path in (tmp_path / "scene").iterdir()}
     for name in first:
         low, high = trimesh.load_scene(tmp_path / "scene" / name).bounds
-        assert low[2] == pytest.approx(0, abs=1e-6) and np.abs(low + high)[:2].max() < 0.05
-        assert high[2] == pytest.approx(0.06 if name == "ground.glb" else 1, abs=1e-6)
+        assert low[1] == pytest.approx(0, abs=1e-6) and np.abs(low + high)[::2].max() < 0.05
+        assert high[1] == pytest.approx(0.06 if name == "ground.glb" else 1, abs=1e-6)
     assert "tower.glb" in capsys.readouterr().out
+
+
+def test_gltf_stands_upright(tmp_path):
+    """A tall box with a red top: as glTF along +y, as .ply along +z; both are one and the same picture."""
+    box = trimesh.creation.box((1, 1, 3))
+    colours = np.where((box.triangles_center[:, 2] > 1)[:, None], [255, 0, 0, 255], [0, 0, 255, 255])
+    box.unmerge_vertices()
+    box.visual.vertex_colors = np.repeat(colours, 3, axis=0).astype(np.uint8)
+    box.export(tmp_path / "box.ply")
+    box.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
+    box.export(tmp_path / "box.glb")
+    turned, plain = (mesh_capture(tmp_path / f"box.{kind}", **FEW) for kind in ("glb", "ply"))
+    assert turned.aabb == pytest.approx(plain.aabb) and turned.aabb[5] > 1.5 and plain.notes == ()
+    difference = load_images(turned.train).astype(int) - load_images(plain.train)
+    assert np.abs(difference).max(-1).mean() < 1
 
 
 def test_read_capture_renders_meshes(tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ occupancy grid is set."""
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -60,30 +61,43 @@ class FitSettings:
     """Where the field is trained, "cpu" or "cuda"."""
 
 
+class Pictures(NamedTuple):
+    """Pictures of any sizes, pixel after pixel, row by row, picture after picture."""
+
+    pixels: np.ndarray
+    """(P, 4) uint8 straight alpha."""
+    ignored: np.ndarray | None = None
+    """(P,) bool: pixels that are never drawn, as a mask asks."""
+
+
 class RayPool:
     """Random pixels of posed pictures as rays with target colours."""
 
-    def __init__(self, cameras: list[Camera], images: np.ndarray, generator: torch.Generator):
-        """images (n, H, W, 4) uint8 straight alpha."""
-        self.images = torch.from_numpy(images).reshape(-1, 4)
-        self.pixels = images.shape[1] * images.shape[2]
+    def __init__(self, cameras: list[Camera], images: np.ndarray | Pictures, generator: torch.Generator):
+        """images (n, H, W, 4) uint8 straight alpha, or pictures of the cameras' sizes."""
+        pictures = images if isinstance(images, Pictures) else Pictures(images.reshape(-1, 4))
+        self.images = torch.from_numpy(pictures.pixels)
+        self.first = torch.tensor(np.cumsum([0, *(camera.width * camera.height for camera in cameras)]))
+        drawn = None if pictures.ignored is None else np.flatnonzero(~pictures.ignored)
+        self.drawn = None if drawn is None else torch.from_numpy(drawn)
         keys = {camera.intrinsics: camera for camera in cameras}
-        index = {key: i for i, key in enumerate(keys)}
-        self.local = torch.stack(
-            [torch.from_numpy(c.local_directions()).reshape(-1, 3).float() for c in keys.values()]
-        )
-        self.map = torch.tensor([index[c.intrinsics] for c in cameras])
+        own = [torch.from_numpy(c.local_directions()).reshape(-1, 3).float() for c in keys.values()]
+        starts = dict(zip(keys, np.cumsum([0, *map(len, own[:-1])]).tolist(), strict=True))
+        self.local = torch.cat(own)
+        self.start = torch.tensor([starts[camera.intrinsics] for camera in cameras])
         poses = np.stack([c.camera_to_world for c in cameras])
         self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
         self.position = torch.from_numpy(poses[:, :3, 3].copy())
-        self.epochs = Epochs(len(self.images), generator)
+        self.epochs = Epochs(len(self.images) if drawn is None else len(drawn), generator)
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel once before
-        any comes again."""
+        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel that is not
+        ignored once before any comes again."""
         chosen = self.epochs.draw(count)
-        view, pixel = chosen // self.pixels, chosen % self.pixels
-        local = self.local[self.map[view], pixel].double()
+        if self.drawn is not None:
+            chosen = self.drawn[chosen]
+        view = torch.searchsorted(self.first, chosen, right=True) - 1
+        local = self.local[self.start[view] + chosen - self.first[view]].double()
         d = torch.einsum("nij,nj->ni", self.rotation[view], local)
         d /= d.norm(dim=1, keepdim=True)
         return self.position[view].contiguous().numpy(), d.numpy(), self.images[chosen].float() / 255
@@ -91,13 +105,13 @@ class RayPool:
 
 def fit(
     cameras: list[Camera],
-    images: np.ndarray,
+    images: np.ndarray | Pictures,
     aabb: np.ndarray,
     settings: FitSettings,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
     name: str = "",
 ) -> StoredField:
-    """Train a field on pictures (n, H, W, 4) uint8 with straight alpha, inside aabb (6,).
+    """Train a field on pictures (n, H, W, 4) uint8 with straight alpha, or of several sizes, inside aabb (6,).
 
     `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is
     given, so that the same seed and number of threads gives the same numbers.
@@ -127,7 +141,7 @@ class FitRun:
     def start(
         cls,
         cameras: list[Camera],
-        images: np.ndarray,
+        images: np.ndarray | Pictures,
         aabb: np.ndarray,
         settings: FitSettings,
         name: str = "",

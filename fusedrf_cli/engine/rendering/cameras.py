@@ -1,4 +1,4 @@
-"""Pinhole cameras with Brown-Conrady distortion: pixels to rays.
+"""Cameras with a pinhole or a fisheye lens, distorted as OpenCV describes it: pixels to rays.
 
 Axes are OpenGL's: +x right, +y up, looking along -z. Pixel (i, j) is column i, row j from the top, its centre
 at (i + 0.5, j + 0.5).
@@ -12,6 +12,8 @@ import numpy as np
 from fusedrf_cli.engine.kernels import cpu
 
 TILE = 16  # pixels along the side of a tile
+NEWTON_STEPS = 50
+NEWTON_NEAR = 1e-13  # focal lengths, or radians
 
 
 @dataclass(frozen=True)
@@ -27,19 +29,31 @@ class Camera:
     width: int
     height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, k3, p1, p2."""
+    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `bend`); of a fisheye k1, k2, k3, k4
+    (see `bend_angle`)."""
     name: str = ""
+    fisheye: bool = False
+    """The distance from the image's centre grows with the angle from the axis, not with its tangent."""
 
     @property
     def intrinsics(self) -> tuple[float, ...]:
         """All that shapes the camera's own ray directions, as a key."""
-        return (self.fl_x, self.fl_y, self.cx, self.cy, self.width, self.height, *self.distortion)
+        inner = (self.fl_x, self.fl_y, self.cx, self.cy, self.width, self.height)
+        return (*inner, self.fisheye, *self.distortion)
+
+    @property
+    def bent(self) -> bool:
+        """Whether rays are other than a pinhole's."""
+        return self.fisheye or any(self.distortion)
 
     def local_directions(self, rows: slice = slice(None)) -> np.ndarray:
-        """(rows, width, 3) float64 directions in the camera's frame, z = -1."""
+        """(rows, width, 3) float64 directions in the camera's frame: z = -1, or of unit length where the lens
+        is a fisheye, which may see what lies beside and behind it."""
         columns = (np.arange(self.width) + 0.5 - self.cx) / self.fl_x
         lines = (np.arange(self.height)[rows] + 0.5 - self.cy) / self.fl_y
         x, y = np.meshgrid(columns, lines)
+        if self.fisheye:
+            return fisheye_directions(x, y, self.distortion)
         if any(self.distortion):
             x, y = undistort(x, y, self.distortion)
         return np.stack([x, -y, -np.ones_like(x)], -1)
@@ -54,7 +68,7 @@ class Camera:
             order = np.arange((bottom - top) * self.width)
         rays_o, rays_d = np.empty((len(order), 3)), np.empty((len(order), 3))
         pose = np.ascontiguousarray(self.camera_to_world, np.float64)
-        if any(self.distortion):
+        if self.bent:
             rays_d[:] = self.local_directions(rows).reshape(-1, 3)[order] @ pose[:3, :3].T
             rays_d /= np.linalg.norm(rays_d, axis=1, keepdims=True)
             rays_o[:] = pose[:3, 3]
@@ -75,18 +89,88 @@ def tile_order(width: int, rows: int) -> np.ndarray:
     return order[order >= 0]
 
 
+def bend(
+    u: np.ndarray, v: np.ndarray, distortion: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """OpenCV's distortion: ideal normalised image coordinates (y down) to distorted ones, and the derivatives
+    of x by u, of x by v (which is that of y by u) and of y by v, stacked first.
+
+    With r² = u² + v² the radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) / (1 + d1 r² + d2 r⁴ + d3 r⁶);
+    p1 and p2 are tangential. d1 to d3 are what OpenCV calls k4 to k6; k4 is here Metashape's.
+    """
+    k1, k2, k3, p1, p2, k4, d1, d2, d3 = (*distortion, *(0.0,) * (9 - len(distortion)))
+    r2 = u * u + v * v
+    over = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    under = 1 + r2 * (d1 + r2 * (d2 + r2 * d3))
+    d_over = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4))
+    d_under = d1 + r2 * (2 * d2 + r2 * 3 * d3)
+    radial = over / under
+    slope = 2 * (d_over - radial * d_under) / under  # twice the derivative of the factor by r²
+    x = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    y = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
+    x_u = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u
+    x_v = u * v * slope + 2 * p1 * u + 2 * p2 * v
+    y_v = radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
+    return x, y, np.stack([x_u, x_v, y_v])
+
+
 def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Invert the Brown-Conrady model by fixed-point iteration: distorted to ideal normalised image
-    coordinates (y down)."""
-    k1, k2, k3, p1, p2 = distortion
-    u, v = x, y
-    for _ in range(12):
-        r2 = u * u + v * v
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        du = 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-        dv = p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-        u, v = (x - du) / radial, (y - dv) / radial
+    """Invert `bend` by Newton steps, halved where one would lead away: distorted to ideal normalised image
+    coordinates (y down). A pixel that no ray reaches gets the nearest that was found."""
+    u, v = np.array(x, np.float64), np.array(y, np.float64)
+    found_x, found_y, slopes = bend(u, v, distortion)
+    far = np.hypot(found_x - x, found_y - y)
+    share = np.ones_like(far)
+    for _ in range(NEWTON_STEPS):
+        if far.size == 0 or far.max() < NEWTON_NEAR:
+            break
+        a, b, d = slopes
+        dx, dy = x - found_x, y - found_y
+        # Never singular: a step along a fold of the lens is long, is seen to lead away, and is halved.
+        area = a * d - b * b
+        area = np.where(np.abs(area) < 1e-12, 1e-12, area)
+        next_u, next_v = u + share * (d * dx - b * dy) / area, v + share * (a * dy - b * dx) / area
+        next_x, next_y, next_slopes = bend(next_u, next_v, distortion)
+        next_far = np.hypot(next_x - x, next_y - y)
+        better = next_far < far
+        u, v = np.where(better, next_u, u), np.where(better, next_v, v)
+        found_x, found_y = np.where(better, next_x, found_x), np.where(better, next_y, found_y)
+        slopes, far = np.where(better, next_slopes, slopes), np.where(better, next_far, far)
+        share = np.where(better, np.minimum(2 * share, 1), share / 2)
     return u, v
+
+
+def bend_angle(angle: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """OpenCV's fisheye: angle from the axis, radians, to distance from the centre in focal lengths,
+    θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸), and its derivative."""
+    k1, k2, k3, k4 = (*distortion, *(0.0,) * (4 - len(distortion)))[:4]
+    a2 = angle * angle
+    radius = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+    return radius, 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
+
+
+def fisheye_directions(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """(..., 3) float64 unit directions, OpenGL axes, of a fisheye's normalised image coordinates (y down).
+
+    `bend_angle` is inverted by Newton steps kept between bounds. Pixels past the widest angle that the lens
+    shows (where the distance from the centre grows no more, at most a half turn) get that angle.
+    """
+    radius = np.hypot(x, y)
+    table = np.linspace(0, np.pi, 2049)
+    reached, slope = bend_angle(table, distortion)
+    rising = np.argmax(slope <= 0) if (slope <= 0).any() else len(table)
+    table, reached = table[: max(rising, 2)], reached[: max(rising, 2)]
+    angle = np.interp(radius, reached, table)
+    step = table[1]
+    low, high = np.maximum(angle - step, 0), np.minimum(angle + step, table[-1])
+    for _ in range(NEWTON_STEPS):
+        found, slope = bend_angle(angle, distortion)
+        following = np.clip(angle - (found - radius) / np.where(slope > 1e-9, slope, 1e-9), low, high)
+        if np.abs(following - angle).max(initial=0) < NEWTON_NEAR:
+            break
+        angle = following
+    across = np.sin(angle) / np.where(radius > 0, radius, 1)
+    return np.stack([x * across, -y * across, -np.cos(angle)], -1)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

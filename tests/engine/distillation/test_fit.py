@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.fit import FitSettings, RayPool, fit, occupancy_of
+from fusedrf_cli.engine.distillation.fit import FitSettings, Pictures, RayPool, fit, occupancy_of
 from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
-from fusedrf_cli.engine.rendering.cameras import orbit, scattered
+from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from tests.analytic.export import way_of
@@ -82,6 +82,25 @@ def test_more_rays_than_pixels_are_as_many_as_there_are(capture):
     rays_o, rays_d, pixels = pool.draw(5000)
     assert rays_o.shape == rays_d.shape == (576, 3) and pixels.shape == (576, 4)
     np.testing.assert_allclose(rays_o, np.tile(cameras[0].camera_to_world[:3, 3], (576, 1)))
+
+
+def test_pictures_of_several_sizes_and_pixels_that_are_ignored():
+    """Every pixel that is not ignored comes once, with its own colour and its own camera's ray."""
+    sizes = ((5, 4), (3, 7), (5, 4))
+    cameras = [
+        Camera(look_at(np.array([2.0 + i, 1, 1]), np.zeros(3), np.array([0.0, 0, 1])), 9, 8, w / 2, 2, w, h)
+        for i, (w, h) in enumerate(sizes)
+    ]
+    count = sum(w * h for w, h in sizes)
+    pixels = np.repeat(np.arange(count, dtype=np.uint8)[:, None], 4, 1)
+    ignored = np.random.default_rng(0).random(count) < 0.4
+    pool = RayPool(cameras, Pictures(pixels, ignored), torch.Generator().manual_seed(0))
+    rays_o, rays_d, drawn = pool.draw(1000)
+    found = np.rint(drawn.numpy()[:, 0] * 255).astype(int)
+    assert np.array_equal(np.sort(found), np.flatnonzero(~ignored))
+    wanted_o, wanted_d = (np.concatenate(part) for part in zip(*[c.rays() for c in cameras], strict=True))
+    np.testing.assert_allclose(rays_o, wanted_o[found])
+    np.testing.assert_allclose(rays_d, wanted_d[found], atol=1e-6)
 
 
 def test_texels_are_near_cubic_but_for_flat_boxes():

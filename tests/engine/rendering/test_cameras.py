@@ -3,51 +3,122 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, look_at, orbit, scattered, undistort
+from fusedrf_cli.engine.rendering.cameras import (
+    Camera,
+    bend,
+    fisheye_directions,
+    framing_camera,
+    look_at,
+    orbit,
+    scattered,
+    undistort,
+)
 from tests.engine.conftest import BOX, DIRECTIONS_26
 
 DISTORTION = (-0.12, 0.05, -0.01, 0.003, -0.002)
 
 
+LENSES = {
+    "pinhole": ((0.0,) * 5, False),
+    "brown": (DISTORTION, False),
+    "barrel": ((0.2, 0, 0, 0, 0), False),
+    "eighth power": ((-0.2, 0.08, -0.02, 0.001, 0.002, 0.004), False),
+    "rational": ((0.3, -0.1, 0.02, -0.001, 0.002, 0.0, 0.35, -0.05, 0.01), False),
+    "equidistant": ((0.0,) * 4, True),
+    "fisheye": ((0.05, -0.02, 0.006, -0.001), True),
+}
+
+
 def distort(u, v, distortion):
-    """Brown-Conrady as OpenCV writes it: ideal to distorted normalised image coordinates (y down)."""
-    k1, k2, k3, p1, p2 = distortion
+    """OpenCV's distortion as its manual writes it: ideal to distorted normalised coordinates (y down)."""
+    k1, k2, k3, p1, p2, k4, d1, d2, d3 = (*distortion, *[0] * (9 - len(distortion)))
     r2 = u * u + v * v
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4) / (1 + d1 * r2 + d2 * r2**2 + d3 * r2**3)
     return u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (
         r2 + 2 * v * v
     ) + 2 * p2 * u * v
 
 
+def on_lens(local, distortion, fisheye):
+    """(N, 3) points in the camera's frame to distorted normalised image coordinates (y down)."""
+    if not fisheye:
+        return distort(local[:, 0] / -local[:, 2], -local[:, 1] / -local[:, 2], distortion)
+    across = np.hypot(local[:, 0], local[:, 1])
+    angle = np.arctan2(across, -local[:, 2])
+    k1, k2, k3, k4 = distortion
+    radius = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+    return local[:, 0] / across * radius, -local[:, 1] / across * radius
+
+
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(N, 2) column and row coordinates of world points."""
     local = (points - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
-    u, v = distort(local[:, 0] / -local[:, 2], -local[:, 1] / -local[:, 2], camera.distortion)
+    u, v = on_lens(local, camera.distortion, camera.fisheye)
     return np.stack([camera.fl_x * u + camera.cx, camera.fl_y * v + camera.cy], 1)
 
 
-def camera_at(distortion=(0.0,) * 5, width=23, height=17) -> Camera:
+def camera_at(distortion=(0.0,) * 5, fisheye=False, width=23, height=17) -> Camera:
     pose = look_at(np.array([3.0, -2.0, 1.5]), np.array([0.1, 0.2, 0.0]), np.array([0.0, 0.0, 1.0]))
-    return Camera(pose, 25.0, 27.0, 11.3, 8.9, width, height, distortion)
+    return Camera(pose, 25.0, 27.0, 11.3, 8.9, width, height, distortion, fisheye=fisheye)
 
 
-@pytest.mark.parametrize("distortion", [(0.0,) * 5, DISTORTION, (0.2, 0, 0, 0, 0)])
+@pytest.mark.parametrize("distortion", [lens for lens, fisheye in LENSES.values() if not fisheye])
 def test_undistort_inverts(distortion):
     u, v = np.random.default_rng(0).uniform(-0.6, 0.6, (2, 400))
     found = undistort(*distort(u, v, distortion), distortion)
-    np.testing.assert_allclose(found, (u, v), atol=1e-6)
+    np.testing.assert_allclose(found, (u, v), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("distortion", [(0.0,) * 5, DISTORTION])
-def test_the_ray_of_a_pixel_passes_what_projects_to_it(distortion):
+@pytest.mark.parametrize("distortion", [lens for lens, fisheye in LENSES.values() if not fisheye])
+def test_the_slopes_of_a_lens_are_its_differences(distortion):
+    u, v = np.random.default_rng(1).uniform(-0.7, 0.7, (2, 50))
+    h = 1e-6
+    by_u, by_v = (
+        (np.array(distort(u + h * i, v + h * j, distortion)) - distort(u - h * i, v - h * j, distortion))
+        / (2 * h)
+        for i, j in ((1, 0), (0, 1))
+    )
+    x, y, (x_u, x_v, y_v) = bend(u, v, distortion)
+    np.testing.assert_allclose([x, y], distort(u, v, distortion), rtol=1e-12)
+    np.testing.assert_allclose([x_u, x_v, x_v, y_v], [by_u[0], by_v[0], by_u[1], by_v[1]], atol=1e-8)
+
+
+@pytest.mark.parametrize("distortion", [lens for lens, fisheye in LENSES.values() if fisheye])
+def test_a_fisheye_sees_beside_and_behind_itself(distortion):
+    """Directions up to 110 degrees from the axis come back from where they land."""
+    random = np.random.default_rng(2)
+    angle, turn = random.uniform(1e-3, np.radians(110), 500), random.uniform(0, 2 * np.pi, 500)
+    d = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), -np.cos(angle)], 1)
+    found = fisheye_directions(*on_lens(d, distortion, True), distortion)
+    np.testing.assert_allclose(found, d, rtol=0, atol=1e-9)
+    assert fisheye_directions(np.zeros(1), np.zeros(1), distortion).tolist() == [[0, 0, -1]]
+
+
+def test_pixels_that_no_ray_reaches_stay_finite():
+    """Barrel distortion folds over: what lies past the fold gets a finite ray, what lies before the right
+    one."""
+    folding, x = (-0.3, 0, 0, 0, 0), np.linspace(0, 3, 200)
+    u, v = undistort(x, np.zeros(200), folding)
+    assert np.isfinite(u).all() and (v == 0).all()
+    fold = 1 / np.sqrt(0.9)
+    inside = x < 0.99 * fold * (1 - 0.3 * fold**2)
+    np.testing.assert_allclose(u[inside] * (1 - 0.3 * u[inside] ** 2), x[inside], atol=1e-9)
+    assert (np.abs(u[inside]) < fold).all()
+    d = fisheye_directions(np.linspace(0, 9, 50), np.zeros(50), (-0.1, 0, 0, 0))
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1)
+    assert (np.diff(np.arccos(-d[:, 2])) >= 0).all()
+
+
+@pytest.mark.parametrize("distortion, fisheye", LENSES.values(), ids=LENSES)
+def test_the_ray_of_a_pixel_passes_what_projects_to_it(distortion, fisheye):
     """A point anywhere along the ray of pixel (i, j) projects to (i + 0.5, j + 0.5)."""
-    camera = camera_at(distortion)
+    camera = camera_at(distortion, fisheye)
     rays_o, rays_d = camera.rays()
     np.testing.assert_allclose(np.linalg.norm(rays_d, axis=1), 1, rtol=1e-12)
     row, column = np.divmod(np.arange(camera.width * camera.height), camera.width)
     for distance in (0.5, 4.0, 100.0):
         found = project(camera, rays_o + distance * rays_d)
-        np.testing.assert_allclose(found, np.stack([column, row], 1) + 0.5, atol=1e-4)
+        np.testing.assert_allclose(found, np.stack([column, row], 1) + 0.5, atol=1e-9)
 
 
 def test_axes_are_opengls():

@@ -1,0 +1,354 @@
+"""COLMAP's sparse models: cameras, posed images and points, from the binary files or the text ones.
+
+Binary files are little endian; images hold world-to-camera as a quaternion (w, x, y, z) and a translation,
+with x right, y down, z forward. Files `rigs` and `frames` of newer versions are not needed.
+"""
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from formats.cameras import checked_size
+from formats.errors import BadIntrinsics, BadModel, BadPose, LimitExceeded, UnsupportedCamera
+from formats.frame import depth_range
+from formats.inputs import read_input
+from formats.points import MAX_POINTS, Points, finite
+from formats.views import View
+
+MAX_CAMERAS_BYTES = 64 * 2**20
+MAX_BYTES = 2**31
+MAX_NAME = 4096
+MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fx fy cx cy",
+}
+"""Parameters of the models that can be rendered, in COLMAP's order. FULL_OPENCV's last three are OpenCV's k4,
+k5 and k6."""
+NUMBERS = [
+    *(
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
+        "FOV",
+    ),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+]
+"""Names of the models by their number in binary files."""
+NO_POINT = 2**64 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One posed image of a model."""
+
+    name: str
+    """Path of the photo inside the folder of photos."""
+    where: str
+    """How errors name it."""
+    view: View
+    """Its camera, for a photo of the size given in the model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """The content of a folder like `sparse/0`."""
+
+    folder: Path
+    images: tuple[Image, ...]
+    points: Points | None
+
+
+def model_folder(path: Path) -> Path | None:
+    """The folder of a model at `path`, or below it where COLMAP and nerfstudio store it; None without one."""
+    places = [path / part for part in ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")]
+    found = next((place for place in places if _has(place, "cameras") and _has(place, "images")), None)
+    if found is None and (path / "sparse").is_dir():
+        found = next((p for p in sorted((path / "sparse").iterdir()) if _has(p, "images")), None)
+    return found
+
+
+def capture_folder(model: Path) -> Path:
+    """The folder above a model, in which the photos lie: `x` of `x/sparse/0` and of `x/colmap/sparse/0`."""
+    for _ in range(3):
+        if model.name.isdecimal() or model.name in ("sparse", "colmap"):
+            model = model.resolve().parent
+    return model
+
+
+def _has(folder: Path, name: str) -> bool:
+    return any((folder / f"{name}.{ending}").is_file() for ending in ("bin", "txt"))
+
+
+def read_model(folder: Path) -> Model:
+    """The model of a folder; binary files are preferred. Points are optional.
+
+    Raises BadIntrinsics, BadModel, BadPose, LimitExceeded, MissingFile, ResourceError, UnsupportedCamera.
+    """
+    cameras = _read(folder, "cameras", {"bin": _binary_cameras, "txt": _text_cameras}, MAX_CAMERAS_BYTES)
+    listed = list(_read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES))
+    if not listed:
+        raise BadModel(f"{folder}: its images file is empty; export the model again")
+    ids, points = _points(folder)
+    images = []
+    for where, name, quaternion, translation, camera, seen in listed:
+        if camera not in cameras:
+            raise BadModel(
+                f"{where}: is of camera {camera}, which the cameras file does not list; export again"
+            )
+        pose = _pose(quaternion, translation, where)
+        near, far = _depths(pose, ids, points, seen)
+        view = replace(cameras[camera], camera_to_world=pose, near=near, far=far)
+        images.append(Image(name, where, view))
+    return Model(folder, tuple(images), points)
+
+
+def read_points(folder: Path) -> Points | None:
+    """The points alone; None where the model has none."""
+    return _points(folder)[1]
+
+
+def _points(folder: Path) -> tuple[np.ndarray, Points | None]:
+    if not _has(folder, "points3D"):
+        return np.empty(0, np.uint64), None
+    return _read(folder, "points3D", {"bin": _binary_points, "txt": _text_points}, MAX_BYTES)
+
+
+def _read(folder: Path, name: str, parsers: dict, limit: int):
+    ending = "bin" if (folder / f"{name}.bin").is_file() else "txt"
+    path = folder / f"{name}.{ending}"
+    data = read_input(path, limit)
+    try:
+        return parsers[ending](path, data)
+    except struct.error:
+        raise BadModel(f"{path}: the file is truncated; copy or export it again") from None
+
+
+def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
+    """(4, 4) camera-to-world, OpenGL axes, of a world-to-camera rotation and translation."""
+    numbers = np.array([*quaternion, *translation], np.float64)
+    usable = np.abs(numbers).max() < 1e15  # False for NaN too
+    length = float(np.linalg.norm(numbers[:4])) if usable else 0.0
+    if not 1e-3 < length < 1e3:
+        raise BadPose(
+            f"{where}: its pose is not a rotation with a finite translation; remove the image, or map again"
+        )
+    w, x, y, z = numbers[:4] / length
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T * [1, -1, -1]
+    pose[:3, 3] = -rotation.T @ numbers[4:]
+    return pose
+
+
+def _depths(pose: np.ndarray, ids: np.ndarray, points: Points | None, seen: np.ndarray) -> tuple:
+    """Nearest and farthest depth of the points that an image saw, outliers left out; None where unknown."""
+    if points is None or not len(ids) or not len(seen):
+        return None, None
+    at = np.minimum(np.searchsorted(ids, seen), len(ids) - 1)
+    found = points.positions[at[ids[at] == seen]]
+    return depth_range(pose, found)
+
+
+# --- cameras ------------------------------------------------------------------------------------------------
+
+
+def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
+    """A camera with the identity as pose."""
+    names = MODELS[model].split()
+    if len(numbers) != len(names):
+        raise BadModel(
+            f"{where}: {model} has {len(numbers)} parameters, expected {len(names)}: {MODELS[model]}"
+        )
+    if not all(abs(number) < 1e30 for number in numbers):
+        raise BadIntrinsics(f"{where}: a parameter is not a finite number; export the model again")
+    said = dict(zip(names, map(float, numbers), strict=True))
+    fl_x, fl_y = (said.get(key, said.get("f", 0.0)) for key in ("fx", "fy"))
+    if not min(fl_x, fl_y) > 0:
+        raise BadIntrinsics(f"{where}: focal length of {min(fl_x, fl_y):g} pixels, expected a positive one")
+    checked_size(width, height, where)
+    fisheye = "FISHEYE" in model
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2", "k4", "d1", "d2", "d3")
+    bends = tuple(said.get(key, 0.0) for key in keys)
+    if not fisheye and not any(bends[5:]):
+        bends = bends[:5]
+    return View("", np.eye(4), fl_x, fl_y, said["cx"], said["cy"], width, height, bends, fisheye)
+
+
+def _known(where: str, model: str) -> str:
+    if model not in MODELS:
+        raise UnsupportedCamera(
+            f"{where}: a camera of the model {model[:40]}, expected one of {', '.join(MODELS)}; undistort "
+            "the photos with COLMAP's image_undistorter"
+        )
+    return model
+
+
+def _binary_cameras(path: Path, data: bytes) -> dict[int, View]:
+    (count,) = struct.unpack_from("<Q", data)
+    _check_count(path, count, len(data), 24)
+    cameras, at = {}, 8
+    for _ in range(count):
+        camera, number, width, height = struct.unpack_from("<IiQQ", data, at)
+        where = f"{path}: camera {camera}"
+        named = NUMBERS[number] if 0 <= number < len(NUMBERS) else f"number {number}"
+        model = _known(where, named)
+        layout = f"<{len(MODELS[model].split())}d"
+        numbers = struct.unpack_from(layout, data, at + 24)
+        cameras[camera] = _camera(where, model, width, height, numbers)
+        at += 24 + struct.calcsize(layout)
+    return cameras
+
+
+def _text_cameras(path: Path, data: bytes) -> dict[int, View]:
+    cameras = {}
+    for line, words in _lines(path, data):
+        if not words:
+            continue
+        if len(words) < 5:
+            raise BadModel(f"{path}: line {line}: expected an id, a model, width, height and its parameters")
+        camera, width, height = (_number(path, line, words[i], int) for i in (0, 2, 3))
+        where = f"{path}: camera {camera}"
+        numbers = [_number(path, line, word, float) for word in words[4:]]
+        cameras[camera] = _camera(where, _known(where, words[1]), width, height, numbers)
+    return cameras
+
+
+# --- images -------------------------------------------------------------------------------------------------
+
+
+def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
+    """(where, name, quaternion, translation, camera, ids of the points it saw) of each image."""
+    (count,) = struct.unpack_from("<Q", data)
+    _check_count(path, count, len(data), 73)
+    at, found = 8, []
+    for _ in range(count):
+        image, *numbers, camera = struct.unpack_from("<I7dI", data, at)
+        end = data.find(b"\0", at + 64, at + 64 + MAX_NAME)
+        if end < 0:
+            raise BadModel(f"{path}: image {image} has no complete name; copy or export it again")
+        name = data[at + 64 : end].decode("utf-8", "replace")
+        (observed,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9
+        if observed > (len(data) - at) // 24:
+            raise BadModel(f"{path}: the file is truncated in image {image}; copy or export it again")
+        seen = np.frombuffer(data, "<u8", 3 * observed, at)[2::3]
+        at += 24 * observed
+        where = f"{path}: image {image} ({name})"
+        found.append((where, name, numbers[:4], numbers[4:], camera, seen[seen != NO_POINT]))
+    return found
+
+
+def _text_images(path: Path, data: bytes) -> list[tuple]:
+    """As `_binary_images`; the second line of an image, which may be empty, holds x, y and point of each
+    observation."""
+    found, lines = [], _lines(path, data)
+    for line, words in lines:
+        if not words:
+            continue
+        if len(words) < 10:
+            raise BadModel(f"{path}: line {line}: expected an id, a pose, a camera and a name")
+        image, camera = (_number(path, line, words[i], int) for i in (0, 8))
+        numbers = [_number(path, line, word, float) for word in words[1:8]]
+        name = " ".join(words[9:])
+        line, observed = next(lines, (line + 1, []))
+        try:
+            seen = np.array(observed[2::3], np.int64)
+        except (ValueError, OverflowError):
+            raise BadModel(f"{path}: line {line}: expected x, y and a point's id again and again") from None
+        where = f"{path}: image {image} ({name})"
+        found.append((where, name, numbers[:4], numbers[4:], camera, seen[seen >= 0].astype(np.uint64)))
+    return found
+
+
+# --- points -------------------------------------------------------------------------------------------------
+
+
+def _binary_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
+    """Ids (N,) uint64 in rising order, and their points."""
+    (count,) = struct.unpack_from("<Q", data)
+    _check_count(path, count, len(data), 51)
+    if count > MAX_POINTS:
+        raise LimitExceeded(f"{path}: {count:,} points, at most {MAX_POINTS:,} are read; thin them out")
+    head = struct.Struct("<Q3d3BdQ")
+    rows, at = [], 8
+    for _ in range(count):
+        row = head.unpack_from(data, at)
+        at += head.size
+        if row[-1] > (len(data) - at) // 8:
+            raise BadModel(f"{path}: the file is truncated in point {row[0]}; copy or export it again")
+        at += 8 * row[-1]
+        rows.append(row[:7])
+    return _sorted_points(rows)
+
+
+def _text_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
+    rows = []
+    for line, words in _lines(path, data):
+        if not words:
+            continue
+        if len(words) < 7:
+            raise BadModel(f"{path}: line {line}: expected an id, a position and a colour")
+        if len(rows) == MAX_POINTS:
+            raise LimitExceeded(f"{path}: more than {MAX_POINTS:,} points; thin them out")
+        position = [_number(path, line, word, float) for word in words[1:4]]
+        whole = [_number(path, line, word, int) for word in (words[0], *words[4:7])]
+        rows.append((whole[0], *position, *whole[1:]))
+    return _sorted_points(rows)
+
+
+def _sorted_points(rows: list[tuple]) -> tuple[np.ndarray, Points]:
+    ids = np.array([row[0] % 2**64 for row in rows], np.uint64)
+    positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
+    colours = np.clip(np.array([row[4:7] for row in rows], np.float64).reshape(-1, 3), 0, 255)
+    order = np.argsort(ids)
+    order = order[(np.abs(positions[order]) < 1e30).all(1)]
+    return ids[order], finite(positions[order], colours[order].astype(np.uint8))
+
+
+# --- parsing ------------------------------------------------------------------------------------------------
+
+
+def _check_count(path: Path, count: int, length: int, smallest: int) -> None:
+    if count > length // smallest:
+        raise BadModel(f"{path}: {count:,} records do not fit into {length:,} bytes; copy or export it again")
+
+
+def _lines(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
+    """Number and words of each line that is not a comment."""
+    for i, line in enumerate(data.decode("utf-8", "replace").split("\n"), 1):
+        if not line.startswith("#"):
+            yield i, line.split()
+
+
+def _number(path: Path, line: int, word: str, kind: type):
+    try:
+        value = kind(word) if len(word) < 40 else math.nan
+    except ValueError:
+        value = math.nan
+    if not abs(value) < 1e30:
+        raise BadModel(f"{path}: line {line}: found {word[:40]!r}, expected a number")
+    return value

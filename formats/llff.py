@@ -1,0 +1,69 @@
+"""LLFF's `poses_bounds.npy`: one row per photo, in the order of the file names.
+
+A row holds 3 x 5 numbers, a camera-to-world matrix with the axes down, right and back beside a column of
+height, width and focal length of the full-size photos, and then the nearest and the farthest depth of what is
+seen.
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from formats.cameras import checked_size
+from formats.errors import BadIntrinsics, BadModel, BadPose
+from formats.inputs import read_input
+from formats.views import View, checked_pose
+
+NAME = "poses_bounds.npy"
+MAX_BYTES = 16 * 2**20
+COLUMNS = 17
+
+
+def read_poses_bounds(path: Path) -> list[tuple[str, View]]:
+    """(how errors name it, its camera at the full photos' size, without a name) of each row.
+
+    Raises BadIntrinsics, BadModel, BadPose, LimitExceeded, MissingFile.
+    """
+    rows = _table(path)
+    return [(f"{path}: row {i}", _view(f"{path}: row {i}", row)) for i, row in enumerate(rows)]
+
+
+def _table(path: Path) -> np.ndarray:
+    """(N, 17) float64, the header held against the bytes before anything is allocated."""
+    data = read_input(path, MAX_BYTES)
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        read = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, fortran, kind = read(file, max_header_size=10_000)
+    except (ValueError, TypeError, SyntaxError, EOFError, UnicodeError) as error:
+        raise BadModel(f"{path}: not an array saved by numpy; export it again") from error
+    if len(shape) != 2 or shape[1] != COLUMNS or kind.kind != "f":
+        size = "x".join(map(str, shape)) or "one"
+        raise BadModel(f"{path}: holds {size} numbers of type {kind}, expected rows of {COLUMNS} floats")
+    left = len(data) - file.tell()
+    if shape[0] * COLUMNS * kind.itemsize != left:
+        raise BadModel(f"{path}: {left:,} bytes cannot hold {shape[0]:,} rows; copy or export it again")
+    flat = np.frombuffer(data, kind, offset=file.tell()).astype(np.float64)
+    return flat.reshape(shape, order="F" if fortran else "C")
+
+
+def _view(where: str, row: np.ndarray) -> View:
+    matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
+    if not np.isfinite(row).all():
+        raise BadPose(f"{where}: holds NaN or infinity; export the poses again")
+    height, width, focal = matrix[:, 4]
+    if not focal > 0 or max(height, width, focal) > 1e9:
+        raise BadIntrinsics(f"{where}: focal length of {focal:g} pixels, expected a positive one")
+    if not 0 < near < far:
+        raise BadIntrinsics(
+            f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth"
+        )
+    width, height = checked_size(round(width), round(height), where)
+    down, right, back, eye = matrix[:, :4].T
+    pose = checked_pose(np.column_stack([right, -down, back, eye]), where)
+    middle = width / 2, height / 2
+    return View("", pose, focal, focal, *middle, width, height, near=float(near), far=float(far))

@@ -1,0 +1,140 @@
+"""Sparse points of structure from motion: positions with colours, read from a .ply file."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from formats.errors import BadModel, LimitExceeded
+from formats.inputs import read_input
+
+MAX_BYTES = 2**31
+MAX_POINTS = 5_000_000
+MAX_HEADER = 1 << 16
+TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+ENDS = re.compile(rb"\nend_header\r?\n")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points on surfaces, in world units; finite."""
+
+    positions: np.ndarray
+    """(N, 3) float64."""
+    colours: np.ndarray
+    """(N, 3) uint8 sRGB; white where the file has none."""
+
+    def moved(self, matrix: np.ndarray) -> "Points":
+        """The same points behind an affine (3, 4) or (4, 4)."""
+        return Points(self.positions @ matrix[:3, :3].T + matrix[:3, 3], self.colours)
+
+
+def finite(positions: np.ndarray, colours: np.ndarray) -> Points:
+    """Points without those that are NaN, infinite or beyond 1e30."""
+    sound = (np.abs(positions) < 1e30).all(1)
+    return Points(positions[sound], colours[sound])
+
+
+def read_ply_points(path: Path | str) -> Points:
+    """The vertices of a .ply, text or binary; other elements are ignored.
+
+    Raises BadModel, LimitExceeded (before anything is allocated), MissingFile.
+    """
+    data = read_input(path, MAX_BYTES)
+    end = ENDS.search(data, 0, MAX_HEADER)
+    if not data.startswith(b"ply") or end is None:
+        raise BadModel(f"{path}: not a .ply file with a complete header; export the points again")
+    coding, count, fields = _header(path, data[: end.start()].decode("latin-1").split("\n"))
+    names = [name for name, _ in fields]
+    if not {"x", "y", "z"} <= set(names):
+        raise BadModel(f"{path}: its vertices lack x, y or z; export the points again")
+    if coding == "ascii":
+        table = _text_table(path, data[end.end() :], count, len(fields))
+        columns = {name: table[:, i] for i, name in enumerate(names)}
+    else:
+        order = "<" if coding == "binary_little_endian" else ">"
+        record = np.dtype([(name, order + kind) for name, kind in fields])
+        if count * record.itemsize > len(data) - end.end():
+            raise BadModel(f"{path}: ends before the last of {count:,} points; copy or export it again")
+        columns = np.frombuffer(data, record, count, end.end())
+    positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
+    return finite(positions, _colours(columns, dict(fields)))
+
+
+def _header(path: Path | str, lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:
+    """Coding, how many vertices, and their properties as (name, numpy type without byte order)."""
+    coding, element, count, fields = "", "", 0, []
+    for words in (line.split() for line in lines[1:]):
+        if words[:1] == ["format"] and len(words) > 1:
+            coding = words[1]
+        elif words[:1] == ["element"] and len(words) == 3:
+            if element == "" and words[1] != "vertex":
+                raise BadModel(
+                    f"{path}: begins with {words[1][:40]!r}, expected points as its vertices first"
+                )
+            element = words[1]
+            count = _count(path, words[2]) if element == "vertex" else count
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in TYPES:
+                raise BadModel(
+                    f"{path}: a vertex property {' '.join(words[1:])[:40]!r} that is not a single number; "
+                    "export the points again"
+                )
+            fields.append((words[2], TYPES[words[1]]))
+    if coding not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise BadModel(f"{path}: unknown .ply format {coding[:40]!r}, expected ascii or binary")
+    if len({name for name, _ in fields}) < len(fields):
+        raise BadModel(f"{path}: two properties of its vertices share a name; export the points again")
+    return coding, count, fields
+
+
+def _count(path: Path | str, digits: str) -> int:
+    count = int(digits) if digits.isdecimal() and len(digits) < 16 else -1
+    if count < 0:
+        raise BadModel(f"{path}: the vertex count is {digits[:40]!r}, expected a whole number")
+    if count > MAX_POINTS:
+        raise LimitExceeded(f"{path}: {count:,} points, at most {MAX_POINTS:,} are read; thin them out")
+    return count
+
+
+def _text_table(path: Path | str, data: bytes, count: int, width: int) -> np.ndarray:
+    if not count:
+        return np.empty((0, width))
+    lines = data.split(b"\n", count)[:count]
+    try:
+        table = np.loadtxt(lines, np.float64, comments=None, ndmin=2) if all(lines) else np.empty((0, 0))
+    except ValueError:
+        table = np.empty((0, 0))
+    if table.shape != (count, width):
+        raise BadModel(
+            f"{path}: expected {count:,} lines of {width} numbers after the header; export it again"
+        )
+    return table
+
+
+def _colours(columns, kinds: dict[str, str]) -> np.ndarray:
+    """(N, 3) uint8 of red, green, blue, whether counted to 255 or to 1."""
+    for names in (("red", "green", "blue"), ("r", "g", "b")):
+        if set(names) <= set(kinds):
+            values = np.stack([columns[name].astype(np.float64) for name in names], 1)
+            unit = kinds[names[0]].startswith("f") and not (values > 1).any()
+            return np.clip(np.nan_to_num(values) * (255.0 if unit else 1.0), 0, 255).astype(np.uint8)
+    return np.full((len(columns["x"]), 3), 255, np.uint8)
