@@ -145,7 +145,7 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
     """The photos to learn from; InvalidInput where masks leave nothing of them."""
     loaded = load_photos(capture.train, request.masks)
     if loaded.ignored is not None and loaded.ignored.all():
-        raise InvalidInput(f"{request.source}: the masks exclude every pixel; masks are black where to ignore")
+        raise InvalidInput(f"{request.source}: the masks exclude every pixel; they are black where to ignore")
     return Pictures(loaded.pixels, loaded.ignored)
 
 

@@ -111,7 +111,8 @@ def fit(
     advance: Callable[[float, dict], None] = lambda share, figures: None,
     name: str = "",
 ) -> StoredField:
-    """Train a field on pictures (n, H, W, 4) uint8 with straight alpha, or of several sizes, inside aabb (6,).
+    """Train a field on pictures (n, H, W, 4) uint8 with straight alpha, or of several sizes, inside a box
+    (6,).
 
     `advance(share, figures)` is told of progress in [0, 1]. The clock decides nothing unless a time budget is
     given, so that the same seed and number of threads gives the same numbers.
