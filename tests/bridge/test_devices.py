@@ -2,13 +2,20 @@
 
 import contextlib
 import shutil
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 
 from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.fields.streamed import opened
-from tests.analytic.export import sparse_field
+from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.progress import NullProgress
+from tests.analytic.export import SHAPE, sparse_field, way_of
 from tests.analytic.fields import Box, Tint
 from tests.bridge.conftest import FIELDS, done, part
 
@@ -57,9 +64,10 @@ def test_an_addition_is_measured_there(fused, sent):
     assert sent.count(("vm", "cuda")) >= 3  # the object, the field it is added to, and what they become
 
 
-def test_what_a_deletion_uncovers_is_learnt_there(fused, sent, monkeypatch):
-    taught = []
-    run = part("editing").DistillRun
-    monkeypatch.setattr(part("editing"), "DistillRun", lambda *words: taught.append(len(sent)) or run(*words))
-    done(fused, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb", "-w")
-    assert taught and sent[taught[0] - 1] == ("vm", "cuda")
+def test_what_an_edit_learns_is_learnt_there(sent):
+    scene = ComposedField([Placed("red", FIELDS["red"], np.eye(4))])
+    student = VM.empty(scene, way_of(SHAPE), SHAPE.size((16,) * 3), torch.Generator().manual_seed(0), "")
+    asked = SimpleNamespace(seed=0, rgb=False, time_budget=None)
+    teach = part("editing").Teacher(asked, "cuda", NullProgress())
+    teach(scene, student, [scene.occupancy.tight_aabb(0)], True)
+    assert sent == [("vm", "cuda"), ("vm", "cpu")]

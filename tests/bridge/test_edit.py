@@ -103,7 +103,7 @@ def test_without_its_sources_a_hole_stays_and_is_said(report, picture, folder):
     gone, wanted, before = covered("blue", -0.1), picture("pair.json"), picture("vm.rfpack")
     (folder / "floor.rfpack").write_bytes(b"another file")
     said = report("delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
-    assert any("the source of 'floor' is not to be had" in w for w in said["warnings"])
+    assert any("the source of 'floor' is gone, has changed" in w for w in said["warnings"])
     assert read_bundle(folder / "less.rfpack").scene.history[-1]["restored"] is False
     after = picture("less.rfpack")
     assert psnr(after[gone], wanted[gone]) > psnr(before[gone], wanted[gone]) + 1

@@ -17,12 +17,14 @@ import warnings
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
 
 from formats.errors import FormatError
-from fusedrf_cli.bridge import edit, scene
+from fusedrf_cli.bridge import editing, scene
+from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
@@ -70,9 +72,10 @@ def reading(read):
 
 
 def edited(path: str) -> None:
-    scene, members, node, field, _ = edit.read_fused(path)
-    edit.names_in(scene, field, node.name)
-    edit.remaining(scene, members, Path(path), (), node.object_to_world[:3, 3], False, Silence())
+    fused = editing.read_fused(path, Memory())
+    assert isinstance(fused.names, set)
+    asked = SimpleNamespace(names=(), allow_outside=False)
+    editing.remaining(asked, fused, "cpu", Silence())
 
 
 class Silence:
