@@ -4,6 +4,8 @@ numba's simulator.
 The simulator runs the functions as plain Python, so the cases are few and small.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -24,6 +26,7 @@ from tests.engine.kernels.simulated import (
     run_simulated,
 )
 from tests.engine.kernels.test_cpu import two_blocks
+from tests.engine.kinds.cases import BOXED, random_boxed
 from tests.engine.kinds.sparse_cases import random_sparse
 
 if HERE:
@@ -47,8 +50,10 @@ FIELDS = {
     "vm of two blocks": lambda dtype: two_blocks(TURNED).with_params(two_blocks(TURNED).params.to(dtype)),
     "sparse": lambda dtype: random_sparse(1, dtype=dtype),
     "sparse without bands": lambda dtype: random_sparse(0, dtype=dtype),
+    **{name: partial(random_boxed, name) for name in BOXED},
 }
-CASES = [(name, torch.float64) for name in FIELDS] + [("vm", torch.float32), ("sparse", torch.float32)]
+SINGLE = ["vm", "sparse", *BOXED]
+CASES = [(name, torch.float64) for name in FIELDS] + [(name, torch.float32) for name in SINGLE]
 every_field = pytest.mark.parametrize(
     "name, dtype", CASES, ids=[f"{name}, {str(dtype).removeprefix('torch.')}" for name, dtype in CASES]
 )

@@ -1,15 +1,23 @@
 """A small random field of each kind, in float64, dense enough to see."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields.box import BoxField
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.boxes import BoxKind
+from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, untrained
 from tests.analytic.rays import affine, turn
 
-from ..conftest import SIXTY_FOUR, random_vm
+from ..conftest import BOX, SIXTY_FOUR, random_vm
 from .sparse_cases import random_sparse
 
 
@@ -31,6 +39,21 @@ def random_vm_mlp(
     return VMMLPField(factors, {name: view.to(dtype) for name, view in weights.items()})
 
 
+def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
+    """A field of a kind over one box, of random numbers under a random occupancy, dense enough to see."""
+    kind = registry.kind(name)
+    shape = kind.shape(Way(ranks=(8, 16)))
+    if hasattr(shape, "hidden"):
+        shape = replace(shape, width=8, hidden=8)
+    generator = torch.Generator().manual_seed(seed)
+    grid = OccupancyGrid.full(BOX, 4)
+    grid = OccupancyGrid(grid.aabb, np.random.default_rng(seed).random(grid.occupied.shape) < 0.4)
+    field = kind.field(shape, BOX, (5, 8, 7), 3.0, -0.5, occupancy=grid)
+    numbers = torch.randn(len(field.params), generator=generator, dtype=torch.float64)
+    return field.with_params(numbers.to(dtype))
+
+
+BOXED = [name for name in registry.names() if isinstance(registry.kind(name), BoxKind)]
 KINDS = {
     "vm": lambda: random_vm(cells=4),
     "vm placed": lambda: random_vm(cells=4, matrix=affine(turn(25) @ np.diag([1, -0.8, 1.1]), (0.1, 0, 0))),
@@ -38,6 +61,7 @@ KINDS = {
     "vm-mlp": lambda: random_vm_mlp(cells=4, matrix=affine(turn(25) @ np.diag([1, -0.8, 1.1]), (0.1, 0, 0))),
     "sparse": lambda: random_sparse(0, depth=0),
     "sparse, levels and bands": lambda: random_sparse(2, depth=2),
+    **{name: partial(random_boxed, name) for name in BOXED},
 }
 
 
