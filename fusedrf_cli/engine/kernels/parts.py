@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import literally, njit
 
 body = njit(fastmath=True, error_model="numpy", cache=True, forceinline=True, _nrt=False)
 
@@ -209,10 +209,29 @@ def store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7):
 
 @body
 def add_scaled(count, out, o, weight, values, v):
-    """out[o : o + count] += weight * values[v : v + count]; the count is a multiple of 8."""
+    """out[o : o + count] += weight * values[v : v + count]; the count is a multiple of 8, and a constant."""
+    literally(count)  # known when this is compiled, and not only where it is inlined: the loop is unrolled
     for tile in range(np.uint64(count // 8)):
         at = tile * np.uint64(8)
         add_scaled_8(out, o + at, weight, values, v + at)
+
+
+@body
+def mixed_8(count, out, o, weights, w, values, v, stride):
+    """out[o : o + 8] = Σ_k weights[w + k] values[v + k stride : v + k stride + 8] over k < count."""
+    zero = out.dtype.type(0)
+    e0, e1, e2, e3, e4, e5, e6, e7 = zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(np.uint64(count)):
+        weight, at = weights[w + k], v + k * stride
+        e0 += weight * values[at]
+        e1 += weight * values[at + np.uint64(1)]
+        e2 += weight * values[at + np.uint64(2)]
+        e3 += weight * values[at + np.uint64(3)]
+        e4 += weight * values[at + np.uint64(4)]
+        e5 += weight * values[at + np.uint64(5)]
+        e6 += weight * values[at + np.uint64(6)]
+        e7 += weight * values[at + np.uint64(7)]
+    store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7)
 
 
 @body
@@ -224,6 +243,7 @@ def scatter_8(out, o, weight, values, v):
 @body
 def scatter(count, out, o, weight, values, v):
     """`add_scaled` to a place where others may be adding too."""
+    literally(count)
     for tile in range(np.uint64(count // 8)):
         at = tile * np.uint64(8)
         scatter_8(out, o + at, weight, values, v + at)

@@ -16,6 +16,7 @@ other, the directional basis (BASIS), its gradient (D_BASIS), the gradient of a 
 from typing import NamedTuple
 
 import numpy as np
+from numba import literally
 
 from fusedrf_cli.engine.kernels.parts import (
     add_scaled,
@@ -116,6 +117,8 @@ def mode_products(params, plane, line, na, nb, nc, a, b, c, out, base):
 
 def mode_scatter(rank, params, grads, plane, line, na, nb, nc, a, b, c, base, stride, scratch):
     """Adjoint of `mode_products`: adds into grads what scratch[base + r * stride] sends to plane and line."""
+    literally(rank)
+    literally(stride)
     ia, ta = texel(params, a, na)
     ib, tb = texel(params, b, nb)
     ic, tc = texel(params, c, nc)
@@ -308,16 +311,13 @@ def begin(field, b, d, scratch):
     x, y, z, _ = object_direction(field, b, d)
     sh_basis(count, (x, y, z), scratch, SH)
     start = np.uint64(field.layout[field.tensor[b], 12])
-    zero = scratch.dtype.type(0)
-    for c in range(3):
-        row = np.uint64(BASIS + c * width)
-        for r in range(np.uint64(width)):
-            scratch[row + r] = zero
-        for k in range(count):
-            source = start + np.uint64((c * count + k) * width)
-            for mode in range(np.uint64(3)):
-                at = mode * np.uint64(COLOUR_RANK)
-                add_scaled(COLOUR_RANK, scratch, row + at, scratch[SH + k], field.params, source + at)
+    for c in range(np.uint64(3)):
+        source, row = start + c * np.uint64(count * width), np.uint64(BASIS) + c * np.uint64(width)
+        for tile in range(np.uint64(width // 8)):
+            at = tile * np.uint64(8)
+            mixed_8(
+                count, scratch, row + at, scratch, np.uint64(SH), field.params, source + at, np.uint64(width)
+            )
 
 
 def end(field, b, d, scratch, grad):
