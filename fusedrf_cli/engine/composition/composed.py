@@ -72,8 +72,8 @@ class ComposedField:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) and rgb (N, 3) at points (N, 3) along unit dirs (N, 3)."""
         # Sums in double, rounded once: single ones would differ in the last bit with the order of the nodes.
-        kind = torch.float64 if self.rule == "add" else torch.float32
-        sigma, rgb = torch.zeros(len(points), dtype=kind), torch.zeros(len(points), 3, dtype=kind)
+        real = torch.float64 if self.rule == "add" else torch.float32
+        sigma, rgb = torch.zeros(len(points), dtype=real), torch.zeros(len(points), 3, dtype=real)
         ask = self._densest if self.rule == "max" else self._sum
         for placed in self.placed:  # one after the other: not all of them need to be in memory
             box = torch.from_numpy(placed.aabb)
