@@ -11,7 +11,7 @@ from safetensors.numpy import save
 from formats import atomic
 from formats.bundle import read_bundle
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
-from fusedrf_cli.engine.distillation.passes import FusedPass
+from fusedrf_cli.engine.fields.computed import ComputedField
 from tests.bridge.conftest import done, part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
@@ -81,14 +81,15 @@ def test_a_second_interrupt_does_not_wait(run, folder, interrupted_in_step):
 
 
 def test_bad_steps_are_told(report, run, folder, monkeypatch):
-    gradient, calls = FusedPass.gradient, []
+    gradient, calls = ComputedField.train_rays, []
 
-    def bad_twice(*words):
+    def bad_twice(self, batch, grads, loss):
         calls.append(0)
-        return gradient(*words) * (float("inf") if len(calls) in (5, 25) else 1)
+        gradient(self, batch, grads, loss)
+        loss *= float("inf") if len(calls) in (5, 25) else 1
 
     with monkeypatch.context() as patch:
-        patch.setattr(FusedPass, "gradient", bad_twice)
+        patch.setattr(ComputedField, "train_rays", bad_twice)
         said = train(report, "out.rfpack")
     assert said["skipped_steps"] == 2 and said["roll_backs"] == 0
     assert any("2 steps were not finite" in warning for warning in said["warnings"])
@@ -129,8 +130,7 @@ def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
 
 
 def test_divergence_is_exit_6(run, folder, monkeypatch):
-    gradient = FusedPass.gradient
-    monkeypatch.setattr(FusedPass, "gradient", lambda *words: float("nan") * gradient(*words))
+    monkeypatch.setattr(ComputedField, "train_rays", lambda self, batch, grads, loss: loss.fill(float("nan")))
     result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 6 and "diverged" in result.stderr and not (folder / "out.rfpack").exists()
     assert "44 steps" in result.stderr and "3 returns" in result.stderr

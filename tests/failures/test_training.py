@@ -18,8 +18,8 @@ from fusedrf_cli.engine.distillation import fit as module
 from fusedrf_cli.engine.distillation.fit import RATE, RETRY_AFTER, FitRun, FitSettings, fit
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.passes import FusedPass
 from fusedrf_cli.engine.distillation.teacher import Points
+from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, orbit, scattered
@@ -175,17 +175,16 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
 def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
     """One step in twenty is NaN: they change nothing, and 0.5 dB of the rest is lost at most."""
     clean = unseen_psnr(fit(CAMERAS, images, BOX, BRIEF))
-    gradient, calls = FusedPass.gradient, []
+    gradient, calls = ComputedField.train_rays, []
 
-    def poisoned(self, field, batch, grads):
+    def poisoned(self, batch, grads, loss):
         calls.append(0)
-        sums = gradient(self, field, batch, grads)
+        gradient(self, batch, grads, loss)
         if len(calls) % 20 == 7:
             grads[:, ::1000] = np.nan
-            sums[0] = np.nan
-        return sums
+            loss[0, 0] = np.nan
 
-    monkeypatch.setattr(FusedPass, "gradient", poisoned)
+    monkeypatch.setattr(ComputedField, "train_rays", poisoned)
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
     figure = clean - unseen_psnr(run.finish())
     assert run.guard.figures() == {"skipped_steps": 4, "roll_backs": 0} and run.steps == 80

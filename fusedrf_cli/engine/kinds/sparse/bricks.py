@@ -120,7 +120,7 @@ class BrickTree:
 
     @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as SparseArrays has them. Raises
+        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as in bodies.py. Raises
         ValueError where they would be too large."""
         depth = np.zeros(self.counts, np.uint8)
         held = np.zeros(self.counts, bool)
@@ -369,7 +369,7 @@ def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def corner_offsets(n: int) -> np.ndarray:
     """(8,) offsets of a voxel's corners from its first in a brick of n voxels a side, as `corner` of
-    sparse_bodies.py."""
+    bodies.py."""
     return (OCTANTS * [(n + 1) ** 2, n + 1, 1]).sum(1)
 
 
