@@ -2,9 +2,9 @@
 
 With x_world = M x_object + t and a unit world direction d: x_object = M^-1 (x_world - t), v = M^-1 d, the
 direction in the object's
-frame is v/|v|, and σ_world(x, d) = σ_object(x_object) |v| (DESIGN, Conventions). That is exact for any invertible M; a
-uniform scale k gives
-σ_object / k. Matrices are (4, 4) float64; columns act on points.
+frame is v/|v|, and σ_world(x, d) = σ_object(x_object) |v| (DESIGN, Conventions). That is
+exact for any invertible M; a uniform scale k gives σ_object / k. Matrices are (4, 4) float64; columns act
+on points.
 """
 
 from dataclasses import dataclass

@@ -29,10 +29,20 @@ class Part:
     """What it learns at, relative to the optimiser's rate."""
     spread: float = 0.0
     """Standard deviation of an untrained field's numbers."""
+    columns: int | None = None
+    """Of a row of numbers, how many are stored; the others fill it up to whole runs and are 0. None: all."""
+
+    @property
+    def on_vertices(self) -> bool:
+        """Whether it has a number, or a row of them, for each vertex of the grid."""
+        return self.axes == (0, 1, 2)
 
 
 class BoxField(ComputedField):
     """A field over one box; σ = scale softplus(feature + shift), scale in 1/length.
+
+    Of a part with numbers for each vertex of the grid those of *used* vertices alone are learnt and stored,
+    which touch a voxel that an occupied cell reaches into: no answer depends on the others.
 
     A kind sets `kind`, `bodies` and `shape_type`, a frozen dataclass of whole numbers that refuses what its
     bodies were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and `check_answers`.
@@ -68,18 +78,6 @@ class BoxField(ComputedField):
         """Raise ValueError where finite numbers could make an answer beyond MAX_ANSWER, whose difference from
         another could be NaN."""
         raise NotImplementedError
-
-    def stored_part(self, part: Part) -> tuple[int, ...]:
-        """Shape under which a part is stored; `pack` and `unpack` lead there and back."""
-        return part.shape
-
-    def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
-        """A part as it is stored."""
-        return values
-
-    def unpack(self, part: Part, stored: torch.Tensor) -> torch.Tensor:
-        """Inverse of `pack`."""
-        return stored
 
     # -- making ------------------------------------------------------------------------------------------
 
@@ -159,10 +157,30 @@ class BoxField(ComputedField):
         """Texels per axis (3,) int64, lower corner (3,) and sides (3,) of the box, as kernels read them."""
         return np.asarray(self.resolution, np.int64), self.box[:3].copy(), self.box[3:] - self.box[:3]
 
+    @property
+    def used(self) -> np.ndarray:
+        """(nx, ny, nz) bool: the vertices of voxels that an occupied cell reaches into."""
+        return used_vertices(self.occupancy, self.box, self.resolution)
+
+    # -- learning ----------------------------------------------------------------------------------------
+
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "BoxField":
+        """See ComputedField."""
+        return super().with_occupancy(occupancy)._afresh("reached")
+
+    @cached_property
+    def reached(self) -> list[np.ndarray | None]:
+        """For each part, where the cache lines begin that hold numbers of used vertices; None: all."""
+        vertices = np.flatnonzero(self.used) if any(part.on_vertices for part in self.parts) else None
+        return [
+            start + lines_of(vertices, int(np.prod(part.shape[3:]))) if part.on_vertices else None
+            for part, start in zip(self.parts, self.starts, strict=False)
+        ]
+
     def groups(self) -> list[Group]:
         """See ComputedField."""
-        ends = zip(self.parts, self.starts, self.starts[1:], strict=False)
-        return [Group(int(low), int(high), part.rate) for part, low, high in ends]
+        ends = zip(self.parts, self.starts, self.starts[1:], self.reached, strict=False)
+        return [Group(int(low), int(high), part.rate, lines) for part, low, high, lines in ends]
 
     # -- storing -----------------------------------------------------------------------------------------
 
@@ -183,6 +201,26 @@ class BoxField(ComputedField):
         }
         return arrays, metadata
 
+    def stored_shape(self, part: Part) -> tuple[int, ...]:
+        """Shape under which a part is stored; of vertices, the used ones in order."""
+        shape = (int(np.count_nonzero(self.used)), *part.shape[3:]) if part.on_vertices else part.shape
+        return shape if part.columns is None else (*shape[:-1], part.columns)
+
+    def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
+        """A part as it is stored."""
+        kept = values[torch.from_numpy(self.used)] if part.on_vertices else values
+        return kept if part.columns is None else kept[..., : part.columns]
+
+    def unpack(self, part: Part, stored: torch.Tensor) -> torch.Tensor:
+        """Inverse of `pack`; what is not stored is 0."""
+        if part.columns is not None:
+            stored = torch.nn.functional.pad(stored, (0, part.shape[-1] - part.columns))
+        if not part.on_vertices:
+            return stored
+        whole = torch.zeros(part.shape)
+        whole[torch.from_numpy(self.used)] = stored
+        return whole
+
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "BoxField":
         """Inverse of `state`. Every number is checked before it can size an array or index one. Raises
@@ -198,7 +236,7 @@ class BoxField(ComputedField):
         )
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
         for part in bare.parts:  # before `params` takes memory
-            found, expected = arrays.get(part.name), bare.stored_part(part)
+            found, expected = arrays.get(part.name), bare.stored_shape(part)
             if found is None or found.shape != expected:
                 have = "nothing" if found is None else list(found.shape)
                 raise ValueError(f"array '{part.name}' should have shape {list(expected)}, found {have}")
@@ -219,6 +257,29 @@ class BoxField(ComputedField):
         """Raise ValueError where a colour's logit could be beyond MAX_ANSWER."""
         if not largest <= MAX_ANSWER:
             raise ValueError(f"a colour's logit would reach {largest:.3g}, expected at most {MAX_ANSWER:g}")
+
+
+def lines_of(rows: np.ndarray, width: int) -> np.ndarray:
+    """(L,) where the cache lines begin that hold any number of some rows (N,) of a table so wide."""
+    numbers = rows[:, None] * width + np.unique([*range(0, width, LINE), width - 1])
+    return np.unique(numbers // LINE) * LINE
+
+
+def used_vertices(occupancy: OccupancyGrid, box: np.ndarray, resolution: tuple[int, int, int]) -> np.ndarray:
+    """(nx, ny, nz) bool: vertices of a grid over a box (6,) within a voxel of an occupied cell."""
+    spans = []
+    for axis in range(3):
+        at = np.linspace(box[axis], box[axis + 3], resolution[axis])
+        voxel = (box[axis + 3] - box[axis]) / (resolution[axis] - 1)
+        cells = occupancy.occupied.shape[axis]
+        place = (np.stack([at - voxel, at + voxel]) - occupancy.aabb[axis]) / occupancy.cell[axis]
+        low, high = np.floor(place[0]).astype(int), np.floor(place[1]).astype(int)
+        spans.append((np.clip(low, 0, cells), np.clip(high + 1, 0, cells)))
+    found = occupancy.occupied
+    for axis, (low, high) in enumerate(spans):  # the box of cells around a vertex is a product of three runs
+        total = np.concatenate([np.zeros_like(found.take([0], axis), int), np.cumsum(found, axis)], axis)
+        found = total.take(high, axis) > total.take(low, axis)
+    return found
 
 
 def checked_box(values: list, what: str) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from fusedrf_cli.engine.kernels.parts import (
     add_scaled,
+    dot,
     linear,
     scatter,
     sh_basis,
@@ -117,15 +118,6 @@ def end(field, frame, d, scratch, grad):
             scratch[row + r] = 0
 
 
-def logit(scratch, memory, at, c):
-    """Inner product of row c of the folded basis with the features in memory[at:]."""
-    row, features = np.uint64(BASIS + c * COLOUR), np.uint64(at)
-    total = scratch.dtype.type(0)
-    for r in range(np.uint64(COLOUR)):
-        total += scratch[row + r] * memory[features + r]
-    return total
-
-
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py; keeps the colour's products."""
     x, y = texels_of(COLOUR, field, 3, 0, place), texels_of(COLOUR, field, 3, 1, place)
@@ -137,8 +129,11 @@ def colour(field, place, p, d, scratch, memory, at):
         e4, e5 = product(params, x, y, z, r + np.uint64(4)), product(params, x, y, z, r + np.uint64(5))
         e6, e7 = product(params, x, y, z, r + np.uint64(6)), product(params, x, y, z, r + np.uint64(7))
         store_8(memory, np.uint64(at) + r, e0, e1, e2, e3, e4, e5, e6, e7)
-    red, green = logit(scratch, memory, at, 0), logit(scratch, memory, at, 1)
-    return float(sigmoid(red)), float(sigmoid(green)), float(sigmoid(logit(scratch, memory, at, 2)))
+    features = np.uint64(at)
+    red = dot(COLOUR, scratch, np.uint64(BASIS), memory, features)
+    green = dot(COLOUR, scratch, np.uint64(BASIS + COLOUR), memory, features)
+    blue = dot(COLOUR, scratch, np.uint64(BASIS + 2 * COLOUR), memory, features)
+    return float(sigmoid(red)), float(sigmoid(green)), float(sigmoid(blue))
 
 
 def line_gradients(params, x, y, z, sent, r):
