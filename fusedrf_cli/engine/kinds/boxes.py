@@ -47,8 +47,8 @@ class BoxKind(Kind):
 
 
 class GridStudent(Student):
-    """A student with numbers for each vertex of a grid, of which those of the scene's occupied cells alone are
-    stored."""
+    """A student with numbers for each vertex of a grid, of which those in occupied cells of the scene alone
+    are stored."""
 
     def plan(self, way: Way, numbers: int) -> Plan:
         """See Student; `numbers` counts what is stored."""
