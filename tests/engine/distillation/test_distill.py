@@ -145,7 +145,7 @@ def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
         pass
 
     @contextlib.contextmanager
-    def whole():
+    def uninterrupted():
         if left and not left.pop():
             raise Stop
         yield
@@ -153,7 +153,7 @@ def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
     left = [0] + [1] * at
     run = a_run(brief)
     with pytest.raises(Stop):
-        run.finish(whole=whole)
+        run.finish(uninterrupted=uninterrupted)
     arrays, state = run.checkpoint()
     arrays = {name: np.array(values) for name, values in arrays.items()}
     again = a_run(brief)

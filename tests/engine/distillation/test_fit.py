@@ -111,9 +111,9 @@ def test_texels_are_near_cubic_but_for_flat_boxes():
 def test_occupancy_finds_matter_and_forgets_nothing_known_empty():
     """All of a dense field is occupied; where the grid already said empty it stays so."""
     field = random_vm(THIRTY_TWO, dtype=torch.float32, scale=100.0)
-    assert occupancy_of(field, 8).occupied.all()
+    assert occupancy_of(field, cells=8).occupied.all()
     left = np.zeros((8, 8, 8), bool)
     left[:3] = True
-    again = occupancy_of(field.with_occupancy(OccupancyGrid(BOX, left)), 8)
+    again = occupancy_of(field.with_occupancy(OccupancyGrid(BOX, left)), cells=8)
     assert not again.occupied[-2:].any() and again.occupied[:2].all()
-    assert not occupancy_of(random_vm(THIRTY_TWO, dtype=torch.float32, scale=1e-6), 8).occupied.any()
+    assert not occupancy_of(random_vm(THIRTY_TWO, dtype=torch.float32, scale=1e-6), cells=8).occupied.any()

@@ -3,7 +3,7 @@ that lie at the vertices (DVGO, Sun et al., CVPR 2022; for sharing it Control-Ne
 
 With v the features of a point, trilinear between vertices, and the decoder's input x = [v, SH(d)] (INPUTS
 numbers): h = max(0, W x + b) of HIDDEN numbers, rgb = sigmoid(V h + c). Both layers lie in params from
-`decoder` on, each as (inputs, outputs) and then its bias; the three outputs are filled up to OUTPUTS.
+`decoder` and `output` on, each as (inputs, outputs) and then its bias; the outputs are filled up to OUTPUTS.
 
 Scratch holds the gradients of the outputs (D_OUT), of h (D_HIDDEN) and of x (D_INPUT), and the harmonics
 (SH); of a shaded sample are kept x, h (HIDDEN_AT) and the outputs (OUT_AT).
@@ -38,8 +38,10 @@ from fusedrf_cli.engine.kinds.dense.bodies import (  # noqa: F401  (of the names
 OUTPUTS = 8
 HARMONICS = 16
 
-Arrays = NamedTuple("Arrays", [*grid_kind.Arrays.__annotations__.items(), ("decoder", object)])
-"""The `dense` kind's, and where in params the decoder begins."""
+Arrays = NamedTuple(
+    "Arrays", [*grid_kind.Arrays.__annotations__.items(), ("decoder", object), ("output", object)]
+)
+"""The `dense` kind's, and where in params the decoder and its second layer begin."""
 
 
 def sizes(field):
@@ -58,11 +60,6 @@ def begin(field, frame, d, scratch):
     sh_basis(HARMONICS, d, scratch, SH)
 
 
-def second_layer(field):
-    """Where the second layer begins in params."""
-    return np.uint64(field.decoder + (INPUTS + 1) * HIDDEN)
-
-
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py; keeps all that the decoder computes."""
     real, base = field.params.dtype.type, np.uint64(at)
@@ -76,7 +73,7 @@ def colour(field, place, p, d, scratch, memory, at):
     hidden, out = base + np.uint64(HIDDEN_AT), base + np.uint64(OUT_AT)
     dense(INPUTS, HIDDEN, field.params, np.uint64(field.decoder), memory, base, memory, hidden)
     rectify(HIDDEN, memory, hidden)
-    dense(HIDDEN, OUTPUTS, field.params, second_layer(field), memory, hidden, memory, out)
+    dense(HIDDEN, OUTPUTS, field.params, np.uint64(field.output), memory, hidden, memory, out)
     red, green, blue = memory[out], memory[out + np.uint64(1)], memory[out + np.uint64(2)]
     return float(sigmoid(red)), float(sigmoid(green)), float(sigmoid(blue))
 
@@ -91,7 +88,7 @@ def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memo
         for c in range(3):
             scratch[D_OUT + c] = real(d_rgb[c] * rgb[c] * (1 - rgb[c]))
         dense_backward(
-            HIDDEN, OUTPUTS, field.params, second_layer(field), memory, hidden, True, scratch, d_out, scratch,
+            HIDDEN, OUTPUTS, field.params, np.uint64(field.output), memory, hidden, True, scratch, d_out, scratch,
             d_hidden, grad,
         )  # fmt: skip
         dense_backward(

@@ -60,7 +60,7 @@ class DenseMLPField(DenseField):
 
     def kernel_arrays(self, params: object) -> bodies.Arrays:
         """See ComputedField."""
-        return bodies.Arrays(*super().kernel_arrays(params), int(self.starts[2]))
+        return bodies.Arrays(*super().kernel_arrays(params), *map(int, self.starts[[2, 4]]))
 
     def reference(self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor):
         """See reference.py."""

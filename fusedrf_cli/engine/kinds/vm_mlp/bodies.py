@@ -44,7 +44,8 @@ def sizes(field) -> dict[str, int]:
     starts = np.cumsum([0, *held.values()]).tolist()
     kept = np.cumsum([3 * rank, inputs, width, width, OUTPUTS]).tolist()
     return {
-        "DENSITY_RANK": field.shape.density_rank, "COLOUR_RANK": rank, "FEATURES": features, "WIDTH": width,
+        "DENSITY_RANK": field.shape.density_rank, "COLOUR_RANK": rank, "PRODUCTS": 3 * rank,
+        "FEATURES": features, "WIDTH": width,
         "INPUTS": inputs, **dict(zip(held, starts, strict=False)), "SCRATCH": starts[-1],
         "INPUT": kept[0], "FIRST": kept[1], "SECOND": kept[2], "LAST": kept[3], "KEPT": kept[4],
         "LEARN_FROM": 1 / 64, "SHADING_COST": 8,
@@ -71,9 +72,9 @@ def colour(field, place, p, d, scratch, memory, at):
     u, v, w, _ = unit_point(field, 0, p)
     colour_features(field, 0, u, v, w, memory, at)
     base, x = np.uint64(at), np.uint64(at + INPUT)
-    basis, width = np.uint64(field.layout[0, 12]), np.uint64(3 * COLOUR_RANK)
+    basis, width = np.uint64(field.layout[0, 12]), np.uint64(PRODUCTS)
     for j in range(np.uint64(FEATURES)):
-        memory[x + j] = dot(3 * COLOUR_RANK, field.params, basis + j * width, memory, base)
+        memory[x + j] = dot(PRODUCTS, field.params, basis + j * width, memory, base)
     for j in range(np.uint64(3)):
         memory[x + np.uint64(FEATURES) + j] = scratch[np.uint64(WAY) + j]
     encode(memory, x)
@@ -138,14 +139,14 @@ def colour_backward(field, p, rgb, d_rgb, scratch, memory, at, grad):
         INPUTS, WIDTH, field.params, network, memory, x, False, scratch, d_first, scratch, d_input, grad
     )
     encode_backward(memory, x, scratch)
-    basis, width = np.uint64(field.layout[0, 12]), np.uint64(3 * COLOUR_RANK)
+    basis, width = np.uint64(field.layout[0, 12]), np.uint64(PRODUCTS)
     d_features = np.uint64(D_FEATURES)
     for r in range(width):
         scratch[d_features + r] = 0
     for j in range(np.uint64(FEATURES)):
         d_x = scratch[np.uint64(D_X) + j]
-        add_scaled(3 * COLOUR_RANK, scratch, d_features, d_x, field.params, basis + j * width)
-        scatter(3 * COLOUR_RANK, grad, basis + j * width, d_x, memory, base)
+        add_scaled(PRODUCTS, scratch, d_features, d_x, field.params, basis + j * width)
+        scatter(PRODUCTS, grad, basis + j * width, d_x, memory, base)
     u, v, w, _ = unit_point(field, 0, p)
     scatter_colour(field, grad, 0, u, v, w, scratch)
 
