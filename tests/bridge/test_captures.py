@@ -18,7 +18,7 @@ DRAFT = ("--quality", "draft")
 def short(monkeypatch):
     """Steps, not seconds, decide, so that a busy machine changes nothing."""
     settings = FitSettings(longest=16, steps=300, samples=1 << 12)
-    monkeypatch.setattr(part("train"), "QUALITY", {"draft": settings})
+    monkeypatch.setattr(part("training"), "QUALITY", {"draft": settings})
 
 
 def eyes(count: int) -> list[np.ndarray]:

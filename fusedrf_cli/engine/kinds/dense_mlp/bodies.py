@@ -88,8 +88,8 @@ def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memo
         for c in range(3):
             scratch[D_OUT + c] = real(d_rgb[c] * rgb[c] * (1 - rgb[c]))
         dense_backward(
-            HIDDEN, OUTPUTS, field.params, np.uint64(field.output), memory, hidden, True, scratch, d_out, scratch,
-            d_hidden, grad,
+            HIDDEN, OUTPUTS, field.params, np.uint64(field.output), memory, hidden, True, scratch, d_out,
+            scratch, d_hidden, grad,
         )  # fmt: skip
         dense_backward(
             INPUTS, HIDDEN, field.params, np.uint64(field.decoder), memory, base, False, scratch, d_hidden,
