@@ -14,6 +14,14 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields.box import (
+    DENSITY_SCALE_PER_EXTENT,
+    DENSITY_SHIFT,
+    MAX_ANSWER,
+    interpolate_axis,
+    unit_texels,
+    whole_numbers,
+)
 from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
@@ -31,11 +39,7 @@ OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several bl
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 MAX_STRIDE = 64
-MAX_TEXELS = 8192  # per axis, in a stored field
-MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
 BASIS_RATE = 0.05  # TensoRF: 1e-3 for the colour basis where factors learn at 2e-2
-DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
-DENSITY_SCALE_PER_EXTENT = 75.0
 
 
 @dataclass(frozen=True)
@@ -420,34 +424,6 @@ def stored_block(i: int, stored: dict, tensors: int) -> Block:
     if sizes[-1] <= 1e-6 * sizes[0]:
         raise ValueError(f"block {i}: object_to_field is singular")
     return Block(stored["tensor"], matrix, str(stored["name"]))
-
-
-def whole_numbers(values: list, least: int, what: str) -> tuple[int, int, int]:
-    """Three whole numbers from `least` to MAX_TEXELS."""
-    if len(values) != 3 or any(type(n) is not int or not least <= n <= MAX_TEXELS for n in values):
-        raise ValueError(f"{what} should be three whole numbers from {least} to {MAX_TEXELS}, found {values}")
-    return tuple(values)
-
-
-def unit_texels(aabb: np.ndarray, old_aabb: np.ndarray, axis: int, count: int) -> torch.Tensor:
-    """(count,) float64 positions of a box's texels on one axis, in unit coordinates of another box."""
-    at = torch.linspace(float(aabb[axis]), float(aabb[axis + 3]), count, dtype=torch.float64)
-    return (at - old_aabb[axis]) / (old_aabb[axis + 3] - old_aabb[axis])
-
-
-def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> torch.Tensor:
-    """Linear interpolation of values along one axis at unit coordinates, corners aligned; 0 outside [0,
-    1]."""
-    n = values.shape[axis]
-    position = unit * (n - 1)
-    lower = position.floor().clamp(0, n - 2).long()
-    fraction = (position - lower).to(values.dtype)
-    inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)
-    shape = [-1 if a == axis else 1 for a in range(values.dim())]
-    fraction, inside = fraction.view(shape), inside.view(shape)
-    return inside * (
-        (1 - fraction) * values.index_select(axis, lower) + fraction * values.index_select(axis, lower + 1)
-    )
 
 
 def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
