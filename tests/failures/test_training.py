@@ -101,7 +101,7 @@ def test_t1_a_cut_box_that_turns_out_empty_is_not_taken(images, monkeypatch):
     corner = np.zeros((8, 8, 8), bool)
     corner[:2, :2, :2] = True
     answers = iter([OccupancyGrid(BOX, corner), OccupancyGrid(BOX, ~corner & corner)])
-    monkeypatch.setattr(module, "occupancy_of", lambda field: next(answers))
+    monkeypatch.setattr(module, "occupancy_of", lambda field, box=None: next(answers))
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
     run.refresh_occupancy()
     assert np.array_equal(run.field.aabb, BOX) and np.array_equal(run.field.occupancy.occupied, corner)
