@@ -29,15 +29,15 @@ def test_every_kind_of_field_is_tried():
 
 
 def test_one_pass_renders_what_the_general_renderer_does(field):
-    """Steps as fine as the finest voxel; both composite by the same rule, one without the colours of samples
-    that weigh next to nothing."""
+    """At steps so fine that it does not matter for how many of them a sample stands; both composite by the
+    same rule, one without the colours of samples that weigh next to nothing."""
     rays_o, rays_d = rays_at(field.aabb, 150)
-    step = 0.25 * field.voxel_size
+    step = 0.05 * field.voxel_size
     fast = render_rays(field, rays_o, rays_d, step=step)
     slow = np.zeros_like(fast)
     march_rays(field, rays_o, rays_d, 0.0, step, 1e-3, slow)
     assert fast[:, 3].max() > 0.5
-    np.testing.assert_allclose(fast, slow, atol=0.02)
+    np.testing.assert_allclose(fast, slow, atol=0.04)
 
 
 def test_the_gradient_of_a_loss_is_that_of_finite_differences(field):

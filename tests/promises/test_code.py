@@ -52,7 +52,8 @@ print(json.dumps({"events": sorted(events), "strangers": sorted(opened - {path})
 """
 UNPICKLING = """
 import pickle
-formats.bundle.decode_field = lambda data, where: pickle.loads(pickle.dumps(FormatError))
+decode = formats.bundle.decode_field
+formats.bundle.decode_field = lambda data, where: pickle.loads(pickle.dumps(decode(data, where)))
 """
 
 
