@@ -29,7 +29,7 @@ def command(field, output, progress, **words):
 
     \b
     Example:
-      fusedrf convert tower.rfpack -o small.rfpack --kind cp
+      fusedrf convert chair.rfpack -o small.rfpack --kind cp
     """
     from fusedrf_cli import bridge
 

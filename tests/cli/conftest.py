@@ -15,7 +15,7 @@ from formats.records import FieldRecord
 from fusedrf_cli.main import cli
 
 ROOT = Path(__file__).parents[2]
-BRIDGE_VERBS = ("train", "fuse", "add", "delete", "render", "evaluate", "chart")
+BRIDGE_VERBS = ("train", "fuse", "convert", "add", "delete", "render", "evaluate", "chart")
 
 
 @pytest.fixture
@@ -56,6 +56,7 @@ def bridge(monkeypatch) -> types.ModuleType:
 
     for name in BRIDGE_VERBS:
         setattr(stub, name, verb(name))
+    stub.list_kinds = lambda progress: stub.report
     monkeypatch.setitem(sys.modules, "fusedrf_cli.bridge", stub)
     monkeypatch.setattr(fusedrf_cli, "bridge", stub, raising=False)
     return stub

@@ -133,6 +133,7 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "holdout": 8,
         "precision": "float16",
         "aabb": (0, 0, 0, 1, 1, 1),
+        "masks": "ignore",
         "resume": False,
     }
 

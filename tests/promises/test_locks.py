@@ -35,10 +35,11 @@ EDITING = """
 import dataclasses, sys, time, types
 from formats.bundle import BundleWriter, read_bundle
 from formats.scene import make_node
-def add(fused, source, output, *, name, **words):
+def add(request, progress):
+    fused, output = request.fused, request.output
     bundle = read_bundle(fused)
     time.sleep(0.02)
-    scene = dataclasses.replace(bundle.scene, nodes=(*bundle.scene.nodes, make_node(name)))
+    scene = dataclasses.replace(bundle.scene, nodes=(*bundle.scene.nodes, make_node(request.name)))
     writer = BundleWriter()
     for member in bundle.fields:
         writer.copy_field(fused, member)
@@ -55,8 +56,8 @@ formats.locks.output_lock = lambda *_: contextlib.nullcontext()
 HOLDING = """
 import sys, time, types
 from formats.atomic import atomic_writer
-def train(source, output, **words):
-    with atomic_writer(output) as file:
+def train(request, progress):
+    with atomic_writer(request.output) as file:
         file.write(b"half")
         print("ready", flush=True)
         time.sleep(60)

@@ -273,6 +273,7 @@ COMMAND = "import sys\nfrom fusedrf_cli.main import main\nmain()"
 # All is imported before: the interpreter's own folders may be closed to others.
 AS_NOBODY = (
     "import difflib, os, sys\nimport formats.locks, fusedrf_cli.commands.train\n"
+    "import fusedrf_cli.engine.kinds.registry\n"
     "from fusedrf_cli.main import main\nos.setuid(65534)\nmain()"
 )
 
