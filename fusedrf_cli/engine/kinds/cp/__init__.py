@@ -9,7 +9,7 @@ class CPKind(BoxKind):
 
     name = "cp"
     good_for = (
-        "Single objects in a few hundred kilobytes, at some 3 dB less than vm and more time per sample."
+        "Single objects in a few hundred kilobytes; more work per sample than vm."
     )
     field = CPField
     takes = frozenset({"ranks", "sh_degree"})

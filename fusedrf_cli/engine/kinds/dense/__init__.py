@@ -8,7 +8,7 @@ class DenseKind(BoxKind):
     """See Kind."""
 
     name = "dense"
-    good_for = "Sharp local detail and fast answers where megabytes do not matter; simple to read elsewhere."
+    good_for = "A plain grid: simple to read elsewhere, where megabytes do not matter."
     field = DenseField
     takes = frozenset({"sh_degree"})
 

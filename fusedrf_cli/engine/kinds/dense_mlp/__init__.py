@@ -8,7 +8,7 @@ class DenseMLPKind(BoxKind):
     """See Kind."""
 
     name = "dense-mlp"
-    good_for = "Fields that are to share one decoder of colours, so that their features can be mixed."
+    good_for = "A plain grid of features with a small decoder of colours."
     field = DenseMLPField
 
 
