@@ -147,12 +147,12 @@ def rays_through(generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
 def march_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
     """All samples of rays that lie in occupied cells."""
     half, alive = np.full(RAYS, 0.5), np.ones(RAYS, bool)
-    ts, found = np.zeros((RAYS, int(4 / STEP))), np.zeros(RAYS, np.int64)
+    (ts, spans), found = np.zeros((2, RAYS, int(4 / STEP))), np.zeros(RAYS, np.int64)
     loops = cpu.loops_for(None, (), bounded)
 
     def ours():
         start = np.zeros(RAYS, np.int64)
-        loops.march(field.grid, rays_o, rays_d, 0.0, half, STEP, start, alive, ts, found)
+        loops.march(field.grid, rays_o, rays_d, 0.0, half, STEP, start, alive, ts, spans, found)
 
     tensors = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
 

@@ -76,7 +76,7 @@ class Scene:
     def aabb(self) -> np.ndarray:
         """(6,) float64 box in the world outside of which nothing is."""
         field, origin, _ = self._asked()
-        return field.occupancy.tight_aabb(0) + np.tile(origin, 2)
+        return field.occupancy.subject + np.tile(origin, 2)
 
     def parameters(self) -> list[torch.Tensor]:
         """The numbers (P,) of each field, once, made to require gradients: what an optimiser is given."""

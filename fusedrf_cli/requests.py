@@ -43,6 +43,11 @@ class TrainRequest(Learning):
     views: int
     size: int
     aabb: tuple[float, ...] | None
+    unbounded: bool | None
+    """Whether the field is to fill all of space; None: as the capture needs."""
+    centre: tuple[float, float, float] | None
+    radius: float | None
+    """Of the core of unbounded space, whose detail is finest."""
     masks: str
     """What the pixels mean that masks exclude: "ignore" or "alpha"."""
     memory: int | None

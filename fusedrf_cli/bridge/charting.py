@@ -17,7 +17,7 @@ from fusedrf_cli import plots
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
-from fusedrf_cli.bridge.rendering import renderable
+from fusedrf_cli.bridge.rendering import placed_box, renderable
 from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
@@ -92,7 +92,7 @@ class Benchmark:
         needed["the pictures to compare with"] = VIEWS * size[0] * size[1] * PER_PIXEL_KEPT
         memory.expect(needed, advice="give a smaller --size")
         if box is None:
-            box = composed.occupancy.tight_aabb(0) + np.tile(composed.origin, 2)
+            box = placed_box(composed.occupancy.subject, composed.origin)
         cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
         truth = [render_image(composed, c, origin=composed.origin).over(WHITE) for c in cameras]
         return cls(scene, memory, size, allow_outside, place, box, truth, source_bytes(loaded))

@@ -6,7 +6,7 @@ import numpy as np
 
 from formats.captures import is_capture, load_images, read_capture
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
-from fusedrf_cli.bridge.rendering import picture_memory, renderable
+from fusedrf_cli.bridge.rendering import picture_memory, placed_box, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.training import WHITE, camera_of, over_white
@@ -84,7 +84,7 @@ def scene_pairs(
     """(camera, truth, how many) of another scene, seen from views around it."""
     loaded = load_scene(against, allow_outside, budget, place)
     field, origin = renderable(loaded)
-    box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
+    box = placed_box(field.occupancy.subject, origin)
     width, height = size or SCENE_SIZE
     composed = not hasattr(field, "render_rays")
     needed = sources(loaded.sizes) | picture(width, height, composed) | measured(width, height)

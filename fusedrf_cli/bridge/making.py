@@ -39,7 +39,7 @@ class Scene:
     def of(cls, loaded: LoadedScene) -> "Scene":
         """A loaded scene."""
         composed = loaded.composed()
-        boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
+        boxes = [composed.occupancy.subject, *sorted((p.aabb for p in composed.placed), key=list)]
         return cls(loaded, composed, boxes)
 
     def background(self) -> Placed:

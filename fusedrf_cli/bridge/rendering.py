@@ -16,6 +16,7 @@ from fusedrf_cli.bridge.memory import Memory, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.training import camera_of
+from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
@@ -76,13 +77,14 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
 
 
 def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
-    """The field to march and the world position of its frame's origin: a lone field that is only moved is
-    taken as it is.
+    """The field to march, and where its frame lies in the world (see `render_image`): a lone field is taken
+    as it is.
     """
     if len(loaded.fields) == 1:
         placed = loaded.fields[0].placed
         if np.array_equal(placed.object_to_world[:3, :3], np.eye(3)):
             return opened(placed.field), placed.object_to_world[:3, 3]
+        return opened(placed.field), placed.object_to_world
     composed = loaded.composed()
     return composed, composed.origin
 
@@ -93,9 +95,14 @@ def choose_views(
     """The views a user asked for; with no choice, one that frames everything."""
     if cameras:
         return [camera_of(v) for v in read_cameras(cameras, size)]
-    box = field.occupancy.tight_aabb(0) + np.tile(origin, 2)
+    box = placed_box(field.occupancy.subject, origin)
     width, height = size or DEFAULT_SIZE
     return orbit(box, count, width, height) if count else [framing_camera(box, 0.9, 0.45, width, height)]
+
+
+def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(6,) world box around a box (6,) of a frame that lies at `origin` (see `render_image`)."""
+    return box + np.tile(origin, 2) if origin.shape == (3,) else transformed_aabb(box, origin)
 
 
 def to_pixels(shot: RenderedImage, background: tuple[float, float, float] | None) -> np.ndarray:

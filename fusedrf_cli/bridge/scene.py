@@ -205,13 +205,14 @@ class _Loader:
 
 
 def background_of(scene: LoadedScene) -> SourceField:
-    """The node marked as background, else the one with the largest box."""
+    """The node marked as background, else one that fills all of space, else the one with the largest box."""
     marked = [f for f in scene.fields if f.background]
-    return (
-        marked[0]
-        if marked
-        else max(scene.fields, key=lambda f: float(np.prod(f.placed.aabb[3:] - f.placed.aabb[:3])))
-    )
+    return marked[0] if marked else max(scene.fields, key=_volume)
+
+
+def _volume(source: SourceField) -> tuple[bool, float]:
+    placed = source.placed
+    return placed.unbounded, float(np.prod(placed.aabb[3:] - placed.aabb[:3]))
 
 
 def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list[dict]:
@@ -254,17 +255,28 @@ def write_field(
     extras: dict | None = None,
 ) -> int:
     """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
-    node is moved to origin (3,). Returns the bytes written. `extras` are the scene's keys that this version
-    does not know.
+    node is placed at `origin`: a position (3,), or a placement (4, 4). Returns the bytes written. `extras`
+    are the scene's keys that this version does not know.
     """
     writer = BundleWriter()
     for member, path in (kept or {}).items():
         writer.copy_field(path, member)
     arrays, metadata = field.state()
     member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
-    where = None if origin is None or not np.any(origin) else [float(v) for v in origin]
-    node = make_node(name, field=member, translation=where)
+    node = make_node(name, field=member, **placement_of(origin))
     generator = f"fusedrf {__version__}"
     graph = SceneGraph(nodes=(node,), history=history, generator=generator, extras=extras or {})
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
+
+
+def placement_of(origin: np.ndarray | None) -> dict:
+    """What a node says of where it lies, as `make_node` takes it: a position (3,), or a placement (4, 4)."""
+    if origin is None or not np.any(origin) or np.array_equal(origin, np.eye(4)):
+        return {}
+    if origin.shape == (3,):
+        return {"translation": [float(v) for v in origin]}
+    unit = float(origin[0, 0])
+    if not np.array_equal(origin[:3, :3], unit * np.eye(3)):
+        return {"matrix": origin}
+    return placement_of(origin[:3, 3]) | ({} if unit == 1 else {"scale": [unit] * 3})

@@ -11,6 +11,7 @@ from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_photos, read_capture
 from formats.meshes import mesh_capture
 from formats.views import Capture, View
+from fusedrf_cli.bridge.extent import Extent, extent_of
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.running import (
     checkpoint_mismatch,
@@ -50,28 +51,30 @@ def train(request: TrainRequest, progress) -> dict:
         kind = trained_kind(request)
         progress.phase("reading", None)
         capture = read_views(request, progress)
-        box = box_of(request, capture)
-        settings = fit_settings(request, kind, capture, box, place)
-        plan = kind.untrained(box, settings.longest, settings.way)
+        extent = extent_of(request, capture, cuts_out(request, capture))
+        settings = fit_settings(request, kind, capture, extent, place)
+        plan = kind.untrained(extent.box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision))
         memory.expect(
             fit_memory(capture, plan, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
-        cameras, pictures = [camera_of(v) for v in capture.train], pictures_of(request, capture)
-        run = FitRun.start(cameras, pictures, box, settings, Path(request.source).resolve().stem)
+        cameras = [extent.camera(camera_of(v)) for v in capture.train]
+        pictures = pictures_of(request, capture)
+        run = FitRun.start(cameras, pictures, extent.box, settings, Path(request.source).resolve().stem)
         if saved:
             if saved[1].get("kind") != kind.name:
                 raise checkpoint_mismatch(request.output)
             run.restore(*saved)
         field, seconds = _run(run, request.output, progress)
         progress.phase("measuring", None)
-        measured = measure(field, capture) if request.holdout else None
+        measured = measure(field, capture, extent.origin) if request.holdout else None
         size = write_field(
             request.output,
             field,
             Path(request.output).stem,
             precision=request.precision,
             overwrite=request.overwrite,
+            origin=extent.origin,
         )
         checkpoint_path(request.output).unlink(missing_ok=True)
     report = {
@@ -80,7 +83,7 @@ def train(request: TrainRequest, progress) -> dict:
         "kind": field.kind,
         "views": len(capture.train),
         "capture": capture.summary(),
-        "aabb": box.tolist(),
+        **extent.report(),
         "steps": run.steps,
         **kind.describe(field),
         "seconds": {"training": seconds},
@@ -133,14 +136,6 @@ def cuts_out(request: TrainRequest, capture: Capture) -> bool:
     return request.masks == "alpha" and any(view.mask_path for view in capture.train)
 
 
-def box_of(request: TrainRequest, capture: Capture) -> np.ndarray:
-    """(6,) the box to learn: the one that was given, that of an object which masks cut out, or the
-    capture's."""
-    default = capture.object_aabb if cuts_out(request, capture) else None
-    chosen = next(box for box in (request.aabb, default, capture.aabb) if box is not None)
-    return np.asarray(chosen, np.float64)
-
-
 def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
     """The photos to learn from; InvalidInput where masks leave nothing of them."""
     loaded = load_photos(capture.train, request.masks)
@@ -150,7 +145,7 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
 
 
 def fit_settings(
-    request: TrainRequest, kind: Kind, capture: Capture, box: np.ndarray, place: str
+    request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str
 ) -> FitSettings:
     """How to fit; UsageProblem where not even the coarsest field is as small as asked."""
     settings = replace(
@@ -161,11 +156,12 @@ def fit_settings(
         time_budget=request.time_budget,
         target_psnr=request.target_psnr,
         opacity_weight=0.0 if capture.opaque and not cuts_out(request, capture) else 0.1,
-        near=0.0,
+        near=extent.near,
+        unbounded=extent.unbounded,
         device=place,
     )
-    longest = fitting_longest(kind, box, settings, request.max_size, request.precision)
-    plan = kind.untrained(box, longest, settings.way)
+    longest = fitting_longest(kind, extent.box, settings, request.max_size, request.precision)
+    plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision), request.max_size)
     return replace(settings, longest=longest)
 
@@ -251,12 +247,13 @@ def camera_of(view: View) -> Camera:
     )
 
 
-def measure(field, capture: Capture) -> dict:
-    """Mean PSNR and SSIM of the held-out views over white, of the pixels that masks do not exclude."""
+def measure(field, capture: Capture, origin: np.ndarray) -> dict:
+    """Mean PSNR and SSIM of the held-out views over white, of the pixels that masks do not exclude, by a
+    field whose frame lies at `origin` (4, 4)."""
     figures = []
     for view in capture.test:
         truth = over_white(load_images([view]))[0]
-        shot = render_image(field, camera_of(view)).over(WHITE)
+        shot = render_image(field, camera_of(view), origin=origin).over(WHITE)
         ignored = load_ignored(view)
         kept = slice(None) if ignored is None else ~ignored
         if ignored is not None:

@@ -35,6 +35,13 @@ from fusedrf_cli.requests import TrainRequest
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
 @click.option(
+    "--unbounded/--bounded",
+    default=None,
+    help="Learn all of space, as photos of a place show it, or a box; default: as the photos need.",
+)
+@click.option("--centre", type=options.VECTOR, help="Middle of what is learnt finest.")
+@click.option("--radius", type=options.POSITIVE, help="Half the side of what is learnt finest.")
+@click.option(
     "--masks",
     type=click.Choice(["ignore", "alpha"]),
     default="ignore",

@@ -16,6 +16,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import transformed_aabb
 from fusedrf_cli.engine.kernels.reference import exact
+from fusedrf_cli.engine.spaces import unbounded
 
 CONDITION_LIMIT = 1e6  # a flatter placement cannot be inverted to float32's accuracy
 
@@ -48,8 +49,14 @@ class Placed:
 
     @cached_property
     def aabb(self) -> np.ndarray:
-        """(6,) world box around the field's occupied cells."""
-        return transformed_aabb(self.field.occupancy.tight_aabb(0), self.object_to_world)
+        """(6,) world box around the field's occupied cells, or, where it fills all of space, around the
+        middle of its core."""
+        return transformed_aabb(self.field.occupancy.subject, self.object_to_world)
+
+    @cached_property
+    def unbounded(self) -> bool:
+        """Whether the field fills all of space."""
+        return self.field.occupancy.space is unbounded
 
     @property
     def voxel_size(self) -> float:
@@ -77,10 +84,14 @@ class Placed:
         stretch = v.norm(dim=1)
         return exact(points, device) @ linear.T + shift, v / stretch[:, None], stretch
 
-    def moved(self, offset: np.ndarray) -> "Placed":
-        """The same placement seen from a frame whose origin is at `offset` (3,)."""
-        matrix = self.object_to_world.copy()
-        matrix[:3, 3] -= offset
+    def moved(self, origin: np.ndarray) -> "Placed":
+        """The same placement seen from a frame that lies at `origin`: a position (3,), or a placement (4,
+        4)."""
+        if origin.shape == (3,):
+            matrix = self.object_to_world.copy()
+            matrix[:3, 3] -= origin
+        else:
+            matrix = np.linalg.inv(origin) @ self.object_to_world
         return Placed(self.name, self.field, matrix)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, placed_cells
+from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, placed_cells, unbounded_cells
+from fusedrf_cli.engine.spaces import unbounded
 
 OCCUPANCY_CELLS = SCENE_CELLS
 RULES = ("max", "add")
@@ -25,7 +26,8 @@ class ComposedField:
     c = Σσ_i c_i / Σσ_i. The frame's origin is the scene's centre, `origin` in the world, so that a scene far
     from the world's
     origin loses no digits: world points and ray origins have `origin` subtracted in float64 before they come
-    here.
+    here. Where a field fills all of space, the frame is that field's, of the largest core where there are
+    several, and `origin` its placement (4, 4).
     """
 
     kind = "composed"
@@ -36,8 +38,13 @@ class ComposedField:
             raise ValueError("a composed scene needs at least one field")
         if rule not in RULES:
             raise ValueError(f"composition should be one of {', '.join(RULES)}, found '{rule}'")
-        boxes = np.stack([p.aabb for p in placed])
-        self.origin = (boxes[:, :3].min(0) + boxes[:, 3:].max(0)) / 2
+        around = [p for p in placed if p.unbounded]
+        if around:
+            largest = max(around, key=lambda p: abs(np.linalg.det(p.object_to_world[:3, :3])))
+            self.origin = largest.object_to_world
+        else:
+            boxes = np.stack([p.aabb for p in placed])
+            self.origin = (boxes[:, :3].min(0) + boxes[:, 3:].max(0)) / 2
         self.placed, self.rule = [p.moved(self.origin) for p in placed], rule
 
     def posed(self, poses: Mapping[str, np.ndarray]) -> "ComposedField":
@@ -54,12 +61,15 @@ class ComposedField:
     def occupancy(self) -> OccupancyGrid:
         """Cells that any placed field's occupied cells reach."""
         grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
+        if any(p.unbounded for p in self.placed):
+            marks = unbounded_cells(grids, OCCUPANCY_CELLS)
+            return OccupancyGrid(unbounded.WHOLE, reduce(np.logical_or, marks), unbounded)
         aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
     @property
     def aabb(self) -> np.ndarray:
-        """(6,) box around all fields, in this frame."""
+        """(6,) box around all fields, in this frame, or in the coordinates of its space."""
         return self.occupancy.aabb
 
     @property
@@ -77,7 +87,8 @@ class ComposedField:
         ask = self._densest if self.rule == "max" else self._sum
         for placed in self.placed:  # one after the other: not all of them need to be in memory
             box = torch.from_numpy(placed.aabb)
-            inside = torch.nonzero(((points >= box[:3]) & (points <= box[3:])).all(1))[:, 0]
+            within = ((points >= box[:3]) & (points <= box[3:])).all(1)
+            inside = torch.nonzero(within | placed.unbounded)[:, 0]
             if len(inside):
                 ask(placed, inside, points, dirs, with_colour, sigma, rgb)
         if self.rule == "add" and with_colour:

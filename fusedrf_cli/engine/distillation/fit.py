@@ -12,6 +12,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.visibility import shown_cells
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
@@ -24,9 +25,18 @@ RATE = 0.02
 RATE_DECAY = 0.05  # the last step's share of the first's rate
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3
+DISTORTION = 1e-3  # weight of that loss in unbounded space; in a box surfaces come out sharp without it
+WEIGHED_RAYS = 1 << 17  # by which it is found what photos show
+STEPS_TO_SHOW = 100  # after which a field in unbounded space shows where things are
+SHOWN_FROM = 0.005  # weight on a ray from which a cell of unbounded space counts as shown
 EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
 # (share of the run, share of final voxels per axis)
 RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
+# The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
+# explain each photo by itself: from a fifth of this many texels, held-out photos gain 3 dB.
+UNBOUNDED_STAGES = ((0.0, 0.05), (0.15, 0.1), (0.3, 0.2), (0.45, 0.4), (0.6, 0.7), (0.75, 1.0))
+UNBOUNDED_STEP = 1.0  # voxels
+UNBOUNDED_SAMPLES = 3  # times the samples of a step in a box: a ray has more of them
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
@@ -54,11 +64,19 @@ class FitSettings:
     opacity_weight: float = 0.1
     """Weight of the captured alpha against the colour; 0 for opaque photos."""
     near: float = 0.0
+    """Distance from a camera, in units of the field's frame, before which nothing is learnt."""
+    unbounded: bool = False
+    """Whether the field fills all of space, seen in pictures without alpha."""
     target_psnr: float | None = None
     """dB of the training rays, less a margin, at which the fit may stop early."""
     seed: int = 0
     device: str = "cpu"
     """Where the field is trained, "cpu" or "cuda"."""
+
+    @property
+    def stages(self) -> tuple[tuple[float, float], ...]:
+        """(share of the run, share of the final voxels per axis from then on)."""
+        return UNBOUNDED_STAGES if self.unbounded else RESOLUTION_STAGES
 
 
 class Pictures(NamedTuple):
@@ -133,7 +151,7 @@ class FitRun:
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.optimiser = Adam.of(field)
         self.started, self.steps = working_time(), 0
-        self.stages, self.refreshes = list(RESOLUTION_STAGES[1:]), [*OCCUPANCY_AT, 1.0]
+        self.stages, self.refreshes = list(settings.stages[1:]), [*OCCUPANCY_AT, 1.0]
         self.mse, self.rays = None, RAYS_PER_STEP[0]
         self.found_matter, self.found_nothing = False, 0
         self.guard = Guard(lambda: self.optimiser.numbers())
@@ -150,9 +168,11 @@ class FitRun:
         """A fit before its first step; the arguments are those of `fit`."""
         generator = torch.Generator().manual_seed(settings.seed)
         pool = RayPool(cameras, images, generator)
-        coarse = max(LEAST_TEXELS, round(settings.longest * RESOLUTION_STAGES[0][1]))
+        coarse = max(LEAST_TEXELS, round(settings.longest * settings.stages[0][1]))
         kind = registry.kind(settings.kind)
         field = kind.create(kind.untrained(aabb, coarse, settings.way), generator, name).to(settings.device)
+        if settings.unbounded:
+            field = field.with_occupancy(shown_cells(cameras, settings.near))
         return cls(field, pool, settings, generator)
 
     def finish(
@@ -239,6 +259,8 @@ class FitRun:
         """Occupancy, box and resolution changes that are due."""
         if self.refreshes and share >= self.refreshes[0]:
             self.refreshes.pop(0)
+            if self.settings.unbounded and self.steps < STEPS_TO_SHOW:
+                return  # all is fog still, and nothing of it shows
             self.guard.check()
             self.refresh_occupancy()
         if self.stages and share >= self.stages[0][0]:
@@ -249,7 +271,7 @@ class FitRun:
     def refresh_occupancy(self) -> None:
         """Mark the cells that hold matter, and cut the box down to them where that saves much. Where none
         does, nothing changes, and it is tried again later."""
-        occupancy = occupancy_of(self.field)
+        occupancy = self.shown_cells() if self.settings.unbounded else occupancy_of(self.field)
         if not occupancy.occupied.any():
             self.found_nothing += 1
             retry = self.share() + RETRY_AFTER
@@ -259,7 +281,7 @@ class FitRun:
         self.found_matter = True
         self.occupy(occupancy)
         tight = occupancy.tight_aabb()
-        if volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
+        if not self.settings.unbounded and volume(tight) < SHRINK_BELOW * volume(occupancy.aabb):
             before = self.field
             self.resize(tight, max(self.field.resolution))
             occupancy = occupancy_of(self.field, tight)
@@ -268,6 +290,21 @@ class FitRun:
                 self.optimiser = Adam.of(self.field)
                 return
             self.occupy(occupancy)
+
+    def shown_cells(self) -> OccupancyGrid:
+        """Cells of which some training ray shows anything, grown by one: haze that no photo shows, and what
+        lies behind surfaces, is no matter."""
+        field = self.field
+        grid = field.occupancy
+        counts = cell_counts(grid.aabb, min(DEFAULT_CELLS, max(field.resolution)))
+        if grid.occupied.shape != counts:  # as fine as those to be found, with the same cells occupied
+            middles = OccupancyGrid.full(grid.aabb, max(counts)).centres()
+            grid = grid.marked(grid.contains(middles).reshape(counts))
+            field = field.with_occupancy(grid)
+        rays_o, rays_d, _ = self.pool.draw(WEIGHED_RAYS)
+        jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
+        weights = field.weights(rays_o, rays_d, jitter, self.settings.near, field.voxel_size)
+        return grid.marked(grid.marked(weights > SHOWN_FROM).dilated().occupied & grid.occupied)
 
     def occupy(self, occupancy: OccupancyGrid) -> None:
         """Another occupancy grid; the optimiser starts anew where the field has fewer numbers then."""
@@ -291,9 +328,12 @@ class FitRun:
         rays_o, rays_d, pixels = self.pool.draw(self.rays)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         background = np.ones((len(rays_o), 3), np.float32)
+        if settings.unbounded:  # haze before any one colour would be wrong before the others
+            background = torch.rand(len(rays_o), 3, generator=self.generator).numpy()
         target = pixels.clone()
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + (1 - pixels[:, 3:])
-        step = (STEP_PER_VOXEL if self.found_matter else 1.0) * field.voxel_size  # long while all is dense
+        fine = UNBOUNDED_STEP if settings.unbounded else STEP_PER_VOXEL
+        step = (fine if self.found_matter else 1.0) * field.voxel_size  # long while all is dense
         batch = Batch(
             rays_o,
             rays_d,
@@ -304,6 +344,7 @@ class FitRun:
             settings.near,
             step,
             EARLY_STOP,
+            DISTORTION if settings.unbounded else 0.0,
         )
         loss = np.zeros((self.optimiser.parts, 3))
         field.train_rays(batch, self.optimiser.grads, loss)
@@ -319,7 +360,8 @@ class FitRun:
         mse = sums[0] / rays
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
         per_ray = max(sums[2] / rays, 1.0)
-        self.rays = int(np.clip(0.9 * self.rays + 0.1 * self.settings.samples / per_ray, *RAYS_PER_STEP))
+        wanted = self.settings.samples * (UNBOUNDED_SAMPLES if self.settings.unbounded else 1)
+        self.rays = int(np.clip(0.9 * self.rays + 0.1 * wanted / per_ray, *RAYS_PER_STEP))
 
 
 def part_of(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
@@ -340,6 +382,7 @@ def occupancy_of(
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
     """
+    space = field.occupancy.space
     box = field.aabb if box is None else box
     counts = cell_counts(box, min(cells, max(field.resolution)))
     cell = (box[3:] - box[:3]) / counts
@@ -348,4 +391,4 @@ def occupancy_of(
     sigma = field.peaks(box[:3], cell, index, PROBES)
     occupied = np.zeros(counts, bool)
     occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
-    return OccupancyGrid(box, occupied).dilated()
+    return OccupancyGrid(box, occupied, space).dilated()

@@ -19,7 +19,7 @@ class Judge:
     """PSNR of a student against its teacher on seeded views that nothing was trained on."""
 
     def __init__(self, teacher: RadianceField, views: int, size: int, seed: int):
-        box = teacher.occupancy.tight_aabb(0)
+        box = teacher.occupancy.subject
         self.cameras = scattered(box, views, size, size, seed=JUDGED_SEED + seed)
         self.truth = [render_image(teacher, c).over(WHITE) for c in self.cameras]
 

@@ -33,5 +33,5 @@ def pruned(student: StoredField) -> OccupancyGrid:
     depth = np.zeros(grid.occupied.shape, np.float32)
     depth[tuple(cells.T)] = student.peaks(grid.aabb[:3], grid.cell, cells, PROBES) * grid.cell.min()
     occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)
-    kept = OccupancyGrid(grid.aabb, occupied).dilated().occupied & grid.occupied
-    return OccupancyGrid(grid.aabb, kept)
+    kept = grid.marked(occupied).dilated().occupied & grid.occupied
+    return grid.marked(kept)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, waves, weights_from_sigma
+from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, waves, weights_from_depths
 
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
 MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
@@ -147,17 +147,17 @@ def _ask_part(
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
     place = torch.zeros(0, 3, dtype=torch.float64)
     kept = [(place, place, torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
-    for ray, ts, counts in waves(teacher, rays_o, rays_d, 0.0, jitter, step, lambda: trans > 1e-3):
+    for ray, ts, spans, counts in waves(teacher, rays_o, rays_d, 0.0, jitter, step, lambda: trans > 1e-3):
         mask = np.arange(ts.shape[1]) < counts[:, None]
         points = torch.from_numpy((rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None])[mask])
         dirs = torch.from_numpy(np.broadcast_to(rays_d[ray][:, None], (*ts.shape, 3))[mask])
         found = teacher.query(points, dirs, with_colour=False)[0].float()
         sigma = np.zeros(ts.shape, np.float32)
         sigma[mask] = found.numpy()
-        weights, after = weights_from_sigma(sigma, step, trans[ray])
+        weights, after = weights_from_depths(sigma * spans.astype(np.float32), trans[ray])
         before = torch.from_numpy((trans[ray][:, None] - np.cumsum(weights, 1) + weights)[mask])
         trans[ray] = after
-        depth = found * step
+        depth = found * torch.from_numpy(spans[mask]).float()
         chosen = (before > SEEN) & (torch.rand(len(points), generator=generator) < chance(depth, before))
         # most samples are empty, and a colour costs more than a density
         shown = torch.from_numpy(weights[mask] > SEEN_WEIGHT) | (chosen & (depth > SEEN_WEIGHT))

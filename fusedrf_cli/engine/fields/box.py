@@ -1,6 +1,6 @@
 """Fields over one box whose numbers lie on texels along its axes."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -8,6 +8,7 @@ import torch
 
 from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
@@ -112,7 +113,7 @@ class BoxField(ComputedField):
     def moved(self, origin: np.ndarray) -> "BoxField":
         """The same field in a frame whose origin is at `origin` (3,) of its own."""
         shift = np.tile(origin, 2)
-        grid = OccupancyGrid(self.occupancy.aabb - shift, self.occupancy.occupied)
+        grid = replace(self.occupancy, aabb=self.occupancy.aabb - shift)
         other = self.with_occupancy(grid)
         other.box = self.box - shift
         return other
@@ -196,7 +197,11 @@ class BoxField(ComputedField):
             "resolution": list(self.resolution),
             "scale": self.scale,
             "shift": self.shift,
-            "cells": {"aabb": self.occupancy.aabb.tolist(), "counts": list(self.occupancy.occupied.shape)},
+            "cells": {
+                "aabb": self.occupancy.aabb.tolist(),
+                "counts": list(self.occupancy.occupied.shape),
+                **({} if self.space is bounded else {"space": name_of(self.space)}),
+            },
             "shape": asdict(self.shape),
         }
         return arrays, metadata
@@ -231,8 +236,11 @@ class BoxField(ComputedField):
         if not (0 < scale < np.inf and np.isfinite(shift)):
             raise ValueError(f"scale should be positive and shift finite, found {scale} and {shift}")
         counts = list(whole_numbers(metadata["cells"]["counts"], 1, "cells"))
+        cells = metadata["cells"]
         grid = OccupancyGrid(
-            checked_box(metadata["cells"]["aabb"], "cells"), unpack_bits(arrays, "occupancy", counts)
+            checked_box(cells["aabb"], "cells"),
+            unpack_bits(arrays, "occupancy", counts),
+            space_named(cells.get("space", "bounded")),
         )
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
         for part in bare.parts:  # before `params` takes memory

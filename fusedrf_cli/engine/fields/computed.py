@@ -13,8 +13,7 @@ import torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Answers, Cells, Points, Rays, Sent
-from fusedrf_cli.engine.spaces import bounded
+from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Answers, Cells, Points, Rays, Sent, Weighed
 
 
 class Batch(NamedTuple):
@@ -29,6 +28,7 @@ class Batch(NamedTuple):
     near: float
     step: float
     early_stop: float
+    distortion: float = 0.0  # weight of the loss by which a ray's matter draws together
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,6 @@ class ComputedField:
 
     kind: str
     bodies: ModuleType
-    space: ModuleType = bounded
     params: torch.Tensor
     occupancy: OccupancyGrid
 
@@ -84,12 +83,21 @@ class ComputedField:
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `query`, with numbers params (P,), in plain torch: on any device, and differentiable in all
-        three. Raises ValueError where the kind has no reference."""
+        """σ (N,) and rgb (N, 3) with numbers params (P,) at points (N, 3) of the space's coordinates, σ per
+        unit of them, in plain torch: on any device, and differentiable in all three. Raises ValueError where
+        the kind has no reference."""
         raise ValueError(
             f"fields of kind '{self.kind}' have no reference in torch: they are computed on 'cpu' and 'cuda' "
             "only, and cannot be differentiated in points or directions; convert them to another kind"
         )
+
+    def answers(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `query`, by `reference`: σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it."""
+        at = self.space.contracted(points)
+        sigma, rgb = self.reference(params, at, dirs)
+        return sigma * self.space.rates(at).to(sigma.dtype), rgb
 
     # -- the same field otherwise ------------------------------------------------------------------------
 
@@ -131,8 +139,13 @@ class ComputedField:
 
     @property
     def aabb(self) -> np.ndarray:
-        """(6,) float64 box in the field's frame."""
+        """(6,) float64 box in the coordinates of the field's space."""
         return self.occupancy.aabb
+
+    @property
+    def space(self) -> ModuleType:
+        """That its numbers and its cells lie in; its points and directions are those of its frame."""
+        return self.occupancy.space
 
     @property
     def device_loops(self) -> ModuleType:
@@ -171,7 +184,7 @@ class ComputedField:
         if self.device_loops is None:
             with torch.no_grad():
                 device = self.params.device
-                found = self.reference(self.params, points.to(device), dirs.to(device))
+                found = self.answers(self.params, points.to(device), dirs.to(device))
                 return tuple(answer.cpu() for answer in found)
         asked = Points(exact(points), exact(dirs), bool(with_colour))
         found = Answers(np.empty(len(points), self.real), np.empty((len(points), 3), self.real))
@@ -202,6 +215,19 @@ class ComputedField:
         self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(cells), out)
         return out
 
+    def weights(
+        self, rays_o: np.ndarray, rays_d: np.ndarray, jitter: np.ndarray, near: float, step: float
+    ) -> np.ndarray:
+        """(X, Y, Z) for each cell of the occupancy the largest weight (NeRF, eq. 3) that a sample in it has
+        on any of rays (N, 3)."""
+        asked = Weighed(exact(rays_o), exact(rays_d), exact(jitter), float(near), float(step), 1e-3)
+        parts = torch.get_num_threads()
+        most = np.zeros((parts, self.occupancy.occupied.size), np.float32)
+        self.loops.sweep(
+            "weigh_ray", self.arrays, self.grid, asked, len(rays_o), 1, most, np.zeros((parts, 3))
+        )
+        return most.max(0).reshape(self.occupancy.occupied.shape)
+
     # -- learning ----------------------------------------------------------------------------------------
 
     def query_backward(
@@ -225,7 +251,9 @@ class ComputedField:
         P).
 
         The loss of a batch is the mean over its rays of mean_c (C_c + (1 - A) background_c - target_c)² +
-        opacity_weight (A - target_3)², with A the opacity. loss (parts, 3) gains the sums over rays of the
+        opacity_weight (A - target_3)² + distortion (Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i), with A the
+        opacity, w the weights, s = t / (1 + t) and δ the lengths of the samples in s (Mip-NeRF 360, eq. 15).
+        loss (parts, 3) gains the sums over rays of the
         colour term, of the opacity term and of the samples taken.
         """
         count = len(batch.rays_o)

@@ -40,7 +40,7 @@ def query(
     params = asked[-1]
     points, dirs = exact(points, params.device), exact(dirs, params.device)
     if field.device_loops is None:
-        sigma, rgb = field.reference(params, points, dirs)
+        sigma, rgb = field.answers(params, points, dirs)
         return sigma, rgb if with_colour else torch.zeros_like(rgb)
     if not wanted:
         return by_kernels(holding(field, params), points, dirs, with_colour)
@@ -117,7 +117,7 @@ def of_reference(
     """(N, 3) and (N, 3) what the derivatives send back to points and directions, by the reference."""
     with torch.enable_grad():
         places = [x.detach().requires_grad_() for x in (points, dirs)]
-        answers = field.reference(field.params.detach(), *places)
+        answers = field.answers(field.params.detach(), *places)
         sent = [(a, d) for a, d in zip(answers, (d_sigma, d_rgb), strict=True) if a.requires_grad]
         if not sent:  # nothing is there
             return tuple(torch.zeros_like(x) for x in places)

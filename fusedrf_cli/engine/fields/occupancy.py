@@ -2,12 +2,15 @@
 is."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
+import torch
 
 from fusedrf_cli.engine.kernels import GridArrays
+from fusedrf_cli.engine.spaces import bounded, unbounded
 
 DEFAULT_CELLS = 128
 SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
@@ -22,14 +25,21 @@ class OccupancyGrid:
     """Cells of an axis-aligned box, occupied or empty."""
 
     aabb: np.ndarray
-    """(6,) float64 [xmin ymin zmin xmax ymax zmax], in the frame of the field that owns the grid."""
+    """(6,) float64 [xmin ymin zmin xmax ymax zmax], in the coordinates of the space, which are those of the
+    frame of the field that owns the grid where that is bounded."""
     occupied: np.ndarray
     """(X, Y, Z) bool."""
+    space: ModuleType = bounded
+    """That its cells, and the numbers of the field that owns it, lie in (engine/spaces)."""
 
     @classmethod
-    def full(cls, aabb: np.ndarray, cells: int = 1) -> "OccupancyGrid":
+    def full(cls, aabb: np.ndarray, cells: int = 1, space: ModuleType = bounded) -> "OccupancyGrid":
         """A grid that skips nothing."""
-        return cls(np.asarray(aabb, np.float64), np.ones(cell_counts(aabb, cells), bool))
+        return cls(np.asarray(aabb, np.float64), np.ones(cell_counts(aabb, cells), bool), space)
+
+    def marked(self, occupied: np.ndarray) -> "OccupancyGrid":
+        """A grid over the same box with other cells (X, Y, Z) bool, perhaps more or fewer."""
+        return replace(self, occupied=occupied)
 
     @property
     def cell(self) -> np.ndarray:
@@ -63,16 +73,20 @@ class OccupancyGrid:
         hi = self.aabb[:3] + (index.max(0) + 1 + margin_cells) * self.cell
         return np.concatenate([np.maximum(lo, self.aabb[:3]), np.minimum(hi, self.aabb[3:])])
 
+    @property
+    def subject(self) -> np.ndarray:
+        """(6,) box of the field's frame that views of it look at: that around the occupied cells, or, in
+        unbounded space, the middle of the core."""
+        return unbounded.SUBJECT if self.space is unbounded else self.tight_aabb(0)
+
     def dilated(self, cells: int = 1) -> "OccupancyGrid":
         """The grid with every occupied region grown by a number of cells."""
         from scipy.ndimage import binary_dilation
 
-        return OccupancyGrid(
-            self.aabb, binary_dilation(self.occupied, np.ones((3, 3, 3), bool), iterations=cells)
-        )
+        return self.marked(binary_dilation(self.occupied, np.ones((3, 3, 3), bool), iterations=cells))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """(N,) bool: which points (N, 3) lie in an occupied cell."""
+        """(N,) bool: which points (N, 3) of the space's coordinates lie in an occupied cell."""
         index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
         inside = ((index >= 0) & (index < self.occupied.shape)).all(1)
         found = np.zeros(len(points), bool)
@@ -124,10 +138,42 @@ def placed_cells(
     return aabb, (marked_cells(grid, matrix, aabb, longest) for grid, matrix in placed)
 
 
+def unbounded_cells(placed: Iterable[tuple[OccupancyGrid, np.ndarray]], longest: int) -> Iterator[np.ndarray]:
+    """Which cells of a grid over unbounded space, `longest` along each axis, each of several placed grids may
+    reach; placed as in `placed_cells`, into the frame of that space."""
+    for grid, matrix in placed:
+        if grid.space is unbounded:
+            yield shared_cells(grid, matrix, longest)
+        else:
+            yield marked_cells(grid, matrix, unbounded.WHOLE, longest, unbounded)
+
+
+def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int) -> np.ndarray:
+    """(X, Y, Z) bool: cells of a grid over unbounded space whose middle lies in or beside an occupied cell of
+    another such grid, placed by a (4, 4)."""
+    own, back = grid.dilated(), np.linalg.inv(object_to_field)
+    wanted = OccupancyGrid.full(unbounded.WHOLE, longest, unbounded)
+    found = []
+    for part in np.array_split(wanted.centres(), -(-wanted.occupied.size // POINTS_AT_ONCE)):
+        at = unbounded.placed(torch.from_numpy(part)).numpy() @ back[:3, :3].T + back[:3, 3]
+        found.append(own.contains(mapped(at, unbounded)))
+    return np.concatenate(found).reshape(wanted.occupied.shape)
+
+
+def mapped(points: np.ndarray, space: ModuleType) -> np.ndarray:
+    """Points (N, 3) of a frame in the coordinates of a space."""
+    return space.contracted(torch.from_numpy(points)).numpy()
+
+
 def marked_cells(
-    grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, longest: int
+    grid: OccupancyGrid,
+    object_to_field: np.ndarray,
+    aabb: np.ndarray,
+    longest: int,
+    space: ModuleType = bounded,
 ) -> np.ndarray:
-    """(X, Y, Z) bool: cells of a field's box that a placed grid's occupied cells reach, grown by one."""
+    """(X, Y, Z) bool: cells of a field's box, in the coordinates of its space, that a placed grid's occupied
+    cells reach, grown by one."""
     counts = np.array(cell_counts(aabb, longest))
     cell = (aabb[3:] - aabb[:3]) / counts
     points = (
@@ -143,7 +189,7 @@ def marked_cells(
     fewer, more = sorted((corners, steps * grid.cell), key=len)
     for part in np.array_split(more, -(-len(more) // POINTS_AT_ONCE)) if len(more) else ():
         for offset in fewer:
-            at = (part + offset) @ object_to_field[:3, :3].T + object_to_field[:3, 3]
+            at = mapped((part + offset) @ object_to_field[:3, :3].T + object_to_field[:3, 3], space)
             index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
             found[tuple(index.T)] = True
     return OccupancyGrid(aabb, found).dilated().occupied

@@ -10,7 +10,7 @@ gradients are gathered:
     sizes(field)                       for Python: constants of the namespace by name; SCRATCH and KEPT, the
                                        numbers kept per shaded sample for the way back, are among them
     density(field, grid, k, p, d, scratch)
-                                       (σ, pre, steps, place): σ per length of the frame; `pre` what
+                                       (σ, pre, steps, place): σ per length of the space's coordinates; `pre` what
                                        `backward` needs of it; for how many steps of the ray the sample k
                                        stands, 0 where there is nothing to sample; `place`, an int or a
                                        tuple, what the other functions need to know of where p lies
@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from fusedrf_cli.engine.kernels.parts import accumulate, along, compared, next_sample, occupied  # noqa: F401
+from fusedrf_cli.engine.kernels.parts import accumulate, along, cell_of, compared, next_sample, occupied  # noqa: F401
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
 LEARN_FROM = COLOUR_FROM  # the same in training
@@ -78,6 +78,17 @@ class Rays(NamedTuple):
     early_stop: object  # float, the transmittance at which a ray ends
 
 
+class Weighed(NamedTuple):
+    """What `weigh_ray` follows."""
+
+    rays_o: object  # (N, 3) float64
+    rays_d: object  # (N, 3) float64, unit length
+    jitter: object  # (N,) float64 in [0, 1)
+    near: object  # float
+    step: object  # float
+    early_stop: object  # float
+
+
 class Cells(NamedTuple):
     """What `peak_of_cell` looks into."""
 
@@ -100,6 +111,7 @@ class Kept(NamedTuple):
     pre: object
     weight: object
     carried: object  # weight that its colour stands for
+    along: object  # how far along the ray, from 0 at its origin to 1 at infinity, where that is needed
     rgb: object  # (K, 3)
     memory: object
 
@@ -163,6 +175,11 @@ def triple(values, i):
     return float(values[i, 0]), float(values[i, 1]), float(values[i, 2])
 
 
+def share_along(t):
+    """From 0 at a ray's origin to 1 at infinity, 1/2 at one unit."""
+    return t / (1.0 + t)
+
+
 def query_point(field, grid, asked, i, scratch, memory, out):
     """σ (1/length) and rgb at point i; both 0 where the field is not known."""
     p, d = point(triple(asked.points, i)), triple(asked.dirs, i)
@@ -177,7 +194,7 @@ def query_point(field, grid, asked, i, scratch, memory, out):
     if known(field, grid, p):
         sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
         if steps > 0:
-            out.sigma[i] = sigma
+            out.sigma[i] = rate(p) * sigma
             if asked.with_colour and sigma > 0:
                 begin(field, frame_of(place), d, scratch)
                 rgb = colour(field, place, p, d, scratch, memory, 0)
@@ -204,10 +221,8 @@ def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
             if shaded:
                 begin(field, frame, d, scratch)
                 rgb = colour(field, place, p, d, scratch, kept.memory, 0)
-            d_sigma = float(sent.d_sigma[i])
-            backward(
-                field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, kept.memory, 0, grad
-            )
+            d_sigma = rate(p) * float(sent.d_sigma[i])
+            backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, kept.memory, 0, grad)
             if shaded:
                 end(field, frame, d, scratch, grad)
 
@@ -231,7 +246,8 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
             p = along(origin, way, u)
             sigma, _, steps, place = density(field, grid, k, p, d, scratch)
             if steps > 0:
-                weight = trans * (1.0 - math.exp(-sigma * span(course, u, steps * step)))
+                length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
+                weight = trans * (1.0 - math.exp(-sigma * length))
                 trans -= weight
                 depth += weight * distance(course, u)
                 waiting += weight
@@ -268,10 +284,13 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                 held = keep(place)
                 ahead_density(field, field.params, held, along(origin, way, u + SAMPLES_AHEAD * steps * step))
                 ahead_density(field, grad, held, p)
-                weight = trans * (1.0 - math.exp(-sigma * span(course, u, steps * step)))
+                length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
+                weight = trans * (1.0 - math.exp(-sigma * length))
                 trans -= weight
                 kept.k[count], kept.piece[count], kept.held[count], kept.steps[count] = k, number, held, steps
                 kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
+                if batch.distortion > 0.0:
+                    kept.along[count] = share_along(distance(course, u))
                 waiting += weight
                 if waiting > LEARN_FROM:
                     if frame_of(place) != current:
@@ -311,6 +330,11 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
     behind = trans * d_trans
     after = trans
     own = 0.0
+    spread = 0.0
+    before, beyond = (0.0, 0.0), (0.0, 0.0)
+    if batch.distortion > 0.0:
+        for q in range(count):
+            before = before[0] + kept.weight[q], before[1] + kept.weight[q] * kept.along[q]
     number = kept.piece[count - 1]
     origin, way, u0, _, course = piece(number, grid, o, d, batch.near)
     for q in range(count - 1, -1, -1):
@@ -332,8 +356,17 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
                 colour(field, place, p, d, scratch, kept.memory, last)
             carried = kept.carried[q]
             d_rgb = d_colour[0] * carried, d_colour[1] * carried, d_colour[2] * carried
-        d_sigma = span(course, u, kept.steps[q] * step) * (after * own - behind)
-        behind += weight * own
+        steps = kept.steps[q]
+        length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
+        if batch.distortion > 0.0:
+            here = kept.along[q]
+            before = before[0] - weight, before[1] - weight * here
+            spread = here * (before[0] - beyond[0]) - (before[1] - beyond[1])
+            spread += weight * length / rate(p) * (1.0 - here) * (1.0 - here) / 3.0
+            spread *= 2.0 * batch.distortion / batch.target.shape[0]
+            beyond = beyond[0] + weight, beyond[1] + weight * here
+        d_sigma = length * (after * (own + spread) - behind)
+        behind += weight * (own + spread)
         after += weight
         if weight > 0.0:
             backward(
@@ -341,6 +374,33 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
             )
     if shaded > 0:
         end(field, current, d, scratch, grad)
+
+
+def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
+    """Raises most[c] to the weight of each sample of ray i that lies in cell c of the grid, counted z first,
+    where it is more. Samples lie `rays.jitter[i]` of a step into each step."""
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
+    nx, ny, nz = grid.skip.shape
+    trans = 1.0
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near)
+        u0 = u0 + rays.jitter[i] * step
+        k = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and trans > rays.early_stop:
+            u = u0 + k * step
+            p = along(origin, way, u)
+            sigma, _, steps, place = density(field, grid, k, p, d, scratch)
+            if steps > 0:
+                length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
+                weight = trans * (1.0 - math.exp(-sigma * length))
+                trans -= weight
+                x = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
+                y = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
+                z = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
+                c = (x * ny + y) * nz + z
+                most[c] = max(most[c], weight)
+            k = advance(field, place, steps, k, p, way, u, u0, step)
+            k = next_sample(grid, origin, way, u0, u1, step, k)
 
 
 def peak_of_cell(field, grid, cells, i, scratch, memory, out):
@@ -385,9 +445,9 @@ def sweep(field, grid, batch, count, most, grads, loss):
     parts = grads.shape[0]
     for p in prange(parts):
         real = field.params.dtype
-        whole, reals = np.empty((5, most), np.int64), np.empty((3, most))
+        whole, reals = np.empty((5, most), np.int64), np.empty((4, most))
         kept = Kept(
-            whole[0], whole[1], whole[2], whole[3], whole[4], reals[0], reals[1], reals[2],
+            whole[0], whole[1], whole[2], whole[3], whole[4], reals[0], reals[1], reals[2], reals[3],
             np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
         )  # fmt: skip
         low, high = p * count // parts, (p + 1) * count // parts
@@ -397,9 +457,9 @@ def sweep(field, grid, batch, count, most, grads, loss):
 # -- marching, which needs no field --------------------------------------------------------------------------
 
 
-def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, counts):
-    """The next samples of ray i, from start[i] (piece and number of the sample) on: distances ts[i], as many
-    as counts[i]."""
+def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, spans, counts):
+    """The next samples of ray i, from start[i] (piece and number of the sample) on: distances ts[i], what
+    lengths of the ray they stand for, spans[i], as many as counts[i]."""
     o, d = triple(rays_o, i), triple(rays_d, i)
     for number in range(start[i] % PIECES, PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, near)
@@ -408,6 +468,7 @@ def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, counts):
         k = next_sample(grid, origin, way, u0, u1, step, first)
         while k >= 0 and counts[i] < ts.shape[1]:
             ts[i, counts[i]] = distance(course, u0 + k * step)
+            spans[i, counts[i]] = span(course, u0 + k * step, step)
             counts[i] += 1
             k = next_sample(grid, origin, way, u0, u1, step, k + 1)
         if k >= 0:
@@ -416,10 +477,10 @@ def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, counts):
     start[i] = -1
 
 
-def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, counts):
-    """The next samples of every living ray: ts (N, K) distances, counts (N,); start (N,) int64, 0 at first,
-    is where to go on, -1 at the end."""
+def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, spans, counts):
+    """The next samples of every living ray: ts (N, K) distances, spans (N, K) the lengths that they stand
+    for, counts (N,); start (N,) int64, 0 at first, is where to go on, -1 at the end."""
     for i in prange(rays_o.shape[0]):
         counts[i] = 0
         if alive[i] and start[i] >= 0:
-            march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, counts)
+            march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, spans, counts)

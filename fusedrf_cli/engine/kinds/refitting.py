@@ -36,5 +36,5 @@ def refitted(field: StoredField, region: np.ndarray, inside: list[Placed], teach
         grown = np.ceil((np.asarray(field.resolution) - 1) * (box[3:] - box[:3]) / (own[3:] - own[:3])) + 1
         student = student.resampled(box, tuple(int(n) for n in grown))
     student = student.with_occupancy(teacher.occupancy)
-    taught, figures = teach(teacher, student, [teacher.occupancy.tight_aabb(0), region], False)
+    taught, figures = teach(teacher, student, [teacher.occupancy.subject, region], False)
     return Edited(taught, region, HOW, False, figures)

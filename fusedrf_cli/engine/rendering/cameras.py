@@ -4,7 +4,7 @@ Axes are OpenGL's: +x right, +y up, looking along -z. Pixel (i, j) is column i, 
 at (i + 0.5, j + 0.5).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -45,6 +45,12 @@ class Camera:
     def bent(self) -> bool:
         """Whether rays are other than a pinhole's."""
         return self.fisheye or any(self.distortion)
+
+    def seen_from(self, centre: np.ndarray, unit: float) -> "Camera":
+        """The same camera in a frame with its origin at `centre` (3,) and its unit `unit` long."""
+        pose = np.array(self.camera_to_world, np.float64)
+        pose[:3, 3] = (pose[:3, 3] - centre) / unit
+        return replace(self, camera_to_world=pose)
 
     def local_directions(self, rows: slice = slice(None)) -> np.ndarray:
         """(rows, width, 3) float64 directions in the camera's frame: z = -1, or of unit length where the lens

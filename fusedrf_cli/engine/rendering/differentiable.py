@@ -26,7 +26,8 @@ from fusedrf_cli.engine.fields.differentiable import settle
 from fusedrf_cli.engine.kernels.reference import exact, interval
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, STEP_PER_VOXEL, waves, weights_from_sigma
+from fusedrf_cli.engine.rendering.volume import EARLY_STOP, STEP_PER_VOXEL, waves, weights_from_depths
+from fusedrf_cli.engine.spaces import bounded
 
 
 class Picture(NamedTuple):
@@ -75,14 +76,15 @@ def render_rays(
         found = volume.render_rays(known, *host, near=near, step=step, early_stop=early_stop)
         return torch.from_numpy(found).to(device)
     volume.check_directions(host[1])
-    ray, ts = visible_samples(known, *host, near, step, early_stop)
-    ray, ts = torch.from_numpy(ray).to(device), exact(ts, device)
+    ray, ts, spans = visible_samples(known, *host, near, step, early_stop)
+    ray, ts, spans = torch.from_numpy(ray).to(device), exact(ts, device), exact(spans, device)
     rays_o, rays_d = exact(rays_o, device), exact(rays_d, device)
-    start, _ = interval(rays_o, rays_d, bounds(field, poses), near)
-    ts = ts + (start - start.detach())[ray]
+    if known.occupancy.space is bounded:  # an unbounded one has no first face for a ray to enter by
+        start, _ = interval(rays_o, rays_d, bounds(field, poses), near)
+        ts = ts + (start - start.detach())[ray]
     dirs = rays_d[ray]
     sigma, rgb = query(field, rays_o[ray] + ts[:, None] * dirs, dirs, poses)
-    weights = composite(sigma * step, ray, len(rays_o))
+    weights = composite(sigma * spans.to(sigma.dtype), ray, len(rays_o))
     columns = torch.cat([rgb, torch.ones_like(sigma)[:, None], ts.to(sigma.dtype)[:, None]], 1)
     return sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
 
@@ -108,27 +110,31 @@ def visible_samples(
     near: float,
     step: float,
     early_stop: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rays (S,) int64, ascending, and distances (S,) of the samples up to where a ray is opaque, in order."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays (S,) int64, ascending, distances (S,) and the lengths (S,) that they stand for of the samples up
+    to where a ray is opaque, in order."""
     trans = np.ones(len(rays_o))
-    rays, distances = [np.zeros(0, np.int64)], [np.zeros(0)]
+    rays, distances, lengths = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
     middle = np.full(len(rays_o), 0.5)
-    for ray, ts, counts in waves(field, rays_o, rays_d, near, middle, step, lambda: trans > early_stop):
+    for ray, ts, spans, counts in waves(
+        field, rays_o, rays_d, near, middle, step, lambda: trans > early_stop
+    ):
         row, slot = np.nonzero(np.arange(ts.shape[1]) < counts[:, None])
         dirs = rays_d[ray[row]]
         points = rays_o[ray[row]] + ts[row, slot, None] * dirs
         sigma = np.zeros(ts.shape)
         found, _ = query(field, torch.from_numpy(points), torch.from_numpy(dirs), with_colour=False)
         sigma[row, slot] = found.cpu().numpy()
-        weights, after = weights_from_sigma(sigma, step, trans[ray])
+        weights, after = weights_from_depths(sigma * spans, trans[ray])
         before = trans[ray, None] - (np.cumsum(weights, 1) - weights)
         kept = before[row, slot] > early_stop
         trans[ray] = after
         rays.append(ray[row[kept]])
         distances.append(ts[row[kept], slot[kept]])
-    ray, ts = np.concatenate(rays), np.concatenate(distances)
+        lengths.append(spans[row[kept], slot[kept]])
+    ray, ts, spans = (np.concatenate(column) for column in (rays, distances, lengths))
     order = np.argsort(ray, kind="stable")
-    return ray[order], ts[order]
+    return ray[order], ts[order], spans[order]
 
 
 def composite(depth: torch.Tensor, ray: torch.Tensor, n: int) -> torch.Tensor:

@@ -10,7 +10,6 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
-from fusedrf_cli.engine.spaces import bounded
 
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
@@ -112,7 +111,7 @@ def march_rays(
     n = len(rays_o)
     trans = np.ones(n, np.float32)
     total = np.zeros((n, 5), np.float32)
-    for ray, ts, counts in waves(
+    for ray, ts, spans, counts in waves(
         field, rays_o, rays_d, near, np.full(n, 0.5), step, lambda: trans > early_stop
     ):
         mask = np.arange(ts.shape[1]) < counts[:, None]
@@ -123,7 +122,7 @@ def march_rays(
             torch.from_numpy(points[mask]), torch.from_numpy(dirs[mask]), with_colour=False
         )
         sigma[mask] = found.numpy()
-        weights, trans[ray] = weights_from_sigma(sigma, step, trans[ray])
+        weights, trans[ray] = weights_from_depths(sigma * spans.astype(np.float32), trans[ray])
         seen = weights > SEEN_WEIGHT
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
@@ -136,10 +135,10 @@ def march_rays(
     out[:] = total
 
 
-def weights_from_sigma(sigma: np.ndarray, step: float, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (N, K) of consecutive samples that start with transmittance trans (N,), and the transmittance
-    behind them."""
-    transmittance = trans[:, None] * np.exp(-np.cumsum(sigma, 1) * step)
+def weights_from_depths(depths: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (N, K) of consecutive samples of optical depths (N, K) that start with transmittance trans
+    (N,), and the transmittance behind them."""
+    transmittance = trans[:, None] * np.exp(-np.cumsum(depths, 1))
     before = np.concatenate([trans[:, None], transmittance[:, :-1]], 1)
     return before - transmittance, transmittance[:, -1]
 
@@ -152,20 +151,21 @@ def waves(
     jitter: np.ndarray,
     step: float,
     alive: Callable[[], np.ndarray],
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """March rays in waves: yields (indices of rays with samples (M,), distances (M, K), how many of them
-    count (M,))."""
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """March rays in waves: yields (indices of rays with samples (M,), distances (M, K), the lengths of the
+    ray that these samples stand for (M, K), how many of them count (M,))."""
     n = len(rays_o)
     start = np.zeros(n, np.int64)
-    ts, counts = np.zeros((n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
-    loops = cpu.loops_for(None, (), getattr(field, "space", bounded))
+    ts, spans, counts = *np.zeros((2, n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
+    loops = cpu.loops_for(None, (), field.occupancy.space)
     while True:
-        loops.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), ts, counts)
+        places = ts, spans, counts
+        loops.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), *places)
         ray = np.flatnonzero(counts)
         if not len(ray):
             return
         longest = counts.max()
-        yield ray, ts[ray, :longest], counts[ray]
+        yield ray, ts[ray, :longest], spans[ray, :longest], counts[ray]
 
 
 def render_image(
@@ -177,8 +177,8 @@ def render_image(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> RenderedImage:
-    """Render one view; origin (3,) is the world position of the field's frame origin (float64, so far scenes
-    hold)."""
+    """Render one view; origin is where the field's frame lies in the world: its origin's position (3,), or
+    its placement (4, 4); float64, so that scenes far away hold."""
     shape = camera.height, camera.width
     picture = RenderedImage(
         np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -201,12 +201,13 @@ def render_bands(
 ) -> Iterator[RenderedImage]:
     """The view of `render_image` as bands of whole rows from the top, for pictures that memory does not hold;
     put together they are that picture to the bit."""
-    shift = np.zeros(3) if origin is None else origin
     rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
     for top in range(0, camera.height, rows):
         order = tile_order(camera.width, min(rows, camera.height - top))
         rays_o, rays_d = camera.rays(slice(top, top + rows), order)
-        found = render_rays(field, rays_o - shift, rays_d, near=near, step=step, early_stop=early_stop)
+        rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
+        found = render_rays(field, rays_o, rays_d, near=near, step=step, early_stop=early_stop)
+        found[:, 4] /= per_length
         pixels = np.empty_like(found)
         pixels[order] = found
         pixels = pixels.reshape(-1, camera.width, 5)
@@ -214,3 +215,20 @@ def render_bands(
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(opacity > 1e-3, pixels[..., 4] / opacity, np.inf).astype(np.float32)
         yield RenderedImage(pixels[..., :3], opacity, depth)
+
+
+def seen_from(
+    origin: np.ndarray | None, rays_o: np.ndarray, rays_d: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+    """World rays (N, 3), unit directions, in a frame that lies at `origin` (see `render_image`), and how much
+    of its length a unit of the world's is along each. Optical depths are the same in both."""
+    if origin is None:
+        return rays_o, rays_d, 1.0
+    if origin.shape == (3,):
+        return rays_o - origin, rays_d, 1.0
+    if np.array_equal(origin[:3, :3], np.eye(3)):
+        return rays_o - origin[:3, 3], rays_d, 1.0
+    inverse = np.linalg.inv(origin[:3, :3])
+    ways = rays_d @ inverse.T
+    lengths = np.linalg.norm(ways, axis=1)
+    return (rays_o - origin[:3, 3]) @ inverse.T, ways / lengths[:, None], lengths

@@ -5,6 +5,7 @@ into PIECES; in each, positions are a straight line in the space's coordinates, 
 """
 
 import numpy as np
+import torch
 
 from fusedrf_cli.engine.kernels.parts import hit_box
 
@@ -14,6 +15,17 @@ PIECES = 1  # of a ray, at most
 def point(p):
     """Where a point of the field's frame lies in the space's coordinates."""
     return p
+
+
+def frame_point(q):
+    """Inverse of `point`."""
+    return q
+
+
+def rate(q):
+    """How many units of the coordinates a unit of length of the frame is at `q`: what a field's numbers say
+    of σ is per unit of the coordinates."""
+    return 1.0
 
 
 def piece(number, grid, o, d, near):
@@ -30,10 +42,25 @@ def distance(course, u):
 
 
 def span(course, u, length):
-    """How much of t a length of u from `u` on stands for: densities are per t."""
+    """How much of t a length of u around `u` stands for: densities are per t."""
     return length
 
 
 def most_samples(aabb: np.ndarray, step: float) -> int:
     """How many samples a ray through a field of a box (6,) can have."""
     return int(float(np.linalg.norm(aabb[3:] - aabb[:3])) / step) + 2
+
+
+def contracted(points: torch.Tensor) -> torch.Tensor:
+    """`point` of each of points (N, 3), differentiable."""
+    return points
+
+
+def placed(points: torch.Tensor) -> torch.Tensor:
+    """`frame_point` of each of coordinates (N, 3), differentiable."""
+    return points
+
+
+def rates(points: torch.Tensor) -> torch.Tensor:
+    """`rate` at each of coordinates (N, 3): (N,)."""
+    return points.new_ones(len(points))

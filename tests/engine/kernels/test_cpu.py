@@ -434,7 +434,9 @@ def march(grid: GridArrays, rays_o, rays_d, step, near=0.0, jitter=0.5, wave=100
     found = [[] for _ in range(n)]
     while (start >= 0).any():
         ts, counts = np.zeros((n, wave)), np.zeros(n, np.int64)
-        MARCH(grid, rays_o, rays_d, near, np.full(n, jitter), step, start, alive, ts, counts)
+        MARCH(
+            grid, rays_o, rays_d, near, np.full(n, jitter), step, start, alive, ts, np.zeros_like(ts), counts
+        )
         for i in range(n):
             found[i].append(ts[i, : counts[i]])
     return [np.concatenate(parts) for parts in found]

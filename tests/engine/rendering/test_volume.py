@@ -7,7 +7,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import framing_camera
-from fusedrf_cli.engine.rendering.volume import render_image, render_rays, weights_from_sigma
+from fusedrf_cli.engine.rendering.volume import render_image, render_rays, weights_from_depths
 from tests.engine.conftest import (
     BOX,
     DIRECTIONS_26,
@@ -118,9 +118,9 @@ def test_no_rays_and_rays_that_miss():
 
 def test_weights_continue_a_wave():
     sigma, step = np.random.default_rng(0).random((5, 12)) * 9, 0.05
-    whole, behind = weights_from_sigma(sigma, step, np.ones(5))
-    first, between = weights_from_sigma(sigma[:, :5], step, np.ones(5))
-    second, last = weights_from_sigma(sigma[:, 5:], step, between)
+    whole, behind = weights_from_depths(sigma * step, np.ones(5))
+    first, between = weights_from_depths(sigma[:, :5] * step, np.ones(5))
+    second, last = weights_from_depths(sigma[:, 5:] * step, between)
     np.testing.assert_allclose(np.concatenate([first, second], 1), whole, rtol=1e-9)
     np.testing.assert_allclose(last, behind)
     np.testing.assert_allclose(whole.sum(1) + behind, 1)

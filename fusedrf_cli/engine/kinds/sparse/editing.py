@@ -102,12 +102,12 @@ def refilled(
     ) << MAX_LEVEL - lattice.tree.depth
     lattice, (taken, sigma) = thinned(lattice, np.where(new, dense, old.covers(middles)), taken, sigma)
 
-    probe = SparseField(SparseShape(0), lattice, field.scale)
+    probe = SparseField(SparseShape(0), lattice, field.scale, space=field.space)
     set_density(probe, sigma)
     kept, facing = shown(probe, taken[lattice.corners].any(1))
     lattice, (taken, facing) = thinned(lattice, kept, taken, facing)
 
-    result = SparseField(field.shape, lattice, field.scale)
+    result = SparseField(field.shape, lattice, field.scale, space=field.space)
     rows, _ = old.at(lattice)
     fresh = taken | np.isnan(rows[:, 0])
     local = local_fill(result, shows, fresh, facing)
@@ -206,7 +206,7 @@ def local_fill(field: SparseField, shows, fresh: np.ndarray, facing: np.ndarray)
     if not own.any():
         own[:1] = True
     part = BrickTree.of(tree.lo, tree.top, tree.counts, tree.level[own], tree.at[own], tree.mask[own])
-    local = SparseField(field.shape, Lattice(part, SIDE), field.scale)
+    local = SparseField(field.shape, Lattice(part, SIDE), field.scale, space=field.space)
     at = field.fine.find(local.fine.keys)[0]
     fill(local, shows, density(shows, local.fine.places), facing[at])
     return local

@@ -8,8 +8,9 @@ activation.
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.sparse import bodies, reference, training
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
+from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
 MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
@@ -61,9 +63,16 @@ class SparseField(ComputedField):
 
     kind, bodies = "sparse", bodies
 
-    def __init__(self, shape: SparseShape, fine: Lattice, scale: float, params: torch.Tensor | None = None):
-        """params (P,) float; None: zeros."""
-        self.shape, self.fine, self.scale = shape, fine, float(scale)
+    def __init__(
+        self,
+        shape: SparseShape,
+        fine: Lattice,
+        scale: float,
+        params: torch.Tensor | None = None,
+        space: ModuleType = bounded,
+    ):
+        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space."""
+        self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
         self.coarse = Lattice(fine.tree, COARSE) if shape.sh_degree else None
         self.params = torch.zeros(self.size) if params is None else params
 
@@ -80,7 +89,7 @@ class SparseField(ComputedField):
         lattice = training.within(self.fine, occupancy)
         if lattice is None:
             return self
-        other = SparseField(self.shape, lattice, self.scale, None).to(self.params.device)
+        other = SparseField(self.shape, lattice, self.scale, None, occupancy.space).to(self.params.device)
         other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
         if other.coarse:
             other.bands[:] = self.bands[self.coarse.find(other.coarse.keys)[0]]
@@ -160,7 +169,7 @@ class SparseField(ComputedField):
     @cached_property
     def occupancy(self) -> OccupancyGrid:
         """Cells that active voxels reach."""
-        return self.tree.occupancy(OCCUPANCY_CELLS)
+        return replace(self.tree.occupancy(OCCUPANCY_CELLS), space=self.lies_in)
 
     def kernel_arrays(self, params: object) -> bodies.Arrays:
         """See ComputedField."""
@@ -247,6 +256,7 @@ class SparseField(ComputedField):
             "top": self.tree.top.tolist(),
             "scale": self.scale,
             "sh_degree": self.shape.sh_degree,
+            **({} if self.lies_in is bounded else {"space": name_of(self.lies_in)}),
         }
         return arrays, metadata
 
@@ -255,7 +265,8 @@ class SparseField(ComputedField):
         """Inverse of `state`. Every number is checked before it can size an array or index one."""
         tree = stored_tree(arrays, metadata)
         shape = SparseShape(whole(metadata["sh_degree"], "sh_degree", 0, 3))
-        field = cls(shape, Lattice(tree, SIDE), positive(metadata["scale"], "scale"))
+        space = space_named(metadata.get("space", "bounded"))
+        field = cls(shape, Lattice(tree, SIDE), positive(metadata["scale"], "scale"), space=space)
         held = {"rows": (field.rows, field.fine)} | (
             {"bands": (field.bands, field.coarse)} if field.coarse else {}
         )

@@ -62,7 +62,7 @@ def interpolated(old: Lattice, values: torch.Tensor, missing: torch.Tensor, new:
 
 def carried(field, lattice: Lattice):
     """A field over another lattice of one level with what it holds, interpolated."""
-    other = type(field)(field.shape, lattice, field.scale)
+    other = type(field)(field.shape, lattice, field.scale, space=field.space)
     here = field.to("cpu")
     missing = torch.zeros(here.rows.shape[1])
     missing[0] = UNTRAINED

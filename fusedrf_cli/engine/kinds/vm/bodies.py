@@ -51,6 +51,7 @@ class Arrays(NamedTuple):
     stride: object  # (B,) int64, steps of the finest block that one sample of this block may stand for
     occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
+    crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
 
 
 def sizes(field) -> dict[str, int]:
@@ -64,6 +65,7 @@ def sizes(field) -> dict[str, int]:
     return {
         "DENSITY_RANK": rank, "COLOUR_RANK": colour_rank, "COEFFICIENTS": field.shape.coefficients,
         **dict(zip(held, starts, strict=False)), "SCRATCH": starts[-1], "KEPT": 3 * colour_rank,
+        "CROSSING": int(any(field.crossings)),
     }  # fmt: skip
 
 
@@ -171,14 +173,30 @@ def mode_scatter(rank, params, grads, plane, line, na, nb, nc, a, b, c, base, st
 # -- a tensor -----------------------------------------------------------------------------------------------
 
 
+def affine(matrices, b, p):
+    """A point by the b-th of matrices (B, 3, 4)."""
+    x, y, z = p
+    return (
+        matrices[b, 0, 0] * x + matrices[b, 0, 1] * y + matrices[b, 0, 2] * z + matrices[b, 0, 3],
+        matrices[b, 1, 0] * x + matrices[b, 1, 1] * y + matrices[b, 1, 2] * z + matrices[b, 1, 3],
+        matrices[b, 2, 0] * x + matrices[b, 2, 1] * y + matrices[b, 2, 2] * z + matrices[b, 2, 3],
+    )
+
+
+def whole_unit(p):
+    """Coordinates of unbounded space, which lie between -2 and 2, in its unit cube."""
+    return 0.25 * p[0] + 0.5, 0.25 * p[1] + 0.5, 0.25 * p[2] + 0.5
+
+
 def unit_point(field, b, p):
     """The unit-cube coordinates of a field point in block b, and whether it lies inside."""
-    x, y, z = p
-    to_unit = field.to_unit
     real = field.params.dtype.type
-    u = to_unit[b, 0, 0] * x + to_unit[b, 0, 1] * y + to_unit[b, 0, 2] * z + to_unit[b, 0, 3]
-    v = to_unit[b, 1, 0] * x + to_unit[b, 1, 1] * y + to_unit[b, 1, 2] * z + to_unit[b, 1, 3]
-    w = to_unit[b, 2, 0] * x + to_unit[b, 2, 1] * y + to_unit[b, 2, 2] * z + to_unit[b, 2, 3]
+    if CROSSING != 0 and field.crossing[b] != 0:
+        u, v, w = affine(field.to_unit, b, frame_point(p))
+        if field.crossing[b] == 2:
+            u, v, w = whole_unit(point((u, v, w)))
+    else:
+        u, v, w = affine(field.to_unit, b, p)
     lo, hi = -EDGE, 1 + EDGE
     inside = u >= lo and v >= lo and w >= lo and u <= hi and v <= hi and w <= hi
     return real(u), real(v), real(w), inside
@@ -250,7 +268,16 @@ def block_density(field, b, p, stretch):
     if field.first.shape[0] != 0 and not matter_at(field, t, u, v, w):
         return 0.0, 0.0
     f = density_feature(field, t, u, v, w)
-    return float(stretch * field.activation[t, 0] * softplus(f + field.activation[t, 1])), float(f)
+    return float(crossed(field, b, p, stretch) * field.activation[t, 0] * softplus(f + field.activation[t, 1])), float(f)
+
+
+def crossed(field, b, p, stretch):
+    """What makes block b's density one per length of the coordinates at p: the stretch of its placement, and
+    for a block that does not lie in the field's own space the length that those coordinates stand for."""
+    if CROSSING != 0 and field.crossing[b] != 0:
+        own = 1.0 if field.crossing[b] == 1 else rate(point(affine(field.to_unit, b, frame_point(p))))
+        return stretch * own / rate(p)
+    return stretch
 
 
 def matter_at(field, t, u, v, w):
@@ -370,7 +397,7 @@ def density_backward(field, place, p, d, pre, d_sigma, scratch, grad):
     """Adjoint of `density`."""
     u, v, w, _ = unit_point(field, place, p)
     t = field.tensor[place]
-    slope = object_direction(field, place, d)[3] * field.activation[t, 0]
+    slope = crossed(field, place, p, object_direction(field, place, d)[3]) * field.activation[t, 0]
     scratch[ONE] = d_sigma * slope * sigmoid(pre + field.activation[t, 1])
     if scratch[ONE] != 0:
         scatter_density(field, grad, t, u, v, w, scratch)

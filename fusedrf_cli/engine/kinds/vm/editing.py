@@ -44,7 +44,7 @@ def as_vm(kind, placed: Placed, teach: Teach) -> Placed:
         return placed
     teacher = ComposedField([Placed(placed.name, placed.field, np.eye(4))])
     student = kind.empty(teacher, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), placed.name)
-    student, _ = teach(teacher, student, [teacher.occupancy.tight_aabb(0)], True)
+    student, _ = teach(teacher, student, [teacher.occupancy.subject], True)
     back = placed.object_to_world.copy()
     back[:3, 3] += back[:3, :3] @ teacher.origin
     return Placed(placed.name, student, back)
@@ -62,7 +62,7 @@ def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, t
         left = emptied.occupancy.occupied.any()
         return Edited(emptied, region, "the cells of its box emptied") if left else None
     student = kind.empty(local, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), RESTORED)
-    student, figures = teach(local, student, [local.occupancy.tight_aabb(0)], True)
+    student, figures = teach(local, student, [local.occupancy.subject], True)
     back = np.eye(4)
     back[:3, 3] = teacher.origin
     whole = blocks_of([Placed("", emptied, np.eye(4)), Placed(RESTORED, student, back)])

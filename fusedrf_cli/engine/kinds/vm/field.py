@@ -10,6 +10,7 @@ edit appends or drops a block and leaves the rest as it is.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -29,11 +30,13 @@ from fusedrf_cli.engine.fields.occupancy import (
     OccupancyGrid,
     placed_cells,
     transformed_aabb,
+    unbounded_cells,
 )
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm import bodies, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.reference import MODES
+from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
@@ -56,14 +59,16 @@ class VMTensor:
     occupied: np.ndarray | None = None
     """(X, Y, Z) bool cells of the box that hold matter; None: all. What the tensor says elsewhere was never
     learnt."""
+    space: ModuleType = bounded
+    """That the box lies in (engine/spaces)."""
 
     @property
     def occupancy(self) -> OccupancyGrid:
         """The occupancy grid in the object's frame."""
         return (
-            OccupancyGrid.full(self.aabb)
+            OccupancyGrid.full(self.aabb, space=self.space)
             if self.occupied is None
-            else OccupancyGrid(self.aabb, self.occupied)
+            else OccupancyGrid(self.aabb, self.occupied, self.space)
         )
 
     @property
@@ -172,7 +177,7 @@ class VMField(ComputedField):
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "VMField":
         """The same numbers of a one-block field under another occupancy grid of its box."""
-        tensor = replace(self.tensors[0], occupied=occupancy.occupied)
+        tensor = replace(self.tensors[0], occupied=occupancy.occupied, space=occupancy.space)
         return VMField(self.shape, (tensor,), self.blocks, self.params, occupancy)
 
     @classmethod
@@ -184,12 +189,14 @@ class VMField(ComputedField):
         if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
         grids = [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks]
-        boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
-        aabb, marks = placed_cells(boxes, grids, OWNERSHIP_CELLS)
+        if any(grid.space is unbounded for grid, _ in grids):
+            space, aabb, marks = unbounded, unbounded.WHOLE, unbounded_cells(grids, OWNERSHIP_CELLS)
+        else:
+            boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
+            space, (aabb, marks) = bounded, placed_cells(boxes, grids, OWNERSHIP_CELLS)
         first, second, count = claimed_cells(marks)
-        unsettled = cls(
-            shape, tensors, blocks, params, OccupancyGrid(aabb, count > 0), owners=(first, second)
-        )
+        occupancy = OccupancyGrid(aabb, count > 0, space)
+        unsettled = cls(shape, tensors, blocks, params, occupancy, owners=(first, second))
         settle_crowded(unsettled, np.argwhere(count > 2), first, second)
         return unsettled
 
@@ -283,10 +290,13 @@ class VMField(ComputedField):
     def kernel_arrays(self, params: object) -> bodies.Arrays:
         """See ComputedField."""
         to_unit, to_object = [], []
-        for block in self.blocks:
+        for block, steps in zip(self.blocks, self.crossings, strict=True):
             box = self.tensors[block.tensor].aabb
             field_to_object = np.linalg.inv(block.object_to_field)
             to_object.append(field_to_object[:3, :3])
+            if steps == 2:  # the box is that of all of space, which bodies.py knows
+                to_unit.append(field_to_object[:3])
+                continue
             scale = np.diag(1.0 / (box[3:] - box[:3]))
             to_unit.append(
                 np.concatenate(
@@ -308,7 +318,21 @@ class VMField(ComputedField):
             self._strides(),
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
+            np.asarray(self.crossings, np.uint8),
         )
+
+    @cached_property
+    def crossings(self) -> list[int]:
+        """For each block how a point in the coordinates of the field's space comes to its tensor: 0, by an
+        affine map; 1, by way of the field's frame; 2, and from there into an unbounded space of its own."""
+        found = []
+        for block in self.blocks:
+            own = self.tensors[block.tensor].space
+            if own is self.space and (own is bounded or np.array_equal(block.object_to_field, np.eye(4))):
+                found.append(0)
+            else:
+                found.append(1 if own is bounded else 2)
+        return found
 
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
@@ -350,6 +374,7 @@ class VMField(ComputedField):
                     "scale": t.scale,
                     "shift": t.shift,
                     "occupancy": list(g.shape),
+                    **({} if t.space is bounded else {"space": name_of(t.space)}),
                 }
                 for t, g in zip(self.tensors, grids, strict=True)
             ],
@@ -392,7 +417,8 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
     if not (0 < scale < np.inf and np.isfinite(shift)):
         raise ValueError(f"tensor {i}: scale should be positive and shift finite, found {scale} and {shift}")
     cells = whole_numbers(stored["occupancy"], 1, f"tensor {i}: occupancy")
-    return VMTensor(resolution, aabb, scale, shift, unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells)))
+    occupied = unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells))
+    return VMTensor(resolution, aabb, scale, shift, occupied, space_named(stored.get("space", "bounded")))
 
 
 def check_answers(i: int, tensor: VMTensor, sections: dict[str, torch.Tensor]) -> None:

@@ -66,7 +66,10 @@ def object_point(field, b: int, points: torch.Tensor) -> tuple[torch.Tensor, tor
     tensor = field.tensors[block.tensor]
     to_object = torch.linalg.inv(exact(block.object_to_field, points.device))
     box = exact(tensor.aabb, points.device)
-    unit = (points @ to_object[:3, :3].T + to_object[:3, 3] - box[:3]) / (box[3:] - box[:3])
+    at = field.space.placed(points) if field.crossings[b] else points
+    at = at @ to_object[:3, :3].T + to_object[:3, 3]
+    at = tensor.space.contracted(at) if field.crossings[b] == 2 else at
+    unit = (at - box[:3]) / (box[3:] - box[:3])
     inside = ((unit >= -EDGE) & (unit <= 1 + EDGE)).all(1)
     if field.owners is not None:
         occupied = torch.from_numpy(tensor.occupancy.occupied).to(points.device)
@@ -74,6 +77,18 @@ def object_point(field, b: int, points: torch.Tensor) -> tuple[torch.Tensor, tor
         cell = (unit.detach() * counts).long().clamp_min(0).minimum(counts - 1)
         inside = inside & occupied[cell.unbind(1)]
     return unit, inside
+
+
+def crossed(field, b: int, points: torch.Tensor) -> torch.Tensor | float:
+    """(N,) what makes the density of a block of another space than the field's one per length of the field's
+    coordinates (N, 3)."""
+    if not field.crossings[b]:
+        return 1.0
+    block = field.blocks[b]
+    to_object = torch.linalg.inv(exact(block.object_to_field, points.device))
+    space = field.tensors[block.tensor].space
+    own = space.contracted(field.space.placed(points) @ to_object[:3, :3].T + to_object[:3, 3])
+    return space.rates(own) / field.space.rates(points)
 
 
 def object_direction(field, b: int, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,6 +107,7 @@ def block_density(field, b: int, points: torch.Tensor, dirs: torch.Tensor) -> to
     kind = field.params.dtype
     feature = vm_density_feature(field.sections(field.blocks[b].tensor), unit.to(kind))
     _, stretch = object_direction(field, b, dirs)
+    stretch = stretch * crossed(field, b, points)
     return torch.where(inside, stretch.to(kind) * density(feature, tensor.scale, tensor.shift), 0)
 
 

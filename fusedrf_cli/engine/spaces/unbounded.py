@@ -1,0 +1,190 @@
+"""The space of a field that fills everything: a core, which coordinates leave as it is, and around it all the
+rest, drawn together.
+
+With n = max |x_i| of a point of the field's frame, the core is n <= 1. Outside, the coordinate a with the
+largest magnitude becomes ±(2 - 1/n) and the two others x_j / n (MERF, Reiser et al. 2023, eq. 3), so that
+coordinates lie in [-2, 2]. In the core and in each of the six slabs around it straight lines stay straight
+and planes flat, so that a ray is a few straight pieces (see bounded.py for what a space has).
+
+A slab's part of a ray from (t0, n0) to (t1, n1) is a line of length L in coordinates; at u along it, with
+s = u / L,
+    t(u) = t0 + (t1 - t0) s n0 / (s n0 + (1 - s) n1).
+"""
+
+import math
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.kernels.parts import hit_box
+
+PIECES = 6  # a straight line meets at most five of the seven regions, and a sixth by rounding at an edge
+FAR = 1e3  # n at which rays end
+ENDLESS = 1e30
+CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
+SIDE = 2.0  # coordinates lie between -SIDE and SIDE
+WHOLE = np.array([-SIDE] * 3 + [SIDE] * 3)
+SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
+
+
+def point(p):
+    """Where a point of the field's frame lies in the space's coordinates."""
+    n = max(abs(p[0]), max(abs(p[1]), abs(p[2])))
+    if n <= 1.0:
+        return p
+    x, y, z = p[0] / n, p[1] / n, p[2] / n
+    end = 2.0 - 1.0 / n
+    if abs(p[0]) == n:
+        return x * end, y, z
+    if abs(p[1]) == n:
+        return x, y * end, z
+    return x, y, z * end
+
+
+def frame_point(q):
+    """Inverse of `point`; what lies beyond FAR comes back at FAR."""
+    m = max(abs(q[0]), max(abs(q[1]), abs(q[2])))
+    if m <= 1.0:
+        return q
+    n = 1.0 / max(2.0 - m, 1.0 / FAR)
+    x, y, z = q[0] * n, q[1] * n, q[2] * n
+    if abs(q[0]) == m:
+        return x / m, y, z
+    if abs(q[1]) == m:
+        return x, y / m, z
+    return x, y, z / m
+
+
+def rate(q):
+    """How many units of the coordinates a unit of length of the frame is at `q`, radially: 1 / n²."""
+    m = max(abs(q[0]), max(abs(q[1]), abs(q[2])))
+    return 1.0 if m <= 1.0 else max(2.0 - m, 1.0 / FAR) ** 2
+
+
+def region_at(o, d, t):
+    """The region of the point at t of a ray, on a border either."""
+    x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+    n = max(abs(x), max(abs(y), abs(z)))
+    if n <= 1.0:
+        return CORE
+    if abs(x) == n:
+        return 2 if x > 0.0 else 1
+    if abs(y) == n:
+        return 4 if y > 0.0 else 3
+    return 6 if z > 0.0 else 5
+
+
+def size_in(region, p):
+    """n of a point (or, of a direction, its change) by the coordinate that a slab goes by."""
+    c = p[0] if region < 3 else (p[1] if region < 5 else p[2])
+    return -c if region % 2 == 1 else c
+
+
+def leaving(region, o, d, t):
+    """Where a ray that is in a region at t leaves it, and the region that it enters there."""
+    end, after = ENDLESS, NOWHERE
+    if region == CORE:
+        for side in range(1, 7):
+            speed = size_in(side, d)
+            if speed > 0.0:
+                at = (1.0 - size_in(side, o)) / speed
+                if at < end:
+                    end, after = at, side
+        return max(end, t), after
+    size, speed = size_in(region, o), size_in(region, d)
+    if speed < 0.0:
+        end, after = (1.0 - size) / speed, CORE
+    if speed > 0.0:
+        end = (FAR - size) / speed
+    for side in range(1, 7):
+        if (side - 1) // 2 != (region - 1) // 2:
+            closing = speed - size_in(side, d)
+            if closing < 0.0:
+                at = (size_in(side, o) - size) / closing
+                if at < end:
+                    end, after = at, side
+    return max(end, t), after
+
+
+def piece(number, grid, o, d, near):
+    """See bounded.py; `course` is (t0, t1 - t0, n0, n1, 1 / L)."""
+    t0 = near
+    region = region_at(o, d, t0)
+    t1, after = leaving(region, o, d, t0)
+    for _ in range(number):
+        if after != NOWHERE:
+            t0, region = t1, after
+            t1, after = leaving(region, o, d, t0)
+        else:
+            region = NOWHERE
+    p0 = (o[0] + t0 * d[0], o[1] + t0 * d[1], o[2] + t0 * d[2])
+    p1 = (o[0] + t1 * d[0], o[1] + t1 * d[1], o[2] + t1 * d[2])
+    n0, n1 = 1.0, 1.0
+    if region > CORE:
+        n0, n1 = max(size_in(region, p0), 1.0), max(size_in(region, p1), 1.0)
+    q0, q1 = in_region(region, p0, n0), in_region(region, p1, n1)
+    x, y, z = q1[0] - q0[0], q1[1] - q0[1], q1[2] - q0[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    if region == NOWHERE or length <= 0.0 or not n0 < FAR:
+        return q0, d, 1.0, 0.0, (t0, 0.0, 1.0, 1.0, 1.0)
+    way = x / length, y / length, z / length
+    u0, u1 = hit_box(q0, way, grid.lo, grid.hi)
+    return q0, way, u0, min(u1, length), (t0, t1 - t0, n0, n1, 1.0 / length)
+
+
+def in_region(region, p, n):
+    """The coordinates of a point whose region and n are known."""
+    if region <= CORE:
+        return p
+    end = (2.0 - 1.0 / n) if region % 2 == 0 else (1.0 / n - 2.0)
+    if region < 3:
+        return end, p[1] / n, p[2] / n
+    if region < 5:
+        return p[0] / n, end, p[2] / n
+    return p[0] / n, p[1] / n, end
+
+
+def distance(course, u):
+    """The distance t along the ray, in the field's frame."""
+    t0, length, n0, n1, per = course
+    s = u * per
+    return t0 + length * s * n0 / (s * n0 + (1.0 - s) * n1)
+
+
+def span(course, u, length):
+    """How much of t a length of u around `u` stands for; where there is less than another such length before
+    or behind it in the piece, that is its own too. Exact, since far out t goes up manifold in one step."""
+    _, whole, n0, n1, per = course
+    s0, s1 = (u - 0.5 * length) * per, (u + 0.5 * length) * per
+    s0 = 0.0 if (u - length) * per < 0.0 else s0
+    s1 = 1.0 if (u + length) * per >= 1.0 else s1
+    return whole * n0 * n1 * (s1 - s0) / ((s0 * n0 + (1.0 - s0) * n1) * (s1 * n0 + (1.0 - s1) * n1))
+
+
+def most_samples(aabb: np.ndarray, step: float) -> int:
+    """How many samples a ray through a field of a box (6,) can have: a piece is at most 2 √3 long, in the
+    core, or 3, in a slab."""
+    return int((2 * math.sqrt(3) + 3.0 * (PIECES - 1)) / step) + 2 * PIECES
+
+
+def contracted(points: torch.Tensor) -> torch.Tensor:
+    """`point` of each of points (N, 3), differentiable."""
+    n, axis = points.abs().max(1, keepdim=True)
+    outside = (points / n.clamp_min(1)).scatter(
+        1, axis, points.gather(1, axis).sign() * (2 - 1 / n.clamp_min(1))
+    )
+    return torch.where(n > 1, outside, points)
+
+
+def rates(points: torch.Tensor) -> torch.Tensor:
+    """`rate` at each of coordinates (N, 3): (N,)."""
+    most = points.abs().amax(1)
+    return torch.where(most > 1, (2 - most).clamp_min(1 / FAR) ** 2, 1)
+
+
+def placed(points: torch.Tensor) -> torch.Tensor:
+    """`frame_point` of each of coordinates (N, 3), differentiable."""
+    most, axis = points.abs().max(1, keepdim=True)
+    n = 1 / (2 - most.clamp_min(1)).clamp_min(1 / FAR)
+    outside = (points * n).scatter(1, axis, points.gather(1, axis).sign() * n)
+    return torch.where(most > 1, outside, points)
