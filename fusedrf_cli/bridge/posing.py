@@ -44,7 +44,7 @@ def pose(request: PoseRequest, progress) -> dict:
         "posed": len(posed.views),
         "left_out": list(posed.unposed),
         "models": list(posed.models),
-        "focal_length": {"pixels": view.fl_x, "of_width": view.width},
+        "focal_length": {"pixels": view.fl_x, "width": view.width},
         "sparse_points": len(posed.points.positions),
         "error_pixels": posed.error,
         "world": WORLD,
