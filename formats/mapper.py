@@ -9,13 +9,12 @@ largest model, if there is any. Each line on stdout is a JSON object: the phases
 of them is done, and last what came out. The process ends when its stdin does, that is, with its parent.
 """
 
-import contextlib
 import json
 import os
 import signal
-import sqlite3
 import sys
 import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,7 +25,11 @@ MAX_SIDE = 1600
 MAX_FEATURES = 4096
 CAMERA = "SIMPLE_RADIAL"
 """COLMAP's model of the cameras: one focal length, one number of distortion."""
-EXHAUSTIVE = 80
+REFINED = 30
+"""Cameras of so many photos each get at last two focal lengths, a centre and four numbers of distortion."""
+CENTRE = 0.05
+"""A centre farther than this share of a side from the picture's middle is not believed."""
+EXHAUSTIVE = 60
 """Up to so many photos each is compared with every other."""
 NEIGHBOURS = 10
 """Of more photos each is compared with so many that follow it, as the frames of a film do."""
@@ -36,8 +39,9 @@ WORDS = 64
 """Clusters of features by which photos are compared as a whole."""
 SAMPLED = 100_000
 """Features that the clusters are made of."""
-PAIRS_AT_ONCE = 20
-"""Pairs that are stored together: progress is counted in these."""
+PER_THREAD, MATCHINGS = 4, 20
+"""Pictures per thread whose features are looked for in one call, and calls in which all pairs are compared:
+progress is counted in these."""
 SEED = 0
 LEAST_MODEL = 3
 """A model of fewer photos is none."""
@@ -56,14 +60,8 @@ def main(folder: Path) -> None:
     features = _extract(pycolmap, folder, database, names, job["threads"])
     _match(pycolmap, folder, database, names, job["threads"])
     models = _map(pycolmap, folder, database, len(names), job["threads"])
-    if models:
-        (folder / "model").mkdir()
-        models[0].write(folder / "model")
-    _say(
-        features=features,
-        models=[model.num_reg_images() for model in models],
-        error=models[0].compute_mean_reprojection_error() if models else None,
-    )
+    error = _keep(pycolmap, folder / "model", models[0], job["threads"]) if models else None
+    _say(features=features, models=[model.num_reg_images() for model in models], error=error)
 
 
 def _die_plainly() -> None:
@@ -100,34 +98,27 @@ def _extract(pycolmap, folder: Path, database: Path, names: list[str], threads: 
     """How many features were found in each picture."""
     options = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False, max_image_size=MAX_SIDE)
     options.sift.max_num_features = MAX_FEATURES
-    with _counting("features", len(names), database, "keypoints"):
-        pycolmap.extract_features(database, folder, image_names=names, extraction_options=options)
-    with contextlib.closing(sqlite3.connect(database)) as connection:
-        rows = connection.execute("SELECT name, rows FROM images LEFT JOIN keypoints USING (image_id)")
-        counts = dict(rows.fetchall())
-    return [counts.get(name) or 0 for name in names]
+    for some in _parts("features", names, PER_THREAD * threads):
+        pycolmap.extract_features(database, folder, image_names=some, extraction_options=options)
+    with pycolmap.Database.open(database) as opened:
+        ids = _ids(opened)
+        return [opened.num_keypoints_for_image(ids[name]) for name in names]
 
 
-@contextlib.contextmanager
-def _counting(phase: str, total: int, database: Path, table: str) -> Iterator[None]:
-    """Say every half second how many rows a table has, while a call fills it."""
-    _say(phase=phase, total=total)
-    over = threading.Event()
+def _parts(phase: str, items: list, length: int) -> Iterator[list]:
+    """The items, so many at a time, telling of it: calls of pycolmap say nothing while they run.
 
-    def count() -> None:
-        while not over.wait(0.5):
-            # A database that is just being written may refuse; the next look will do.
-            with contextlib.suppress(sqlite3.Error):
-                with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as reader:
-                    _say(done=reader.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    Nor may anybody look into the database from here meanwhile: Python's SQLite is another than pycolmap's,
+    and where two of them have one file open in one process, it is damaged.
+    """
+    _say(phase=phase, total=len(items))
+    for i in range(0, len(items), length):
+        yield items[i : i + length]
+        _say(done=min(i + length, len(items)))
 
-    counter = threading.Thread(target=count)
-    counter.start()
-    try:
-        yield
-    finally:
-        over.set()
-        counter.join()
+
+def _ids(opened) -> dict[str, int]:
+    return {image.name: image.image_id for image in opened.read_all_images()}
 
 
 # --- pairs --------------------------------------------------------------------------------------------------
@@ -141,19 +132,19 @@ def _match(pycolmap, folder: Path, database: Path, names: list[str], threads: in
         _say(phase="comparing", total=None)
         pairs = likely_pairs(_descriptors(pycolmap, database, names))
     listed = folder / "pairs.txt"
-    listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs))
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=PAIRS_AT_ONCE)
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    with _counting("matching", len(pairs), database, "two_view_geometries"):
+    for some in _parts("matching", pairs, max(1, -(-len(pairs) // MATCHINGS))):
+        listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some))
         pycolmap.match_image_pairs(database, matching, pairing, verification)
 
 
 def _descriptors(pycolmap, database: Path, names: list[str]) -> list[np.ndarray]:
     """(M, 128) uint8 of each picture."""
     with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        ids = _ids(opened)
         return [np.asarray(opened.read_descriptors(ids[name]).data).reshape(-1, 128) for name in names]
 
 
@@ -230,6 +221,38 @@ def _map(pycolmap, folder: Path, database: Path, count: int, threads: int) -> li
         next_image_callback=came,
     )
     return sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def _keep(pycolmap, folder: Path, model, threads: int) -> float:
+    """Write a model, its lenses refined where that is to be believed; returns its mean error in pixels."""
+    folder.mkdir()
+    model.write(folder)
+    error = model.compute_mean_reprojection_error()
+    if _refined(pycolmap, model, threads):
+        model.write(folder)
+        error = model.compute_mean_reprojection_error()
+    return error
+
+
+def _refined(pycolmap, model, threads: int) -> bool:
+    """Fit the lenses of a model more closely, and say whether the result is to be used.
+
+    Few photos do not tell a lens that is off centre from a camera that is turned.
+    """
+    photos = Counter(model.images[i].camera_id for i in model.reg_image_ids())
+    if min(photos.values()) < REFINED:
+        return False
+    _say(phase="refining", total=None)
+    cameras = [model.cameras[i] for i in photos]
+    for camera in cameras:
+        f, x, y, k = camera.params
+        camera.model, camera.params = pycolmap.CameraModelId.OPENCV, [f, f, x, y, k, 0, 0, 0]
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
+    options.ceres.solver_options.num_threads = threads
+    pycolmap.bundle_adjustment(model, options)
+    sides = np.array([(camera.width, camera.height) for camera in cameras])
+    centres = np.array([camera.params[2:4] for camera in cameras])
+    return bool((np.abs(centres / sides - 0.5) < CENTRE).all())
 
 
 if __name__ == "__main__":

@@ -350,19 +350,28 @@ def test_the_same_photos_give_the_same_poses(found, tmp_path):
 
 
 @with_pycolmap
-def test_many_photos_are_posed_by_likely_pairs(tmp_path, monkeypatch):
-    """The list of pairs is made in the process, so that is where the limit is lowered."""
+def test_many_photos_are_posed_by_likely_pairs_and_their_lens_is_refined(tmp_path, monkeypatch):
+    """Those limits hold in the process, so that is where they are lowered."""
     import formats
 
     place = Path(formats.__file__).parent
     shutil.copytree(place, tmp_path / "instead/formats")
     mapper = tmp_path / "instead/formats/mapper.py"
-    mapper.write_text(mapper.read_text().replace("EXHAUSTIVE = 80", "EXHAUSTIVE = 4"))
+    text = mapper.read_text()
+    for found, lowered in (("EXHAUSTIVE = 60", "EXHAUSTIVE = 4"), ("REFINED = 30", "REFINED = 6")):
+        assert found in text
+        text = text.replace(found, lowered)
+    mapper.write_text(text)
     monkeypatch.setattr(posing, "__file__", str(tmp_path / "instead/formats/posing.py"))
     corner.write_photos(tmp_path / "photos", 6)
     told = Told()
-    assert len(estimate(tmp_path / "photos", photos_to_pose(tmp_path / "photos"), 1, told).views) == 6
-    assert "comparing" in told.phases
+    posed = estimate(tmp_path / "photos", photos_to_pose(tmp_path / "photos"), 1, told)
+    assert list(told.phases) == ["reading", "features", "comparing", "matching", "mapping", "refining"]
+    (view, *_), true = posed.views, corner.poses(6)
+    assert view.fl_x == pytest.approx(corner.FOCAL, rel=0.02) and view.fl_x != view.fl_y
+    assert abs(view.cx - corner.SIZE[0] / 2) < 8 and any(view.distortion[3:])
+    turned, moved, _ = corner.aligned(np.array([view.camera_to_world for view in posed.views]), true)
+    assert len(turned) == 6 and turned.max() < 1.5 and moved.max() < 0.02
 
 
 @with_pycolmap
