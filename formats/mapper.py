@@ -170,6 +170,8 @@ def _looks(descriptors: list[np.ndarray]) -> np.ndarray:
     random = np.random.default_rng(SEED)
     share = max(1, sum(map(len, descriptors)) // SAMPLED)
     sample = np.concatenate([found[::share] for found in descriptors]).astype(np.float32)
+    if not len(sample):
+        return np.zeros((len(descriptors), 1), np.float32)
     words = sample[random.permutation(len(sample))[:WORDS]]
     for _ in range(10):  # Lloyd's iteration
         nearest = _nearest(sample, words)

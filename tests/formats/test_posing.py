@@ -144,6 +144,7 @@ def test_pairs_are_neighbours_and_those_that_look_alike():
 def test_pairs_of_pictures_without_features():
     found = [np.zeros((0, 128), np.uint8), *np.random.default_rng(0).integers(0, 256, (4, 9, 128), np.uint8)]
     assert likely_pairs(found) == [(i, j) for i in range(5) for j in range(i + 1, 5)]
+    assert {(i, i + 1) for i in range(29)} <= set(likely_pairs([np.zeros((0, 128), np.uint8)] * 30))
 
 
 # --- the world's axes ---------------------------------------------------------------------------------------
