@@ -39,9 +39,9 @@ WORDS = 64
 """Clusters of features by which photos are compared as a whole."""
 SAMPLED = 100_000
 """Features that the clusters are made of."""
-PER_THREAD, MATCHINGS = 4, 20
+PER_THREAD, MATCHINGS = 4, 10
 """Pictures per thread whose features are looked for in one call, and calls in which all pairs are compared:
-progress is counted in these."""
+progress is counted in these. Each call has to index its pictures' features anew."""
 SEED = 0
 LEAST_MODEL = 3
 """A model of fewer photos is none."""
