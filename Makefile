@@ -2,6 +2,8 @@
 # PIP_FLAGS='--extra-index-url https://download.pytorch.org/whl/cpu' gets the small torch, without CUDA.
 PYTHON ?= .venv/bin/python
 PIP_FLAGS ?=
+# EXTRAS=dev,capture gets pycolmap (134 MB) too, without which the tests of posing photos are skipped.
+EXTRAS ?= dev
 VENV := $(filter .venv/bin/python,$(PYTHON))
 
 # What `make fuzz` does: mutated packs against every reader, and kills of every writer at random moments.
@@ -58,5 +60,5 @@ clean:  ## all that can be made again
 
 .venv/.stamp: pyproject.toml constraints.txt
 	$$(command -v python3.11 || command -v python3) -m venv .venv
-	.venv/bin/python -m pip install -q $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	.venv/bin/python -m pip install -q $(PIP_FLAGS) -c constraints.txt -e '.[$(EXTRAS)]'
 	touch $@

@@ -21,7 +21,9 @@ from formats.frame import default_box, object_box, scene_frame, shown_box, subje
 from formats.images import read_image_header, write_png
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
-    LONGEST,
+    Folder,
+    chosen_copy,
+    copies,
     find_photo,
     has_pictures,
     is_file,
@@ -34,7 +36,6 @@ from formats.photos import (
     photo_folder,
     pictures,
     plain_background,
-    reduced,
 )
 from formats.points import Points
 from formats.transforms import (
@@ -59,6 +60,7 @@ __all__ = [
     "load_photos",
     "read_cameras",
     "read_capture",
+    "write_cameras",
     "write_capture",
 ]
 
@@ -82,13 +84,15 @@ def is_capture(path: Path | str) -> bool:
         return False
 
 
-def read_capture(path: Path | str) -> Capture:
+def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
     """The views of a folder, of one file with poses, or of a mesh, which is rendered (see `mesh_capture`).
 
     Photos are found and measured here, and decoded by `load_photos` and `load_images`. Frames are in natural
-    order of their paths; those whose photo is missing are left out and listed. Raises BadImage,
-    BadIntrinsics, BadJson, BadMask, BadMesh, BadModel, BadPose, BadSchema, LimitExceeded, MissingFile,
-    NoPoses, NoViews, UnsupportedCamera.
+    order of their paths; those whose photo is missing are left out and listed. A side of the photos is made
+    `downscale` times smaller (None: until it is at most LONGEST), or a copy of that size is read.
+
+    Raises BadImage, BadIntrinsics, BadJson, BadMask, BadMesh, BadModel, BadPose, BadSchema, LimitExceeded,
+    MissingFile, NoPoses, NoViews, UnsupportedCamera.
     """
     path = Path(path)
     if not path.exists():
@@ -98,87 +102,99 @@ def read_capture(path: Path | str) -> Capture:
     if is_mesh(path):
         return mesh_capture(path)
     if path.is_dir():
-        return _read_folder(path)
+        return _read_folder(path, downscale)
     if path.name == llff.NAME:
-        return _read_llff(path)
+        return _read_llff(path, downscale)
     if match := BLENDER_FILE.fullmatch(path.name):
-        return _read_blender(path, **{"test" if match[1] == "test" else "train": path})
-    return _read_transforms(path)
+        return _read_blender(path, downscale, **{"test" if match[1] == "test" else "train": path})
+    return _read_transforms(path, downscale)
 
 
-def _read_folder(path: Path) -> Capture:
+def _read_folder(path: Path, downscale: int | None) -> Capture:
     train, val, test, single = (path / f"transforms{split}.json" for split in ("_train", "_val", "_test", ""))
     if train.exists() or val.exists():
-        return _read_blender(path, train if train.exists() else val, test if test.exists() else None)
+        known = train if train.exists() else val
+        return _read_blender(path, downscale, known, test if test.exists() else None)
     if single.exists():
-        return _read_transforms(single)
+        return _read_transforms(single, downscale)
     if test.exists():
-        return _read_blender(path, test=test)
+        return _read_blender(path, downscale, test=test)
     if (model := colmap.model_folder(path)) is not None:
-        return _read_colmap(path, model)
+        return _read_colmap(path, model, downscale)
     if is_file(path / llff.NAME):
-        return _read_llff(path / llff.NAME)
+        return _read_llff(path / llff.NAME, downscale)
     if (folders := polycam.keyframes(path)) is not None:
-        return _read_polycam(path, *folders)
+        return _read_polycam(path, *folders, downscale)
     found = "pictures but" if has_pictures(path) else "neither pictures nor"
     raise NoPoses(
         f"{path}: found {found} no camera poses (transforms.json, transforms_train.json, COLMAP's sparse/0, "
-        "LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first, for example with COLMAP"
+        "LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
     )
 
 
 # --- one reader per layout ----------------------------------------------------------------------------------
 
 
-def _read_blender(path: Path, train: Path | None = None, test: Path | None = None) -> Capture:
-    parts = [read_part(file) if file else Part() for file in (train, test)]
+def _read_blender(
+    path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
+) -> Capture:
+    parts = [read_part(file, downscale) if file else Part() for file in (train, test)]
     return _capture(path, "blender", *parts, stated=BLENDER_AABB)
 
 
-def _read_transforms(path: Path) -> Capture:
-    document, train, test = read_splits(path)
+def _read_transforms(path: Path, downscale: int | None) -> Capture:
+    document, train, test = read_splits(path, downscale)
     points, notes = sparse_points(path, document, train.views + test.views)
     train, test = (replace(part, views=with_depths(part.views, points)) for part in (train, test))
     return _capture(path, "transforms", train, test, stated_aabb(path, document), points, notes)
 
 
-def _read_colmap(path: Path, folder: Path) -> Capture:
+def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     model = colmap.read_model(folder)
     base = colmap.capture_folder(folder) if path == folder else path
     images = sorted(model.images, key=lambda image: natural(image.name))
-    photos, notes = _model_photos(folder, base, [image.name for image in images])
+    place, photos, notes = _model_photos(folder, base, [image.name for image in images], downscale)
     names = frame_names([{"file_path": image.name} for image in images])
     views, alpha = [], False
     for image, name, photo in zip(images, names, photos, strict=True):
         if photo is None:
             continue
         header = read_image_header(photo)
-        view = replace(image.view, name=name)
-        views.append(on_photo(view, photo, header, image.where, _model_mask(base, image.name)))
+        mask, reduction = _model_mask(base, image.name), place.reduction(header, downscale)
+        views.append(on_photo(replace(image.view, name=name), photo, header, image.where, mask, reduction))
         alpha |= header.alpha
     missing = [image.name for image, photo in zip(images, photos, strict=True) if photo is None]
-    part = Part(tuple(views), alpha, tuple(missing), tuple(notes))
+    part = Part(tuple(views), alpha, tuple(missing), notes)
     return _capture(path, "colmap", part, Part(), None, model.points)
 
 
-def _model_photos(folder: Path, base: Path, names: list[str]) -> tuple[list[Path | None], list[str]]:
-    """The photo of each name of a model, None where it is missing, and a note on where they are from."""
-    for root in (base / "images", base / "input", base):
-        chosen = photo_folder(root, names)
+def _model_photos(
+    folder: Path, base: Path, names: list[str], downscale: int | None
+) -> tuple[Folder, list[Path | None], tuple[str, ...]]:
+    """The folder that a model's photos are in, the photo of each name, None where it is missing, and a note
+    on where they are from."""
+    # Beside the capture itself lie other captures, not copies of it.
+    for places in (copies(base / "images"), copies(base / "input"), [Folder(base)]):
+        chosen = photo_folder(places, names, downscale)
         if chosen is not None:
-            note = f"{folder}: photos are read from {chosen.name}"
-            return [find_photo(chosen, name) for name in names], [note] if chosen != root else []
+            note = f"{folder}: photos are read from {chosen.path.name}"
+            found = [find_photo(chosen.path, name) for name in names]
+            return chosen, found, (note,) if chosen != places[0] else ()
     # The smaller copies of LLFF's scenes have other names, in the same order as the full-size photos.
-    for place in (base / "images", *reduced(base / "images")):
-        files = pictures(place)
-        if len(files) == len(names):
-            ranked = dict(zip(sorted(names), files, strict=True))
-            note = f"{folder}: photos of {place.name} have other names and are matched by order"
-            return [ranked[name] for name in names], [note]
+    if (chosen := _counted(base / "images", len(names), downscale)) is not None:
+        ranked = dict(zip(sorted(names), pictures(chosen.path), strict=True))
+        note = f"{folder}: photos of {chosen.path.name} have other names and are matched by order"
+        return chosen, [ranked[name] for name in names], (note,)
     raise MissingFile(
         f"{folder}: names {len(names)} photos such as {names[0]}, but {base / 'images'} has none of them; "
         "put the photos there"
     )
+
+
+def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
+    """The folder out of `copies` to read photos from whose names say nothing: it has so many."""
+    listed = [(place, pictures(place.path)) for place in copies(images)]
+    return chosen_copy([(place, files[0]) for place, files in listed if len(files) == count > 0], downscale)
 
 
 def _model_mask(base: Path, name: str) -> Path | None:
@@ -188,31 +204,28 @@ def _model_mask(base: Path, name: str) -> Path | None:
     return exact if is_file(exact) else find_photo(masks, name)
 
 
-def _read_llff(path: Path) -> Capture:
+def _read_llff(path: Path, downscale: int | None) -> Capture:
     rows = llff.read_poses_bounds(path)
     images = path.parent / "images"
-    counts = {place: pictures(place) for place in (images, *reduced(images))}
-    suited = [files for files in counts.values() if len(files) == len(rows) > 0]
-    if not suited:
-        found = ", ".join(f"{len(files)} in {place.name}" for place, files in counts.items())
+    place = _counted(images, len(rows), downscale)
+    if place is None:
+        counts = [(place.path.name, len(pictures(place.path))) for place in copies(images)]
+        found = ", ".join(f"{count} in {name}" for name, count in counts)
         raise BadModel(
             f"{path}: has {len(rows)} poses, one per photo by the order of names, but there are {found}; "
             "restore all photos, or estimate the poses again"
         )
-    headers = [read_image_header(files[0]) for files in suited]
-    small = [max(header.width, header.height) <= LONGEST for header in headers]
-    photos = suited[small.index(True) if any(small) else -1]
     views, alpha = [], False
-    for (where, view), photo in zip(rows, photos, strict=True):
-        header = read_image_header(photo)
-        views.append(on_photo(replace(view, name=photo.stem), photo, header, f"{where} ({photo.name})"))
+    for i, (row, photo) in enumerate(zip(rows, pictures(place.path), strict=True)):
+        where, header = f"{path}: row {i} ({photo.name})", read_image_header(photo)
+        view = replace(llff.row_view(where, row), name=photo.stem)
+        views.append(on_photo(view, photo, header, where, reduction=place.reduction(header, downscale)))
         alpha |= header.alpha
-    folder = photos[0].parent
-    notes = () if folder == images else (f"{path}: photos are read from {folder.name}",)
+    notes = () if place.path == images else (f"{path}: photos are read from {place.path.name}",)
     return _capture(path, "llff", Part(tuple(views), alpha, (), notes), Part(), None)
 
 
-def _read_polycam(path: Path, images: Path, cameras: Path) -> Capture:
+def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
     views, alpha, missing = [], False, []
     for file in sorted(cameras.glob("*.json"), key=lambda file: natural(file.name)):
         view, photo = polycam.read_camera(file), find_photo(images, file.stem)
@@ -220,7 +233,8 @@ def _read_polycam(path: Path, images: Path, cameras: Path) -> Capture:
             missing.append(file.stem)
             continue
         header = read_image_header(photo)
-        views.append(on_photo(view, photo, header, str(file)))
+        reduction = Folder(images).reduction(header, downscale)
+        views.append(on_photo(view, photo, header, str(file), reduction=reduction))
         alpha |= header.alpha
     return _capture(path, "polycam", Part(tuple(views), alpha, tuple(missing)), Part(), None)
 
@@ -252,16 +266,18 @@ def _capture(
     if (kept := object_boxes(views)) is not None:
         corners = [view.corners(1.0, bounds) for view, bounds in zip(views, kept, strict=True)]
         cut_out = object_box(poses[:, :3, 3], np.array(corners))
-    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_doubts(path, poses))))
+    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_smaller(path, views))))
     return Capture(path, kind, train.views, test.views, box, opaque, cut_out, missing, points, frame, notes)
 
 
-def _doubts(path: Path, poses: np.ndarray) -> Iterator[str]:
-    """Sentences about poses from which no depth follows."""
-    if len(poses) < 3:
-        yield f"{path}: has {len(poses)} photos; depth needs at least three from different places"
-    elif np.ptp(poses[:, :3, 3], axis=0).max() == 0:
-        yield f"{path}: all cameras are at one point, from which no depth follows; move between photos"
+def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:
+    """A sentence about photos that are made smaller on reading."""
+    most = max(views, key=lambda view: view.reduction)
+    if most.reduction > 1:
+        yield (
+            f"{path}: photos are made {most.reduction} times smaller, to {most.width}x{most.height}; "
+            "--downscale 1 takes them whole"
+        )
 
 
 def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | None) -> tuple:
@@ -289,22 +305,26 @@ def write_capture(
     (folder / split).mkdir(parents=True, exist_ok=True)
     for view, picture in zip(views, pixels, strict=True):
         write_png(folder / split / f"{view.name}.png", picture)
-    more = any(view.fisheye or any(view.distortion[5:]) for view in views)
-    shared = _intrinsics(views[0], more)
+    files = [f"./{split}/{view.name}" for view in views]
+    write_cameras(folder / f"transforms_{split}.json", views, files)
+
+
+def write_cameras(path: Path, views: Sequence[View], files: Sequence[str], **more) -> None:
+    """A transforms.json with the cameras of views and the path of each one's photo; `more` are further keys
+    of the file. Raises ResourceError."""
+    higher = any(view.fisheye or any(view.distortion[5:]) for view in views)
+    shared = _intrinsics(views[0], higher)
     frames = [
         {
-            "file_path": f"./{split}/{view.name}",
-            **{key: value for key, value in _intrinsics(view, more).items() if value != shared[key]},
+            "file_path": file,
+            **{key: value for key, value in _intrinsics(view, higher).items() if value != shared[key]},
             "transform_matrix": view.camera_to_world.tolist(),
         }
-        for view in views
+        for view, file in zip(views, files, strict=True)
     ]
-    document = {
-        "camera_angle_x": 2 * math.atan(0.5 * views[0].width / views[0].fl_x),
-        **shared,
-        "frames": frames,
-    }
-    with atomic_writer(folder / f"transforms_{split}.json") as file:
+    angle = 2 * math.atan(0.5 * views[0].width / views[0].fl_x)
+    document = {"camera_angle_x": angle, **shared, **more, "frames": frames}
+    with atomic_writer(path) as file:
         file.write(json.dumps(document, indent=1, allow_nan=False).encode() + b"\n")
 
 

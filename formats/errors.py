@@ -155,6 +155,12 @@ class BadPose(FormatError):
     """A camera pose that is not a rigid motion."""
 
 
+class PosingFailed(FormatError):
+    """Structure from motion broke down."""
+
+    exit_code = 1
+
+
 class BadIntrinsics(FormatError):
     """A focal length, principal point, picture size or distortion that is missing or impossible."""
 

@@ -15,6 +15,10 @@ from formats.png import png_writer
 
 MAX_SIDE = 16384
 EXIF_ORIENTATION = 0x0112
+EXIF_PART = 0x8769
+EXIF_FOCAL_35MM = 0xA405
+DIAGONAL_35MM = 43.27
+"""Millimetres across the corners of the film that EXIF's equivalent focal lengths refer to."""
 DEEP_MODES = ("I", "F")
 """Pillow's modes with 16 bits or more, which it would clip to 8, not scale."""
 DECODING_ERRORS = (
@@ -41,15 +45,26 @@ class Header(NamedTuple):
     """The EXIF orientation, 1 to 8: how to turn the stored pixels upright; 1 where none is given."""
 
 
-def read_image(path: Path | str, orientation: int = 1) -> np.ndarray:
+def read_image(path: Path | str, orientation: int = 1, reduction: int = 1) -> np.ndarray:
     """(H, W, 4) uint8, straight alpha, 255 where the file has none.
 
     The pixels stand as stored: an EXIF rotation is not applied, as the tools that estimate poses ignore it
-    too, unless `orientation` (as EXIF counts them) asks for one. Raises BadImage, LimitExceeded (before
-    decoding), MissingFile.
+    too, unless `orientation` (as EXIF counts them) asks for one. With `reduction` each is the mean of so many
+    a side of the turned picture, colours weighted by alpha; what is left over at the right and below is cut
+    off. Raises BadImage, LimitExceeded (before decoding), MissingFile.
     """
     with _opened(path) as image:
-        return oriented(np.array(image.convert("RGBA")), orientation)
+        return reduced(oriented(np.array(image.convert("RGBA")), orientation), reduction)
+
+
+def reduced(pixels: np.ndarray, factor: int) -> np.ndarray:
+    """(H, W, 4) uint8, straight alpha, to (H // factor, W // factor, 4)."""
+    from PIL import Image
+
+    if factor == 1:
+        return pixels
+    high, wide = (side // factor * factor for side in pixels.shape[:2])
+    return np.array(Image.fromarray(np.ascontiguousarray(pixels)).reduce(factor, (0, 0, wide, high)))
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -67,6 +82,31 @@ def read_image_header(path: Path | str) -> Header:
     """Size, alpha and orientation, without decoding. Raises as `read_image`."""
     with _opened(path) as image:
         return Header(*image.size, image.has_transparency_data, _orientation(image))
+
+
+def read_focal(path: Path | str) -> float | None:
+    """Focal length in diagonals of the picture, from EXIF; None where it does not say. Raises as
+    `read_image`."""
+    with _opened(path) as image:
+        try:
+            said = float(image.getexif().get_ifd(EXIF_PART).get(EXIF_FOCAL_35MM, 0))
+        except DECODING_ERRORS:  # broken metadata
+            return None
+    return said / DIAGONAL_35MM if 1 <= said <= 10_000 else None
+
+
+def write_smaller(path: Path | str, smaller: Path, longest: int) -> tuple[int, int]:
+    """Decode all of a picture and write it as RGB PNG, at most `longest` pixels a side, as stored; returns
+    its width and height. Raises as `read_image`."""
+    from PIL import Image
+
+    with _opened(path) as image:
+        shrink = min(1.0, longest / max(image.size))
+        size = tuple(max(1, round(side * shrink)) for side in image.size)
+        image.draft("RGB", size)  # a JPEG is decoded at about this size, which is several times faster
+        picture = image.convert("RGB")
+    picture.resize(size, Image.Resampling.LANCZOS).save(smaller, "PNG", compress_level=1)
+    return size
 
 
 def oriented(pixels: np.ndarray, orientation: int) -> np.ndarray:

@@ -20,17 +20,11 @@ MAX_BYTES = 16 * 2**20
 COLUMNS = 17
 
 
-def read_poses_bounds(path: Path) -> list[tuple[str, View]]:
-    """(how errors name it, its camera at the full photos' size, without a name) of each row.
+def read_poses_bounds(path: Path) -> np.ndarray:
+    """(N, 17) float64, the header held against the bytes before anything is allocated.
 
-    Raises BadIntrinsics, BadModel, BadPose, LimitExceeded, MissingFile.
+    Raises BadModel, LimitExceeded, MissingFile.
     """
-    rows = _table(path)
-    return [(f"{path}: row {i}", _view(f"{path}: row {i}", row)) for i, row in enumerate(rows)]
-
-
-def _table(path: Path) -> np.ndarray:
-    """(N, 17) float64, the header held against the bytes before anything is allocated."""
     data = read_input(path, MAX_BYTES)
     file = io.BytesIO(data)
     try:
@@ -51,7 +45,11 @@ def _table(path: Path) -> np.ndarray:
     return flat.reshape(shape, order="F" if fortran else "C")
 
 
-def _view(where: str, row: np.ndarray) -> View:
+def row_view(where: str, row: np.ndarray) -> View:
+    """The camera of a row (17,) at the full photos' size, without a name; errors are led by `where`.
+
+    Raises BadIntrinsics, BadPose.
+    """
     matrix, (near, far) = row[:15].reshape(3, 5), row[15:]
     if not np.isfinite(row).all():
         raise BadPose(f"{where}: holds NaN or infinity; export the poses again")
@@ -60,7 +58,8 @@ def _view(where: str, row: np.ndarray) -> View:
         raise BadIntrinsics(f"{where}: focal length of {focal:g} pixels, expected a positive one")
     if not 0 < near < far:
         raise BadIntrinsics(
-            f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth"
+            f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth; estimate the "
+            "poses again"
         )
     width, height = checked_size(round(width), round(height), where)
     down, right, back, eye = matrix[:, :4].T

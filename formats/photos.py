@@ -2,7 +2,8 @@
 
 A camera is given for photos of a certain size. The photos on disk may be smaller copies in a folder
 `images_2`, `images_4` or `images_8` beside `images`, have another extension, or be stored sideways with an
-EXIF orientation; the camera is scaled to the photo that is read.
+EXIF orientation; the camera is scaled to the photo that is read. Large photos are made smaller on reading, by
+a whole factor: each pixel is the mean of so many a side.
 """
 
 import re
@@ -19,8 +20,9 @@ from formats.images import Header, oriented, read_image, read_image_header, read
 from formats.views import View
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".PNG", ".JPG", ".JPEG")
-LONGEST = 1024
-"""Pixels of a photo's longer side past which a smaller copy is taken where there is one."""
+LONGEST = 1080
+"""Pixels of a photo's longer side past which a smaller copy is taken where there is one, and otherwise the
+photo is made smaller; unless a factor is asked for."""
 MAX_ASPECT_ERROR = 0.02
 """Relative difference allowed between the aspect ratios of a photo and its camera, for rounded sizes."""
 SAMPLED = 6
@@ -40,10 +42,26 @@ def natural(text: str) -> list:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in DIGITS.split(text)]
 
 
+@dataclass(frozen=True)
+class Folder:
+    """A folder of photos."""
+
+    path: Path
+    factor: int = 1
+    """How many times smaller a side of them is than of the full-size photos: 4 of `images_4`."""
+
+    def reduction(self, header: Header, downscale: int | None) -> int:
+        """By how much one of its photos is to be made smaller; `downscale` is for the full-size photo, None:
+        as much as LONGEST asks for."""
+        if downscale is None:
+            return -(-max(header.width, header.height) // LONGEST)
+        return max(1, downscale // self.factor)
+
+
 def has_pictures(folder: Path) -> bool:
     """Whether pictures lie in the folder, in its `images`, or in reduced copies of those."""
     images = folder / "images"
-    return any(pictures(place) for place in (folder, images, *reduced(images)))
+    return any(pictures(place.path) for place in (Folder(folder), *copies(images)))
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -73,40 +91,53 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def reduced(folder: Path) -> list[Path]:
-    """Folders of smaller copies beside `folder`, `folder_2` before `folder_8`."""
+def copies(folder: Path) -> list[Folder]:
+    """`folder`, and the folders of smaller copies beside it, `folder_2` before `folder_8`."""
     try:
-        copies = [place for place in folder.parent.glob(f"{_escaped(folder.name)}_*") if place.is_dir()]
+        found = [place for place in folder.parent.glob(f"{_escaped(folder.name)}_*") if place.is_dir()]
     except (OSError, ValueError):
-        return []
-    numbered = [(place.name[len(folder.name) + 1 :], place) for place in copies]
-    return [place for _, place in sorted((int(n), place) for n, place in numbered if n.isdecimal())]
+        found = []
+    numbered = [(place.name[len(folder.name) + 1 :], place) for place in found]
+    factors = sorted((int(n), place) for n, place in numbered if n.isdecimal() and int(n) > 0)
+    return [Folder(folder), *(Folder(place, factor) for factor, place in factors)]
 
 
 def _escaped(name: str) -> str:
     return re.sub(r"([*?\[])", r"[\1]", name)
 
 
-def photo_folder(folder: Path, names: Iterable[str]) -> Path | None:
-    """`folder`, or the copy of it with the largest photos of at most LONGEST pixels a side, or else with the
-    smallest photos; None where none of the names is found."""
-    last = None
-    for place in (folder, *reduced(folder)):
-        photo = next((found for name in names if (found := find_photo(place, name))), None)
-        if photo is None:
-            continue
-        last = place
+def photo_folder(places: Iterable[Folder], names: Iterable[str], downscale: int | None) -> Folder | None:
+    """The folder of `places` (as `copies` gives them) to read the named photos from; None where none of the
+    names is found."""
+    names, firsts = list(names), []
+    for place in places:
+        photo = next((found for name in names if (found := find_photo(place.path, name))), None)
+        if photo is not None:
+            firsts.append((place, photo))
+    return chosen_copy(firsts, downscale)
+
+
+def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:
+    """Of folders in the order of their factors, each with one of its photos: the one with the largest photos
+    of at most LONGEST a side, or else with the smallest; where `downscale` is given, the one with the
+    smallest photos out of which that can be made, or else with the largest."""
+    if downscale is not None:
+        whole = [place for place, _ in places if downscale % place.factor == 0]
+        return whole[-1] if whole else places[0][0] if places else None
+    for place, photo in places:
         header = read_image_header(photo)
         if max(header.width, header.height) <= LONGEST:
-            break
-    return last
+            return place
+    return places[-1][0] if places else None
 
 
 # --- fitting to cameras -------------------------------------------------------------------------------------
 
 
-def on_photo(view: View, photo: Path, header: Header, where: str, mask: Path | None = None) -> View:
-    """The view with its camera scaled to the photo on disk.
+def on_photo(
+    view: View, photo: Path, header: Header, where: str, mask: Path | None = None, reduction: int = 1
+) -> View:
+    """The view with its camera scaled to the photo on disk, which is made `reduction` times smaller.
 
     Tools disagree on whether poses refer to the pixels as stored or as turned by EXIF: the orientation whose
     aspect ratio equals the camera's is used, and the pixels as stored where both do. Raises BadIntrinsics
@@ -121,7 +152,12 @@ def on_photo(view: View, photo: Path, header: Header, where: str, mask: Path | N
             f"{where}: w and h say {view.width}x{view.height}, but {photo.name} is {header.width}x"
             f"{header.height}, another shape; use the photos that the poses were estimated from"
         )
-    fitted = replace(view.stretched(*size), image_path=photo, orientation=orientation)
+    if reduction > min(size):
+        raise BadIntrinsics(
+            f"{where}: {photo.name} is {header.width}x{header.height} and cannot be made {reduction} times "
+            "smaller; give a smaller --downscale"
+        )
+    fitted = replace(view.stretched(*size), image_path=photo, orientation=orientation).reduced(reduction)
     if mask is None:
         return fitted
     found = read_image_header(mask)
@@ -214,13 +250,20 @@ def load_ignored(view: View) -> np.ndarray | None:
         return None
     kept = read_mask(view.mask_path)
     high, wide = kept.shape
-    if not _same_shape((wide, high), (view.width, view.height)):
+    rows, columns = _sampled(high, view.height, view.reduction), _sampled(wide, view.width, view.reduction)
+    if not _same_shape((wide, high), (view.width, view.height)) and view.reduction == 1:
         raise BadMask(
             f"{view.mask_path} is {wide}x{high} now, expected {view.width}x{view.height}; read it again"
         )
-    rows = ((np.arange(view.height) + 0.5) * high / view.height).astype(int)
-    columns = ((np.arange(view.width) + 0.5) * wide / view.width).astype(int)
     return ~kept[rows[:, None], columns]
+
+
+def _sampled(stored: int, shown: int, reduction: int) -> np.ndarray:
+    """(shown,) where the centres of a view's pixels lie in a mask of `stored` pixels along that side. A mask
+    of the photo's size has up to `reduction` - 1 more at its end, which the view leaves out."""
+    covered = shown * reduction
+    span = covered if 0 <= stored - covered < reduction else stored
+    return ((np.arange(shown) + 0.5) * span / shown).astype(int)
 
 
 def plain_background(views: Sequence[View]) -> bool:
@@ -270,7 +313,7 @@ def _decoded(view: View) -> np.ndarray:
     if view.pixels is not None:
         pixels = oriented(view.pixels, view.orientation)
     else:
-        pixels = read_image(view.image_path, view.orientation)
+        pixels = read_image(view.image_path, view.orientation, view.reduction)
     if pixels.shape != (view.height, view.width, 4):
         height, width = pixels.shape[:2]
         raise MixedSizes(

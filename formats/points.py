@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.atomic import atomic_writer
 from formats.errors import BadModel, LimitExceeded
 from formats.inputs import read_input
 
@@ -77,6 +78,20 @@ def read_ply_points(path: Path | str) -> Points:
         columns = np.frombuffer(data, record, count, end.end())
     positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
     return finite(positions, _colours(columns, dict(fields)))
+
+
+def write_ply_points(path: Path | str, points: Points) -> None:
+    """A binary .ply of float32 positions and colours. Raises ResourceError."""
+    kinds = [(axis, "<f4") for axis in "xyz"] + [(hue, "u1") for hue in ("red", "green", "blue")]
+    table = np.empty(len(points.positions), kinds)
+    for i, axis in enumerate("xyz"):
+        table[axis] = points.positions[:, i]
+    for i, hue in enumerate(("red", "green", "blue")):
+        table[hue] = points.colours[:, i]
+    properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in kinds]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *properties]
+    with atomic_writer(path) as file:
+        file.write("\n".join([*head, "end_header", ""]).encode() + table.tobytes())
 
 
 def _header(path: Path | str, lines: list[str]) -> tuple[str, int, list[tuple[str, str]]]:

@@ -20,7 +20,7 @@ from formats.cameras import (
 from formats.errors import BadSchema, MissingFile
 from formats.frame import depth_range
 from formats.images import read_image_header
-from formats.photos import find_photo, is_file, natural, on_photo, photo_folder
+from formats.photos import Folder, copies, find_photo, is_file, natural, on_photo, photo_folder
 from formats.points import Points, read_ply_points
 from formats.views import View
 
@@ -41,27 +41,27 @@ class Part:
     notes: tuple[str, ...] = ()
 
 
-def read_part(path: Path) -> Part:
+def read_part(path: Path, downscale: int | None) -> Part:
     """All frames of a file."""
     document = read_document(path)
-    return _views(path, document, list(enumerate(read_frames(path, document))))
+    return _views(path, document, list(enumerate(read_frames(path, document))), downscale)
 
 
-def read_splits(path: Path) -> tuple[dict, Part, Part]:
+def read_splits(path: Path, downscale: int | None) -> tuple[dict, Part, Part]:
     """The document of a nerfstudio or instant-ngp file, and its frames to train on and to test with."""
     document = read_document(path)
     frames = list(enumerate(read_frames(path, document)))
-    train, test = (_views(path, document, part) for part in _split(path, document, frames))
+    train, test = (_views(path, document, part, downscale) for part in _split(path, document, frames))
     return document, train, test
 
 
 # --- frames -------------------------------------------------------------------------------------------------
 
 
-def _views(path: Path, document: dict, frames: list[tuple[int, dict]]) -> Part:
-    """Views of the (index, frame) pairs whose photo exists, their cameras scaled to the photo's own size."""
+def _views(path: Path, document: dict, frames: list[tuple[int, dict]], downscale: int | None) -> Part:
+    """Views of the (index, frame) pairs whose photo exists, their cameras scaled to what is read of it."""
     frames = sorted(frames, key=lambda item: natural(frame_file(item[1])))
-    folders = _folders(path, [frame_file(frame) for _, frame in frames])
+    folders = _folders(path, [frame_file(frame) for _, frame in frames], downscale)
     photos = [_photo(path, folders, frame_file(frame)) for _, frame in frames]
     found = [(i, frame, photo) for (i, frame), photo in zip(frames, photos, strict=True) if photo]
     names = frame_names([frame for _, frame, _ in found])
@@ -70,7 +70,9 @@ def _views(path: Path, document: dict, frames: list[tuple[int, dict]]) -> Part:
         where = frame_where(path, i, frame)
         header = read_image_header(photo)
         view = frame_view(where, document, frame, name, header[:2])
-        views.append(on_photo(view, photo, header, where, _mask(path, folders, frame, where)))
+        reduction = folders[_rooted(frame_file(frame))[0]].reduction(header, downscale)
+        mask = _mask(path, folders, frame, where)
+        views.append(on_photo(view, photo, header, where, mask, reduction))
         alpha |= header.alpha
     missing = [frame_file(f) for (_, f), photo in zip(frames, photos, strict=True) if not photo]
     return Part(tuple(views), alpha, tuple(missing), tuple(_notes(path, folders)))
@@ -84,33 +86,36 @@ def _rooted(file: str) -> tuple[str, str]:
     return str(PurePosixPath(*parts[:cut])), str(PurePosixPath(*parts[cut:]))
 
 
-def _folders(path: Path, files: Iterable[str]) -> dict[str, Path]:
+def _folders(path: Path, files: Iterable[str], downscale: int | None) -> dict[str, Folder]:
     """For each folder of photos in the file, the one that is read: itself or a smaller copy."""
     named: dict[str, list[str]] = {}
     for root, name in map(_rooted, filter(None, files)):
         named.setdefault(root, []).append(name)
-    chosen = {root: photo_folder(path.parent / root, names) for root, names in named.items()}
+    places = {root: path.parent / root for root in named}
+    # Beside the capture itself lie other captures, not copies of it.
+    among = {root: copies(at) if at != path.parent else [Folder(at)] for root, at in places.items()}
+    chosen = {root: photo_folder(among[root], names, downscale) for root, names in named.items()}
     return {root: folder for root, folder in chosen.items() if folder}
 
 
-def _photo(path: Path, folders: dict[str, Path], file: str) -> Path | None:
+def _photo(path: Path, folders: dict[str, Folder], file: str) -> Path | None:
     root, name = _rooted(file) if file else ("", "")
-    return find_photo(folders[root], name) if root in folders else None
+    return find_photo(folders[root].path, name) if root in folders else None
 
 
-def _notes(path: Path, folders: dict[str, Path]) -> Iterable[str]:
+def _notes(path: Path, folders: dict[str, Folder]) -> Iterable[str]:
     for root, folder in folders.items():
-        if folder != path.parent / root:
-            yield f"{path}: photos are read from {folder.name} instead of {root}"
+        if folder.factor > 1:
+            yield f"{path}: photos are read from {folder.path.name} instead of {root}"
 
 
-def _mask(path: Path, folders: dict[str, Path], frame: dict, where: str) -> Path | None:
+def _mask(path: Path, folders: dict[str, Folder], frame: dict, where: str) -> Path | None:
     """The frame's mask, from a folder like `masks_4` where the photo is from `images_4` and there is one."""
     written = written_path(frame, "mask_path")
     if not written:
         return None
     mask, root = path.parent / written, _rooted(frame_file(frame))[0]
-    copy = folders[root].name.removeprefix(PurePosixPath(root).name)
+    copy = f"_{folders[root].factor}" if folders[root].factor > 1 else ""
     reduced = mask.parent.with_name(mask.parent.name + copy) / mask.name if mask.parent.name else mask
     found = next((file for file in (reduced, mask) if is_file(file)), None)
     if found is None:

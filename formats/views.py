@@ -15,6 +15,10 @@ from formats.errors import BadPose, NoViews
 from formats.frame import SceneFrame
 from formats.points import Points
 
+LEAST_VIEWS = 3
+"""Depth does not follow from fewer photos."""
+APART = 1e-9
+"""Cameras nearer to each other than this share of their distance from the origin stand at one point."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 ORTHONORMAL_TOLERANCE = 1e-3
 
@@ -39,6 +43,9 @@ class View:
     image_path: Path | None = None
     orientation: int = 1
     """EXIF orientation to apply to the photo's stored pixels to get this camera's; 1 for none."""
+    reduction: int = 1
+    """Pixels a side of the turned photo that one of this camera's is the mean of; those that are left over at
+    its right and lower border are not used."""
     mask_path: Path | None = None
     """A picture of the same aspect ratio, black where the photo must be ignored."""
     near: float | None = None
@@ -53,6 +60,12 @@ class View:
         x, y = width / self.width, height / self.height
         focal = {"fl_x": self.fl_x * x, "fl_y": self.fl_y * y, "cx": self.cx * x, "cy": self.cy * y}
         return replace(self, width=width, height=height, **focal)
+
+    def reduced(self, factor: int) -> "View":
+        """The same camera behind its photo made smaller by a whole factor."""
+        focal = {key: getattr(self, key) / factor for key in ("fl_x", "fl_y", "cx", "cy")}
+        size = {"width": self.width // factor, "height": self.height // factor}
+        return replace(self, **size, **focal, reduction=self.reduction * factor)
 
     def corners(self, depth: float, box: tuple[int, int, int, int] | None = None) -> np.ndarray:
         """(4, 3) world points at a depth behind the corners of the picture, or of a box (left, top, right,
@@ -99,6 +112,8 @@ class Capture:
         """What was read and chosen, for a report."""
         views = self.train + self.test
         facts = {"kind": self.kind, "missing": len(self.missing)}
+        if views[0].image_path is not None:
+            facts["photos"] = f"{views[0].width}x{views[0].height}"
         if self.points is not None:
             facts["sparse_points"] = len(self.points.positions)
         if masked := sum(view.mask_path is not None for view in views):
@@ -118,6 +133,29 @@ def hold_out(capture: Capture, every: int) -> Capture:
             "to train on; hold out fewer"
         )
     return replace(capture, train=train, test=capture.test + capture.train[::every])
+
+
+def check_parallax(capture: Capture) -> None:
+    """Photos from which depth follows: at least LEAST_VIEWS, not all from one point. Raises BadPose, NoViews.
+
+    Views of a mesh are not photos: nobody can take more.
+    """
+    views = capture.train
+    if capture.kind == "mesh":
+        return
+    if len(views) < LEAST_VIEWS:
+        held = f" beside {len(capture.test)} that only measure" if capture.test else ""
+        raise NoViews(
+            f"{capture.path}: has {len(views)} photos to learn from{held}, but depth follows only from "
+            f"{LEAST_VIEWS} or more; add photos from other places"
+        )
+    eyes = np.array([view.camera_to_world[:3, 3] for view in views])
+    if np.ptp(eyes, axis=0).max() <= APART * np.abs(eyes).max():
+        raise BadPose(
+            f"{capture.path}: the cameras of all {len(views)} photos, {views[0].name} to {views[-1].name}, "
+            "stand at one point, from which no depth follows; take photos from different places, or estimate "
+            "their poses again with `fusedrf pose`"
+        )
 
 
 def checked_pose(matrix: object, where: str) -> np.ndarray:

@@ -15,7 +15,7 @@ from fusedrf_cli import __version__, options
 from fusedrf_cli.errors import FusedRFError, Interrupted
 
 COMMANDS = (
-    *("train", "compose", "fuse", "convert", "add", "delete", "render", "eval", "chart"),
+    *("pose", "train", "compose", "fuse", "convert", "add", "delete", "render", "eval", "chart"),
     *("info", "kinds", "validate", "completion"),
 )
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"

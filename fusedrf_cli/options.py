@@ -191,6 +191,20 @@ class RanksType(_Text):
         return ranks
 
 
+class DownscaleType(_Text):
+    """'auto' -> None, or a whole number."""
+
+    name, expected = "auto|N", "auto or a whole number from 1 to 64"
+
+    def parse(self, text):
+        if text == "auto":
+            return None
+        factor = int(text)
+        if not 1 <= factor <= 64:
+            raise ValueError(text)
+        return factor
+
+
 class KindType(click.ParamType):
     """The name of a kind of field, or another word that is allowed. Names are looked up when they are needed,
     and no kind is imported for it."""
@@ -236,7 +250,7 @@ class KindsType(KindType):
 RANKS = RanksType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
-INPUT, SCENE = InputType(), InputType(stdin=True)
+INPUT, SCENE, DOWNSCALE = InputType(), InputType(stdin=True), DownscaleType()
 
 
 # --- options ------------------------------------------------------------------------------------------------
@@ -302,6 +316,7 @@ PLACEMENT = {  # flags -> what click.option takes; `compose` has them once per i
     ("-s", "--scale"): {"type": SCALE, "help": "Scale by k, or by x,y,z; applied before turn and move."},
     ("--matrix",): {"type": AFFINE, "help": "Any affine instead: 16 numbers by rows, a file of them, or -."},
 }
+threads = click.option("--threads", type=click.IntRange(1, 4096), help="CPU threads; default: all.")
 _RUNNING = (
     click.option(
         "--device",
@@ -310,7 +325,7 @@ _RUNNING = (
         show_default=True,
         help="Where to compute.",
     ),
-    click.option("--threads", type=click.IntRange(1, 4096), help="CPU threads; default: all."),
+    threads,
 )
 _seed = click.option(
     "--seed",

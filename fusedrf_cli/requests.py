@@ -26,6 +26,16 @@ class Learning(Running):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PoseRequest:
+    """Photos to a capture, which says where they were taken."""
+
+    photos: str
+    output: str
+    overwrite: bool
+    threads: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainRequest(Learning):
     """Photos or a mesh to one field."""
 
@@ -48,6 +58,8 @@ class TrainRequest(Learning):
     centre: tuple[float, float, float] | None
     radius: float | None
     """Of the core of unbounded space, whose detail is finest."""
+    downscale: int | None
+    """How many times smaller a side of photos is made; None: until it is no longer than photos need be."""
     masks: str
     """What the pixels mean that masks exclude: "ignore" or "alpha"."""
     memory: int | None

@@ -11,7 +11,8 @@ from fusedrf_cli.bridge.editing import add, delete
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.listing import list_kinds
+from fusedrf_cli.bridge.posing import pose
 from fusedrf_cli.bridge.rendering import render
 from fusedrf_cli.bridge.training import train
 
-__all__ = ["add", "chart", "convert", "delete", "evaluate", "fuse", "list_kinds", "render", "train"]
+__all__ = ["add", "chart", "convert", "delete", "evaluate", "fuse", "list_kinds", "pose", "render", "train"]

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 
 from formats.atomic import check_space
-from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_photos, read_capture
+from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_photos
 from formats.meshes import mesh_capture
-from formats.views import Capture, View
+from formats.views import Capture, View, check_parallax
 from fusedrf_cli.bridge.extent import Extent, extent_of
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
+from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.running import (
     checkpoint_mismatch,
     checkpoint_path,
@@ -124,11 +125,13 @@ def read_views(request: TrainRequest, progress) -> Capture:
     capture = (
         mesh_capture(source, n_train=request.views, size=request.size, seed=request.seed)
         if is_mesh(source)
-        else read_capture(source)
+        else posed_capture(source, request.downscale, request.threads, progress)
     )
     if capture.missing:
         progress.warn(f"{source}: {len(capture.missing)} frames have no photo and were left out")
-    return hold_out(capture, request.holdout) if request.holdout else capture
+    capture = hold_out(capture, request.holdout) if request.holdout else capture
+    check_parallax(capture)
+    return capture
 
 
 def cuts_out(request: TrainRequest, capture: Capture) -> bool:

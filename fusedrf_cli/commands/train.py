@@ -33,6 +33,13 @@ from fusedrf_cli.requests import TrainRequest
     help="Pixels a side of a mesh's views.",
 )
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
+@click.option(
+    "--downscale",
+    type=options.DOWNSCALE,
+    default="auto",
+    show_default=True,
+    help="Make a side of photos N times smaller; auto: to at most 1080 pixels.",
+)
 @click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
 @click.option(
     "--unbounded/--bounded",
@@ -57,7 +64,8 @@ def command(source, output, progress, **words):
     """Learn one field from photos or a mesh.
 
     SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF or Polycam), its
-    transforms.json, or a .glb, .gltf, .obj or .ply mesh.
+    transforms.json, or a .glb, .gltf, .obj or .ply mesh. Photos without poses are posed first, as by
+    `fusedrf pose`.
 
     \b
     Example:

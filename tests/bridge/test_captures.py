@@ -35,7 +35,7 @@ def speckled(path, width: int, height: int, seed: int = 0) -> np.ndarray:
 
 def test_a_colmap_model_is_trained_on(report, folder):
     names = [f"{i}.png" for i in range(3)]
-    binary_model(folder / "garden/sparse/0", names, params=(12, 12, 8, 6), size=(16, 12))
+    binary_model(folder / "garden/sparse/0", names, params=(12, 12, 8, 6), size=(16, 12), apart=0.5)
     for i, name in enumerate(names):
         speckled(folder / "garden/images" / name, 16, 12, i)
     said = report("train", "garden", "-o", "out.rfpack", *DRAFT)

@@ -10,6 +10,7 @@ from fusedrf_cli import bridge
 from fusedrf_cli.main import cli
 
 CALLS = {
+    "pose": ("pose", "in", "-o", "out"),
     "train": ("train", "in", "-o", "out"),
     "fuse": ("fuse", "in", "-o", "out"),
     "add": ("add", "in", "in", "-o", "out", "--name", "n"),

@@ -15,7 +15,7 @@ from formats.records import FieldRecord
 from fusedrf_cli.main import cli
 
 ROOT = Path(__file__).parents[2]
-BRIDGE_VERBS = ("train", "fuse", "convert", "add", "delete", "render", "evaluate", "chart")
+BRIDGE_VERBS = ("pose", "train", "fuse", "convert", "add", "delete", "render", "evaluate", "chart")
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,11 @@ from formats.errors import (
     MissingFile,
     MixedSizes,
     NoPoses,
+    NoViews,
     UnsupportedCamera,
 )
 from formats.points import read_ply_points
+from formats.views import check_parallax
 from tests.formats.test_captures import PIXEL, POINT, POSE, SIZE, frame, photo, project, real, write
 
 # The same camera as COLMAP says it: x right is world +y, y down is world -z, z forward is world -x.
@@ -50,15 +53,17 @@ def test_the_quaternion_of_these_tests():
 
 
 def binary_model(
-    folder: Path, names=NAMES, model=1, params=(80, 80, 50, 40), size=SIZE, points=POINTS
+    folder: Path, names=NAMES, model=1, params=(80, 80, 50, 40), size=SIZE, points=POINTS, apart=0.0
 ) -> None:
+    """All cameras at one place, or `apart` from each other."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIiQQ", 1, 5, model, *size) + struct.pack(f"<{len(params)}d", *params)
     )
     images = struct.pack("<Q", len(names))
     for i, name in enumerate(names):
-        images += struct.pack("<I7dI", 10 * i + 1, *QUATERNION, *TRANSLATION, 5) + name.encode() + b"\0"
+        moved = TRANSLATION + [i * apart, 0, 0]
+        images += struct.pack("<I7dI", 10 * i + 1, *QUATERNION, *moved, 5) + name.encode() + b"\0"
         seen = [*points, 2**64 - 1]
         images += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddQ", 1.5, 2.5, p) for p in seen)
     (folder / "images.bin").write_bytes(images)
@@ -164,7 +169,7 @@ def test_colmap_photos_of_another_size_and_ending(tmp_path):
     """Photos of 2000 x 1600 with copies of a half, a quarter and an eighth: the quarter is the largest that
     is not too large."""
     binary_model(tmp_path / "sparse/0", ("a.JPG",), params=(1600, 1600, 1000, 800), size=(2000, 1600))
-    copies = {"images": (2000, 1600), "images_2": (1040, 832), "images_4": (500, 400), "images_8": (250, 200)}
+    copies = {"images": (2000, 1600), "images_2": (1100, 880), "images_4": (500, 400), "images_8": (250, 200)}
     for folder, size in copies.items():
         photo(tmp_path / folder / "a.png", size)
     capture = read_capture(tmp_path)
@@ -348,7 +353,7 @@ BAD_TABLES = {
     "mirrored": (llff_rows(3) * [-1, *[1] * 4, -1, *[1] * 4, -1, *[1] * 6], BadPose, "mirrored"),
     "no focal length": (changed(14, 0.0), BadIntrinsics, "row 1"),
     "no size": (changed(4, 0.0), BadIntrinsics, "row 1"),
-    "bounds the wrong way round": (changed(15, 99.0), BadIntrinsics, "row 1: bounds of 99 and 30"),
+    "bounds the wrong way round": (changed(15, 99.0), BadIntrinsics, "bounds of 99 and 30"),
     "columns missing": (llff_rows(3)[:, :15], BadModel, "3x15 numbers"),
     "no table": (np.zeros(17), BadModel, "17 numbers"),
     "words": (np.array([["a"] * 17]), BadModel, "expected rows of 17 floats"),
@@ -699,14 +704,24 @@ def test_a_room_seen_from_its_middle(tmp_path):
     assert capture.aabb == pytest.approx([-9] * 3 + [11] * 3)
 
 
-def test_poses_without_depth_are_noted(tmp_path):
+def test_poses_without_depth(tmp_path):
+    """They have a box and can be compared with, but nothing can be learnt from them."""
     noisy(tmp_path / "a.png")
-    turning = ring(9, 0, np.zeros(3), inward=False)
-    for poses, said in ((turning, "one point"), (ring(9, 4, np.zeros(3))[:2], "2 photos")):
+    turning = ring(9, 0, np.full(3, 7.0), inward=False)
+    for poses, error, said in (
+        (turning, BadPose, "all 9 photos, a_00000 to a_00008, stand at one point"),
+        (ring(9, 4, np.zeros(3))[:2], NoViews, "has 2 photos to learn from, but"),
+    ):
         write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in poses], fl_x=80)
         capture = read_capture(tmp_path)
-        assert said in capture.notes[-1] and (capture.aabb[3:] > capture.aabb[:3]).all()
-        assert capture.summary()["notes"] == list(capture.notes)
+        assert (capture.aabb[3:] > capture.aabb[:3]).all()
+        with pytest.raises(error, match=said):
+            check_parallax(capture)
+    write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in ring(9, 1e-3, np.ones(3))], fl_x=80)
+    check_parallax(read_capture(tmp_path))
+    with pytest.raises(NoViews, match="has 2 photos to learn from beside 7 that only measure"):
+        held = read_capture(tmp_path)
+        check_parallax(replace(held, train=held.train[:2], test=held.train[2:]))
 
 
 def test_photos_that_all_look_one_way(tmp_path):

@@ -1,0 +1,275 @@
+"""Camera poses out of photos alone, by structure from motion (the `[capture]` extra, see `mapper.py`).
+
+What comes out has z up, the focus of the cameras at the origin, and the first photo looking along +y. Its
+units are arbitrary, as photos do not tell how large things are: the cameras stand some DISTANCE from the
+focus.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from formats import colmap
+from formats.atomic import atomic_folder
+from formats.captures import write_cameras
+from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
+from formats.frame import scene_frame
+from formats.images import Header, read_focal, read_image_header, write_smaller
+from formats.mapper import MAX_SIDE
+from formats.photos import copies, natural, pictures
+from formats.points import Points, write_ply_points
+from formats.views import View
+
+LEAST_PHOTOS = 3
+DISTANCE = 4.0
+"""Median distance of the cameras from the origin: about that of the cameras of Blender's captures."""
+FEW_FEATURES = 200
+"""A photo of fewer features is blurred, or shows little but plain surfaces."""
+LEVEL = 0.17
+"""Cameras turn about a vertical axis if their x axes spread at least so much in two directions."""
+UPS = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+"""Where up is in the stored picture (right, up), by EXIF orientation; (0, 1) of the others."""
+CAMERAS = "transforms.json"
+POINTS = "points.ply"
+UNREAD = (".heic", ".heif", ".HEIC", ".HEIF")
+"""Photos of phones that cannot be decoded here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """Photos that found their place."""
+
+    views: tuple[View, ...]
+    """For the photos as stored, whatever their EXIF orientation."""
+    points: Points
+    unposed: tuple[str, ...]
+    """Names of the photos that did not find a place."""
+    plain: tuple[str, ...]
+    """Those of them that have few features."""
+    models: tuple[int, ...]
+    """Photos of each model that came out, the largest first; only that one is used."""
+    error: float
+    """Mean distance of a point from where its photos show it, in pixels of the pictures that were compared
+    (at most MAX_SIDE a side)."""
+
+
+def check_extra(folder: Path | str) -> None:
+    """MissingExtra where pycolmap is not installed. It is not imported: see `mapper.py`."""
+    if find_spec("pycolmap") is None:
+        raise MissingExtra(
+            f"{folder}: to estimate where its photos were taken needs an extra: "
+            'pip install "fusedrf[capture]"'
+        )
+
+
+def photos_to_pose(folder: Path | str) -> list[Path]:
+    """The photos of a folder, or of its `images`, in natural order. Raises MissingFile, NoViews."""
+    folder = Path(folder)
+    places = (folder, *(place.path for place in copies(folder / "images")))
+    found = next((files for files in map(pictures, places) if files), [])
+    if not found:
+        unread = [file for place in places if place.is_dir() for file in place.iterdir()]
+        if unread := [file for file in unread if file.suffix in UNREAD]:
+            raise NoViews(
+                f"{folder}: its {len(unread)} photos such as {unread[0].name} are HEIC, which is not read; "
+                "convert them to JPEG, or set the phone to its most compatible format"
+            )
+        raise MissingFile(f"{folder}: holds no photos; give the folder that they lie in")
+    if len(found) < LEAST_PHOTOS:
+        raise NoViews(
+            f"{folder}: holds {len(found)} photos, but where they were taken follows from {LEAST_PHOTOS} or "
+            "more that overlap; take more, from different places"
+        )
+    return sorted(found, key=lambda file: natural(file.name))
+
+
+def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress) -> Posed:
+    """Where photos were taken. `progress` has `phase` and `advance` of fusedrf_cli/progress.py.
+
+    The same photos and threads give the same poses. An interrupt leaves nothing behind. Raises BadImage,
+    LimitExceeded, MissingExtra, NoPoses, PosingFailed.
+    """
+    check_extra(folder)
+    with tempfile.TemporaryDirectory(prefix="fusedrf-poses-") as work:
+        work = Path(work)
+        headers = _prepare(work, photos, threads, progress)
+        told = _run(folder, work, threads, progress)
+        counts = dict(zip(photos, told["features"], strict=True))
+        if not told["models"] or told["models"][0] < LEAST_PHOTOS:
+            raise NoPoses(_not_found(folder, counts, max(told["models"], default=0)))
+        model = colmap.read_model(work / "model")
+    placed = {int(Path(image.name).stem): image.view for image in model.images}
+    views = [
+        replace(placed[i].stretched(*headers[i][:2]), image_path=photos[i], name=photos[i].stem)
+        for i in sorted(placed)
+    ]
+    unposed = [photo for i, photo in enumerate(photos) if i not in placed]
+    views, points = upright(views, model.points, [headers[i].orientation for i in sorted(placed)])
+    return Posed(
+        views,
+        points,
+        tuple(photo.name for photo in unposed),
+        tuple(photo.name for photo in unposed if counts[photo] < FEW_FEATURES),
+        tuple(told["models"]),
+        told["error"],
+    )
+
+
+def _not_found(folder: Path | str, counts: dict[Path, int], placed: int) -> str:
+    """The sentence for photos that give no model."""
+    least = min(counts, key=counts.get)
+    plain = sum(count < FEW_FEATURES for count in counts.values())
+    shown = f" ({plain} of them, such as {least.name}, are blurred or plain)" if plain else ""
+    return (
+        f"{folder}: {placed or 'none'} of its {len(counts)} photos{shown} found their place; likely they "
+        "overlap too little, were taken from one spot, are blurred, or show plain walls or things that move: "
+        "take more, moving a step between them, each with two thirds of what the one before shows"
+    )
+
+
+def write_posed(folder: Path | str, posed: Posed, overwrite: bool, relative: bool) -> None:
+    """A capture that `read_capture` and nerfstudio read: CAMERAS, which names the photos where they lie, and
+    POINTS. Paths are from `folder`, or whole unless `relative`. Raises OutputExists, ResourceError."""
+    target = os.path.realpath(folder)
+    files = [os.path.realpath(view.image_path.parent) for view in posed.views]
+    files = [str(Path(at) / view.image_path.name) for at, view in zip(files, posed.views, strict=True)]
+    if relative:
+        files = [_from(target, file) for file in files]
+    more = {"ply_file_path": POINTS, "unposed": list(posed.unposed)}
+    with atomic_folder(folder, overwrite=overwrite) as place:
+        write_ply_points(place / POINTS, posed.points)
+        write_cameras(place / CAMERAS, posed.views, files, **more)
+
+
+def _from(target: str, file: str) -> str:
+    try:
+        return Path(os.path.relpath(file, target)).as_posix()
+    except ValueError:  # on another drive
+        return file
+
+
+# --- the process --------------------------------------------------------------------------------------------
+
+
+def _prepare(work: Path, photos: Sequence[Path], threads: int, progress) -> list[Header]:
+    """Write a job for `mapper.py`, with the photos as PNG of at most MAX_SIDE; returns their headers.
+
+    All are decoded here, so that broken ones are named at once and every kind that is read can be posed.
+    """
+    progress.phase("reading", len(photos))
+
+    def prepare(item: tuple[int, Path]) -> tuple[Header, tuple]:
+        i, photo = item
+        size = write_smaller(photo, work / f"{i:06d}.png", MAX_SIDE)
+        header, focal = read_image_header(photo), read_focal(photo)
+        pixels = None if focal is None else focal * float(np.hypot(*size))
+        return header, (*size, pixels)
+
+    headers, cameras = [], {}
+    with ThreadPoolExecutor(threads) as pool:
+        for i, (header, camera) in enumerate(pool.map(prepare, enumerate(photos))):
+            headers.append(header)
+            # Photos of one size and focal length are taken to be of one camera.
+            cameras.setdefault(camera, []).append(f"{i:06d}.png")
+            progress.advance(i + 1)
+    keys = ("width", "height", "focal")
+    listed = [dict(zip(keys, camera, strict=True), photos=names) for camera, names in cameras.items()]
+    (work / "job.json").write_text(json.dumps({"threads": threads, "cameras": listed}))
+    return headers
+
+
+def _run(folder: Path | str, work: Path, threads: int, progress) -> dict:
+    """What `mapper.py` says last: features, models, error. It is ended whatever happens here."""
+    places = [str(Path(__file__).parents[1]), *filter(None, sys.path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": str(threads)}
+    with open(work / "log", "wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "formats.mapper", str(work)],
+            stdin=subprocess.PIPE,  # which ends with this process
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env=environment,
+            start_new_session=True,  # Ctrl-C comes here, and ends the other from here
+        )
+    told = {}
+    with process:
+        try:
+            for line in process.stdout:
+                told = json.loads(line)
+                if "phase" in told:
+                    progress.phase(told["phase"], told["total"])
+                elif "done" in told:
+                    progress.advance(told["done"])
+        finally:
+            if "features" not in told:
+                process.kill()
+    if process.returncode or "features" not in told:
+        raise PosingFailed(_broken(folder, work / "log", process.returncode))
+    return told
+
+
+def _broken(folder: Path | str, log: Path, code: int) -> str:
+    """The sentence for a process that ended early; its log's last line may say why."""
+    lines = log.read_text("utf-8", "replace").strip().splitlines()
+    said = f" ({lines[-1][:200]})" if lines else ""
+    return (
+        f"{folder}: structure from motion broke down with code {code}{said}; try again with --threads 1, "
+        "which takes less memory, or give poses from another program"
+    )
+
+
+# --- the world's axes ---------------------------------------------------------------------------------------
+
+
+def upright(
+    views: Sequence[View], points: Points, orientations: Sequence[int]
+) -> tuple[tuple[View, ...], Points]:
+    """The same with z up, the focus at the origin, the cameras about DISTANCE from it, and the first looking
+    along +y. `orientations` are the photos' (EXIF), which say where up is in them."""
+    poses = np.array([view.camera_to_world for view in views])
+    turn = _level(poses, orientations)
+    poses = turn @ poses
+    positions = points.positions @ turn[:3, :3].T
+    depths = [(pose[:3, 3] - np.median(positions, 0)) @ pose[:3, 2] for pose in poses]
+    frame = scene_frame(poses, float(np.median(depths)))
+    scale = DISTANCE / frame.distance
+    poses[:, :3, 3] = (poses[:, :3, 3] - frame.focus) * scale
+    turned = tuple(replace(view, camera_to_world=pose) for view, pose in zip(views, poses, strict=True))
+    return turned, Points((positions - frame.focus) * scale, points.colours)
+
+
+def _level(poses: np.ndarray, orientations: Sequence[int]) -> np.ndarray:
+    """(4, 4) rotation that makes the cameras' vertical +z, and the first's look +y as far as it is level."""
+    sides = np.array([UPS.get(orientation, (0, 1)) for orientation in orientations], float)
+    ups = np.einsum("nij,nj->ni", poses[:, :3, :2], sides)
+    up = _vertical(ups, np.cross(ups, poses[:, :3, 2]))
+    look = -poses[0, :3, 2]
+    if np.linalg.norm(np.cross(look, up)) < 0.1:  # straight up or down: then what is up in it, lies ahead
+        look = ups[0]
+    ahead = look - (look @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    turn = np.eye(4)
+    turn[:3, :3] = np.cross(ahead, up), ahead, up
+    return turn
+
+
+def _vertical(ups: np.ndarray, rights: np.ndarray) -> np.ndarray:
+    """(3,) unit: at right angles to the cameras' x axes (N, 3), which people hold level even where they look
+    down; or the mean of their ups, if those axes do not lie in a plane."""
+    mean = ups.mean(0) / max(np.linalg.norm(ups.mean(0)), 1e-9)
+    _, spread, axes = np.linalg.svd(rights)
+    if spread[1] > LEVEL * np.sqrt(len(rights)):
+        up = axes[2] * np.sign(axes[2] @ mean)
+    else:  # all look one way: only a tilt to the side is known
+        up = mean - (mean @ axes[0]) * axes[0]
+    length = np.linalg.norm(up)
+    return up / length if length > 1e-3 and up @ mean > 0.7 * length else mean

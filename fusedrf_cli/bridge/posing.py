@@ -1,0 +1,115 @@
+"""`pose`: where photos were taken; and the same for `train`, which keeps it in the user's cache."""
+
+import atexit
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+from formats.captures import read_capture
+from formats.errors import NoPoses
+from formats.photos import has_pictures
+from formats.posing import CAMERAS, Posed, check_extra, estimate, photos_to_pose, write_posed
+from formats.views import Capture
+from fusedrf_cli import __version__
+from fusedrf_cli.bridge.running import available_cores
+from fusedrf_cli.requests import PoseRequest
+
+WORLD = (
+    "z is up as the cameras were held, the cameras' focus is the origin, the first photo looks along +y; "
+    "units are arbitrary"
+)
+"""Of a capture whose poses were estimated."""
+NAMED = 12
+"""At most so many photos are named in a warning."""
+
+
+def pose(request: PoseRequest, progress) -> dict:
+    """Estimate poses and write them as a capture."""
+    started = time.monotonic()
+    photos = photos_to_pose(request.photos)
+    posed = estimate(request.photos, photos, request.threads or available_cores(), progress)
+    _warn_of_unposed(request.photos, posed.unposed, posed.plain, len(photos), progress)
+    write_posed(request.output, posed, request.overwrite, relative=True)
+    view = posed.views[0]
+    return {
+        "output": request.output,
+        "photos": len(photos),
+        "posed": len(posed.views),
+        "left_out": list(posed.unposed),
+        "models": list(posed.models),
+        "focal_length": {"pixels": view.fl_x, "width": view.width},
+        "sparse_points": len(posed.points.positions),
+        "error_pixels": posed.error,
+        "world": WORLD,
+        "seconds": time.monotonic() - started,
+    }
+
+
+def posed_capture(source: str, downscale: int | None, threads: int | None, progress) -> Capture:
+    """A capture, or photos without poses, whose poses are then estimated, or taken from an earlier time."""
+    try:
+        return read_capture(source, downscale)
+    except NoPoses:
+        if not has_pictures(Path(source)):
+            raise
+    photos = photos_to_pose(source)
+    folder = _cached(source, photos)
+    if not (folder / CAMERAS).exists():
+        progress.tell(f"{source}: has photos but no poses, so these are estimated first")
+        posed = estimate(source, photos, threads or available_cores(), progress)
+        folder = _keep(posed, folder)
+        progress.phase("reading", None)
+    unposed = json.loads((folder / CAMERAS).read_text())["unposed"]
+    _warn_of_unposed(source, unposed, (), len(photos), progress)
+    capture = read_capture(folder, downscale)
+    note = (
+        f"{source}: where {len(photos) - len(unposed)} of {len(photos)} photos were taken is estimated from "
+        f"them: {WORLD}; it is kept in {folder}"
+    )
+    return replace(capture, path=Path(source), notes=(note, *capture.notes))
+
+
+def _cached(source: str, photos: Sequence[Path]) -> Path:
+    """Where the poses of these photos are kept, in the user's cache; they are others when a photo changes."""
+    check_extra(source)
+    stated = [(os.path.realpath(photo), *_stamp(photo)) for photo in photos]
+    facts = json.dumps([__version__, version("pycolmap"), stated])
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(home) / "fusedrf" / "poses" / hashlib.sha256(facts.encode()).hexdigest()[:16]
+
+
+def _stamp(photo: Path) -> tuple[int, int]:
+    status = photo.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def _keep(posed: Posed, folder: Path) -> Path:
+    """Write poses to the cache, or where that cannot be written to a folder that ends with the process."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder.parent, os.W_OK):
+            raise PermissionError
+    except OSError:
+        folder = Path(tempfile.mkdtemp(prefix="fusedrf-poses-")) / folder.name
+        atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
+    write_posed(folder, posed, overwrite=True, relative=False)
+    return folder
+
+
+def _warn_of_unposed(source: str, unposed: Sequence[str], plain: Sequence[str], count: int, progress) -> None:
+    """Say which photos did not find a place, where some did not."""
+    if not unposed:
+        return
+    more = f" and {len(unposed) - NAMED} more" if len(unposed) > NAMED else ""
+    names = ", ".join(unposed[:NAMED]) + more
+    why = f"; {', '.join(plain[:NAMED])} are blurred or plain" if plain else ""
+    progress.warn(
+        f"{source}: {len(unposed)} of {count} photos found no place and were left out: {names}{why}"
+    )

@@ -1,0 +1,28 @@
+"""`fusedrf pose`: where photos were taken, out of the photos alone."""
+
+import click
+
+from fusedrf_cli import options
+from fusedrf_cli.requests import PoseRequest
+
+
+@click.command("pose")
+@click.argument("photos", type=options.INPUT)
+@options.writing("The folder to write, CAPTURE.", folders=True)
+@options.threads
+@options.reporting
+def command(photos, output, progress, **words):
+    """Find out where photos were taken.
+
+    PHOTOS is a folder of overlapping photos without poses, or the frames of a film. CAPTURE gets a
+    transforms.json, which names the photos where they lie, and sparse points; `train` reads it. Its z is up,
+    its units are arbitrary. Needs fusedrf[capture]. `train PHOTOS` does the same first, and keeps it in the
+    user's cache.
+
+    \b
+    Example:
+      fusedrf pose photos/ -o garden
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.pose(PoseRequest(photos=photos, output=output, **words), progress)
