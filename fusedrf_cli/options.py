@@ -106,6 +106,18 @@ class VectorType(_Text):
         return _numbers(text, (3,))
 
 
+class DirectionType(_Text):
+    """'azimuth,elevation' -> two floats, degrees; the elevation is from straight below to straight above."""
+
+    name, expected = "AZIMUTH,ELEVATION", "two angles in degrees, the elevation from -90 to 90"
+
+    def parse(self, text):
+        azimuth, elevation = _numbers(text, (2,))
+        if abs(elevation) > 90:
+            raise ValueError(text)
+        return azimuth, elevation
+
+
 class ScaleType(_Text):
     """'k' or 'x,y,z' -> three floats, none of them 0; a negative one mirrors."""
 
@@ -235,7 +247,7 @@ class KindsType(KindType):
 
 RANKS = RanksType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
-AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
+AABB, COLOUR, AFFINE, DIRECTION = BoxType(), ColourType(), AffineType(), DirectionType()
 INPUT, SCENE = InputType(), InputType(stdin=True)
 
 

@@ -76,6 +76,14 @@ class Fused:
         return self.node.object_to_world[:3, 3]
 
     @property
+    def framing(self) -> np.ndarray | tuple[float, ...] | None:
+        """(6,) the box in the world that pictures show, before the edit and after it; None where they are
+        taken from a capture's cameras."""
+        if self.scene.framing is not None or (self.scene.cameras or {}).get("surroundings"):
+            return self.scene.framing
+        return self.field.occupancy.tight_aabb(0) + np.tile(self.origin, 2)
+
+    @property
     def names(self) -> set[str]:
         """Of the objects that can be deleted: those that the history and those that the field tell of."""
         parts = {part.name for part in self.kind.parts(self.field)} - {self.node.name}
@@ -238,6 +246,8 @@ def write_edited(request: EditRequest, fused: Fused, field: StoredField, precisi
         history=(*fused.scene.history, entry),
         kept=dict.fromkeys(fused.others, fused.path),
         extras=fused.scene.extras,
+        framing=fused.framing,
+        cameras=fused.scene.cameras,
     )
 
 

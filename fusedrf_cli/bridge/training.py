@@ -12,6 +12,7 @@ from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_
 from formats.meshes import mesh_capture
 from formats.views import Capture, View
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
+from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.running import (
     checkpoint_mismatch,
     checkpoint_path,
@@ -20,7 +21,7 @@ from fusedrf_cli.bridge.running import (
     resumable,
 )
 from fusedrf_cli.bridge.scene import refuse_options, unusable_kind, write_field
-from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes
+from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
@@ -51,9 +52,10 @@ def train(request: TrainRequest, progress) -> dict:
         progress.phase("reading", None)
         capture = read_views(request, progress)
         box = box_of(request, capture)
-        settings = fit_settings(request, kind, capture, box, place)
+        kept = cameras_of_capture(capture, cuts_out(request, capture), progress)
+        settings = fit_settings(request, kind, capture, box, place, camera_bytes(kept))
         plan = kind.untrained(box, settings.longest, settings.way)
-        check_space(request.output, bytes_of(plan, request.precision))
+        check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
         memory.expect(
             fit_memory(capture, plan, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
@@ -72,6 +74,7 @@ def train(request: TrainRequest, progress) -> dict:
             Path(request.output).stem,
             precision=request.precision,
             overwrite=request.overwrite,
+            cameras=kept,
         )
         checkpoint_path(request.output).unlink(missing_ok=True)
     report = {
@@ -150,9 +153,10 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
 
 
 def fit_settings(
-    request: TrainRequest, kind: Kind, capture: Capture, box: np.ndarray, place: str
+    request: TrainRequest, kind: Kind, capture: Capture, box: np.ndarray, place: str, besides: int = 0
 ) -> FitSettings:
-    """How to fit; UsageProblem where not even the coarsest field is as small as asked."""
+    """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
+    bytes in its bundle."""
     settings = replace(
         QUALITY[request.quality],
         kind=kind.name,
@@ -164,9 +168,10 @@ def fit_settings(
         near=0.0,
         device=place,
     )
-    longest = fitting_longest(kind, box, settings, request.max_size, request.precision)
+    room = request.max_size and max(1, request.max_size - besides)
+    longest = fitting_longest(kind, box, settings, room, request.precision)
     plan = kind.untrained(box, longest, settings.way)
-    check_size(bytes_of(plan, request.precision), request.max_size)
+    check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)
 
 
