@@ -15,7 +15,7 @@ from fusedrf_cli.requests import RenderRequest
 @click.option(
     "--views",
     type=click.Choice(["capture", "heldout"]),
-    help="All views of the capture that the scene was learnt from, or those that were held out.",
+    help="All views of the photos that the scene was learnt from, or those that were held out.",
 )
 @click.option("--orbit", type=click.IntRange(1), metavar="N", help="N views around the scene.")
 @click.option("--look-at", type=options.VECTOR, help="Look at this point of the world.")
@@ -23,7 +23,7 @@ from fusedrf_cli.requests import RenderRequest
     "--from",
     "direction",
     type=options.DIRECTION,
-    help="Look from this side: degrees about the upward axis, and above the horizon.",
+    help="Look from this side: degrees from +x about the upward axis, and above the horizon.",
 )
 @click.option(
     "--zoom", type=options.POSITIVE, default=1.0, show_default=True, help="2: from half as far away."
@@ -45,10 +45,9 @@ from fusedrf_cli.requests import RenderRequest
 def command(scene, output, progress, **words):
     """Render pictures or a film.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. Of a capture that shows its surroundings
-    pictures are taken as its photos were: one of them by default, and --orbit circles what they look at, at
-    the distance and the height that they were taken from. Anything else is framed from outside.
-    --look-at, --from and --zoom change the one view or the orbit.
+    SCENE is a bundle, a scene.json, or - for a scene on stdin. What was learnt from photos of a place is
+    shown as one of them shows it, and --orbit circles what they look at, at their distance and height.
+    Anything else is framed from outside. --look-at, --from and --zoom change that view or orbit.
 
     \b
     Example:
