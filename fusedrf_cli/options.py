@@ -245,9 +245,9 @@ class KindsType(KindType):
         return tuple(name for name in self.names() if name in asked)
 
 
-RANKS = RanksType()
+RANKS, DIRECTION = RanksType(), DirectionType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
-AABB, COLOUR, AFFINE, DIRECTION = BoxType(), ColourType(), AffineType(), DirectionType()
+AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
 INPUT, SCENE = InputType(), InputType(stdin=True)
 
 

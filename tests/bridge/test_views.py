@@ -383,16 +383,27 @@ def test_cameras_count_in_the_size_that_is_allowed(folder, short):
     assert found[0] == whole.longest > found[1] >= found[2]
 
 
+class Listener:
+    """Takes what a command warns of."""
+
+    def __init__(self):
+        self.said = []
+
+    def warn(self, sentence: str) -> None:
+        self.said.append(sentence)
+
+
+@pytest.mark.parametrize("cut_out", [False, True])
+def test_photos_that_masks_cut_an_object_out_of_show_no_surroundings(folder, cut_out):
+    speckled_capture(folder)
+    capture = read_capture(folder / "wall")
+    assert cameras_of_capture(capture, cut_out, Listener())["surroundings"] is not cut_out
+
+
 def test_a_mesh_has_no_cameras_and_too_many_are_not_kept(tmp_path):
-    class Listener:
-        said = []
-
-        def warn(self, sentence: str) -> None:
-            self.said.append(sentence)
-
     two_coloured_cube().export(tmp_path / "cube.ply")
-    capture = mesh_capture(tmp_path / "cube.ply", n_train=2, size=16)
-    assert cameras_of_capture(capture, False, Listener()) is None and Listener.said == []
+    capture, listener = mesh_capture(tmp_path / "cube.ply", n_train=2, size=16), Listener()
+    assert cameras_of_capture(capture, False, listener) is None and listener.said == []
     many = replace(capture, kind="colmap", train=tuple(photo(i, EYES[0]) for i in range(10_001)))
-    assert cameras_of_capture(many, False, Listener()) is None
-    assert len(Listener.said) == 1 and "does not keep its cameras" in Listener.said[0]
+    assert cameras_of_capture(many, False, listener) is None
+    assert len(listener.said) == 1 and "does not keep its cameras" in listener.said[0]
