@@ -199,7 +199,7 @@ def _lens(row: list[float]) -> dict:
     whole = width.is_integer() and height.is_integer()
     if not (whole and 1 <= min(width, height) and max(width, height) <= MAX_SIDE):
         raise BadSchema(f"cameras: a photo of {width:g}x{height:g} pixels, expected 1 to {MAX_SIDE} a side")
-    if not (min(focal[:2]) > 0 and max(map(abs, (*focal, *distortion))) < LARGEST):
+    if not (min(focal[:2]) > 1 / LARGEST and max(map(abs, (*focal, *distortion))) < LARGEST):
         raise BadSchema("cameras: a lens whose focal length, centre or distortion is out of range")
     return {
         **dict(zip(("fl_x", "fl_y", "cx", "cy"), focal, strict=True)),

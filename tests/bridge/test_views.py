@@ -1,6 +1,7 @@
 """Where pictures are taken from: as a capture's photos were, or framed; before and after fuses and edits."""
 
 import json
+import random
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,16 +10,17 @@ import pytest
 
 from formats.bundle import read_bundle
 from formats.captures import read_capture, write_capture
+from formats.errors import FormatError
 from formats.images import read_image, write_png
 from formats.meshes import mesh_capture
 from formats.rig import Rig, read_rig
-from formats.scene import SceneGraph, make_node, read_scene, write_scene
+from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, read_scene, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.training import camera_of
-from fusedrf_cli.bridge.views import choose_views
+from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
@@ -29,6 +31,8 @@ from tests.bridge.conftest import FIELDS, part
 from tests.formats.test_captures import looking_at
 from tests.formats.test_meshes import two_coloured_cube
 from tests.formats.test_rig import LENSES, TURNED, rig_of
+from tests.promises.mutations import spoilt_json
+from tests.promises.packs import GOLDEN
 
 SMALL = ("--seed", "0", "--no-rgb")
 FOCUS = np.array([0.05, -0.1, 0.02])
@@ -268,6 +272,26 @@ def test_an_edit_of_a_trained_field_does_not_move_the_view_either(report, folder
     before = views_of(folder, "red.rfpack")[0]
     report("add", "red.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack", *SMALL)
     assert same(views_of(folder, "g.rfpack")[0], before)
+
+
+def test_hostile_cameras_are_refused_or_make_views_of_finite_numbers():
+    """P18, of what stands in `cameras`: rounded and placed again, circled, and at other sizes."""
+    good, taken = json.dumps(read_bundle(GOLDEN / "ring.rfpack").scene.cameras).encode(), 0
+    for seed in range(600):
+        spoilt = spoilt_json(good, random.Random(seed))
+        data = b'{"format": "rfpack", "version": "1.1", "nodes": [], "cameras": %s}' % spoilt
+        try:
+            scene = parse_scene(data, "here")
+        except FormatError as error:
+            assert str(error).isprintable()
+            continue
+        rig, taken = read_rig(scene.cameras), taken + 1
+        for kept in filter(None, (rig, rig.placed(TURNED))):
+            dump_scene(SceneGraph((), cameras=kept.content()))
+        lens = pinhole(camera_of(sized(rig.typical, (8, 6))))
+        for camera in [*standing(rig).orbit(lens, 3), *(camera_of(sized(v, (8, 6))) for v in rig.views)]:
+            assert all(np.isfinite(numbers).all() for numbers in camera.rays()), seed
+    assert 20 < taken < 200
 
 
 # --- what stands free ---------------------------------------------------------------------------------------

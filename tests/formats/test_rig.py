@@ -259,6 +259,7 @@ HOSTILE = {
     "no pixel": lambda: spoilt(put("lenses", 0, 1, value=0)),
     "a million pixels a side": lambda: spoilt(put("lenses", 0, 1, value=10**6)),
     "no focal length": lambda: spoilt(put("lenses", 0, 2, value=0)),
+    "focal length next to nothing": lambda: spoilt(put("lenses", 0, 3, value=1e-300)),
     "endless distortion": lambda: spoilt(put("lenses", 1, 6, value=1e300)),
     "held out -1": lambda: spoilt(put("held_out", value=-1)),
     "held out 5": lambda: spoilt(put("held_out", value=5)),
