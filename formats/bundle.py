@@ -20,6 +20,7 @@ from formats.errors import (
 )
 from formats.inputs import open_input
 from formats.records import FieldHeader, FieldRecord, decode_field, decode_header, encode_field
+from formats.rig import read_rig
 from formats.scene import (
     FORMAT,
     MEMBER,
@@ -298,6 +299,8 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
         "version": scene.version,
         "generator": scene.generator,
         "composition": scene.composition,
+        "framing": scene.framing and list(scene.framing),
+        "cameras": scene.cameras and read_rig(scene.cameras).summary(),
         "nodes": nodes,
         "objects": objects_in(scene, headers),
         "history": list(scene.history),

@@ -17,6 +17,7 @@ from formats.errors import BadIntrinsics, BadModel, BadPose, LimitExceeded, Unsu
 from formats.frame import depth_range
 from formats.inputs import read_input
 from formats.points import MAX_POINTS, Points, finite
+from formats.rotations import matrices
 from formats.views import View
 
 MAX_CAMERAS_BYTES = 64 * 2**20
@@ -151,13 +152,7 @@ def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.nda
             f"{where}: its pose is not a rotation with a finite translation; remove the image, or map again"
         )
     w, x, y, z = numbers[:4] / length
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = matrices(np.array([x, y, z, w]))
     pose = np.eye(4)
     pose[:3, :3] = rotation.T * [1, -1, -1]
     pose[:3, 3] = -rotation.T @ numbers[4:]

@@ -1,4 +1,4 @@
-"""The scene graph: named fields placed in a tree of transforms, and its JSON.
+"""The scene graph: named fields placed in a tree of transforms, what pictures of it show, and its JSON.
 
 Frames: `node_to_parent` and `object_to_world` are (4, 4) float64 and act on column points; the world's is the
 product from the root down. Placement words are glTF's: `translation`, `rotation` (unit quaternion xyzw) and
@@ -37,9 +37,12 @@ from formats.errors import (
     SingularTransform,
 )
 from formats.inputs import parse_json, read_input
+from formats.rig import FARTHEST, RigSchema, read_rig
+from formats.rotations import matrices
 
 FORMAT = "rfpack"
-VERSION = "1.0"
+VERSION = "1.1"
+PLAIN_VERSION = "1.0"  # of scenes that have neither cameras nor a framing
 MEMBER = r"fields/[0-9a-f]{16}\.safetensors"
 MAX_SCENE_BYTES = 4 << 20
 MAX_NODES = 10_000
@@ -57,6 +60,7 @@ BIDIRECTIONAL = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 Vector3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
 Vector4 = Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
 Matrix4 = Annotated[list[Vector4], msgspec.Meta(min_length=4, max_length=4)]
+Box = Annotated[list[float], msgspec.Meta(min_length=6, max_length=6)]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
 
 
@@ -84,11 +88,13 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
     composition: Literal["max", "add"] = "max"
     history: list[dict] = []
     requires: Annotated[list[str], msgspec.Meta(max_length=0)] = []
+    framing: Box | msgspec.UnsetType = msgspec.UNSET
+    cameras: RigSchema | msgspec.UnsetType = msgspec.UNSET
 
 
 NODE_KEYS = NodeSchema.__struct_fields__
 PLACEMENT_KEYS = ("translation", "rotation", "scale", "matrix")
-SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history")
+SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history", "framing", "cameras")
 
 
 @dataclass(frozen=True)
@@ -133,8 +139,12 @@ class SceneGraph:
     composition: str = "max"
     history: tuple[dict, ...] = ()
     generator: str = "fusedrf"
-    version: str = VERSION
+    version: str = PLAIN_VERSION
     extras: dict = dataclasses.field(default_factory=dict)
+    framing: tuple[float, ...] | None = None
+    """(6,) the box in the world that pictures show, xmin to zmax; without one they show all there is."""
+    cameras: dict | None = None
+    """Of the capture that a field was learnt from, in the world, as `formats.rig.read_rig` takes them."""
 
     def __post_init__(self):
         if self.composition not in ("max", "add"):
@@ -220,7 +230,9 @@ def parse_scene(data: bytes, where: str) -> SceneGraph:
     try:
         spec = msgspec.convert(known, SceneSchema)
         roots = tuple(_build_node(node) for node in nodes)
-        return SceneGraph(roots, spec.composition, tuple(spec.history), spec.generator, spec.version, extras)
+        shown = _framing(content), _cameras(content)
+        history = tuple(spec.history)
+        return SceneGraph(roots, spec.composition, history, spec.generator, spec.version, extras, *shown)
     except msgspec.ValidationError as error:
         raise BadSchema(f"{where}: {error}") from error
     except FormatError as error:
@@ -232,13 +244,16 @@ def dump_scene(scene: SceneGraph) -> bytes:
 
     Read back before it is returned, so what is written can be read; raises as `parse_scene` where it cannot.
     """
+    shown = {"framing": scene.framing and list(scene.framing), "cameras": scene.cameras}
+    shown = {key: value for key, value in shown.items() if value is not None}
     content = {
         "format": FORMAT,
-        "version": scene.version,
+        "version": max(scene.version, VERSION, key=_numbered) if shown else scene.version,
         "generator": scene.generator,
         "composition": scene.composition,
         "nodes": [_node_content(node) for node in scene.nodes],
         "history": list(scene.history),
+        **shown,
         **{key: scene.extras[key] for key in sorted(scene.extras)},
     }
     try:
@@ -389,14 +404,9 @@ def _placement_matrix(placement: dict, name: str) -> np.ndarray:
         if len(placement) > 1:
             raise BadSchema(f"node {name!r}: has a matrix and {sorted(placement)[-1]}, expected one of them")
         return _numbers(placement["matrix"], (4, 4), name, "matrix")
-    x, y, z, w = _unit(_numbers(placement.get("rotation", [0, 0, 0, 1]), (4,), name, "rotation"), name)
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    turn = _unit(_numbers(placement.get("rotation", [0, 0, 0, 1]), (4,), name, "rotation"), name)
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation * _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
+    matrix[:3, :3] = matrices(turn) * _numbers(placement.get("scale", [1, 1, 1]), (3,), name, "scale")
     matrix[:3, 3] = _numbers(placement.get("translation", [0, 0, 0]), (3,), name, "translation")
     return matrix
 
@@ -449,7 +459,7 @@ def _check_version(content: object, where: str) -> bool:
     match = re.fullmatch(r"([0-9]{1,4})\.([0-9]{1,4})", found) if isinstance(found, str) else None
     if match is None:
         raise BadSchema(f"{where}: version {found!r}, expected a string such as {VERSION!r}")
-    major, minor = (int(number) for number in VERSION.split("."))
+    major, minor = _numbered(VERSION)
     if int(match[1]) != major:
         raise NewerVersion(f"{where}: version {found}, but this fusedrf reads {major}.x; update fusedrf")
     if content.get("requires"):
@@ -461,6 +471,30 @@ def _check_version(content: object, where: str) -> bool:
         text = f"{where}: version {found} is newer than {VERSION}; what is new is ignored"
         warnings.warn(text, FormatWarning, 3)
     return newer
+
+
+def _numbered(version: str) -> tuple[int, ...]:
+    """'1.10' -> (1, 10), which comes after (1, 9)."""
+    return tuple(int(number) for number in version.split("."))
+
+
+def _framing(content: dict) -> tuple[float, ...] | None:
+    """The box that pictures show, checked."""
+    box = content.get("framing")
+    if box is None:
+        return None
+    if max(map(abs, box)) >= FARTHEST or not all(
+        low < high for low, high in zip(box[:3], box[3:], strict=True)
+    ):
+        raise BadSchema(f"framing {box} is no box, expected each minimum below its maximum")
+    return tuple(float(number) for number in box)
+
+
+def _cameras(content: dict) -> dict | None:
+    """The cameras as they stand in the file, once they are known to be readable."""
+    if "cameras" in content:
+        read_rig(content["cameras"])
+    return content.get("cameras")
 
 
 def _check_extent(nodes: object, where: str) -> None:

@@ -106,6 +106,18 @@ class VectorType(_Text):
         return _numbers(text, (3,))
 
 
+class DirectionType(_Text):
+    """'azimuth,elevation' -> two floats, degrees; the elevation is from straight below to straight above."""
+
+    name, expected = "AZIMUTH,ELEVATION", "two angles in degrees, the elevation from -90 to 90"
+
+    def parse(self, text):
+        azimuth, elevation = _numbers(text, (2,))
+        if abs(elevation) > 90:
+            raise ValueError(text)
+        return azimuth, elevation
+
+
 class ScaleType(_Text):
     """'k' or 'x,y,z' -> three floats, none of them 0; a negative one mirrors."""
 
@@ -247,7 +259,7 @@ class KindsType(KindType):
         return tuple(name for name in self.names() if name in asked)
 
 
-RANKS = RanksType()
+RANKS, DIRECTION = RanksType(), DirectionType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
 INPUT, SCENE, DOWNSCALE = InputType(), InputType(stdin=True), DownscaleType()

@@ -16,6 +16,7 @@ from fusedrf_cli.engine.composition.affine import Placed, rigid_motion
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.differentiable import Poses, numbers, query
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, look_at
@@ -76,7 +77,7 @@ class Scene:
     def aabb(self) -> np.ndarray:
         """(6,) float64 box in the world outside of which nothing is."""
         field, origin, _ = self._asked()
-        return field.occupancy.subject + np.tile(origin, 2)
+        return placed_box(field.occupancy.subject, origin)
 
     def parameters(self) -> list[torch.Tensor]:
         """The numbers (P,) of each field, once, made to require gradients: what an optimiser is given."""
@@ -156,6 +157,11 @@ class Scene:
             placed = [Placed(name, self.fields[name], pose) for name, pose in now.items()]
             self._composed = placed, ComposedField(placed, self.rule)
         field = self._composed[1]
+        if field.origin.shape != (3,):
+            raise ValueError(
+                f"'{name}' fills all of space in a frame of its own unit, which these functions do not know; "
+                "ask its field in its own frame (`fields`), or give --bounded where it is trained"
+            )
         return field, field.origin, shifted(learnt, torch.from_numpy(field.origin))
 
     def _near(self, points: torch.Tensor, origin: np.ndarray) -> torch.Tensor:

@@ -145,7 +145,14 @@ class RenderRequest(Running):
     overwrite: bool
     cameras: str | None
     path: str | None
+    views: str | None
+    """"capture" or "heldout": the cameras of the capture that the scene keeps."""
     orbit: int | None
+    look_at: tuple[float, float, float] | None
+    direction: tuple[float, float] | None
+    """From where to look: azimuth and elevation in degrees."""
+    zoom: float
+    """How many times nearer than the default."""
     size: tuple[int, int] | None
     background: tuple[float, float, float] | None
     """None: transparent."""

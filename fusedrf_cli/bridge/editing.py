@@ -23,6 +23,7 @@ from fusedrf_cli.bridge.scene import (
     history_nodes,
     load_scene,
     make_field,
+    short_origin,
     stored,
     write_field,
 )
@@ -31,7 +32,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.fields.occupancy import placed_box, seen_box, transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import Edited, enclosing
@@ -72,8 +73,16 @@ class Fused:
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) of the field's frame in the world."""
-        return self.node.object_to_world[:3, 3]
+        """Where the field's frame lies in the world: a position (3,), or a placement (4, 4)."""
+        return short_origin(self.node.object_to_world)
+
+    @property
+    def framing(self) -> np.ndarray | tuple[float, ...] | None:
+        """(6,) the box in the world that pictures show, before the edit and after it; None where they are
+        taken from a capture's cameras."""
+        if self.scene.framing is not None or (self.scene.cameras or {}).get("surroundings"):
+            return self.scene.framing
+        return placed_box(self.field.occupancy.subject, self.origin)
 
     @property
     def names(self) -> set[str]:
@@ -185,7 +194,7 @@ def without_objects(
     teach = Teacher(request, place, progress, len(inside))
     for node in inside:
         progress.phase(f"deleting {node['name']}", 1.0)
-        box = np.asarray(node["aabb"], np.float64) - np.tile(fused.origin, 2)
+        box = seen_box(np.asarray(node["aabb"], np.float64), fused.origin)
         rest = remaining(request, fused, place, progress)
         restored &= rest is not None
         edited = kind.refilled(field, box, rest, teach)
@@ -238,6 +247,8 @@ def write_edited(request: EditRequest, fused: Fused, field: StoredField, precisi
         history=(*fused.scene.history, entry),
         kept=dict.fromkeys(fused.others, fused.path),
         extras=fused.scene.extras,
+        framing=fused.framing,
+        cameras=fused.scene.cameras,
     )
 
 
@@ -371,7 +382,7 @@ def edit_report(
         "source_bytes": Path(request.fused).stat().st_size,
         "touched": {
             "names": names,
-            "aabb": (edited.box + np.tile(fused.origin, 2)).tolist(),
+            "aabb": placed_box(edited.box, fused.origin).tolist(),
             **fused.kind.counts(edited.field),
             "share_of_box": float(min(1.0, np.prod(extent / whole))),
             "how": f"{edited.how}; {SAME_BITS if edited.local else NEARLY}",

@@ -6,11 +6,12 @@ import numpy as np
 
 from formats.captures import is_capture, load_images, read_capture
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
-from fusedrf_cli.bridge.rendering import picture_memory, placed_box, renderable
+from fusedrf_cli.bridge.rendering import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.training import WHITE, camera_of, over_white
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
+from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image

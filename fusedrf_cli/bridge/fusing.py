@@ -7,6 +7,7 @@ from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.making import Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
+from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
 from fusedrf_cli.bridge.running import Saved, checkpoint_path, engine, load_checkpoint
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
@@ -45,7 +46,8 @@ def fuse(request: FuseRequest, progress) -> dict:
         started = time.monotonic()
         kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
         nodes = history_nodes(loaded, request.output, kept)
-        asked = student_request(request, loaded, nodes)
+        cameras = kept_cameras(loaded, progress)
+        asked = student_request(request, loaded, graph_bytes(nodes, cameras))
         try:
             student = kind.student(scene.composed, asked)
             held = make_room(memory, student, scene, request)
@@ -82,6 +84,8 @@ def fuse(request: FuseRequest, progress) -> dict:
             origin=scene.composed.origin,
             history=(entry,),
             kept=kept,
+            framing=kept_framing(loaded, scene.composed, cameras),
+            cameras=cameras,
         )
         checkpoint_path(request.output).unlink(missing_ok=True)
     report = {
@@ -99,12 +103,12 @@ def fuse(request: FuseRequest, progress) -> dict:
     return report
 
 
-def student_request(request: FuseRequest, loaded: LoadedScene, nodes: list[dict]) -> StudentRequest:
-    """What is asked of the kind's student."""
+def student_request(request: FuseRequest, loaded: LoadedScene, overhead: int) -> StudentRequest:
+    """What is asked of the kind's student; overhead: bytes of the bundle besides its field."""
     return StudentRequest(
         sizes=BundleSizes(),
         limit=request.max_size or DEFAULT_MAX_SIZE,
-        overhead=graph_bytes(nodes),
+        overhead=overhead,
         target=request.target_psnr,
         precision=request.precision,
         ranks=request.ranks,

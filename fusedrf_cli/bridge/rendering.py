@@ -9,21 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from formats.atomic import atomic_folder
-from formats.captures import read_cameras
 from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
 from fusedrf_cli.bridge.memory import Memory, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
-from fusedrf_cli.bridge.training import camera_of
-from fusedrf_cli.engine.fields.occupancy import transformed_aabb
-from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
+from fusedrf_cli.bridge.views import choose_views
+from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
-DEFAULT_SIZE = (800, 800)
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
@@ -42,7 +38,9 @@ def render(request: RenderRequest, progress) -> dict:
         budget = Memory(request.memory)
         loaded = load_scene(request.scene, request.allow_outside, budget, place)
         field, origin = renderable(loaded)
-        views = choose_views(field, origin, request.cameras or request.path, request.orbit, request.size)
+        views = choose_views(request, loaded, field, origin)
+        if suffix in FILMS:
+            check_sizes(output, views)
         if suffix == ".png" and len(views) > 1:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
@@ -80,29 +78,17 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
     """The field to march, and where its frame lies in the world (see `render_image`): a lone field is taken
     as it is.
     """
-    if len(loaded.fields) == 1:
-        placed = loaded.fields[0].placed
-        if np.array_equal(placed.object_to_world[:3, :3], np.eye(3)):
-            return opened(placed.field), placed.object_to_world[:3, 3]
-        return opened(placed.field), placed.object_to_world
+    if (lone := loaded.lone()) is not None:
+        return lone
     composed = loaded.composed()
     return composed, composed.origin
 
 
-def choose_views(
-    field, origin: np.ndarray, cameras: str | None, count: int | None, size: tuple[int, int] | None
-) -> list[Camera]:
-    """The views a user asked for; with no choice, one that frames everything."""
-    if cameras:
-        return [camera_of(v) for v in read_cameras(cameras, size)]
-    box = placed_box(field.occupancy.subject, origin)
-    width, height = size or DEFAULT_SIZE
-    return orbit(box, count, width, height) if count else [framing_camera(box, 0.9, 0.45, width, height)]
-
-
-def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(6,) world box around a box (6,) of a frame that lies at `origin` (see `render_image`)."""
-    return box + np.tile(origin, 2) if origin.shape == (3,) else transformed_aabb(box, origin)
+def check_sizes(output: str, views: list[Camera]) -> None:
+    """UsageProblem where the pictures of a film would differ in size."""
+    sizes = {(view.width, view.height) for view in views}
+    if len(sizes) > 1:
+        raise UsageProblem(f"{output}: a film has one size, and its views have {len(sizes)}; give --size")
 
 
 def to_pixels(shot: RenderedImage, background: tuple[float, float, float] | None) -> np.ndarray:

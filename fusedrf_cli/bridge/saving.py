@@ -9,6 +9,7 @@ from formats.bundle import BundleWriter, is_bundle, read_headers
 from formats.records import FieldRecord
 from formats.scene import Node, SceneGraph, make_node
 from fusedrf_cli import __version__
+from fusedrf_cli.bridge.rigs import kept_cameras
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.fields.base import StoredField
 
@@ -25,8 +26,8 @@ def save_scene(
     """Write a scene with the fields and placements (4, 4), object to world, of its nodes' names as they are
     now, as one bundle; returns its bytes. Fields that several nodes share are stored once.
 
-    What else the scene's own bundle holds (kept sources, its history, keys of later versions) stays. Raises
-    what `BundleWriter.write` and `make_node` raise.
+    What else the scene's own bundle holds (kept sources, its history, keys of later versions) stays; cameras
+    of a capture stay where they are in the world. Raises what `BundleWriter.write` and `make_node` raise.
     """
     writer, members, nodes = BundleWriter(), {}, []
     for source in scene.fields:
@@ -42,7 +43,13 @@ def save_scene(
         for member in read_headers(scene.path)[1].keys() - shown:
             writer.copy_field(scene.path, member)
     graph = SceneGraph(
-        tuple(nodes), scene.composition, history, f"fusedrf {__version__}", extras=scene.graph.extras
+        tuple(nodes),
+        scene.composition,
+        history,
+        f"fusedrf {__version__}",
+        extras=scene.graph.extras,
+        framing=scene.graph.framing,
+        cameras=kept_cameras(scene),
     )
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.streamed import StreamedField
+from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.errors import FusedRFError, InvalidInput, UsageProblem
@@ -41,6 +41,19 @@ class SourceField:
 
 
 @dataclass(frozen=True)
+class PlacedRig:
+    """Cameras that a source of a scene keeps."""
+
+    name: str
+    """Of the node that names the source."""
+    background: bool
+    cameras: dict
+    """In the source's own world, as its scene.json has them."""
+    object_to_world: np.ndarray
+    """(4, 4) from that world to the scene's."""
+
+
+@dataclass(frozen=True)
 class LoadedScene:
     """A scene graph with its fields read."""
 
@@ -49,6 +62,8 @@ class LoadedScene:
     graph: SceneGraph
     path: Path | None
     shelf: Shelf
+    rigs: tuple[PlacedRig, ...] = ()
+    """Of its sources."""
 
     @property
     def sizes(self) -> list[int]:
@@ -63,6 +78,14 @@ class LoadedScene:
     def composed(self) -> ComposedField:
         """The scene as one field."""
         return ComposedField(self.placed, self.composition)
+
+    def lone(self) -> tuple[StoredField, np.ndarray] | None:
+        """The field of a scene that is one field, and where its frame lies in the world: a position (3,)
+        where it is only moved, else a placement (4, 4)."""
+        if len(self.fields) == 1:
+            placed = self.fields[0].placed
+            return opened(placed.field), short_origin(placed.object_to_world)
+        return None
 
 
 def make_field(record: FieldRecord, where: str) -> StoredField:
@@ -132,6 +155,7 @@ class _Loader:
         self.path, self.budget, self.shelf, self.place = path, budget, Shelf(), place
         self.bundles: dict[Path, tuple[SceneGraph, dict[str, FieldHeader]]] = {}
         self.fields: dict[str, StreamedField] = {}
+        self.rigs: list[PlacedRig] = []
 
     def load(
         self, graph: SceneGraph, allow_outside: bool, headers: dict[str, FieldHeader] | None = None
@@ -150,7 +174,7 @@ class _Loader:
             self.shelf.resize(self.budget.room({}))
             self.budget.expect(sources(sizes, self.shelf.room, READING), advice="use smaller sources")
         fields = tuple(self.source(*where) for where in found)
-        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf)
+        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs))
 
     def sources(self, leaf, path: Path) -> list[tuple]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
@@ -168,6 +192,8 @@ class _Loader:
                 f"{path}: the bundle holds no field, so node '{leaf.name}' would be empty; choose another "
                 "source"
             )
+        if scene.cameras is not None:
+            self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
         return [
             (
@@ -253,10 +279,13 @@ def write_field(
     history: tuple[dict, ...] = (),
     kept: dict[str, Path] | None = None,
     extras: dict | None = None,
+    framing: Sequence[float] | None = None,
+    cameras: dict | None = None,
 ) -> int:
     """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
     node is placed at `origin`: a position (3,), or a placement (4, 4). Returns the bytes written. `extras`
-    are the scene's keys that this version does not know.
+    are the scene's keys that this version does not know; framing (6,) and cameras are what pictures of it
+    show (bridge/rigs.py).
     """
     writer = BundleWriter()
     for member, path in (kept or {}).items():
@@ -265,9 +294,23 @@ def write_field(
     member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
     node = make_node(name, field=member, **placement_of(origin))
     generator = f"fusedrf {__version__}"
-    graph = SceneGraph(nodes=(node,), history=history, generator=generator, extras=extras or {})
+    framing = None if framing is None else tuple(float(number) for number in framing)
+    graph = SceneGraph(
+        nodes=(node,),
+        history=history,
+        generator=generator,
+        extras=extras or {},
+        framing=framing,
+        cameras=cameras,
+    )
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
+
+
+def short_origin(object_to_world: np.ndarray) -> np.ndarray:
+    """A placement (4, 4), or, where it only moves, the position (3,)."""
+    moves = np.array_equal(object_to_world[:3, :3], np.eye(3))
+    return object_to_world[:3, 3] if moves else object_to_world
 
 
 def placement_of(origin: np.ndarray | None) -> dict:

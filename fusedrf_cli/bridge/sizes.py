@@ -59,7 +59,14 @@ def kept_texels(used: np.ndarray) -> int:
     return int(sides[0] @ held @ sides[1])
 
 
-def graph_bytes(nodes: list[dict]) -> int:
+def graph_bytes(nodes: list[dict], cameras: dict | None = None) -> int:
     """At most so many bytes for all of a fused bundle but its field; nodes are those of its history."""
     node = make_node("fused", field=f"fields/{'0' * 16}.safetensors", translation=(math.pi,) * 3)
-    return BESIDES + len(dump_scene(SceneGraph((node,), history=({"nodes": nodes},))))
+    framing = (-math.pi,) * 3 + (math.pi,) * 3
+    scene = SceneGraph((node,), history=({"nodes": nodes},), framing=framing, cameras=cameras)
+    return BESIDES + len(dump_scene(scene))
+
+
+def camera_bytes(cameras: dict | None) -> int:
+    """About so many bytes of a bundle for the cameras that it keeps, a little more than they take."""
+    return 0 if cameras is None else len(dump_scene(SceneGraph((), cameras=cameras)))

@@ -14,6 +14,7 @@ from formats.views import Capture, View, check_parallax
 from fusedrf_cli.bridge.extent import Extent, extent_of
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.posing import posed_capture
+from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.running import (
     checkpoint_mismatch,
     checkpoint_path,
@@ -22,7 +23,7 @@ from fusedrf_cli.bridge.running import (
     resumable,
 )
 from fusedrf_cli.bridge.scene import refuse_options, unusable_kind, write_field
-from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes
+from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
@@ -35,6 +36,8 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
 
+UNBOUNDED_DEGREE = 1  # SH: with more, colours that depend on the view explain what places should
+UNBOUNDED_TEXELS = 1.4  # times those of a box: half of them lie outside the core
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
@@ -52,10 +55,12 @@ def train(request: TrainRequest, progress) -> dict:
         kind = trained_kind(request)
         progress.phase("reading", None)
         capture = read_views(request, progress)
-        extent = extent_of(request, capture, cuts_out(request, capture))
-        settings = fit_settings(request, kind, capture, extent, place)
+        cut_out = cuts_out(request, capture)
+        extent = extent_of(request, capture, cut_out)
+        kept = cameras_of_capture(capture, cut_out, progress)
+        settings = fit_settings(request, kind, capture, extent, place, camera_bytes(kept))
         plan = kind.untrained(extent.box, settings.longest, settings.way)
-        check_space(request.output, bytes_of(plan, request.precision))
+        check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
         memory.expect(
             fit_memory(capture, plan, settings), advice="use fewer or smaller photos, or a lower --quality"
         )
@@ -76,6 +81,7 @@ def train(request: TrainRequest, progress) -> dict:
             precision=request.precision,
             overwrite=request.overwrite,
             origin=extent.origin,
+            cameras=kept,
         )
         checkpoint_path(request.output).unlink(missing_ok=True)
     report = {
@@ -148,13 +154,17 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
 
 
 def fit_settings(
-    request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str
+    request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str, besides: int = 0
 ) -> FitSettings:
-    """How to fit; UsageProblem where not even the coarsest field is as small as asked."""
+    """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
+    bytes in its bundle."""
+    degree = request.sh_degree
+    if degree is None and extent.unbounded and "sh_degree" in kind.takes:
+        degree = UNBOUNDED_DEGREE
     settings = replace(
         QUALITY[request.quality],
         kind=kind.name,
-        way=Way(request.precision, request.ranks, request.sh_degree),
+        way=Way(request.precision, request.ranks, degree),
         seed=request.seed,
         time_budget=request.time_budget,
         target_psnr=request.target_psnr,
@@ -163,9 +173,12 @@ def fit_settings(
         unbounded=extent.unbounded,
         device=place,
     )
-    longest = fitting_longest(kind, extent.box, settings, request.max_size, request.precision)
+    if extent.unbounded:
+        settings = replace(settings, longest=round(UNBOUNDED_TEXELS * settings.longest))
+    room = request.max_size and max(1, request.max_size - besides)
+    longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     plan = kind.untrained(extent.box, longest, settings.way)
-    check_size(bytes_of(plan, request.precision), request.max_size)
+    check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)
 
 

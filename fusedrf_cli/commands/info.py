@@ -21,7 +21,22 @@ def _brief(summary: dict) -> dict:
     shown = ("member", "kind", "precision", "bytes", "parameters")
     fields = [{key: field[key] for key in shown} for field in summary["fields"]]
     history = [_scalars(event) for event in summary["history"]]
-    return {**summary, "nodes": nodes, "objects": _inside(summary), "fields": fields, "history": history}
+    cameras = summary["cameras"] and _cameras(summary["cameras"])
+    return {
+        **summary,
+        "cameras": cameras,
+        "nodes": nodes,
+        "objects": _inside(summary),
+        "fields": fields,
+        "history": history,
+    }
+
+
+def _cameras(cameras: dict) -> dict:
+    """The cameras of a capture on one line."""
+    sizes = cameras["sizes"]
+    size = "x".join(map(str, cameras["photo_size"])) + (f" and {sizes - 1} more" if sizes > 1 else "")
+    return {key: cameras[key] for key in ("count", "held_out")} | {"photo_size": size}
 
 
 def _inside(summary: dict) -> list[dict]:
@@ -52,9 +67,10 @@ def _scalars(event: dict) -> dict:
 def command(scene, progress):
     """List what a bundle or scene holds.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. Of a fused bundle the objects are listed with
-    kind, place, size in the world and bytes; an object that was distilled into one field with others has no
-    bytes of its own. Damage is found, but arrays are not decoded, so the answer is quick.
+    SCENE is a bundle, a scene.json, or - for a scene on stdin. Of one that was learnt from photos their
+    cameras are counted. Of a fused bundle the objects are listed with kind, place, size in the world and
+    bytes; an object that was distilled into one field with others has no bytes of its own. Damage is found,
+    but arrays are not decoded, so the answer is quick.
 
     \b
     Example:
@@ -67,6 +83,8 @@ def command(scene, progress):
 
 def _of_stdin() -> dict:
     """The same as `formats.bundle.read_summary` gives for a scene.json."""
+    from formats.rig import read_rig
+
     scene, data = options.stdin_scene()
     nodes = [
         {
@@ -88,6 +106,8 @@ def _of_stdin() -> dict:
         "format": "scene",
         "bytes": len(data),
         **facts,
+        "framing": scene.framing and list(scene.framing),
+        "cameras": scene.cameras and read_rig(scene.cameras).summary(),
         "nodes": nodes,
         "history": list(scene.history),
         "objects": [],

@@ -12,7 +12,22 @@ from fusedrf_cli.requests import RenderRequest
 @options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).", folders=True)
 @click.option("--cameras", type=options.INPUT, help="Views of a transforms.json.")
 @click.option("--path", type=options.INPUT, help="Views of a nerfstudio camera_path.json.")
+@click.option(
+    "--views",
+    type=click.Choice(["capture", "heldout"]),
+    help="All views of the photos that the scene was learnt from, or those that were held out.",
+)
 @click.option("--orbit", type=click.IntRange(1), metavar="N", help="N views around the scene.")
+@click.option("--look-at", type=options.VECTOR, help="Look at this point of the world.")
+@click.option(
+    "--from",
+    "direction",
+    type=options.DIRECTION,
+    help="Look from this side: degrees from +x about the upward axis, and above the horizon.",
+)
+@click.option(
+    "--zoom", type=options.POSITIVE, default=1.0, show_default=True, help="2: from half as far away."
+)
 @options.size
 @click.option(
     "--background",
@@ -27,18 +42,23 @@ from fusedrf_cli.requests import RenderRequest
 @options.allow_outside
 @options.running
 @options.reporting
-def command(scene, output, cameras, path, orbit, progress, **words):
+def command(scene, output, progress, **words):
     """Render pictures or a film.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. By default one view frames all of it.
+    SCENE is a bundle, a scene.json, or - for a scene on stdin. What was learnt from photos of a place is
+    shown as one of them shows it, and --orbit circles what they look at, at their distance and height.
+    Anything else is framed from outside. --look-at, --from and --zoom change that view or orbit.
 
     \b
     Example:
       fusedrf render fused.rfpack --orbit 60 --size 400x400 -o turn.gif
     """
-    if sum(choice is not None for choice in (cameras, path, orbit)) > 1:
-        raise UsageProblem("--cameras, --path and --orbit each choose the views; give one of them")
+    chosen = [name for name in ("cameras", "path", "views", "orbit") if words[name] is not None]
+    if len(chosen) > 1:
+        raise UsageProblem("--cameras, --path, --views and --orbit each choose the views; give one of them")
+    aimed = words["look_at"] is not None or words["direction"] is not None or words["zoom"] != 1
+    if aimed and chosen and chosen != ["orbit"]:
+        raise UsageProblem(f"--look-at, --from and --zoom do not apply to --{chosen[0]}; leave them out")
     from fusedrf_cli import bridge
 
-    views = {"cameras": cameras, "path": path, "orbit": orbit}
-    return bridge.render(RenderRequest(scene=scene, output=output, **views, **words), progress)
+    return bridge.render(RenderRequest(scene=scene, output=output, **words), progress)

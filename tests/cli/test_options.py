@@ -28,6 +28,7 @@ SPELLED = "1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1"
         (options.BYTES, "1.5kib", 1536),
         (options.BYTES, "300", 300),
         (options.VECTOR, "1,-2.5,3e2", (1.0, -2.5, 300.0)),
+        (options.DIRECTION, "-90,30", (-90.0, 30.0)),
         (options.SCALE, "2", (2.0, 2.0, 2.0)),
         (options.SCALE, "1,-1,1", (1.0, -1.0, 1.0)),
         (options.AABB, "-1,-1,-1,1,1,2", (-1.0, -1.0, -1.0, 1.0, 1.0, 2.0)),
@@ -51,6 +52,7 @@ def test_a_type_reads_what_it_should(kind, text, value):
         (options.SIZE, ["800", "0x1", "1x99999", "-1x2", "1.5x2", "1x2x3", ""]),
         (options.BYTES, ["0", "-1", "1XB", "MB", "1ib", "nan", "9" * 400, ""]),
         (options.VECTOR, ["1,2", "1,2,3,4", "1,2,nan", "1,2,inf", "1,2,1e999", "a,b,c", ""]),
+        (options.DIRECTION, ["1", "1,2,3", "0,91", "0,-90.1", "nan,0", ""]),
         (options.SCALE, ["0", "1,0,1", "1,2", "nan", ""]),
         (options.AABB, ["0,0,0,1,1", "0,0,0,0,1,1", "1,1,1,0,0,0", "0,0,0,1,1,inf"]),
         (options.DOWNSCALE, ["0", "65", "-2", "1.5", "half", ""]),
@@ -196,13 +198,33 @@ def test_render_hands_on_a_background(run, bridge, colour, background):
     name, asked = bridge.call
     assert (name, asked["scene"], asked["output"]) == ("render", "chair.rfpack", "out.png")
     assert asked["background"] == background
-    others = {"cameras", "path", "orbit", "size", "depth", "fps", "allow_outside"}
-    assert set(asked) == {*COMMON, "scene", "output", "background", *others} - {"seed"}
+    others = {"cameras", "path", "views", "orbit", "look_at", "direction", "zoom", "size", "depth", "fps"}
+    wanted = {*COMMON, "scene", "output", "background", "allow_outside", *others}
+    assert set(asked) == wanted - {"seed"}
 
 
-def test_render_takes_one_choice_of_views(run, bridge):
-    result = run("render", "chair.rfpack", "-o", "out", "--orbit", "3", "--cameras", "table.rfpack")
-    assert result.exit_code == 2 and bridge.call is None
+def test_render_hands_on_where_to_look(run, bridge):
+    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--from", "-90,30", "--zoom", "2")
+    assert run("render", "chair.rfpack", "-o", "out", *words).exit_code == 0
+    asked = bridge.call[1]
+    found = [asked[word] for word in ("orbit", "look_at", "direction", "zoom", "views")]
+    assert found == [4, (1, -2, 0.5), (-90, 30), 2, None]
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (("--orbit", "3", "--cameras", "table.rfpack"), "give one of them"),
+        (("--orbit", "3", "--views", "capture"), "give one of them"),
+        (("--views", "heldout", "--zoom", "2"), "do not apply to --views"),
+        (("--cameras", "table.rfpack", "--look-at", "0,0,0"), "do not apply to --cameras"),
+        (("--path", "table.rfpack", "--from", "0,0"), "do not apply to --path"),
+        (("--views", "all"), "'capture', 'heldout'"),
+    ],
+)
+def test_render_takes_one_choice_of_views(run, bridge, words, says):
+    result = run("render", "chair.rfpack", "-o", "out", *words)
+    assert result.exit_code == 2 and says in result.stderr and bridge.call is None
 
 
 def test_eval_hands_on_both_sides(run, bridge):

@@ -5,6 +5,7 @@ import os
 import time
 import unicodedata
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,18 @@ def test_a_newer_minor_version_warns_and_keeps_what_it_does_not_know():
     assert written["nodes"][0]["children"][0]["glow"] == 2
 
 
+def test_what_pictures_show_is_kept_and_asks_for_version_1_1():
+    """P1: a scene without it keeps its bytes, and a later version its number."""
+    box = (-1.0, -2.0, -3.0, 1.0, 2.0, 3.5)
+    plain = SceneGraph((make_node("a", source="a.rfpack"),))
+    framed = parse_scene(dump_scene(replace(plain, framing=box)), "here")
+    assert (plain.version, framed.version, framed.framing) == ("1.0", "1.1", box)
+    assert b'"version": "1.0"' in dump_scene(plain) and b"framing" not in dump_scene(plain)
+    assert dump_scene(framed) == dump_scene(replace(plain, framing=box))
+    later = json.loads(dump_scene(replace(plain, framing=box, version="1.10")))
+    assert (later["version"], later["framing"]) == ("1.10", list(box))
+
+
 def node(**keys) -> bytes:
     return scene_json({"name": "n", **keys})
 
@@ -175,6 +188,12 @@ REFUSED = {
     "version words": (scene_json(version="1.0.0"), errors.BadSchema),
     "newer major": (scene_json(version="2.0"), errors.NewerVersion),
     "requires": (scene_json(requires=["time"]), errors.NewerVersion),
+    "framing of 5": (scene_json(framing=[0, 0, 0, 1, 1]), errors.BadSchema),
+    "framing inside out": (scene_json(framing=[0, 0, 1, 1, 1, 0]), errors.BadSchema),
+    "framing far": (scene_json(framing=[0, 0, 0, 1, 1, 1e300]), errors.BadSchema),
+    "framing of text": (scene_json(framing=["0", 0, 0, 1, 1, 1]), errors.BadSchema),
+    "null framing": (scene_json(framing=None), errors.BadSchema),
+    "null cameras": (scene_json(cameras=None), errors.BadSchema),
     "no nodes": (b'{"format": "rfpack", "version": "1.0"}', errors.BadSchema),
     "nodes object": (b'{"format": "rfpack", "version": "1.0", "nodes": {}}', errors.BadSchema),
     "node number": (scene_json(1), errors.BadSchema),
@@ -397,7 +416,8 @@ def test_any_change_of_a_value_is_read_or_refused(data):
     )
     content = json.loads(node(translation=[1, 2, 3], rotation=[0, 0, 0, 1], children=[{"name": "c"}]))
     at = data.draw(st.sampled_from([content, content["nodes"][0], content["nodes"][0]["children"][0]]))
-    at[data.draw(st.sampled_from([*at, "matrix", "history", "requires"]))] = data.draw(junk)
+    keys = [*at, "matrix", "history", "requires", "framing", "cameras"]
+    at[data.draw(st.sampled_from(keys))] = data.draw(junk)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", errors.FormatWarning)
         try:

@@ -12,6 +12,7 @@ from formats import errors, inputs, records, scene
 from formats.archive import MAX_MEMBERS, write_archive
 from formats.bundle import member_name
 from formats.records import MAX_HEADER
+from formats.rig import MAX_CAMERAS, MAX_NAME_BYTES
 from formats.scene import SceneGraph, dump_scene, expand_scene, make_node, parse_scene, write_scene
 from tests.formats.test_records import HOSTILE as BAD_FIELDS
 from tests.formats.test_scene import REFUSED as BAD_SCENES
@@ -48,6 +49,10 @@ def many(part: bytes, end: bytes) -> bytes:
     return HEAD + b'"x": [' + part * (FULL // len(part)) + end + b'], "nodes": []}'
 
 
+def rigged(**columns) -> bytes:
+    return scene_json(cameras={"focus": [0, 0, 0], "distance": 1, **columns})
+
+
 KEYS = b",".join(b'"%d":0' % i for i in range(190_000))
 ENTRIES = b",".join(b'{"":%d}' % i for i in range(190_000))
 SCENES = {
@@ -62,6 +67,8 @@ SCENES = {
     "more than 4 MB": b" " * (4 << 20) + b"{}",
     "10,001 nodes": scene_json(*[{"name": str(i)} for i in range(10_001)]),
     "65 levels": nested(65),
+    "10,001 cameras": rigged(names=["a"] * 10_001),
+    "4 MB of lenses": rigged(lenses=[[1] * 16] * 80_000),
 }
 
 
@@ -250,8 +257,10 @@ def test_limits_are_those_of_the_specification():
         "at most 1 MiB",
         "at most 4 MiB",
         "at most 10,000 nodes, 64 levels",
+        "of each camera, 1 to 10,000: printable text of 1 to 200 bytes",
     ):
         assert words in spec
+    assert (MAX_CAMERAS, MAX_NAME_BYTES) == (10_000, 200)
     assert (MAX_MEMBERS, MAX_HEADER, scene.MAX_SCENE_BYTES) == (10_001, 1 << 20, 4 << 20)
     assert f"{inputs.MAX_VALUES:,}" in spec and f"{inputs.MAX_KEYS:,}" in spec
     assert f"{inputs.MAX_NESTING} levels" in spec

@@ -11,6 +11,7 @@ from formats import scene as scene_file
 from formats.bundle import BundleWriter, read_bundle, read_summary
 from formats.errors import FormatWarning, NewerVersion
 from formats.images import read_image
+from formats.rig import read_rig
 from fusedrf_cli.bridge.rendering import renderable, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.cameras import orbit
@@ -38,6 +39,7 @@ def decibels(one: np.ndarray, other: np.ndarray) -> float:
     ("name", "picture"),
     [
         ("pair.rfpack", "pair.png"),
+        ("ring.rfpack", "pair.png"),
         ("later.rfpack", "pair.png"),
         ("coded-8.rfpack", "coded.png"),
         ("coded-4.rfpack", "coded.png"),
@@ -48,6 +50,21 @@ def test_kept_packs_render_as_they_did(name, picture):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)
         assert decibels(rendered(GOLDEN / name), read_image(GOLDEN / picture)[..., :3]) >= 60
+
+
+def test_kept_cameras_stand_where_they_stood():
+    """P1: ring.rfpack has four cameras around z, 2 away and 1 up, of which the third is a fisheye."""
+    scene = read_bundle(GOLDEN / "ring.rfpack").scene
+    rig = read_rig(scene.cameras)
+    assert (scene.version, scene.framing) == ("1.1", (-1.5, -1.0, -0.5, 1.5, 1.0, 0.75))
+    assert [view.name for view in rig.train] == ["r_0", "r_1", "r_2"] and len(rig.test) == 1
+    for view, place in zip(rig.views, ((2, 0, 1), (0, 2, 1), (-2, 0, 1), (0, -2, 1)), strict=True):
+        np.testing.assert_allclose(view.camera_to_world[:3, 3], place)
+        back = np.array(place) / np.sqrt(5)  # it looks at the origin, and its right is level
+        np.testing.assert_allclose(view.camera_to_world[:3, 2], back, atol=1e-7)
+        np.testing.assert_allclose(view.camera_to_world[2, 0], 0, atol=1e-7)
+    assert [view.fisheye for view in rig.views] == [False, False, True, False]
+    assert rig.views[2].distortion == (0.05, -0.02, 0.006, -0.001)
 
 
 def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):

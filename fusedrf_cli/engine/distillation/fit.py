@@ -25,7 +25,9 @@ RATE = 0.02
 RATE_DECAY = 0.05  # the last step's share of the first's rate
 STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3
-DISTORTION = 1e-3  # weight of that loss in unbounded space; in a box surfaces come out sharp without it
+SETTLED = 0.25  # share of the run after which a scene in unbounded space has taken shape
+EARLY_NEAR = 5.0  # times the near distance of such a scene, at first
+DISTORTION = 0.012  # weight of that loss in unbounded space; in a box surfaces come out sharp without it
 WEIGHED_RAYS = 1 << 17  # by which it is found what photos show
 STEPS_TO_SHOW = 100  # after which a field in unbounded space shows where things are
 SHOWN_FROM = 0.005  # weight on a ray from which a cell of unbounded space counts as shown
@@ -341,10 +343,10 @@ class FitRun:
             target.numpy(),
             background,
             settings.opacity_weight,
-            settings.near,
+            self.near(share),
             step,
             EARLY_STOP,
-            DISTORTION if settings.unbounded else 0.0,
+            min(1.0, share / SETTLED) * DISTORTION if settings.unbounded else 0.0,
         )
         loss = np.zeros((self.optimiser.parts, 3))
         field.train_rays(batch, self.optimiser.grads, loss)
@@ -352,6 +354,13 @@ class FitRun:
         if self.guard.accepts(sums, self.optimiser):
             self.learn(sums, len(rays_o), RATE_DECAY**share * self.guard.rate)
         self.steps += 1
+
+    def near(self, share: float) -> float:
+        """The distance from a camera before which nothing is learnt, which shrinks while the scene takes
+        shape: the cheapest explanation of a photo is fog right before its camera."""
+        settings = self.settings
+        early = max(0.0, 1 - share / SETTLED) if settings.unbounded else 0.0
+        return settings.near * (1 + (EARLY_NEAR - 1) * early)
 
     def learn(self, sums: np.ndarray, rays: int, decay: float) -> None:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size

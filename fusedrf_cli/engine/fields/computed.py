@@ -94,7 +94,7 @@ class ComputedField:
     def answers(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `query`, by `reference`: σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it."""
+        """σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it, by `reference`."""
         at = self.space.contracted(points)
         sigma, rgb = self.reference(params, at, dirs)
         return sigma * self.space.rates(at).to(sigma.dtype), rgb

@@ -201,6 +201,17 @@ def transformed_aabb(aabb: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.concatenate([moved.min(0), moved.max(0)])
 
 
+def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(6,) world box around a box (6,) of a frame that lies at `origin`: a position (3,), or a placement (4,
+    4)."""
+    return box + np.tile(origin, 2) if origin.shape == (3,) else transformed_aabb(box, origin)
+
+
+def seen_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(6,) box of a frame that lies at `origin` around a world box (6,)."""
+    return box - np.tile(origin, 2) if origin.shape == (3,) else transformed_aabb(box, np.linalg.inv(origin))
+
+
 def box_corners(aabb: np.ndarray) -> np.ndarray:
     """(8, 3) corners of a box (6,)."""
     sides = zip(aabb[:3], aabb[3:], strict=True)

@@ -10,8 +10,8 @@ gradients are gathered:
     sizes(field)                       for Python: constants of the namespace by name; SCRATCH and KEPT, the
                                        numbers kept per shaded sample for the way back, are among them
     density(field, grid, k, p, d, scratch)
-                                       (σ, pre, steps, place): σ per length of the space's coordinates; `pre` what
-                                       `backward` needs of it; for how many steps of the ray the sample k
+                                       (σ, pre, steps, place): σ per length of the space's coordinates; `pre`
+                                       what `backward` needs of it; for how many steps of the ray the sample k
                                        stands, 0 where there is nothing to sample; `place`, an int or a
                                        tuple, what the other functions need to know of where p lies
     colour(field, place, p, d, scratch, memory, at)

@@ -4,7 +4,7 @@ Axes are OpenGL's: +x right, +y up, looking along -z. Pixel (i, j) is column i, 
 at (i + 0.5, j + 0.5).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -192,7 +192,69 @@ def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     return pose
 
 
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """From which side, and from how far, cameras look at a target; angles in radians."""
+
+    target: np.ndarray
+    """(3,) float64."""
+    distance: float
+    azimuth: float
+    """About `up`, from +x where that is +z (see `level`)."""
+    elevation: float
+    """Above the plane through the target that is at right angles to `up`."""
+    up: np.ndarray = field(default_factory=UP.copy)
+    """(3,) unit vector."""
+
+    def camera(self, lens: Camera, turn: float = 0.0, name: str = "view") -> Camera:
+        """A camera with the lens of another one, turned by an angle about `up`."""
+        east, north = level(self.up)
+        azimuth, flat = self.azimuth + turn, np.cos(self.elevation)
+        away = np.cos(azimuth) * flat * east + np.sin(azimuth) * flat * north
+        eye = self.target + (away + np.sin(self.elevation) * self.up) * self.distance
+        return replace(lens, camera_to_world=look_at(eye, self.target, self.up), name=name)
+
+    def orbit(self, lens: Camera, count: int) -> list[Camera]:
+        """`count` cameras evenly around the target, all at one elevation."""
+        turns = (2 * np.pi * i / count for i in range(count))
+        return [self.camera(lens, turn, f"orbit_{i:04d}") for i, turn in enumerate(turns)]
+
+
+def level(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) at right angles to each other and to up: azimuth 0, which is +x or, where that is
+    nearly up or down, +y; and a quarter turn on, anticlockwise seen from above."""
+    ahead = np.array([1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    east = ahead - (ahead @ up) * up
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
+
+
+def azimuth_of(away: np.ndarray, up: np.ndarray) -> float:
+    """The angle about up, radians, at which a vector (3,) points; see `level`."""
+    east, north = level(up)
+    return float(np.arctan2(away @ north, away @ east))
+
+
 FRAMING_FOV = 0.6911112  # radians, horizontal: the field of view of NeRF-Synthetic's cameras
+AZIMUTH, ELEVATION = 0.9, 0.45  # radians, from which a box is framed
+
+
+def framing_lens(width: int, height: int) -> Camera:
+    """The camera, at the origin, that boxes are framed with."""
+    focal = 0.5 * width / np.tan(FRAMING_FOV / 2)
+    return Camera(np.eye(4), focal, focal, width / 2, height / 2, width, height, name="view")
+
+
+def framing(
+    aabb: np.ndarray, lens: Camera, azimuth: float = AZIMUTH, elevation: float = ELEVATION
+) -> Outlook:
+    """The outlook from which a camera that stands outside a box (6,) frames its bounding ball."""
+    centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
+    narrow = np.arctan(0.5 * min(lens.width, lens.height) / lens.fl_x)
+    return Outlook(centre, 0.92 * radius / np.sin(narrow), azimuth, elevation)
 
 
 def framing_camera(
@@ -200,23 +262,16 @@ def framing_camera(
 ) -> Camera:
     """A camera outside a box (6,) that frames its bounding ball; azimuth from +x about +z, elevation above
     the xy plane, radians."""
-    centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
-    focal = 0.5 * width / np.tan(FRAMING_FOV / 2)
-    narrow = np.arctan(0.5 * min(width, height) / focal)
-    away = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
-    eye = centre + away * (0.92 * radius / np.sin(narrow))
-    pose = look_at(eye, centre, np.array([0.0, 0.0, 1.0]))
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height, name=name)
+    lens = framing_lens(width, height)
+    return framing(aabb, lens, azimuth, elevation).camera(lens, name=name)
 
 
-def orbit(aabb: np.ndarray, count: int, width: int, height: int, elevation: float = 0.45) -> list[Camera]:
+def orbit(
+    aabb: np.ndarray, count: int, width: int, height: int, elevation: float = ELEVATION
+) -> list[Camera]:
     """`count` cameras evenly around a box, all at one elevation."""
-    return [
-        framing_camera(aabb, 2 * np.pi * i / count + 0.9, elevation, width, height, name=f"orbit_{i:04d}")
-        for i in range(count)
-    ]
+    lens = framing_lens(width, height)
+    return framing(aabb, lens, elevation=elevation).orbit(lens, count)
 
 
 def scattered(

@@ -5,9 +5,13 @@ import pytest
 
 from fusedrf_cli.engine.rendering.cameras import (
     Camera,
+    Outlook,
+    azimuth_of,
     bend,
     fisheye_directions,
     framing_camera,
+    framing_lens,
+    level,
     look_at,
     orbit,
     scattered,
@@ -162,6 +166,30 @@ def test_framing_cameras_see_the_whole_box():
         at = project(camera, 0.9 * corners + 0.1 * corners.mean(0))
         assert (at > 0).all() and (at < [camera.width, camera.height]).all()
         np.testing.assert_allclose(project(camera, corners.mean(0)[None])[0], [camera.cx, camera.cy])
+
+
+@pytest.mark.parametrize("up", DIRECTIONS_26)
+def test_an_outlook_stands_where_its_angles_say(up):
+    """Around any upward direction: at its distance, its height and its turn, level, and looking at the
+    target."""
+    target, lens = np.array([0.3, -0.2, 5.0]), framing_lens(8, 6)
+    east, north = level(up)
+    axes = np.array([east, north, up])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(np.cross(east, north), up, atol=1e-12)
+    for azimuth, elevation in ((0.0, 0.0), (2.5, 0.7), (-1.0, -1.2)):
+        camera = Outlook(target, 3.0, azimuth, elevation, up).camera(lens, turn=0.25)
+        away = camera.camera_to_world[:3, 3] - target
+        assert np.linalg.norm(away) == pytest.approx(3)
+        assert away @ up == pytest.approx(3 * np.sin(elevation))
+        assert azimuth_of(away, up) == pytest.approx(azimuth + 0.25)
+        assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-12)
+        np.testing.assert_allclose(project(camera, target[None])[0], [4, 3], atol=1e-9)
+
+
+def test_azimuth_is_from_x_about_z():
+    assert np.array_equal(level(np.array([0.0, 0, 1])), np.eye(3)[:2])
+    assert azimuth_of(np.array([0.0, 2.0, 7.0]), np.array([0.0, 0, 1])) == pytest.approx(np.pi / 2)
 
 
 def test_scattered_views_follow_their_seed():

@@ -268,7 +268,8 @@ def block_density(field, b, p, stretch):
     if field.first.shape[0] != 0 and not matter_at(field, t, u, v, w):
         return 0.0, 0.0
     f = density_feature(field, t, u, v, w)
-    return float(crossed(field, b, p, stretch) * field.activation[t, 0] * softplus(f + field.activation[t, 1])), float(f)
+    slope = crossed(field, b, p, stretch) * field.activation[t, 0]
+    return float(slope * softplus(f + field.activation[t, 1])), float(f)
 
 
 def crossed(field, b, p, stretch):

@@ -1,0 +1,80 @@
+"""What a bundle keeps for pictures of it: the cameras of a capture, and the box that pictures show."""
+
+import numpy as np
+
+from formats.errors import FormatError, LimitExceeded
+from formats.rig import Rig, capture_rig, read_rig
+from formats.views import Capture
+from fusedrf_cli.bridge.scene import LoadedScene, PlacedRig
+from fusedrf_cli.bridge.sizes import camera_bytes
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.occupancy import placed_box
+
+MAX_CAMERA_BYTES = 2 << 20  # half of what a scene.json may have
+
+
+def cameras_of_capture(capture: Capture, cut_out: bool, progress) -> dict | None:
+    """The cameras of a capture as scene.json has them; None of a mesh, and, with a warning, where they are
+    more than a bundle keeps. cut_out: masks cut an object out of its photos, which show no surroundings then.
+    """
+    if capture.kind == "mesh":
+        return None
+    try:
+        cameras = capture_rig(capture, capture.frame is not None and not cut_out).content()
+        if camera_bytes(cameras) > MAX_CAMERA_BYTES:
+            raise LimitExceeded(f"they take more than {MAX_CAMERA_BYTES:,} bytes")
+    except FormatError as error:
+        progress.warn(f"{capture.path}: the bundle does not keep its cameras: {error}")
+        return None
+    return cameras
+
+
+def rig_of(scene: LoadedScene, progress=None) -> Rig | None:
+    """The cameras that a scene keeps, in its world: its own, else those of the source that `chosen_rig` names
+    where its placement is one that cameras can follow; otherwise a warning says that they are left."""
+    if scene.graph.cameras is not None:
+        return read_rig(scene.graph.cameras)
+    source = chosen_rig(scene.rigs)
+    if source is None:
+        return None
+    rig = read_rig(source.cameras).placed(source.object_to_world)
+    if rig is None and progress is not None:
+        progress.warn(
+            f"'{source.name}' is stretched, sheared or mirrored, which no camera can follow: its cameras are "
+            "left out"
+        )
+    return rig
+
+
+def chosen_rig(rigs: tuple[PlacedRig, ...]) -> PlacedRig | None:
+    """Of sources that keep cameras the background, else the only one that shows surroundings, else the only
+    one."""
+    background = [rig for rig in rigs if rig.background]
+    around = [rig for rig in rigs if rig.cameras.get("surroundings")]
+    return next((group[0] for group in (background, around, rigs) if len(group) == 1), None)
+
+
+def kept_cameras(scene: LoadedScene, progress=None) -> dict | None:
+    """What a bundle made of a scene keeps of its cameras, as scene.json has them."""
+    if scene.graph.cameras is not None:
+        return scene.graph.cameras
+    rig = rig_of(scene, progress)
+    return rig and rig.content()
+
+
+def kept_framing(scene: LoadedScene, composed: ComposedField, cameras: dict | None) -> np.ndarray | None:
+    """(6,) the box in the world that pictures of a scene show, which a field made of it keeps, so that its
+    pictures stay where they are when objects come and go; None where they are taken from a capture's
+    cameras."""
+    if cameras is not None and cameras.get("surroundings"):
+        return None
+    field, origin = scene.lone() or (composed, composed.origin)
+    return framed_box(scene, field, origin)
+
+
+def framed_box(scene: LoadedScene, field, origin: np.ndarray) -> np.ndarray:
+    """(6,) the box in the world that a scene says its pictures show, else all matter of its field, whose
+    frame lies at `origin` (see `render_image`)."""
+    if scene.graph.framing is not None:
+        return np.asarray(scene.graph.framing)
+    return placed_box(field.occupancy.subject, origin)
