@@ -79,7 +79,7 @@ def test_train_keeps_the_poses_that_it_estimates(report, holiday, folder, tmp_pa
     (kept,) = (tmp_path / "cache/fusedrf/poses").iterdir()
     assert str(kept) in said["capture"]["notes"][0] and len(read_capture(kept).train) == 5
     again = report("train", "holiday", "-o", "out.rfpack", "-w", *DRAFT)
-    assert len(holiday) == 1 and again["aabb"] == said["aabb"] and again["warnings"]
+    assert len(holiday) == 1 and again["centre"] == said["centre"] and again["warnings"]
     # A photo that changed, or came, asks for them again.
     shutil.copy(folder / "holiday/p0.png", folder / "holiday/p7.png")
     report("train", "holiday", "-o", "out.rfpack", "-w", *DRAFT)

@@ -16,6 +16,7 @@ from formats.meshes import mesh_capture
 from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, read_scene, write_scene
 from formats.views import View
+from fusedrf_cli.bridge.extent import Extent
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
@@ -397,12 +398,13 @@ def test_training_on_an_object_keeps_its_cameras_and_how_it_is_framed(report, fo
 
 def test_cameras_count_in_the_size_that_is_allowed(folder, short):
     """A field that just fits is made smaller where cameras come on top."""
-    training, capture, box = part("training"), read_capture(folder / "photos"), np.array([-1.0] * 3 + [1] * 3)
+    training, capture = part("training"), read_capture(folder / "photos")
+    box = Extent(np.array([-1.0] * 3 + [1] * 3), np.zeros(3))
     words = dict.fromkeys(("ranks", "sh_degree", "time_budget", "target_psnr", "max_size"))
     asked = SimpleNamespace(quality="draft", precision="float16", seed=0, masks="ignore", **words)
     kind = registry.kind("vm")
     whole = training.fit_settings(asked, kind, capture, box, "cpu")
-    asked.max_size = training.bytes_of(kind.untrained(box, whole.longest, whole.way), "float16")
+    asked.max_size = training.bytes_of(kind.untrained(box.box, whole.longest, whole.way), "float16")
     found = [training.fit_settings(asked, kind, capture, box, "cpu", more).longest for more in (0, 1, 10_000)]
     assert found[0] == whole.longest > found[1] >= found[2]
 

@@ -139,6 +139,9 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "precision": "float16",
         "aabb": (0, 0, 0, 1, 1, 1),
         "downscale": None,
+        "unbounded": None,
+        "centre": None,
+        "radius": None,
         "masks": "ignore",
         "resume": False,
     }

@@ -4,16 +4,24 @@ import numpy as np
 import pytest
 import torch
 
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.visibility import shown_cells
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.specialise import specialised
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.rendering.cameras import Camera, look_at
 from fusedrf_cli.engine.rendering.volume import march_rays, render_rays
 from fusedrf_cli.engine.spaces import space_named, unbounded
 from fusedrf_cli.engine.spaces.unbounded import FAR, PIECES, WHOLE
+from tests.analytic.rays import affine, turn
+
+from ..conftest import random_vm
 
 GRID = OccupancyGrid.full(WHOLE, space=unbounded)
 SPACE = specialised(None, {}, unbounded)[1]
@@ -98,7 +106,7 @@ def test_the_map_has_an_inverse_in_every_form(radius):
 
 
 def even(sigma: float, resolution: int = 64) -> VMField:
-    """A field that is everywhere as dense, in float64, grey."""
+    """A field whose numbers say one density everywhere, in float64, grey: sigma / n² per length."""
     plan = registry.kind("vm").plan_at(WHOLE, (resolution,) * 3, Way(ranks=(8, 8), sh_degree=0))
     field = registry.kind("vm").create(plan, torch.Generator().manual_seed(0)).with_occupancy(GRID)
     tensor = field.tensors[0]
@@ -106,27 +114,24 @@ def even(sigma: float, resolution: int = 64) -> VMField:
     return field.with_params(torch.zeros_like(field.params, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("end, off", [(10.0, 0.01), (100.0, 0.15), (1000.0, 0.15)])
-def test_fog_is_as_thick_as_its_formula_says(end, off):
-    """Fog of even density, and empty cells that end it at a distance: the opacity is 1 - exp(-σ r), and the
-    depth that of the exponential, as far as the few steps far out tell it; densities are per length of the
-    frame, also there."""
-    sigma = 0.5 / end
-    field = even(sigma)
-    o, d = np.array([[0.1, 0.2, -0.3]]), np.array([[1.0, 0.3, -0.2]])
+@pytest.mark.parametrize("cells", [115, 127, 128])
+def test_fog_is_as_thick_as_its_formula_says(cells):
+    """Fog, thinner by n² far out, that ends at n = 2.5, 32 or FAR: with τ the integral of σ / n(t)² along a
+    ray that leaves the core by its +x face, the opacity is 1 - exp(-τ), and the depth the mean of t by
+    exp(-τ) dτ."""
+    sigma, shown = 0.6, np.zeros((128,) * 3, bool)
+    shown[:cells] = True
+    o, d = np.array([0.1, 0.2, -0.3]), np.array([1.0, 0.3, -0.2])
     d /= np.linalg.norm(d)
-    shown = np.zeros((128,) * 3, bool)
-    cells = GRID.aabb[0] + (np.arange(128) + 0.5) / 32
-    last = 2 - 1 / end if end < FAR else 2.0
-    shown[cells < last] = True
-    grid = OccupancyGrid(WHOLE, shown, unbounded)
-    edge = GRID.aabb[0] + (np.flatnonzero(cells < last)[-1] + 1) / 32  # of the cells, along x
-    n = min(1 / (2 - edge) if edge < 2 else FAR, FAR)
-    reach = (n - o[0, 0]) / d[0, 0]
-    out = render_rays(field.with_occupancy(grid), o, d, step=1e-3, early_stop=0.0)[0]
-    assert out[3] == pytest.approx(-np.expm1(-sigma * reach), abs=2e-3)
-    wanted = (1 - np.exp(-sigma * reach) * (1 + sigma * reach)) / sigma
-    assert out[4] == pytest.approx(wanted, rel=off)
+    field = even(sigma).with_occupancy(OccupancyGrid(WHOLE, shown, unbounded))
+    out = render_rays(field, o[None], d[None], step=1e-3, early_stop=0.0)[0]
+    edge = min(cells / 32 - 2, 2 - 1 / FAR)
+    y = np.linspace(o[0], edge, 400_001)  # of the mapped x: dτ = σ dy / d_x in the core and outside
+    x = np.where(y < 1, y, 1 / (2 - np.maximum(y, 1)))
+    depth = sigma * (y - y[0]) / d[0]
+    assert out[3] == pytest.approx(-np.expm1(-depth[-1]), abs=1e-3)
+    t = (x - o[0]) / d[0]
+    assert out[4] == pytest.approx(np.trapezoid(t * np.exp(-depth), depth), rel=0.02)
 
 
 def random_field(seed: int = 0) -> VMField:
@@ -136,7 +141,9 @@ def random_field(seed: int = 0) -> VMField:
     field = kind.create(kind.plan_at(WHOLE, (9, 9, 9), Way(ranks=(8, 8))), generator)
     occupied = np.random.default_rng(seed).random((8, 8, 8)) < 0.7
     numbers = torch.randn(len(field.params), generator=generator, dtype=torch.float64)
-    return field.with_occupancy(OccupancyGrid(WHOLE, occupied, unbounded)).with_params(0.5 * numbers)
+    field = field.with_occupancy(OccupancyGrid(WHOLE, occupied, unbounded)).with_params(0.5 * numbers)
+    object.__setattr__(field.tensors[0], "shift", -4.0)  # dense enough to see
+    return field
 
 
 def test_waves_and_the_one_pass_show_the_same():
@@ -175,6 +182,105 @@ def test_gradients_reach_numbers_far_out():
         slope = (loss(field.params + step) - loss(field.params - step)) / 2e-5
         # colours of weights below the loops' threshold are left out: a jump where one passes it
         assert grads[0, at] == pytest.approx(slope, rel=2e-2, abs=1e-6)
+
+
+def distortion(field: VMField, o: np.ndarray, d: np.ndarray, jitter: np.ndarray, step: float) -> float:
+    """The mean over rays of Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i, as it is written (Mip-NeRF 360, eq.
+    15)."""
+    ts, spans, counts = *np.zeros((2, len(o), 4000)), np.zeros(len(o), np.int64)
+    start, alive = np.zeros(len(o), np.int64), np.ones(len(o), bool)
+    SPACE["march"](field.occupancy.arrays, o, d, 0.0, jitter, step, start, alive, ts, spans, counts)
+    assert (start < 0).all()
+    total = 0.0
+    for i in range(len(o)):
+        t, lengths = ts[i, : counts[i]], spans[i, : counts[i]]
+        points = torch.from_numpy(o[i] + t[:, None] * d[i])
+        sigma, _ = field.query(points, torch.from_numpy(np.tile(d[i], (len(t), 1))), False)
+        depth = sigma.numpy() * lengths
+        weights = np.exp(-(np.cumsum(depth) - depth)) * -np.expm1(-depth)
+        s = t / (1 + t)
+        total += (weights[:, None] * weights * abs(s[:, None] - s)).sum()
+        total += (weights**2 * lengths * (1 - s) ** 2).sum() / 3
+    return total / len(o)
+
+
+def test_the_distortion_loss_sends_back_its_own_gradient():
+    field = random_field(4)
+    rng = np.random.default_rng(5)
+    d = rng.normal(size=(6, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    o, jitter = rng.normal(size=(6, 3)), rng.random(6)
+    found = []
+    for weight in (0.0, 0.7):
+        batch = Batch(o, d, jitter, np.zeros((6, 4)), np.zeros((6, 3)), 0.0, 0.0, 0.05, -1.0, weight)
+        grads = np.zeros((1, len(field.params)))
+        field.train_rays(batch, grads, np.zeros((1, 3)))
+        found.append(grads[0])
+    found = (found[1] - found[0]) / 0.7
+    for at in np.argsort(-abs(found))[:40:8]:
+        step = torch.zeros_like(field.params)
+        step[at] = 1e-5
+        both = [distortion(field.with_params(field.params + s), o, d, jitter, 0.05) for s in (step, -step)]
+        assert found[at] == pytest.approx((both[0] - both[1]) / 2e-5, rel=1e-5, abs=1e-10)
+
+
+def test_the_largest_weight_of_each_cell():
+    """Against the weights of every sample of every ray, cell by cell."""
+    field = random_field(6)
+    rng = np.random.default_rng(7)
+    d = rng.normal(size=(20, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    o, jitter, grid = rng.normal(size=(20, 3)), rng.random(20), field.occupancy
+    wanted = np.zeros(grid.occupied.shape)
+    ts, spans, counts = *np.zeros((2, 20, 4000)), np.zeros(20, np.int64)
+    start = np.zeros(20, np.int64)
+    SPACE["march"](grid.arrays, o, d, 0.1, jitter, 0.05, start, np.ones(20, bool), ts, spans, counts)
+    for i in range(20):
+        trans = 1.0
+        for t, length in zip(ts[i, : counts[i]], spans[i, : counts[i]], strict=True):
+            if trans <= 1e-3:
+                break
+            x = o[i] + t * d[i]
+            sigma, _ = field.query(torch.from_numpy(x[None]), torch.from_numpy(d[i : i + 1]), False)
+            weight = trans * -np.expm1(-float(sigma) * length)
+            trans -= weight
+            cell = tuple(np.clip(((mapped(x) - WHOLE[:3]) / grid.cell).astype(int), 0, 7))
+            wanted[cell] = max(wanted[cell], weight)
+    assert wanted.max() > 0.1
+    assert field.weights(o, d, jitter, 0.1, 0.05) == pytest.approx(wanted, abs=1e-5)
+
+
+def test_cells_that_no_camera_sees_are_left_out():
+    pose = look_at(np.array([2.5, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]))
+    camera = Camera(pose, 50, 50, 25, 25, 50, 50)
+    grid = shown_cells([camera], 0.8)
+    seen = np.array([[0.0, 0, 0], [-50.0, 3, 2], [1.5, 0.2, 0]])  # the focus, behind it, before it
+    unseen = np.array([[5.0, 0, 0], [0.0, 0, 40], [2.45, 0, 0], [-1.0, 5, 0]])
+    assert grid.contains(np.array([mapped(x) for x in seen])).all()
+    assert not grid.contains(np.array([mapped(x) for x in unseen])).any()
+
+
+def test_blocks_of_a_place_and_an_object_show_what_their_composition_does():
+    """A bounded and an unbounded tensor, the latter turned and scaled: compiled answers against the composed
+    scene and the reference."""
+    place, thing = random_field(1).with_occupancy(GRID), random_vm(dtype=torch.float64, cells=4)
+    matrix = affine(turn(30) @ np.diag([0.4, 0.5, 0.4]), (0.8, 0.5, -0.3))
+    base = affine(2.0, (0.3, 0, 0.1))
+    placed = [Placed("place", place, base), Placed("thing", thing, base @ matrix)]
+    composed = ComposedField(placed)
+    joined = blocks_of(composed.placed)
+    assert joined.space is unbounded and composed.occupancy.space is unbounded
+    rng = np.random.default_rng(2)
+    points = torch.from_numpy(rng.normal(size=(400, 3)) * np.exp(rng.normal(size=(400, 1))))
+    dirs = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(400, 3))), dim=1)
+    sigma, rgb = composed.query(points, dirs)
+    found, colour = joined.query(points, dirs)
+    same, told = joined.answers(joined.params, points, dirs)
+    assert (sigma > 0).sum() > 300
+    assert found.numpy() == pytest.approx(sigma.numpy(), rel=1e-4, abs=1e-6)
+    assert colour.numpy() == pytest.approx(rgb.numpy(), abs=1e-4)
+    assert same.numpy() == pytest.approx(found.numpy(), rel=1e-6, abs=1e-9)
+    assert told.numpy() == pytest.approx(colour.numpy(), abs=1e-6)
 
 
 def test_gradients_in_points_cross_no_border_wrongly():
