@@ -28,6 +28,7 @@ def test_blocks_are_listed_with_their_bytes_through_edits(report, folder):
     assert left == [o for o in said["objects"] if o["name"] != "red"]
 
 
+@pytest.mark.slow
 def test_the_objects_of_a_distilled_field_have_places_alone(report, folder):
     report("fuse", "pair.json", "-o", "f.rfpack", "--kind", "sparse", *SMALL)
     said = report("info", "f.rfpack")["objects"]

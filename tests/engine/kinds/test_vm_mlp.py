@@ -241,6 +241,7 @@ def pictures_of_a_ball(count: int, size: int):
     return cameras, np.stack(images)
 
 
+@pytest.mark.slow
 def test_a_tiny_fit_learns_a_ball():
     cameras, images = pictures_of_a_ball(10, 40)
     settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=32, steps=150, samples=1 << 14)
