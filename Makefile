@@ -14,7 +14,7 @@ SEED ?= 0
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-slow fuzz lint bench bench-paper ablation stability clean
+.PHONY: help demo test test-slow fuzz lint bench bench-paper bench-real ablation stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -23,8 +23,11 @@ help:  ## this list
 demo: $(VENV)  ## two small scenes, fused and rendered
 	$(PYTHON) examples/demo.py
 
+# One process per core, and one thread in each: most of the time goes to compiling, which runs on one core.
+test: export NUMBA_NUM_THREADS = 1
+test: export OMP_NUM_THREADS = 1
 test: $(VENV)  ## the quick tests
-	$(PYTHON) -m pytest -q -m 'not slow'
+	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile
 
 test-slow: $(VENV)  ## every test
 	$(PYTHON) -m pytest -q
@@ -45,6 +48,9 @@ ablation: $(VENV)  ## what each part of distilling is worth; SCENE= for one of y
 
 bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder with chair/ and fuze/
 	$(PYTHON) -m benchmarks.paper $(if $(DATA),--data $(DATA))
+
+bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SHARE= for less time
+	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

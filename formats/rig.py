@@ -87,10 +87,9 @@ class Rig:
         length = float(np.linalg.norm(mean))
         return mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
 
-    @property
-    def height(self) -> float:
-        """The median of the cameras' heights above the focus, along `up`."""
-        return float(np.median((self.poses[:, :3, 3] - self.focus) @ self.up))
+    def height(self, up: np.ndarray) -> float:
+        """The median of the cameras' heights above the focus, along a unit vector (3,)."""
+        return float(np.median((self.poses[:, :3, 3] - self.focus) @ up))
 
     @property
     def typical(self) -> View:

@@ -106,6 +106,20 @@ class VectorType(_Text):
         return _numbers(text, (3,))
 
 
+class UpType(_Text):
+    """'auto' -> None, or 'x,y,z' -> three floats, not all of them 0."""
+
+    name, expected = "auto|x,y,z", "auto or a direction x,y,z, not 0,0,0"
+
+    def parse(self, text):
+        if text == "auto":
+            return None
+        direction = _numbers(text, (3,))
+        if not any(direction):
+            raise ValueError(text)
+        return direction
+
+
 class DirectionType(_Text):
     """'azimuth,elevation' -> two floats, degrees; the elevation is from straight below to straight above."""
 
@@ -259,7 +273,7 @@ class KindsType(KindType):
         return tuple(name for name in self.names() if name in asked)
 
 
-RANKS, DIRECTION = RanksType(), DirectionType()
+RANKS, DIRECTION, UP = RanksType(), DirectionType(), UpType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
 INPUT, SCENE, DOWNSCALE = InputType(), InputType(stdin=True), DownscaleType()

@@ -11,23 +11,24 @@ import numpy as np
 import torch
 
 from fusedrf_cli.bridge.saving import save_scene
-from fusedrf_cli.bridge.scene import LoadedScene, load_scene
+from fusedrf_cli.bridge.scene import LoadedScene, load_scene, short_origin
 from fusedrf_cli.engine.composition.affine import Placed, rigid_motion
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.differentiable import Poses, numbers, query
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, look_at
 from fusedrf_cli.engine.rendering.differentiable import (
     Picture,
     camera_rays,
     render_image,
     render_rays,
+    seen_from,
     shifted,
 )
 from fusedrf_cli.engine.rendering.volume import EARLY_STOP
+from fusedrf_cli.engine.spaces import unbounded
 
 __all__ = ["Camera", "Picture", "Scene", "camera_rays", "look_at", "open_scene", "rigid_motion"]
 
@@ -87,7 +88,9 @@ class Scene:
     def query(self, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) per unit of length and rgb (N, 3) in [0, 1] at points (N, 3), along unit dirs (N, 3)."""
         field, origin, poses = self._asked()
-        return query(field, self._near(points, origin), dirs, poses)
+        points, dirs, per_length = seen_from(origin, points, dirs)
+        sigma, rgb = query(field, points, dirs, poses)
+        return sigma if per_length is None else sigma * per_length.to(sigma), rgb
 
     def render_rays(
         self,
@@ -100,12 +103,14 @@ class Scene:
     ) -> torch.Tensor:
         """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) with unit directions.
 
-        step is the distance of samples, None: half the finest voxel; samples behind which less light than
-        early_stop is left are not asked. Where nothing needs a gradient this is many times faster.
+        near is the distance at which rays begin. step is the distance of samples, None: as fine as what is
+        there; samples behind which less light than early_stop is left are not asked. Both are lengths of the
+        frame of a field that fills all of space, where there is one. Where nothing needs a gradient this is
+        many times faster.
         """
         field, origin, poses = self._asked()
-        rays_o = self._near(rays_o, origin)
-        return render_rays(field, rays_o, rays_d, poses=poses, near=near, step=step, early_stop=early_stop)
+        how = {"poses": poses, "origin": origin, "near": near, "step": step, "early_stop": early_stop}
+        return render_rays(field, rays_o, rays_d, **how)
 
     def render(
         self,
@@ -145,25 +150,17 @@ class Scene:
         return now
 
     def _asked(self) -> tuple[RadianceField, np.ndarray, Poses | None]:
-        """The field that answers for the scene, the world position (3,) of its frame's origin, and those
-        placements in its frame that need a gradient."""
+        """The field that answers for the scene, where its frame lies in the world (a position (3,), or a
+        placement (4, 4)), and those placements in its frame that need a gradient."""
         now = self._now()
         learnt = {name: pose for name, pose in self.placements.items() if pose.requires_grad}
         (name, place), *others = now.items()
-        if not others and not learnt and np.array_equal(place[:3, :3], np.eye(3)):
-            return self.fields[name], place[:3, 3], None
+        moved = np.array_equal(place[:3, :3], np.eye(3))
+        if not others and not learnt and (moved or self.fields[name].occupancy.space is unbounded):
+            return self.fields[name], short_origin(place), None
         known = self._composed and {p.name: p.object_to_world for p in self._composed[0]}
         if not known or any(not np.array_equal(known[name], pose) for name, pose in now.items()):
             placed = [Placed(name, self.fields[name], pose) for name, pose in now.items()]
             self._composed = placed, ComposedField(placed, self.rule)
         field = self._composed[1]
-        if field.origin.shape != (3,):
-            raise ValueError(
-                f"'{name}' fills all of space in a frame of its own unit, which these functions do not know; "
-                "ask its field in its own frame (`fields`), or give --bounded where it is trained"
-            )
-        return field, field.origin, shifted(learnt, torch.from_numpy(field.origin))
-
-    def _near(self, points: torch.Tensor, origin: np.ndarray) -> torch.Tensor:
-        """World points (N, 3) in the frame whose origin is given, without losing digits."""
-        return exact(points, points.device) - exact(origin, points.device)
+        return field, field.origin, shifted(learnt, field.origin)

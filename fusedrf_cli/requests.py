@@ -153,6 +153,8 @@ class RenderRequest(Running):
     """From where to look: azimuth and elevation in degrees."""
     zoom: float
     """How many times nearer than the default."""
+    up: tuple[float, float, float] | None
+    """Which way of the world is up, of any length but 0; None: as the scene tells."""
     size: tuple[int, int] | None
     background: tuple[float, float, float] | None
     """None: transparent."""

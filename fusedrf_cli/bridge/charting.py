@@ -17,11 +17,11 @@ from fusedrf_cli import plots
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
+from fusedrf_cli.bridge.pictures import WHITE
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
-from fusedrf_cli.bridge.training import WHITE
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered

@@ -38,6 +38,7 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import Edited, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import DistillSettings
+from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import AddRequest, DeleteRequest, EditRequest
 
@@ -129,15 +130,22 @@ def add(request: AddRequest, progress) -> dict:
         new = load_scene(request.source, budget=memory, place=place)
         memory.expect(*addition_memory(fused.field, new), advice="add a smaller object")
         objects = [placed_at(p, opened(p.field), request).moved(fused.origin) for p in new.placed]
+        truth = ComposedField([Placed("", fused.field.to(place), np.eye(4)), *objects])
+        if truth.origin.shape == (4, 4) and not np.array_equal(truth.origin, np.eye(4)):
+            raise InvalidInput(
+                f"{request.source}: it fills all of space, around more than {request.fused} does; place both "
+                "in a scene.json and fuse that"
+            )
         progress.phase("adding", 1.0)
         try:
             edited = fused.kind.added(fused.field, objects, Teacher(request, place, progress, len(objects)))
         except ValueError as error:
             raise InvalidInput(f"{request.fused}: {error}") from error
         progress.phase("measuring", None)
-        truth = ComposedField([Placed("", fused.field.to(place), np.eye(4)), *objects])
         judge = Judge(truth, REGION_SETTINGS.views, REGION_SETTINGS.view_size, request.seed)
-        as_read = stored(edited.field, precision).moved(truth.origin)
+        as_read = stored(edited.field, precision)
+        if truth.origin.shape == (3,):
+            as_read = as_read.moved(truth.origin)
         reached = judge(as_read.to(place))
         nodes = history_nodes(new, request.output, {})
         entry = {
@@ -276,7 +284,8 @@ def read_fused(path: str, memory: Memory) -> Fused:
     (leaf,) = leaves
     memory.expect(sources([held_size(headers[leaf.field])], copies=READING), advice="edit a smaller field")
     field = make_field(read_field(path, leaf.field), path)
-    if not np.array_equal(leaf.object_to_world[:3, :3], np.eye(3)):
+    only_moved = np.array_equal(leaf.object_to_world[:3, :3], np.eye(3))
+    if not only_moved and field.occupancy.space is bounded:
         raise InvalidInput(f"{path}: its field is turned or scaled, and cannot be edited; fuse it first")
     others = [member for member in headers if member != leaf.field]
     return Fused(path, scene, others, leaf, field, registry.kind(field.kind), headers[leaf.field].precision)

@@ -1,11 +1,15 @@
 """What of a capture's world a field covers: a box, or all of it around a core."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from formats.frame import scene_frame
 from formats.views import Capture, View
+from fusedrf_cli.bridge.hull import visual_hull
+from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.engine.distillation.visibility import shown_cells
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
@@ -33,6 +37,9 @@ class Extent:
     unbounded: bool = False
     near: float = 0.0
     """In the frame's units, the distance from a camera before which nothing is learnt."""
+    cells: OccupancyGrid | None = None
+    """Over the box: where there can be anything to learn, an object that masks cut out or what photos of a
+    place show; None: anywhere."""
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the world in the field's frame."""
@@ -54,18 +61,27 @@ class Extent:
 
 def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     """The extent that was asked for, or that suits the capture: photos that show a subject and all around it
-    need unbounded space; one that masks cut out, or that stands before nothing, a box."""
+    need unbounded space; one that masks cut out (`cut_out`), or that stands before nothing, a box."""
     asked = request.unbounded or request.centre is not None or request.radius is not None
     if request.aabb is not None and asked:
         raise UsageProblem("--aabb is a box, and --unbounded, --centre and --radius are of space without one")
     if request.unbounded is False and asked:
         raise UsageProblem("--centre and --radius are of unbounded space; leave --bounded out")
     boxed = request.aabb is not None or request.unbounded is False or cut_out or capture.frame is None
-    if boxed and not asked:
-        default = capture.object_aabb if cut_out else None
-        box = next(box for box in (request.aabb, default, capture.aabb) if box is not None)
-        return Extent(np.asarray(box, np.float64), np.zeros(3))
-    return _unbounded(request, capture)
+    if not boxed or asked:
+        return _unbounded(request, capture)
+    if capture.object_aabb is not None:
+        return _around_object(request, capture)
+    box = capture.aabb if request.aabb is None else request.aabb
+    return Extent(np.asarray(box, np.float64), np.zeros(3))
+
+
+def _around_object(request: TrainRequest, capture: Capture) -> Extent:
+    """The visual hull of what the masks of the training photos keep, in the box of the object or the one that
+    is asked for. Rays through pixels of the object alone do not tell what is empty around it."""
+    box = capture.object_aabb if request.aabb is None else np.asarray(request.aabb, np.float64)
+    hull = visual_hull(capture.train, box)
+    return Extent(hull.aabb, np.zeros(3), cells=hull)
 
 
 def _unbounded(request: TrainRequest, capture: Capture) -> Extent:
@@ -77,7 +93,11 @@ def _unbounded(request: TrainRequest, capture: Capture) -> Extent:
     if frame.layout == "outward":
         unit = max(unit, float(np.linalg.norm(poses[:, :3, 3] - frame.focus, axis=1).max()))
     radius = CORE[frame.layout] * unit if request.radius is None else request.radius
-    return Extent(WHOLE, centre, radius, True, near_of(views, unit) / radius)
+    near = near_of(views, unit) / radius
+    whole = Extent(WHOLE, centre, radius, True, near)
+    shown = shown_cells([whole.camera(camera_of(view)) for view in views], near)
+    box = shown.tight_aabb(0)  # texels that no photo shows would be lost
+    return replace(whole, box=box, cells=shown.within(box))
 
 
 def near_of(views: tuple[View, ...], distance: float) -> float:

@@ -8,11 +8,13 @@ import numpy as np
 import torch
 
 from formats.atomic import check_space
-from formats.captures import hold_out, is_mesh, load_ignored, load_images, load_photos
+from formats.captures import hold_out, is_mesh, load_photos
 from formats.meshes import mesh_capture
-from formats.views import Capture, View, check_parallax
+from formats.views import Capture, check_parallax
 from fusedrf_cli.bridge.extent import Extent, extent_of
+from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
+from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.running import (
@@ -29,22 +31,19 @@ from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Way
-from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.rendering.metrics import psnr, ssim
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.spaces.unbounded import SIDE
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
 
 UNBOUNDED_DEGREE = 1  # SH: with more, colours that depend on the view explain what places should
-UNBOUNDED_TEXELS = 1.4  # times those of a box: half of them lie outside the core
+UNBOUNDED_TEXELS = 2.0  # times those of a box, along an axis of all of space: half lie outside the core
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
     "normal": FitSettings(longest=224, steps=4000, samples=1 << 14),
     "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
 }
-WHITE = (1.0, 1.0, 1.0)
 
 
 def train(request: TrainRequest, progress) -> dict:
@@ -66,14 +65,19 @@ def train(request: TrainRequest, progress) -> dict:
         )
         cameras = [extent.camera(camera_of(v)) for v in capture.train]
         pictures = pictures_of(request, capture)
-        run = FitRun.start(cameras, pictures, extent.box, settings, Path(request.source).resolve().stem)
+        name = Path(request.source).resolve().stem
+        run = FitRun.start(cameras, pictures, extent.box, settings, name, extent.cells)
         if saved:
             if saved[1].get("kind") != kind.name:
                 raise checkpoint_mismatch(request.output)
             run.restore(*saved)
         field, seconds = _run(run, request.output, progress)
         progress.phase("measuring", None)
-        measured = measure(field, capture, extent.origin) if request.holdout else None
+        measured = None
+        if request.holdout:
+            measured = measure(field, capture, pictures, extent.origin, run.psnr)
+            if capture.kind != "mesh":
+                warn_of_holdout(request.output, measured, progress)
         size = write_field(
             request.output,
             field,
@@ -141,8 +145,10 @@ def read_views(request: TrainRequest, progress) -> Capture:
 
 
 def cuts_out(request: TrainRequest, capture: Capture) -> bool:
-    """Whether masks cut an object out of its photos."""
-    return request.masks == "alpha" and any(view.mask_path for view in capture.train)
+    """Whether masks cut an object out of its photos: what they exclude is to be transparent, or they keep so
+    little of the photos' borders that the rest is learnt from pixels of the object alone."""
+    transparent = request.masks == "alpha" and any(view.mask_path for view in capture.train)
+    return transparent or capture.object_aabb is not None
 
 
 def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
@@ -174,12 +180,20 @@ def fit_settings(
         device=place,
     )
     if extent.unbounded:
-        settings = replace(settings, longest=round(UNBOUNDED_TEXELS * settings.longest))
+        settings = replace(settings, longest=texels_of_place(extent.box, settings.longest))
     room = request.max_size and max(1, request.max_size - besides)
     longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)
+
+
+def texels_of_place(box: np.ndarray, longest: int) -> int:
+    """Texels on the longest side of a part (6,) of unbounded space: planes over it have as many as over all
+    of space, where a field in a box has so many."""
+    a, b, c = box[3:] - box[:3]
+    shrunk = np.sqrt((a * b + b * c + c * a) / (3 * (2 * SIDE) ** 2)) / (max(a, b, c) / (2 * SIDE))
+    return round(UNBOUNDED_TEXELS * longest / shrunk)
 
 
 def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:
@@ -245,42 +259,3 @@ def check_size(smallest: int, allowed: float | None) -> None:
             f"--max-size is too small: the file takes up to {readable_size(smallest)} at its coarsest, where "
             f"{readable_size(int(allowed))} were allowed; give more"
         )
-
-
-def camera_of(view: View) -> Camera:
-    """A capture's view as the engine's camera."""
-    return Camera(
-        view.camera_to_world,
-        view.fl_x,
-        view.fl_y,
-        view.cx,
-        view.cy,
-        view.width,
-        view.height,
-        tuple(view.distortion),
-        view.name,
-        view.fisheye,
-    )
-
-
-def measure(field, capture: Capture, origin: np.ndarray) -> dict:
-    """Mean PSNR and SSIM of the held-out views over white, of the pixels that masks do not exclude, by a
-    field whose frame lies at `origin` (4, 4)."""
-    figures = []
-    for view in capture.test:
-        truth = over_white(load_images([view]))[0]
-        shot = render_image(field, camera_of(view), origin=origin).over(WHITE)
-        ignored = load_ignored(view)
-        kept = slice(None) if ignored is None else ~ignored
-        if ignored is not None:
-            shot[ignored] = truth[ignored]
-        if ignored is None or not ignored.all():
-            figures.append((psnr(shot[kept], truth[kept]), ssim(shot, truth)))
-    mean = np.mean(figures, 0) if figures else (float("nan"), float("nan"))
-    return {"psnr": float(mean[0]), "ssim": float(mean[1]), "views": len(figures)}
-
-
-def over_white(images: np.ndarray) -> np.ndarray:
-    """(n, H, W, 4) uint8 straight alpha to (n, H, W, 3) float32 over white."""
-    values = images.astype(np.float32) / 255
-    return values[..., :3] * values[..., 3:] + 1 - values[..., 3:]

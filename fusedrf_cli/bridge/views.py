@@ -8,14 +8,15 @@ import numpy as np
 from formats.captures import read_cameras
 from formats.rig import FARTHEST, Rig
 from formats.views import NO_DISTORTION, View
+from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import chosen_rig, framed_box, rig_of
 from fusedrf_cli.bridge.scene import LoadedScene
-from fusedrf_cli.bridge.training import camera_of
-from fusedrf_cli.engine.rendering.cameras import Camera, Outlook, azimuth_of, framing, framing_lens
+from fusedrf_cli.engine.rendering.cameras import UP, Camera, Outlook, azimuth_of, framing, framing_lens
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
 DEFAULT_SIZE = (800, 800)
+LEANING = 0.7  # cosine: photos held within 45 degrees of +z leave +z upright
 LEAST_APART = 1e-9  # of a target's distance from the world's origin
 
 
@@ -24,24 +25,38 @@ def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.n
     one that frames everything. The field is the scene's, its frame lies at `origin` (see `render_image`)."""
     if request.cameras or request.path:
         return [camera_of(view) for view in read_cameras(request.cameras or request.path, request.size)]
-    rig = rig_of(scene)
+    rig, up = rig_of(scene), upward(request, scene)
     if request.views:
         return [camera_of(sized(view, request.size)) for view in captured(request, scene, rig)]
     if rig is not None and rig.surroundings:
         photo = camera_of(sized(rig.typical, request.size))
         if request.orbit is None and not aimed(request):
             return [photo]
-        lens, outlook = pinhole(photo), standing(rig)
+        lens, outlook = pinhole(photo), standing(rig, up)
     else:
         lens = framing_lens(*(request.size or DEFAULT_SIZE))
-        outlook = framing(framed_box(scene, field, origin), lens)
+        outlook = replace(framing(framed_box(scene, field, origin), lens), up=up)
     outlook = turned(outlook, request)
     return outlook.orbit(lens, request.orbit) if request.orbit else [outlook.camera(lens)]
 
 
 def aimed(request: RenderRequest) -> bool:
     """Whether the view is to be other than the default one."""
-    return request.look_at is not None or request.direction is not None or request.zoom != 1
+    asked = (request.look_at, request.direction, request.up)
+    return any(word is not None for word in asked) or request.zoom != 1
+
+
+def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
+    """(3,) unit vector: which way of the world is up. As was asked for, or as photos of a place were held;
+    for anything else +z, but where the photos of one object were held quite otherwise."""
+    if request.up is not None:
+        up = np.array(request.up) / np.abs(request.up).max()
+        return up / np.linalg.norm(up)
+    rig = rig_of(scene)
+    if rig is None or rig.surroundings:
+        return UP if rig is None else rig.up
+    own = scene.graph.cameras is not None and scene.graph.framing is None
+    return rig.up if own and rig.up @ UP < LEANING else UP
 
 
 def turned(outlook: Outlook, request: RenderRequest) -> Outlook:
@@ -70,12 +85,12 @@ def sized(view: View, size: tuple[int, int] | None) -> View:
     return view.reframed(*size) if size else view
 
 
-def standing(rig: Rig) -> Outlook:
-    """The outlook on the focus of a rig from the median distance and height of its cameras, and from the side
-    of the typical one."""
+def standing(rig: Rig, up: np.ndarray) -> Outlook:
+    """The outlook on the focus of a rig from the median distance of its cameras and their height along `up`,
+    a unit vector (3,), and from the side of the typical one."""
     eye = rig.typical.camera_to_world[:3, 3]
-    elevation = float(np.arcsin(np.clip(rig.height / rig.distance, -1, 1)))
-    return Outlook(rig.focus, rig.distance, azimuth_of(eye - rig.focus, rig.up), elevation, rig.up)
+    elevation = float(np.arcsin(np.clip(rig.height(up) / rig.distance, -1, 1)))
+    return Outlook(rig.focus, rig.distance, azimuth_of(eye - rig.focus, up), elevation, up)
 
 
 def pinhole(camera: Camera) -> Camera:

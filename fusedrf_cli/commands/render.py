@@ -28,6 +28,13 @@ from fusedrf_cli.requests import RenderRequest
 @click.option(
     "--zoom", type=options.POSITIVE, default=1.0, show_default=True, help="2: from half as far away."
 )
+@click.option(
+    "--up",
+    type=options.UP,
+    default="auto",
+    show_default=True,
+    help="Which way of the world is up; auto: as photos were held, or +z.",
+)
 @options.size
 @click.option(
     "--background",
@@ -47,7 +54,8 @@ def command(scene, output, progress, **words):
 
     SCENE is a bundle, a scene.json, or - for a scene on stdin. What was learnt from photos of a place is
     shown as one of them shows it, and --orbit circles what they look at, at their distance and height.
-    Anything else is framed from outside. --look-at, --from and --zoom change that view or orbit.
+    Anything else is framed from outside. --look-at, --from, --zoom and --up change that view or
+    orbit.
 
     \b
     Example:
@@ -56,9 +64,11 @@ def command(scene, output, progress, **words):
     chosen = [name for name in ("cameras", "path", "views", "orbit") if words[name] is not None]
     if len(chosen) > 1:
         raise UsageProblem("--cameras, --path, --views and --orbit each choose the views; give one of them")
-    aimed = words["look_at"] is not None or words["direction"] is not None or words["zoom"] != 1
+    aimed = any(words[name] is not None for name in ("look_at", "direction", "up")) or words["zoom"] != 1
     if aimed and chosen and chosen != ["orbit"]:
-        raise UsageProblem(f"--look-at, --from and --zoom do not apply to --{chosen[0]}; leave them out")
+        raise UsageProblem(
+            f"--look-at, --from, --zoom and --up do not apply to --{chosen[0]}; leave them out"
+        )
     from fusedrf_cli import bridge
 
     return bridge.render(RenderRequest(scene=scene, output=output, **words), progress)

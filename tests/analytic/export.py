@@ -20,7 +20,7 @@ from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, VMMLPField, we
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
 
 SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's tests too
-BANDED = VMShape(16, 24, 2)  # the default one, for tints of degree 2
+BANDED = VMShape(16, 8, 2)  # for tints of degree 2
 Y0, Y1 = 0.28209479177387814, 0.4886025119029199  # constants of the first two SH bands
 CELLS = 4  # of the occupancy, per axis
 

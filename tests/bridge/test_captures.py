@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from formats.images import write_png
+from formats.images import read_image, write_png
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from tests.bridge.conftest import part
 from tests.formats.test_captures import looking_at
@@ -46,12 +46,24 @@ def test_a_colmap_model_is_trained_on(report, folder):
 
 @pytest.fixture
 def masked(folder):
-    """Photos of two sizes that show grey; wherever the masks are dark noise lies over it."""
+    """Photos whose masks cut out their middle."""
+    return masked_photos(folder, 255)
+
+
+@pytest.fixture
+def crossed(folder):
+    """Photos before whose middle somebody passes, which masks exclude."""
+    return masked_photos(folder, 0)
+
+
+def masked_photos(folder, middle: int):
+    """Photos of two sizes that show grey; noise lies over it where the masks are dark. These are of one
+    level in the middle, and of the opposite one along the border."""
     frames = []
     for i, eye in enumerate(eyes(6)):
         width, height = (24, 16) if i % 2 else (16, 20)
-        levels = np.zeros((height, width), np.uint8)
-        levels[4:-4, 4:-4] = 255
+        levels = np.full((height, width), 255 - middle, np.uint8)
+        levels[4:-4, 4:-4] = middle
         noise = np.random.default_rng(i).integers(0, 256, (height, width, 3), np.uint8)
         pixels = np.where(levels[..., None] > 0, np.uint8(90), noise)
         (folder / "wall").mkdir(exist_ok=True)
@@ -65,7 +77,7 @@ def masked(folder):
     return folder
 
 
-def test_what_masks_exclude_is_neither_learnt_nor_measured(report, masked):
+def test_what_masks_exclude_is_neither_learnt_nor_measured(report, crossed):
     box = ("--aabb", "-2,-2,-2,2,2,2")
     said = report("train", "wall", "-o", "out.rfpack", "--holdout", "3", *box, *DRAFT)
     assert said["capture"]["masked"] == 6 and said["holdout"]["views"] == 2
@@ -78,6 +90,28 @@ def test_masks_as_alpha_make_a_box_for_the_object(report, masked):
     low, high = np.split(np.array(said["aabb"]), 2)
     # The squares reach 8 pixels from the middle at f = 20 and a distance of 4.1.
     assert (high - low < 6).all() and (low < 0).all() and (high > 0).all()
+
+
+@pytest.mark.parametrize("masks", ["ignore", "alpha"])
+def test_an_object_that_masks_cut_out_stands_free(report, masked, masks):
+    """It is learnt in a box of its own, without the place around it, whatever masks mean: nothing is where
+    the wider photos show what their masks exclude beside it, though no ray through that need be drawn."""
+    said = report("train", "wall", "-o", "out.rfpack", "--masks", masks, *DRAFT)
+    low, high = np.split(np.array(said["aabb"]), 2)
+    assert said["space"] == "bounded" and (high - low < 4).all() and (low < 0).all() and (high > 0).all()
+    assert not report("info", "out.rfpack")["cameras"]["surroundings"]
+    words = ("--views", "capture", "--background", "transparent")
+    files = report("render", "out.rfpack", "-o", "look", *words)["files"]
+    for path in files:
+        alpha = read_image(masked / path)[..., 3]
+        middle = alpha[5:-5, 5:-5].mean()
+        assert middle > 128
+        if alpha.shape == (16, 24):
+            assert not alpha[:, :2].any() and not alpha[:, -2:].any()
+
+
+def test_unbounded_space_may_be_asked_for_with_masks(report, masked):
+    assert report("train", "wall", "-o", "out.rfpack", "--unbounded", *DRAFT)["space"] == "unbounded"
 
 
 def test_masks_that_exclude_everything(run, masked):

@@ -17,10 +17,11 @@ from fusedrf_cli.bridge import memory
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.shelf import Shelf
+from fusedrf_cli.engine.kinds.vm.field import VMShape
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.errors import ResourceProblem
 from tests.analytic import scenes
-from tests.analytic.export import BANDED, vm_field
+from tests.analytic.export import vm_field
 from tests.analytic.fields import Box
 
 ROOT = Path(__file__).parents[2]
@@ -122,7 +123,7 @@ def large(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("large")
     rng = np.random.default_rng(0)
     for i in range(8):
-        field = vm_field(Box(30.0, 0.5, tint=scenes.HUES[i % 5]), (120,) * 3, shape=BANDED, cells=32)
+        field = vm_field(Box(30.0, 0.5, tint=scenes.HUES[i % 5]), (120,) * 3, shape=VMShape(), cells=32)
         field.params.numpy()[:] += rng.normal(0, 1e-3, field.params.numel())
         write_field(str(folder / f"o{i}.rfpack"), field, f"o{i}", precision="float16", overwrite=False)
     for n in (2, 4, 8):
@@ -170,6 +171,6 @@ def test_teachers_are_streamed_where_memory_is_short(large):
         measured(large, "fuse", f"s{n}.json", *limit, "--memory", allowed, "-o", f"tight{n}.rfpack")
         for n in (2, 8)
     ]
-    teacher = 4 * BANDED.size((120,) * 3)
+    teacher = 4 * VMShape().size((120,) * 3)
     assert (large / "free8.rfpack").read_bytes() == (large / "tight8.rfpack").read_bytes()
     assert (tight[1][1] - tight[0][1]) / 6 <= 0.1 * teacher + (1 << 20)

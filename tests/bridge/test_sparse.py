@@ -1,5 +1,7 @@
 """`fuse --kind sparse`, and edits of what it makes, as whole commands."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -20,10 +22,22 @@ def short(tiny):
         yield
 
 
+@pytest.fixture(scope="module")
+def made(short, shop, tmp_path_factory):
+    """The shop with sparse.rfpack, floor and red fused to bricks, sources inside; and what fusing said."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("made") / "shop")
+    return folder, done(folder, "fuse", "pair.json", "-o", "sparse.rfpack", *SPARSE, "--keep-sources")
+
+
 @pytest.fixture
-def fused(report):
-    """What fusing floor and red to bricks says, sources inside."""
-    return report("fuse", "pair.json", "-o", "sparse.rfpack", *SPARSE, "--keep-sources")
+def folder(tmp_path, made):
+    return shutil.copytree(made[0], tmp_path / "shop")
+
+
+@pytest.fixture
+def fused(made):
+    """What the fusing said."""
+    return made[1]
 
 
 def field_of(folder, name: str):

@@ -17,10 +17,10 @@ from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, read_scene, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.extent import Extent
+from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
-from fusedrf_cli.bridge.training import camera_of
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.kinds import registry
@@ -73,7 +73,8 @@ def room(folder):
 
 def views_of(folder, scene: str, **asked) -> list[Camera]:
     """The cameras that `render` takes."""
-    words = dict.fromkeys(("cameras", "path", "views", "orbit", "look_at", "direction", "size", "memory"))
+    unset = ("cameras", "path", "views", "orbit", "look_at", "direction", "up", "size", "memory")
+    words = dict.fromkeys(unset)
     words |= {"zoom": 1.0, "background": None, "depth": False, "fps": 24.0, "allow_outside": False}
     words |= {"scene": str(folder / scene), "output": "out", "overwrite": False}
     request = RenderRequest(device="cpu", threads=None, **words | asked)
@@ -125,7 +126,7 @@ def test_an_orbit_keeps_the_distance_and_the_height_of_the_photos(folder):
     cameras, up = views_of(folder, "room.rfpack", orbit=8), RIG.up
     away = np.array([eye_of(camera) for camera in cameras]) - RIG.focus
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), RIG.distance, atol=1e-6)
-    np.testing.assert_allclose(away @ up, RIG.height, atol=1e-6)
+    np.testing.assert_allclose(away @ up, RIG.height(up), atol=1e-6)
     for camera in cameras:
         np.testing.assert_allclose(target_of(camera, RIG.distance), RIG.focus, atol=1e-6)
         assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-7)  # level
@@ -290,7 +291,8 @@ def test_hostile_cameras_are_refused_or_make_views_of_finite_numbers():
         for kept in filter(None, (rig, rig.placed(TURNED))):
             dump_scene(SceneGraph((), cameras=kept.content()))
         lens = pinhole(camera_of(sized(rig.typical, (8, 6))))
-        for camera in [*standing(rig).orbit(lens, 3), *(camera_of(sized(v, (8, 6))) for v in rig.views)]:
+        photos = (camera_of(sized(view, (8, 6))) for view in rig.views)
+        for camera in [*standing(rig, rig.up).orbit(lens, 3), *photos]:
             assert all(np.isfinite(numbers).all() for numbers in camera.rays()), seed
     assert 20 < taken < 200
 
@@ -306,6 +308,38 @@ def test_an_object_is_framed_as_before_whatever_photos_it_was_learnt_from(folder
         cameras = zip(views_of(folder, scene, orbit=3, size=(20, 10)), orbit(box, 3, 20, 10), strict=True)
         assert all(same(one, other) for one, other in cameras)
     assert len(views_of(folder, "object.rfpack", views="capture")) == 6
+
+
+def rolled(rig: Rig, degrees: float) -> Rig:
+    """The same rig in a world that was turned about +x, objects and all."""
+    turn = np.radians(degrees)
+    matrix = np.eye(4)
+    matrix[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    return rig.placed(matrix)
+
+
+@pytest.mark.parametrize("degrees, follows", [(0, False), (30, False), (90, True), (180, True)])
+def test_an_object_stands_upright_in_a_world_whose_z_is_not_up(folder, degrees, follows):
+    """As its photos were held, where that is more than 45 degrees from +z; --up goes before."""
+    rig = rolled(OBJECT, degrees)
+    keep(folder, "object.rfpack", rig)
+    up = rig.up if follows else np.array([0.0, 0, 1])
+    for camera in views_of(folder, "object.rfpack", orbit=4):
+        assert camera.camera_to_world[:3, 1] @ up > 0.8  # from 26 degrees above
+        assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-6)
+    (camera,) = views_of(folder, "object.rfpack", up=(0.0, 3.0, 0.0))
+    assert camera.camera_to_world[:3, 1] @ [0, 1, 0] > 0.8 and camera.camera_to_world[1, 0] == 0
+
+
+def test_which_way_is_up_may_be_said(folder):
+    """A place is circled about that direction, at the height of its photos along it; without an orbit it is
+    no longer shown as a photo shows it."""
+    up = np.array([0.6, 0.0, 0.8])
+    cameras = views_of(folder, "room.rfpack", orbit=6, up=tuple(5 * up))
+    away = np.array([eye_of(camera) for camera in cameras]) - RIG.focus
+    np.testing.assert_allclose(away @ up, RIG.height(up), atol=1e-6)
+    assert all(abs(camera.camera_to_world[:3, 0] @ up) < 1e-7 for camera in cameras)
+    assert same(views_of(folder, "room.rfpack", up=tuple(5 * up))[0], replace(cameras[0], name="view"))
 
 
 @pytest.mark.parametrize("scene", ["red.rfpack", "room.rfpack"])

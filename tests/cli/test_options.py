@@ -201,17 +201,19 @@ def test_render_hands_on_a_background(run, bridge, colour, background):
     name, asked = bridge.call
     assert (name, asked["scene"], asked["output"]) == ("render", "chair.rfpack", "out.png")
     assert asked["background"] == background
-    others = {"cameras", "path", "views", "orbit", "look_at", "direction", "zoom", "size", "depth", "fps"}
-    wanted = {*COMMON, "scene", "output", "background", "allow_outside", *others}
+    others = {"cameras", "path", "views", "orbit", "look_at", "direction", "zoom", "up", "size", "depth"}
+    wanted = {*COMMON, "scene", "output", "background", "allow_outside", "fps", *others}
     assert set(asked) == wanted - {"seed"}
 
 
 def test_render_hands_on_where_to_look(run, bridge):
-    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--from", "-90,30", "--zoom", "2")
+    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--from", "-90,30", "--zoom", "2", "--up", "0,-2,0")
     assert run("render", "chair.rfpack", "-o", "out", *words).exit_code == 0
     asked = bridge.call[1]
-    found = [asked[word] for word in ("orbit", "look_at", "direction", "zoom", "views")]
-    assert found == [4, (1, -2, 0.5), (-90, 30), 2, None]
+    found = [asked[word] for word in ("orbit", "look_at", "direction", "zoom", "up", "views")]
+    assert found == [4, (1, -2, 0.5), (-90, 30), 2, (0, -2, 0), None]
+    run("render", "chair.rfpack", "-o", "out", "--up", "auto")
+    assert bridge.call[1]["up"] is None
 
 
 @pytest.mark.parametrize(
@@ -222,6 +224,8 @@ def test_render_hands_on_where_to_look(run, bridge):
         (("--views", "heldout", "--zoom", "2"), "do not apply to --views"),
         (("--cameras", "table.rfpack", "--look-at", "0,0,0"), "do not apply to --cameras"),
         (("--path", "table.rfpack", "--from", "0,0"), "do not apply to --path"),
+        (("--views", "capture", "--up", "0,0,1"), "do not apply to --views"),
+        (("--up", "0,0,0"), "not 0,0,0"),
         (("--views", "all"), "'capture', 'heldout'"),
     ],
 )

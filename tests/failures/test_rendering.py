@@ -23,7 +23,8 @@ from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, STEP_PER_VOXEL, render_image, render_rays
+from fusedrf_cli.engine.rendering.volume import EARLY_STOP, render_image, render_rays
+from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 from fusedrf_cli.main import cli
 from tests.analytic import scenes
 from tests.analytic.export import SHAPE, exported, vm_field, way_of

@@ -153,7 +153,7 @@ def test_up_height_and_distance_of_a_ring():
     rig = rig_of(inward(12, radius=3.0, height=4.0, focus=(1.0, 2.0, 3.0)))
     np.testing.assert_allclose(rig.focus, [1, 2, 3], atol=1e-9)
     np.testing.assert_allclose(rig.up, [0, 0, 1], atol=1e-12)
-    assert (rig.height, rig.distance) == (pytest.approx(4.0), pytest.approx(5.0))
+    assert (rig.height(rig.up), rig.distance) == (pytest.approx(4.0), pytest.approx(5.0))
 
 
 def test_ups_that_cancel_out():

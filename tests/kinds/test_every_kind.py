@@ -1,5 +1,9 @@
 """What every kind of field does, whoever wrote it: fused, edited, trained and charted as whole commands."""
 
+import shutil
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -12,7 +16,7 @@ from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import TinySettings
+from tests.bridge.conftest import TinySettings, done
 from tests.bridge.test_edit import AT, blues, covered
 
 QUICK = {"blocks", "cp", "dense", "vm"}  # the others' loops take half a minute each to compile
@@ -29,11 +33,25 @@ def short(tiny):  # noqa: F811
         yield
 
 
+@pytest.fixture(scope="module")
+def made(short, shop, tmp_path_factory):
+    """made(kind): a bundle of floor and red fused to it, sources inside, and what fusing said; made once."""
+
+    @cache
+    def made(kind: str) -> tuple[Path, dict]:
+        folder = shutil.copytree(shop, tmp_path_factory.mktemp(kind) / "shop")
+        words = ("--kind", kind, "--max-size", str(SIZE), "--keep-sources")
+        return folder / "fused.rfpack", done(folder, "fuse", "pair.json", "-o", "fused.rfpack", *words)
+
+    return made
+
+
 @pytest.fixture
-def fused(report, kind):
-    """What fusing floor and red to a kind says, sources inside."""
-    words = ("--kind", kind, "--max-size", str(SIZE), "--keep-sources")
-    return report("fuse", "pair.json", "-o", "fused.rfpack", *words)
+def fused(made, folder, kind):
+    """What the fusing said; fused.rfpack lies in the folder."""
+    bundle, said = made(kind)
+    shutil.copy(bundle, folder)
+    return said
 
 
 @pytest.mark.parametrize("kind", KINDS)

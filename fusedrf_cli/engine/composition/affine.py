@@ -58,6 +58,10 @@ class Placed:
         """Whether the field fills all of space."""
         return self.field.occupancy.space is unbounded
 
+    def reaches(self, box: np.ndarray) -> bool:
+        """Whether there may be anything of it in a box (6,) of the world."""
+        return self.unbounded or bool((self.aabb[:3] <= box[3:]).all() and (box[:3] <= self.aabb[3:]).all())
+
     @property
     def voxel_size(self) -> float:
         """The field's finest detail in world units."""

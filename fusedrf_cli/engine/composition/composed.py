@@ -9,7 +9,14 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, placed_cells, unbounded_cells
+from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.occupancy import (
+    SCENE_CELLS,
+    OccupancyGrid,
+    Pace,
+    placed_cells,
+    unbounded_cells,
+)
 from fusedrf_cli.engine.spaces import unbounded
 
 OCCUPANCY_CELLS = SCENE_CELLS
@@ -59,11 +66,15 @@ class ComposedField:
 
     @cached_property
     def occupancy(self) -> OccupancyGrid:
-        """Cells that any placed field's occupied cells reach."""
+        """Cells that any placed field's occupied cells reach. In unbounded space each is sampled as finely as
+        those that reach it need: most of it is far from anything that is fine."""
         grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
         if any(p.unbounded for p in self.placed):
-            marks = unbounded_cells(grids, OCCUPANCY_CELLS)
-            return OccupancyGrid(unbounded.WHOLE, reduce(np.logical_or, marks), unbounded)
+            again = ((p.field.occupancy, p.object_to_world) for p in self.placed)
+            steps = (sampling_step(p.field) for p in self.placed)
+            pace = Pace(OccupancyGrid.full(unbounded.WHOLE, OCCUPANCY_CELLS, unbounded))
+            marks = pace.kept(unbounded_cells(grids, OCCUPANCY_CELLS), again, steps)
+            return pace.grid(reduce(np.logical_or, marks))
         aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 

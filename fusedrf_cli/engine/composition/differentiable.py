@@ -89,7 +89,9 @@ def densest(parts: list, points: torch.Tensor, dirs: torch.Tensor) -> list:
 
 
 def reached(placed: Placed, points: torch.Tensor) -> torch.Tensor:
-    """Indices of the points (N, 3) that lie in a placed field's box."""
+    """Indices of the points (N, 3) that lie in a placed field's box; of all where it fills all of space."""
+    if placed.unbounded:
+        return torch.arange(len(points), device=points.device)
     box = exact(placed.aabb, points.device)
     return torch.nonzero(((points >= box[:3]) & (points <= box[3:])).all(1))[:, 0]
 

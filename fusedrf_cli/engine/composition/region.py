@@ -13,7 +13,8 @@ from fusedrf_cli.engine.fields.occupancy import (
     SCENE_CELLS,
     OccupancyGrid,
     cell_counts,
-    marked_cells,
+    mapped,
+    reached_cells,
 )
 
 
@@ -31,7 +32,8 @@ class ClippedField:
         """The field's own cells that lie in the box, on a grid of the box itself."""
         counts = np.maximum(np.ceil((self.box[3:] - self.box[:3]) / self.field.occupancy.cell).astype(int), 1)
         grid = OccupancyGrid(self.box, np.ones(counts, bool))
-        found = self.field.occupancy.dilated().contains(grid.centres())
+        own = self.field.occupancy
+        found = own.dilated().contains(mapped(grid.centres(), own.space))
         return OccupancyGrid(self.box, found.reshape(counts))
 
     @property
@@ -81,7 +83,8 @@ class PatchedField:
     kind = "patched"
 
     def __init__(self, field: RadianceField, aabb: np.ndarray, region: np.ndarray, inside: MaxOf):
-        """aabb (6,) is the box of it all, region (6,) a part of it where `inside` answers."""
+        """aabb (6,) is the box of it all in the coordinates of the field's space, region (6,) a box of its
+        frame where `inside` answers."""
         self.field, self.aabb, self.region, self.inside = field, aabb, region, inside
 
     @property
@@ -98,16 +101,17 @@ class PatchedField:
         )
         longest = max(longest, min(DEFAULT_CELLS, SCENE_CELLS))
         counts = cell_counts(self.aabb, longest)
-        grid = OccupancyGrid(self.aabb, np.ones(counts, bool))
-        centres = grid.centres()
-        reach = grid.cell / 2
+        grid = OccupancyGrid(self.aabb, np.ones(counts, bool), own.space)
+        places = grid.centres()
+        centres = own.space.placed(torch.from_numpy(places)).numpy()
+        reach = grid.cell / 2 / own.space.rates(torch.from_numpy(places)).numpy()[:, None]
         within = ((centres > self.region[:3] + reach) & (centres < self.region[3:] - reach)).all(1)
-        found = own.dilated().contains(centres) & ~within
+        found = own.dilated().contains(places) & ~within
         beside = ((centres > self.region[:3] - reach) & (centres < self.region[3:] + reach)).all(1)
         for one in self.inside.placed:
-            reached = marked_cells(one.field.occupancy, one.object_to_world, self.aabb, longest)
+            reached = reached_cells(one.field.occupancy, one.object_to_world, self.aabb, longest, own.space)
             found |= reached.ravel() & beside
-        return OccupancyGrid(self.aabb, found.reshape(counts))
+        return OccupancyGrid(self.aabb, found.reshape(counts), own.space)
 
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True

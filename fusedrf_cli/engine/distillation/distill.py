@@ -5,6 +5,7 @@ Three phases: ask the teacher on rays through it, fit the student's σ and colou
 kept only if the student got better on views of its own.
 """
 
+import weakref
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -26,8 +27,15 @@ from fusedrf_cli.engine.distillation.losses import (
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
-from fusedrf_cli.engine.distillation.teacher import Chance, TeacherPool, ask, matter_first, random_rays
-from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.distillation.teacher import (
+    Chance,
+    TeacherPool,
+    ask,
+    matter_first,
+    no_point,
+    random_rays,
+)
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds.student import DistillSettings
@@ -111,14 +119,15 @@ class DistillRun:
         of the same teacher and settings is taken where there is one.
         """
         self.teacher, self.boxes, self.rgb, self.judge = teacher, boxes, rgb, judge
-        self.settings, self.recipe, self.step = settings, recipe, 0.5 * student.voxel_size
+        self.settings, self.recipe, self.step = settings, recipe, sampling_step(student)
         coarse = settings.steps > 0 and recipe.coarse(student)
         self.student, self.refined = (halved(student), student) if coarse else (student, None)
         """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
         self.report = DistillReport()
         self.optimiser = Adam.of(self.student)
-        self.guard = Guard(lambda: self.optimiser.numbers())
+        itself = weakref.ref(self)  # a circle of references would keep hundreds of megabytes for longer
+        self.guard = Guard(lambda: itself().optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.learnt_seconds = 0.0
         """That this process has learnt for."""
@@ -145,7 +154,8 @@ class DistillRun:
         self.generator.manual_seed(settings.seed + 1)
         judge = self.judge or Judge(self.teacher, settings.views, settings.view_size, settings.seed)
         rays_o, rays_d = random_rays(self.boxes, settings.rays, self.generator)
-        pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)
+        chance = self.recipe.chance if settings.steps else no_point
+        pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, chance)
         held_out = HeldOut(self.teacher, self.boxes, self.step, settings.seed)
         if self.random is not None:
             self.generator.set_state(self.random)
@@ -178,8 +188,9 @@ class DistillRun:
         self.guard.check()
         self.before = self.student.params.clone()
         self._prune()
-        self.optimiser = Adam.of(self.student)
-        self.guard.renew()
+        if self.settings.steps:  # else nothing was learnt before
+            self.optimiser = Adam.of(self.student)
+            self.guard.renew()
         self.report.steps["points"] = self.steps
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
         self.schedule = self.recipe.schedule()

@@ -10,10 +10,10 @@ from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import random_rays
-from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.rendering.volume import STEP_PER_VOXEL, render_rays
+from fusedrf_cli.engine.rendering.volume import render_rays
 
 RATE, RATE_DECAY = 3e-3, 0.1
 RAYS = 200_000
@@ -51,7 +51,7 @@ class RayLesson:
         generator = torch.Generator().manual_seed(self.seed + 1)
         epochs, optimiser = Epochs(len(self.rays_o), generator), Adam.of(student)
         guard = Guard(optimiser.numbers)
-        step, white = STEP_PER_VOXEL * student.voxel_size, np.ones((RAYS_PER_STEP, 3), np.float32)
+        step, white = sampling_step(student), np.ones((RAYS_PER_STEP, 3), np.float32)
         started, share = working_time(), 0.0
         for i in range(steps):
             share = i / steps if seconds is None else max(i / steps, (working_time() - started) / seconds)

@@ -12,8 +12,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.visibility import shown_cells
-from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.base import StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
@@ -23,7 +22,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera
 
 RATE = 0.02
 RATE_DECAY = 0.05  # the last step's share of the first's rate
-STEP_PER_VOXEL = 0.5
+UNBOUNDED_DECAY = 0.2  # the same in unbounded space, where the last texels come late: 0.3 dB
 EARLY_STOP = 1e-3
 SETTLED = 0.25  # share of the run after which a scene in unbounded space has taken shape
 EARLY_NEAR = 5.0  # times the near distance of such a scene, at first
@@ -36,8 +35,7 @@ EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
 RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
 # explain each photo by itself: a start at a twentieth of the texels, not at a fifth, gained 3 dB held out.
-UNBOUNDED_STAGES = ((0.0, 0.05), (0.15, 0.1), (0.3, 0.2), (0.45, 0.4), (0.6, 0.7), (0.75, 1.0))
-UNBOUNDED_STEP = 1.0  # voxels
+UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.7), (0.5, 1.0))
 UNBOUNDED_SAMPLES = 3  # times the samples of a step in a box: a ray has more of them
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
@@ -149,7 +147,11 @@ class FitRun:
         pool: RayPool,
         settings: FitSettings,
         generator: torch.Generator,
+        limits: OccupancyGrid | None = None,
     ):
+        """limits: cells over the field's box that alone may hold matter, where something besides the pictures
+        says so: wherever no ray tells that there is nothing, cells found anew would grow by one each time."""
+        self.limits = limits
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
         self.optimiser = Adam.of(field)
         self.started, self.steps = working_time(), 0
@@ -166,16 +168,17 @@ class FitRun:
         aabb: np.ndarray,
         settings: FitSettings,
         name: str = "",
+        limits: OccupancyGrid | None = None,
     ) -> "FitRun":
-        """A fit before its first step; the arguments are those of `fit`."""
+        """A fit before its first step; the arguments are those of `fit` and of FitRun."""
         generator = torch.Generator().manual_seed(settings.seed)
         pool = RayPool(cameras, images, generator)
         coarse = max(LEAST_TEXELS, round(settings.longest * settings.stages[0][1]))
         kind = registry.kind(settings.kind)
         field = kind.create(kind.untrained(aabb, coarse, settings.way), generator, name).to(settings.device)
-        if settings.unbounded:
-            field = field.with_occupancy(shown_cells(cameras, settings.near))
-        return cls(field, pool, settings, generator)
+        if limits is not None:
+            field = field.with_occupancy(limits)
+        return cls(field, pool, settings, generator, limits)
 
     def finish(
         self,
@@ -301,15 +304,18 @@ class FitRun:
         counts = cell_counts(grid.aabb, min(DEFAULT_CELLS, max(field.resolution)))
         if grid.occupied.shape != counts:  # as fine as those to be found, with the same cells occupied
             middles = OccupancyGrid.full(grid.aabb, max(counts)).centres()
-            grid = grid.marked(grid.contains(middles).reshape(counts))
-            field = field.with_occupancy(grid)
+            field = field.with_occupancy(grid.marked(grid.contains(middles).reshape(counts)))
+            grid = field.occupancy  # bricks have counts of their own
         rays_o, rays_d, _ = self.pool.draw(WEIGHED_RAYS)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         weights = field.weights(rays_o, rays_d, jitter, self.settings.near, field.voxel_size)
         return grid.marked(grid.marked(weights > SHOWN_FROM).dilated().occupied & grid.occupied)
 
     def occupy(self, occupancy: OccupancyGrid) -> None:
-        """Another occupancy grid; the optimiser starts anew where the field has fewer numbers then."""
+        """Another occupancy grid, within the limits; the optimiser starts anew where the field has fewer
+        numbers then."""
+        if self.limits is not None:
+            occupancy = occupancy.limited(self.limits)
         self.field = self.field.with_occupancy(occupancy)
         if len(self.field.params) == len(self.optimiser.field.params):
             self.optimiser.field = self.field
@@ -334,8 +340,7 @@ class FitRun:
             background = torch.rand(len(rays_o), 3, generator=self.generator).numpy()
         target = pixels.clone()
         target[:, :3] = pixels[:, :3] * pixels[:, 3:] + torch.from_numpy(background) * (1 - pixels[:, 3:])
-        fine = UNBOUNDED_STEP if settings.unbounded else STEP_PER_VOXEL
-        step = (fine if self.found_matter else 1.0) * field.voxel_size  # long while all is dense
+        step = sampling_step(field) if self.found_matter else field.voxel_size  # long while all is dense
         batch = Batch(
             rays_o,
             rays_d,
@@ -352,7 +357,8 @@ class FitRun:
         field.train_rays(batch, self.optimiser.grads, loss)
         sums = loss.sum(0)
         if self.guard.accepts(sums, self.optimiser):
-            self.learn(sums, len(rays_o), RATE_DECAY**share * self.guard.rate)
+            decay = UNBOUNDED_DECAY if settings.unbounded else RATE_DECAY
+            self.learn(sums, len(rays_o), decay**share * self.guard.rate)
         self.steps += 1
 
     def near(self, share: float) -> float:

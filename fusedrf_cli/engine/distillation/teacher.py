@@ -29,6 +29,11 @@ def matter_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tens
     return torch.where(depth > MATTER, 1.0, EMPTY_SHARE)
 
 
+def no_point(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
+    """None at all, for a student that learns from rays alone."""
+    return torch.zeros_like(depth)
+
+
 @dataclass
 class Points:
     """Samples of a teacher, in the teacher's frame."""

@@ -19,10 +19,12 @@ def shown_cells(cameras: list[Camera], near: float) -> OccupancyGrid:
     """
     counts = cell_counts(unbounded.WHOLE, CELLS)
     grid = OccupancyGrid.full(unbounded.WHOLE, CELLS, unbounded)
-    points = unbounded.placed(torch.from_numpy(grid.centres())).numpy()
+    centres = grid.centres()
+    real = (np.abs(centres) < 1).sum(1) >= 2  # beyond the core's edges coordinates stand for no place
+    points = unbounded.placed(torch.from_numpy(centres)).numpy()
     seen = np.zeros(len(points), bool)
     for camera in cameras:
-        rest = np.flatnonzero(~seen)
+        rest = np.flatnonzero(real & ~seen)
         seen[rest[seen_by(camera, points[rest], near)]] = True
     return grid.marked(seen.reshape(counts)).dilated()
 

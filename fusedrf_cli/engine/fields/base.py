@@ -22,7 +22,7 @@ class RadianceField(Protocol):
 
     @property
     def voxel_size(self) -> float:
-        """The finest detail the field can hold, in units of its frame; renderers step by half of it."""
+        """The finest detail the field can hold, in units of its frame; see `sampling_step`."""
         ...
 
     def query(
@@ -46,6 +46,13 @@ class StoredField(RadianceField, Protocol):
         ...
 
 
+def sampling_step(field: RadianceField) -> float:
+    """The distance, in the coordinates of its space, at which pictures sample a field; where its grid says
+    how far apart samples may lie in which cells, their smallest distance."""
+    grid = field.occupancy
+    return grid.unit or grid.space.STEP_PER_VOXEL * field.voxel_size
+
+
 NOTHING = 1e-4  # optical depth through a whole box under which a field shows nothing
 PROBED_AT_ONCE = 1 << 16
 
@@ -58,8 +65,9 @@ def holds_matter(field: RadianceField) -> bool:
     offsets = np.concatenate([np.zeros((1, 3)), PROBES - 0.5]) * grid.cell
     for start in range(0, len(middles), PROBED_AT_ONCE):
         for offset in offsets:
-            points = torch.from_numpy(middles[start : start + PROBED_AT_ONCE] + offset)
+            at = torch.from_numpy(middles[start : start + PROBED_AT_ONCE] + offset)
+            points = grid.space.placed(at)
             sigma, _ = field.query(points, torch.eye(3, dtype=torch.float64)[[0] * len(points)], False)
-            if bool((sigma * through > NOTHING).any()):
+            if bool((sigma / grid.space.rates(at) * through > NOTHING).any()):
                 return True
     return False

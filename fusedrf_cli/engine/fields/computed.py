@@ -108,9 +108,9 @@ class ComputedField:
         return other._afresh("arrays", "grid", "loops")
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "ComputedField":
-        """The same numbers under another occupancy grid."""
+        """The same numbers under another occupancy grid, sampled evenly at the field's own step."""
         other = copy(self)
-        other.occupancy = occupancy
+        other.occupancy = occupancy.marked(occupancy.occupied)
         return other._afresh("arrays", "grid")
 
     def to(self, device: str | torch.device) -> "ComputedField":

@@ -15,6 +15,9 @@ from fusedrf_cli.engine.spaces import bounded, unbounded
 DEFAULT_CELLS = 128
 SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
 THINNEST = 12  # texels across a flat box
+MAX_STRIDE = 255
+ROUNDED = 1e-9  # cells: faces that lie so close are the same
+OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -31,6 +34,10 @@ class OccupancyGrid:
     """(X, Y, Z) bool."""
     space: ModuleType = bounded
     """That its cells, and the numbers of the field that owns it, lie in (engine/spaces)."""
+    stride: np.ndarray | None = None
+    """(X, Y, Z) uint8: samples in a cell may lie so many times `unit` apart; None: a step everywhere."""
+    unit: float = 0.0
+    """The distance of samples where they lie closest; 0: it follows from the field's voxel."""
 
     @classmethod
     def full(cls, aabb: np.ndarray, cells: int = 1, space: ModuleType = bounded) -> "OccupancyGrid":
@@ -38,8 +45,8 @@ class OccupancyGrid:
         return cls(np.asarray(aabb, np.float64), np.ones(cell_counts(aabb, cells), bool), space)
 
     def marked(self, occupied: np.ndarray) -> "OccupancyGrid":
-        """A grid over the same box with other cells (X, Y, Z) bool, perhaps more or fewer."""
-        return replace(self, occupied=occupied)
+        """A grid over the same box with other cells (X, Y, Z) bool, perhaps more or fewer, sampled evenly."""
+        return OccupancyGrid(self.aabb, occupied, self.space)
 
     @property
     def cell(self) -> np.ndarray:
@@ -61,7 +68,8 @@ class OccupancyGrid:
     @cached_property
     def arrays(self) -> GridArrays:
         """The arrays kernels read."""
-        return GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
+        stride = np.zeros((0, 0, 0), np.uint8) if self.stride is None else self.stride
+        return GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell, stride, self.unit)
 
     def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
         """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where
@@ -79,6 +87,25 @@ class OccupancyGrid:
         unbounded space, the middle of the core."""
         return unbounded.SUBJECT if self.space is unbounded else self.tight_aabb(0)
 
+    def within(self, aabb: np.ndarray) -> "OccupancyGrid":
+        """The cells of a box (6,) whose faces are, but for rounding, those of cells."""
+        first, end = np.rint((aabb.reshape(2, 3) - self.aabb[:3]) / self.cell).astype(int)
+        cells = tuple(slice(a, b) for a, b in zip(first, end, strict=True))
+        return replace(self, aabb=np.asarray(aabb, np.float64), occupied=self.occupied[cells])
+
+    def limited(self, limits: "OccupancyGrid") -> "OccupancyGrid":
+        """The occupied cells that those of another grid of this space reach into; all where none does."""
+        reached, middles = np.zeros_like(self.occupied), limits.centres()
+        # Spots in a cell of the limits, its corners among them, no farther apart than own cells are wide.
+        counts = 1 + np.ceil(limits.cell / self.cell).astype(int)
+        axes = [OWN * np.linspace(-c, c, n) for c, n in zip(limits.cell, counts, strict=True)]
+        for spot in np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3):
+            index = np.floor((middles + spot - self.aabb[:3]) / self.cell).astype(int)
+            inside = ((index >= 0) & (index < self.occupied.shape)).all(1)
+            reached[tuple(index[inside].T)] = True
+        reached &= self.occupied
+        return self.marked(reached) if reached.any() else self
+
     def dilated(self, cells: int = 1) -> "OccupancyGrid":
         """The grid with every occupied region grown by a number of cells."""
         from scipy.ndimage import binary_dilation
@@ -94,9 +121,74 @@ class OccupancyGrid:
         found[inside] = self.occupied[i, j, k]
         return found
 
+    def strides_at(self, points: np.ndarray) -> np.ndarray:
+        """(N,) strides at points (N, 3) of the space's coordinates, the smallest near them."""
+        if self.stride is None:
+            return np.ones(len(points))
+        from scipy.ndimage import minimum_filter
+
+        least = minimum_filter(np.where(self.occupied, self.stride, MAX_STRIDE), 3)
+        index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
+        return least[tuple(np.clip(index, 0, np.array(least.shape) - 1).T)]
+
     def centres(self) -> np.ndarray:
         """(M, 3) centres of the occupied cells."""
         return self.aabb[:3] + (np.argwhere(self.occupied) + 0.5) * self.cell
+
+
+class Pace:
+    """How far apart samples may lie in each cell of a grid over several placed fields: as the finest of those
+    that reach it needs, and no farther than a cell, so that none stands for what lies in finer ones: cells
+    are counted as reached up to one around matter."""
+
+    def __init__(self, grid: OccupancyGrid):
+        """grid: its box, cells and space."""
+        self.whole, self.spacing = grid, np.full(grid.occupied.shape, np.inf, np.float32)
+
+    def kept(
+        self,
+        marks: Iterable[np.ndarray],
+        placed: Iterable[tuple[OccupancyGrid, np.ndarray]],
+        steps: Iterable[float],
+    ) -> Iterator[np.ndarray]:
+        """The marks as they come, noted: the cells (X, Y, Z) bool that each of several placed grids reaches,
+        which is sampled at a step of its own; placed as in `placed_cells`."""
+        for mark, (grid, matrix), step in zip(marks, placed, steps, strict=True):
+            self.spacing[mark] = np.minimum(self.spacing[mark], self.needed(mark, grid, matrix, step))
+            yield mark
+
+    def needed(self, mark: np.ndarray, grid: OccupancyGrid, object_to_field: np.ndarray, step: float):
+        """How far apart in the coordinates of this space samples may lie that a placed grid needs: a number,
+        or one for each of the cells of `mark`.
+
+        What is d long in the frame is, with n as in unbounded.py, d / n long across and d / n² along the way
+        out, in each of the two spaces by its own n.
+        """
+        finest = step * squeezed(object_to_field)
+        space, same = self.whole.space, np.array_equal(object_to_field, np.eye(4))
+        if grid.stride is None and space is grid.space and (space is bounded or same):
+            return finest
+        back = np.linalg.inv(object_to_field)
+        here = torch.from_numpy(self.whole.marked(mark).centres())
+        frame = space.placed(here).numpy()
+        there = grid.space.contracted(torch.from_numpy(frame @ back[:3, :3].T + back[:3, 3]))
+        ratio = (space.rates(here) / grid.space.rates(there)).sqrt().numpy()
+        if space is not bounded:  # to the far side of a cell
+            ratio *= np.maximum(1 - self.whole.cell[0] / 2 / space.rates(here).sqrt().numpy(), 0.1)
+        return finest * np.minimum(ratio, ratio**2) * grid.strides_at(there.numpy())
+
+    def grid(self, occupied: np.ndarray) -> OccupancyGrid:
+        """The grid with those cells (X, Y, Z) bool."""
+        grid = self.whole.marked(occupied)
+        known = np.isfinite(self.spacing)
+        if not known.any():
+            return grid
+        spacing = np.minimum(self.spacing, self.whole.cell.min())
+        most, least = spacing[known].max(), spacing[known].min()
+        unit = float(max(least, most / MAX_STRIDE))
+        strides = np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
+        stride = np.clip(strides, 1, MAX_STRIDE).astype(np.uint8)
+        return replace(grid, stride=None if stride.max() == 1 else stride, unit=unit)
 
 
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:
@@ -141,16 +233,25 @@ def placed_cells(
 def unbounded_cells(placed: Iterable[tuple[OccupancyGrid, np.ndarray]], longest: int) -> Iterator[np.ndarray]:
     """Which cells of a grid over unbounded space, `longest` along each axis, each of several placed grids may
     reach; placed as in `placed_cells`, into the frame of that space."""
-    for grid, matrix in placed:
-        if grid.space is unbounded:
-            yield shared_cells(grid, matrix, longest)
-        else:
-            yield marked_cells(grid, matrix, unbounded.WHOLE, longest, unbounded)
+    return (reached_cells(*one, unbounded.WHOLE, longest, unbounded) for one in placed)
+
+
+def reached_cells(
+    grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, longest: int, space: ModuleType
+) -> np.ndarray:
+    """(X, Y, Z) bool: cells of a field's box, in the coordinates of its space, that a placed grid of either
+    space may reach; where that fills all of space, the field's does."""
+    if grid.space is unbounded:
+        return shared_cells(grid, object_to_field, longest)
+    return marked_cells(grid, object_to_field, aabb, longest, space)
 
 
 def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int) -> np.ndarray:
-    """(X, Y, Z) bool: cells of a grid over unbounded space whose middle lies in or beside an occupied cell of
-    another such grid, placed by a (4, 4)."""
+    """(X, Y, Z) bool: cells of a grid over unbounded space that occupied cells of another such grid, placed
+    by a (4, 4), reach: those that share a volume with one where it lies as it is, else those whose middle
+    lies in or beside one."""
+    if np.array_equal(object_to_field, np.eye(4)):
+        return overlapped(grid, longest)
     own, back = grid.dilated(), np.linalg.inv(object_to_field)
     wanted = OccupancyGrid.full(unbounded.WHOLE, longest, unbounded)
     found = []
@@ -158,6 +259,22 @@ def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int)
         at = unbounded.placed(torch.from_numpy(part)).numpy() @ back[:3, :3].T + back[:3, 3]
         found.append(own.contains(mapped(at, unbounded)))
     return np.concatenate(found).reshape(wanted.occupied.shape)
+
+
+def overlapped(grid: OccupancyGrid, longest: int) -> np.ndarray:
+    """(X, Y, Z) bool: cells of all of unbounded space, `longest` along each axis, that share a volume with an
+    occupied cell of a grid over a part of it."""
+    found, counts = grid.occupied, np.asarray(grid.occupied.shape)
+    whole = cell_counts(unbounded.WHOLE, longest)
+    for axis, count in enumerate(counts):
+        low, side = grid.aabb[axis], grid.aabb[axis + 3] - grid.aabb[axis]
+        edges = unbounded.WHOLE[axis] + 2 * unbounded.SIDE / whole[axis] * np.arange(whole[axis] + 1)
+        at = (edges - low) / side * count
+        at = np.where(abs(at - np.rint(at)) < ROUNDED, np.rint(at), at)
+        first, last = np.floor(at[:-1]).astype(int), np.ceil(at[1:]).astype(int)
+        runs = zip(np.clip(first, 0, count), np.clip(last, 0, count), strict=True)
+        found = np.stack([found.take(range(a, b), axis).any(axis) for a, b in runs], axis)
+    return found
 
 
 def mapped(points: np.ndarray, space: ModuleType) -> np.ndarray:
@@ -195,10 +312,24 @@ def marked_cells(
     return OccupancyGrid(aabb, found).dilated().occupied
 
 
+def squeezed(matrix: np.ndarray) -> float:
+    """How long the shortest image of a unit of length is under a (4, 4) affine."""
+    return float(np.linalg.svd(matrix[:3, :3], compute_uv=False)[-1])
+
+
 def transformed_aabb(aabb: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """(6,) box around a box's eight corners after a (4, 4) affine."""
     moved = box_corners(aabb) @ matrix[:3, :3].T + matrix[:3, 3]
     return np.concatenate([moved.min(0), moved.max(0)])
+
+
+def placement(origin: np.ndarray) -> np.ndarray:
+    """(4, 4) of a frame that lies at `origin`: a position (3,), or that placement itself."""
+    if origin.shape == (4, 4):
+        return origin
+    matrix = np.eye(4)
+    matrix[:3, 3] = origin
+    return matrix
 
 
 def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:

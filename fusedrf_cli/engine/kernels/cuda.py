@@ -120,8 +120,8 @@ def sweep_kernel(item, scratch_size: int, memory_size: int, real):
                 scratch[r] = 0
             kept = Kept(
                 wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
-                wholes[4, :, thread], reals[0, :, thread], reals[1, :, thread], reals[2, :, thread],
-                reals[3, :, thread], reals[4:7, :, thread].T, memory,
+                wholes[4, :, thread], wholes[5, :, thread], reals[0, :, thread], reals[1, :, thread],
+                reals[2, :, thread], reals[3, :, thread], reals[4:7, :, thread].T, memory,
             )  # fmt: skip
             for i in range(thread, count, threads):
                 item(field, grid, batch, i, kept, scratch, grads[0], loss[0])
@@ -131,10 +131,10 @@ def sweep_kernel(item, scratch_size: int, memory_size: int, real):
 
 @lru_cache(maxsize=2)
 def sweep_memory(most: int, threads: int, kind: np.dtype) -> tuple:
-    """What the ways back of so many threads need: (5, most, threads) whole numbers and (7, ..) reals, a
+    """What the ways back of so many threads need: (6, most, threads) whole numbers and (7, ..) reals, a
     thread's own next to its neighbours', as threads read them."""
     shape = most, threads
-    return cuda.device_array((5, *shape), np.int32), cuda.device_array((7, *shape), kind)
+    return cuda.device_array((6, *shape), np.int32), cuda.device_array((7, *shape), kind)
 
 
 @cache

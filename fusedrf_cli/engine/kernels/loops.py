@@ -37,6 +37,7 @@ from fusedrf_cli.engine.kernels.parts import accumulate, along, cell_of, compare
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
 LEARN_FROM = COLOUR_FROM  # the same in training
+LENT_FROM = COLOUR_FROM  # the same in pictures, behind a ray's first colour
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 SAMPLES_AHEAD = 2
@@ -103,9 +104,10 @@ class Kept(NamedTuple):
     """What the way back of one ray needs of its samples. `memory` holds the KEPT numbers of as many shaded
     samples as fit; its last slot serves all beyond, whose colours are then evaluated twice."""
 
-    k: object  # int, the sample's number in its piece
+    k: object  # int, twice the number of the sample in its piece: where `many` is even it is between two
     piece: object  # int
     held: object  # int, what `again` makes the place of
+    many: object  # int
     steps: object  # int
     slot: object  # int, where in memory, or -1: not shaded
     pre: object
@@ -180,6 +182,29 @@ def share_along(t):
     return t / (1.0 + t)
 
 
+def between(k, many):
+    """Twice the number, on a ray's lattice, of the middle of `many` steps from step k on."""
+    return 2 * k + many - 1
+
+
+def optical_length(course, p, u, many, steps, step):
+    """How much of a ray, by the unit that σ at p is of, a sample at u stands for: `many` steps around it, and
+    as many again behind it for each of `steps` beyond the first."""
+    return rate(p) * span(course, u + 0.5 * (steps - 1) * many * step, steps * many * step)
+
+
+def met(field, grid, line, k, many, u, step, d, scratch):
+    """What a ray meets at u of a piece, line (origin, direction, course), in `many` steps from step k on: the
+    point; the share of the light that is lost there; and what `density` says besides σ."""
+    origin, way, course = line
+    p = along(origin, way, u)
+    sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
+    opacity = 0.0
+    if steps > 0:
+        opacity = 1.0 - math.exp(-sigma * optical_length(course, p, u, many, steps, step))
+    return p, opacity, pre, steps, place
+
+
 def query_point(field, grid, asked, i, scratch, memory, out):
     """σ (1/length) and rgb at point i; both 0 where the field is not known."""
     p, d = point(triple(asked.points, i)), triple(asked.dirs, i)
@@ -230,28 +255,29 @@ def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
 def render_ray(field, grid, rays, i, scratch, memory, out):
     """Marches, shades and composites ray i in one pass: out[i] is premultiplied rgb, opacity, Σ w t.
 
-    Samples sit at the middle of each step. `waiting` is the weight of samples too light to be shaded; the
-    next shaded one lends them its colour.
+    A sample sits in the middle of the steps it stands for. `waiting` is the weight of samples too light to be
+    shaded: the next one that is lends them its colour, at the end of the ray the last one.
     """
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
-    trans, waiting = 1.0, 0.0
+    r, g, b = 0.0, 0.0, 0.0
+    trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
     current = -1
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.near)
         u0 = u0 + 0.5 * step
-        k = next_sample(grid, origin, way, u0, u1, step, 0)
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
-            u = u0 + k * step
-            p = along(origin, way, u)
-            sigma, _, steps, place = density(field, grid, k, p, d, scratch)
+            u = u0 + 0.5 * between(k, many) * step
+            p, opacity, _, steps, place = met(
+                field, grid, (origin, way, course), k, many, u, step, d, scratch
+            )
             if steps > 0:
-                length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
-                weight = trans * (1.0 - math.exp(-sigma * length))
+                weight = trans * opacity
                 trans -= weight
                 depth += weight * distance(course, u)
                 waiting += weight
-                if waiting > COLOUR_FROM:
+                if waiting > enough:
                     if frame_of(place) != current:
                         current = frame_of(place)
                         begin(field, current, d, scratch)
@@ -259,9 +285,12 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
                     red += waiting * r
                     green += waiting * g
                     blue += waiting * b
-                    waiting = 0.0
-            k = advance(field, place, steps, k, p, way, u, u0, step)
-            k = next_sample(grid, origin, way, u0, u1, step, k)
+                    waiting, enough = 0.0, LENT_FROM
+            k = advance(field, place, many * steps, k, p, way, u, u0, step)
+            k, many = next_sample(grid, origin, way, u0, u1, step, k)
+    red += waiting * r
+    green += waiting * g
+    blue += waiting * b
     out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
 
 
@@ -275,19 +304,20 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, batch.near)
         u0 = u0 + batch.jitter[i] * step
-        k = next_sample(grid, origin, way, u0, u1, step, 0)
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > batch.early_stop and count < kept.k.shape[0]:
-            u = u0 + k * step
-            p = along(origin, way, u)
-            sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
+            u = u0 + 0.5 * between(k, many) * step
+            p, opacity, pre, steps, place = met(
+                field, grid, (origin, way, course), k, many, u, step, d, scratch
+            )
             if steps > 0:
-                held = keep(place)
-                ahead_density(field, field.params, held, along(origin, way, u + SAMPLES_AHEAD * steps * step))
+                held, reach = keep(place), SAMPLES_AHEAD * many * steps * step
+                ahead_density(field, field.params, held, along(origin, way, u + reach))
                 ahead_density(field, grad, held, p)
-                length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
-                weight = trans * (1.0 - math.exp(-sigma * length))
+                weight = trans * opacity
                 trans -= weight
-                kept.k[count], kept.piece[count], kept.held[count], kept.steps[count] = k, number, held, steps
+                kept.k[count], kept.many[count], kept.steps[count] = between(k, many), many, steps
+                kept.piece[count], kept.held[count] = number, held
                 kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
                 if batch.distortion > 0.0:
                     kept.along[count] = share_along(distance(course, u))
@@ -307,8 +337,8 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                     waiting = 0.0
                     shaded += 1
                 count += 1
-            k = advance(field, place, steps, k, p, way, u, u0, step)
-            k = next_sample(grid, origin, way, u0, u1, step, k)
+            k = advance(field, place, many * steps, k, p, way, u, u0, step)
+            k, many = next_sample(grid, origin, way, u0, u1, step, k)
     work = count + SHADING_COST * shaded
     d_colour, d_trans = compared(batch, i, (red, green, blue), trans, work, loss)
     if count > 0:
@@ -341,7 +371,7 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         if PIECES > 1 and kept.piece[q] != number:
             number = kept.piece[q]
             origin, way, u0, _, course = piece(number, grid, o, d, batch.near)
-        u = u0 + batch.jitter[i] * step + kept.k[q] * step
+        u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
         p = along(origin, way, u)
         place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
         rgb, d_rgb = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -356,8 +386,7 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
                 colour(field, place, p, d, scratch, kept.memory, last)
             carried = kept.carried[q]
             d_rgb = d_colour[0] * carried, d_colour[1] * carried, d_colour[2] * carried
-        steps = kept.steps[q]
-        length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
+        length = optical_length(course, p, u, kept.many[q], kept.steps[q], step)
         if batch.distortion > 0.0:
             here = kept.along[q]
             before = before[0] - weight, before[1] - weight * here
@@ -385,22 +414,22 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.near)
         u0 = u0 + rays.jitter[i] * step
-        k = next_sample(grid, origin, way, u0, u1, step, 0)
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
-            u = u0 + k * step
-            p = along(origin, way, u)
-            sigma, _, steps, place = density(field, grid, k, p, d, scratch)
+            u = u0 + 0.5 * between(k, many) * step
+            p, opacity, _, steps, place = met(
+                field, grid, (origin, way, course), k, many, u, step, d, scratch
+            )
             if steps > 0:
-                length = rate(p) * span(course, u + 0.5 * (steps - 1) * step, steps * step)
-                weight = trans * (1.0 - math.exp(-sigma * length))
+                weight = trans * opacity
                 trans -= weight
                 x = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
                 y = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
                 z = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
                 c = (x * ny + y) * nz + z
                 most[c] = max(most[c], weight)
-            k = advance(field, place, steps, k, p, way, u, u0, step)
-            k = next_sample(grid, origin, way, u0, u1, step, k)
+            k = advance(field, place, many * steps, k, p, way, u, u0, step)
+            k, many = next_sample(grid, origin, way, u0, u1, step, k)
 
 
 def peak_of_cell(field, grid, cells, i, scratch, memory, out):
@@ -445,10 +474,10 @@ def sweep(field, grid, batch, count, most, grads, loss):
     parts = grads.shape[0]
     for p in prange(parts):
         real = field.params.dtype
-        whole, reals = np.empty((5, most), np.int64), np.empty((4, most))
+        whole, reals = np.empty((6, most), np.int64), np.empty((4, most))
         kept = Kept(
-            whole[0], whole[1], whole[2], whole[3], whole[4], reals[0], reals[1], reals[2], reals[3],
-            np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
+            whole[0], whole[1], whole[2], whole[3], whole[4], whole[5], reals[0], reals[1], reals[2],
+            reals[3], np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
         )  # fmt: skip
         low, high = p * count // parts, (p + 1) * count // parts
         sweep_task(field, grid, batch, low, high, kept, np.zeros(SCRATCH, real), grads[p], loss[p])
@@ -465,12 +494,12 @@ def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, spans, cou
         origin, way, u0, u1, course = piece(number, grid, o, d, near)
         u0 = u0 + jitter[i] * step
         first = start[i] // PIECES if number == start[i] % PIECES else 0
-        k = next_sample(grid, origin, way, u0, u1, step, first)
+        k, many = next_sample(grid, origin, way, u0, u1, step, first)
         while k >= 0 and counts[i] < ts.shape[1]:
-            ts[i, counts[i]] = distance(course, u0 + k * step)
-            spans[i, counts[i]] = span(course, u0 + k * step, step)
+            u = u0 + 0.5 * between(k, many) * step
+            ts[i, counts[i]], spans[i, counts[i]] = distance(course, u), span(course, u, many * step)
             counts[i] += 1
-            k = next_sample(grid, origin, way, u0, u1, step, k + 1)
+            k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
         if k >= 0:
             start[i] = k * PIECES + number
             return

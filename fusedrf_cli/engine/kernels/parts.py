@@ -20,12 +20,14 @@ FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must no
 
 class GridArrays(NamedTuple):
     """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
-    one."""
+    one. Samples in a cell may be `stride` times `unit` apart; without strides they are a step apart."""
 
     skip: object  # (X, Y, Z) uint8
     lo: object  # (3,) float, lower corner
     hi: object  # (3,) float, upper corner
     cell: object  # (3,) float, size of a cell
+    stride: object = np.zeros((0, 0, 0), np.uint8)  # (X, Y, Z) uint8, at least 1 in occupied cells
+    unit: object = 0.0  # float
 
 
 @body
@@ -74,8 +76,8 @@ def exit_distance(p, d, lo, cell, i, s):
 
 @body
 def next_sample(grid, origin, way, u0, u1, step, k):
-    """First k' >= k whose sample u0 + k' step of a straight line lies in an occupied cell, or -1 when there
-    is none before u1.
+    """(first k' >= k at which u0 + k' step of a straight line lies in an occupied cell, for how many steps
+    from there on one sample may stand), or (-1, 1) when there is no such k' before u1.
 
     Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
     the same.
@@ -86,14 +88,18 @@ def next_sample(grid, origin, way, u0, u1, step, k):
     while True:
         u = u0 + k * step
         if u >= u1:
-            return -1
+            return -1, 1
         x, y, z = along(origin, way, u)
         i = cell_of(x, lo[0], cell[0], nx)
         j = cell_of(y, lo[1], cell[1], ny)
         m = cell_of(z, lo[2], cell[2], nz)
         s = int(skip[np.uint64(i), np.uint64(j), np.uint64(m)])
         if s == 0:
-            return k
+            many = 1
+            if grid.stride.shape[0] != 0:
+                spacing = grid.unit * grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)]
+                many = max(1, int(min(spacing, u1 - u + 0.5 * step) / step + FACE_TOLERANCE))
+            return k, many
         away = min(
             exit_distance(x, dx, lo[0], cell[0], i, s),
             min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),

@@ -117,6 +117,23 @@ def composite_weights(sigma: torch.Tensor, step: float) -> torch.Tensor:
     return before * alpha
 
 
+def lent(weights: torch.Tensor, first: float, later: float) -> torch.Tensor:
+    """(N, K) the weights that the colours of a ray's samples stand for, of weights (N, K): that of all since
+    the last sample that was shaded, where it is over `first`, or over `later` behind the first that was; what
+    is left over at the end goes to the last."""
+    shown, rows = torch.zeros_like(weights), torch.arange(len(weights))
+    waiting, enough = torch.zeros_like(weights[:, 0]), torch.full_like(weights[:, 0], first)
+    last = torch.full((len(weights),), -1)
+    for k in range(weights.shape[1]):
+        waiting = waiting + weights[:, k]
+        shaded = waiting > enough
+        shown[:, k] = torch.where(shaded, waiting, 0)
+        waiting, enough = torch.where(shaded, 0, waiting), torch.where(shaded, later, enough)
+        last = torch.where(shaded, k, last)
+    shown[rows, last] += torch.where(last >= 0, waiting, 0)
+    return shown
+
+
 def interval(
     rays_o: torch.Tensor, rays_d: torch.Tensor, box: torch.Tensor, near: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -155,13 +172,14 @@ def render_rays(
     early_stop: float = 0.0,
     jitter=0.5,
     colour_from: float = 0.0,
+    lent_from: float | None = None,
 ) -> torch.Tensor:
     """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) float64 through a field that has a
     `reference`, on the CPU.
 
     Every sample of the lattice is asked. A sample counts while the transmittance before it is over
     early_stop, and its colour where its weight is over colour_from: both thresholds are the kernels' own, 0
-    leaves them out.
+    leaves them out. With lent_from, light samples take other ones' colours as in pictures (`lent`).
     """
     ts, taken = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter, dtype=torch.float64))
     points = (rays_o[:, None] + ts[..., None] * rays_d[:, None])[taken]
@@ -173,6 +191,8 @@ def render_rays(
         before = torch.exp(-step * (torch.cumsum(sigma, 1) - sigma))
     weights = composite_weights(torch.where(before > early_stop, sigma, 0), step)
     shown = torch.where(weights > colour_from, weights, 0)
+    if lent_from is not None:
+        shown = lent(weights, colour_from, lent_from)
     columns = [
         (shown[..., None] * rgb).sum(1),
         weights.sum(1, keepdim=True),

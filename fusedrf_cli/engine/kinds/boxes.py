@@ -7,11 +7,12 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.box import BoxField
+from fusedrf_cli.engine.fields.box import BoxField, used_vertices
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Way, finest_within
 
-BEYOND_CELLS = 1.3  # vertices that are used over those inside occupied cells: some lie just beyond
+COUNTED = 3  # times the used vertices are counted to find how many fit
 MOST_HELD = 60_000_000  # numbers in memory: with what learning adds, some 1.5 GB
 
 
@@ -35,6 +36,10 @@ class BoxKind(Kind):
         parts = self.field.parts_of(self.shape(way), resolution)
         return [Section(part.name, (*part.shape[:-1], part.columns or part.shape[-1])) for part in parts]
 
+    def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
+        """See Kind; with what fills rows up."""
+        return sum(int(np.prod(part.shape)) for part in self.field.parts_of(self.shape(way), resolution))
+
     def student(self, scene: ComposedField, request: StudentRequest) -> Student:
         """See Kind."""
         parts = self.field.parts_of(self.shape(Way()), (2, 2, 2))
@@ -50,20 +55,29 @@ class GridStudent(Student):
     """A student with numbers for each vertex of a grid, of which those in occupied cells of the scene alone
     are stored."""
 
+    finer = 1.0
+    """Times the scene's finest voxel: a student's own is no finer."""
+
+    @property
+    def cells(self) -> OccupancyGrid:
+        """Those that it has numbers in."""
+        return self.scene.occupancy
+
     def plan(self, way: Way, numbers: int) -> Plan:
         """See Student; `numbers` counts what is stored."""
-        box, kind = self.scene.aabb, self.kind
-        share = min(1.0, BEYOND_CELLS * float(self.scene.occupancy.occupied.mean()))
+        box, kind, cells = self.scene.aabb, self.kind, self.cells
+        share = min(1.0, float(cells.occupied.mean()))
 
         def wanted(resolution: tuple[int, int, int]) -> float:
-            held = kind.numbers(way, resolution)
-            return max(share * held, held * numbers / MOST_HELD)
+            stored = share * sum(np.prod(section.shape) for section in kind.sections(way, resolution))
+            return max(stored, kind.numbers(way, resolution) * numbers / MOST_HELD)
 
-        resolution = finest_within(box, self.scene.voxel_size, wanted, numbers)
+        for _ in range(COUNTED):  # coarser grids have more vertices just beyond the cells
+            resolution = finest_within(box, self.finer * self.scene.voxel_size, wanted, numbers)
+            used = np.count_nonzero(used_vertices(cells, box, resolution))
+            share = used / np.prod(resolution)
         whole = kind.plan_at(box, resolution, way, numbers)
-        vertices = int(share * np.prod(resolution))
         sections = [
-            Section(s.name, (vertices, *s.shape[3:])) if s.shape[:3] == resolution else s
-            for s in whole.sections
+            Section(s.name, (used, *s.shape[3:])) if s.shape[:3] == resolution else s for s in whole.sections
         ]
         return replace(whole, sections=sections)

@@ -59,8 +59,3 @@ class Teach(Protocol):
 def enclosing(boxes: list[np.ndarray]) -> np.ndarray:
     """(6,) the box around boxes."""
     return np.concatenate([np.min([b[:3] for b in boxes], 0), np.max([b[3:] for b in boxes], 0)])
-
-
-def overlaps(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two boxes (6,) share a volume."""
-    return bool((a[:3] < b[3:]).all() and (b[:3] < a[3:]).all())

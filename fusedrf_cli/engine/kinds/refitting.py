@@ -6,7 +6,8 @@ import numpy as np
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.region import MaxOf, PatchedField
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing, overlaps
+from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
+from fusedrf_cli.engine.spaces import bounded
 
 HOW = "learnt again in the region, and held to what it showed elsewhere"
 
@@ -19,7 +20,7 @@ def added(field: StoredField, objects: list[Placed], teach: Teach) -> Edited:
 
 def refilled(field: StoredField, box: np.ndarray, rest: list[Placed], teach: Teach) -> Edited | None:
     """The field that shows in a box (6,) what the rest does there; None where nothing is left."""
-    inside = [p for p in rest if overlaps(p.aabb, box)]
+    inside = [p for p in rest if p.reaches(box)]
     return refitted(field, box, inside, teach)
 
 
@@ -27,7 +28,8 @@ def refitted(field: StoredField, region: np.ndarray, inside: list[Placed], teach
     """The field after learning to show, inside a region (6,), the densest of placed fields, and outside it
     what it showed; None where that is nothing at all."""
     own = field.occupancy.aabb
-    box = enclosing([own, region]) if inside else own
+    grows = inside and field.occupancy.space is bounded  # unbounded space holds every region
+    box = enclosing([own, region]) if grows else own
     teacher = PatchedField(field, box, region, MaxOf(inside))
     if not teacher.occupancy.occupied.any():
         return None

@@ -238,7 +238,10 @@ class Student:
 
     def largest(self) -> Plan:
         """The largest that the limit allows at the dearest precision; TooSmall where it allows none."""
-        way, limit = self.ways()[-1][-1], self.request.limit
+        return self.largest_of(self.ways()[-1][-1], self.request.limit)
+
+    def largest_of(self, way: Way, limit: int) -> Plan:
+        """The largest of a way in a file of so many bytes; TooSmall where there is none."""
         smallest = self.bytes_of_plan(self.plan(way, 1), way)
         if smallest > limit:
             raise TooSmall(smallest)

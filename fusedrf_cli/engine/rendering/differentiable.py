@@ -21,12 +21,12 @@ from fusedrf_cli.engine.composition.differentiable import (
     query,
     structure,
 )
-from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.differentiable import settle
 from fusedrf_cli.engine.kernels.reference import exact, interval
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, STEP_PER_VOXEL, waves, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import EARLY_STOP, waves, weights_from_depths
 from fusedrf_cli.engine.spaces import bounded
 
 
@@ -51,12 +51,14 @@ def render_rays(
     rays_d: torch.Tensor,
     *,
     poses: Poses | None = None,
+    origin: np.ndarray | None = None,
     near: float = 0.0,
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> torch.Tensor:
     """Render rays (N, 3), directions of unit length, of the frame of a field, placed or composed or neither:
-    (N, 5) premultiplied rgb, opacity and Σ w t, on the field's device.
+    (N, 5) premultiplied rgb, opacity and Σ w t, on the field's device. With `origin`, where that frame lies
+    (a position (3,), or a placement (4, 4)), rays and t are the world's.
 
     Differentiable in the fields' numbers, rays_o, rays_d and `poses` (composition/differentiable.py). Where
     nothing needs a gradient it is `volume.render_rays`, which is faster: it leaves out the colour of the
@@ -65,16 +67,17 @@ def render_rays(
     ValueError for a direction of no length.
     """
     if isinstance(field, Placed):
-        field, origin = ComposedField([field]), exact(ComposedField([field]).origin, rays_o.device)
-        poses, rays_o = shifted(poses, origin), rays_o - origin
+        field = ComposedField([field])
+        poses, origin = shifted(poses, field.origin), field.origin
+    rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
     known, device = structure(field, poses), device_of(field)
-    step = step or STEP_PER_VOXEL * known.voxel_size
+    step = step or sampling_step(known)
     host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]
     if not needs_gradient(field, rays_o, rays_d, *(poses or {}).values()):
         for part in parts(field):
             settle(part)
         found = volume.render_rays(known, *host, near=near, step=step, early_stop=early_stop)
-        return torch.from_numpy(found).to(device)
+        return in_lengths(torch.from_numpy(found).to(device), per_length)
     volume.check_directions(host[1])
     ray, ts, spans = visible_samples(known, *host, near, step, early_stop)
     ray, ts, spans = torch.from_numpy(ray).to(device), exact(ts, device), exact(spans, device)
@@ -86,7 +89,8 @@ def render_rays(
     sigma, rgb = query(field, rays_o[ray] + ts[:, None] * dirs, dirs, poses)
     weights = composite(sigma * spans.to(sigma.dtype), ray, len(rays_o))
     columns = torch.cat([rgb, torch.ones_like(sigma)[:, None], ts.to(sigma.dtype)[:, None]], 1)
-    return sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
+    found = sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
+    return in_lengths(found, per_length)
 
 
 def needs_gradient(field: RadianceField, *inputs: torch.Tensor) -> bool:
@@ -96,9 +100,35 @@ def needs_gradient(field: RadianceField, *inputs: torch.Tensor) -> bool:
     return any(x.requires_grad for x in inputs) or any(p.requires_grad for p in numbers(field))
 
 
-def shifted(poses: Poses | None, origin: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Placements seen from a frame whose origin is at `origin` (3,)."""
-    offset = torch.nn.functional.pad(origin[:, None], (3, 0, 0, 1))
+def seen_from(
+    origin: np.ndarray | None, points: torch.Tensor, dirs: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """World points and unit dirs (N, 3) in a frame that lies at `origin` (see `render_rays`), and how long
+    (N,) a unit of the world's is there along each; None: as long."""
+    if origin is None:
+        return points, dirs, None
+    place = exact(origin, points.device)
+    if place.shape == (3,):
+        return exact(points, points.device) - place, dirs, None
+    inverse = torch.linalg.inv(place[:3, :3])
+    ways = exact(dirs, dirs.device) @ inverse.T
+    lengths = ways.norm(dim=1)
+    return (exact(points, points.device) - place[:3, 3]) @ inverse.T, ways / lengths[:, None], lengths
+
+
+def in_lengths(found: torch.Tensor, per_length: torch.Tensor | None) -> torch.Tensor:
+    """(N, 5) rays' columns with distances in a unit of which `per_length` (N,) make up one of another."""
+    if per_length is None:
+        return found
+    return torch.cat([found[:, :4], found[:, 4:] / per_length[:, None].to(found)], 1)
+
+
+def shifted(poses: Poses | None, origin: np.ndarray) -> dict[str, torch.Tensor]:
+    """Placements seen from a frame that lies at `origin`: a position (3,), or a placement (4, 4)."""
+    if origin.shape == (4, 4):
+        inverse = torch.from_numpy(np.linalg.inv(origin))
+        return {name: inverse.to(pose) @ pose for name, pose in (poses or {}).items()}
+    offset = torch.nn.functional.pad(torch.from_numpy(origin)[:, None], (3, 0, 0, 1))
     return {name: pose - offset.to(pose) for name, pose in (poses or {}).items()}
 
 
@@ -169,14 +199,11 @@ def render_image(
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> Picture:
-    """Render one view from `pose` (4, 4), camera to world, in place of the camera's own; origin (3,) is the
-    world position of the field's frame origin. Differentiable as `render_rays`, and in `pose`."""
+    """Render one view from `pose` (4, 4), camera to world, in place of the camera's own; see `render_rays`
+    for origin. Differentiable as that is, and in `pose`."""
     rays_o, rays_d = camera_rays(camera, pose)
-    if origin is not None:
-        rays_o = rays_o - exact(origin, rays_o.device)
-    found = render_rays(field, rays_o, rays_d, poses=poses, near=near, step=step, early_stop=early_stop).view(
-        camera.height, camera.width, 5
-    )
+    how = {"poses": poses, "origin": origin, "near": near, "step": step, "early_stop": early_stop}
+    found = render_rays(field, rays_o, rays_d, **how).view(camera.height, camera.width, 5)
     opacity = found[..., 3]
     depth = torch.where(opacity > 1e-3, found[..., 4] / opacity.clamp_min(1e-3), torch.inf)
     return Picture(found[..., :3], opacity, depth)

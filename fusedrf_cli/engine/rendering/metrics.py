@@ -13,21 +13,32 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return PSNR_CAP if mse == 0 else min(PSNR_CAP, float(-10 * np.log10(mse)))
 
 
-def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004) of two (H, W, 3) pictures, Gaussian window of sigma 1.5; NaN
-    when under 11 pixels."""
+def colour_corrected(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Pixels (N, 3) after the affine map of colours, 3 x 4, that takes them nearest to `truth` (N, 3) by
+    least squares; in [0, 1]."""
+    known = np.concatenate([picture, np.ones((len(picture), 1))], 1, dtype=np.float64)
+    matrix = np.linalg.lstsq(known, truth.astype(np.float64), rcond=None)[0]
+    return np.clip(known @ matrix, 0, 1)
+
+
+def ssim(a: np.ndarray, b: np.ndarray, kept: np.ndarray | None = None) -> float:
+    """Structural similarity (Wang et al. 2004) of two (H, W, 3) pictures, Gaussian window of sigma 1.5, mean
+    over the whole windows, or over those around the pixels that are `kept`, (H, W) bool; NaN where there is
+    none, as under 11 pixels."""
     from skimage.metrics import structural_similarity
 
     if min(a.shape[:2]) < SSIM_WINDOW:
         return float("nan")
-    return float(
-        structural_similarity(
-            a,
-            b,
-            data_range=1.0,
-            channel_axis=2,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-        )
+    _, found = structural_similarity(
+        a,
+        b,
+        data_range=1.0,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
     )
+    whole = (slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2)),) * 2
+    found = found[whole] if kept is None else found[whole][kept[whole]]
+    return float(found.mean(dtype=np.float64)) if found.size else float("nan")

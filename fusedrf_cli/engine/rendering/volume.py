@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
 
-STEP_PER_VOXEL = 0.5
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
 SEEN_WEIGHT = 1e-6  # samples lighter than this stay black
 RAYS_AT_ONCE = 1 << 16
@@ -52,7 +51,7 @@ def render_rays(
     of no length, along which there is no end, or one that is not finite.
     """
     check_directions(rays_d)
-    step = step or STEP_PER_VOXEL * field.voxel_size
+    step = step or sampling_step(field)
     out = np.zeros((len(rays_o), 5), np.float32)
     compiled = getattr(field, "device_loops", True) is not None
     fast = getattr(field, "render_rays", None) if compiled else None

@@ -10,6 +10,7 @@ import torch
 from fusedrf_cli.engine.kernels.parts import hit_box
 
 PIECES = 1  # of a ray, at most
+STEP_PER_VOXEL = 0.5  # of a field's finest voxel, at which pictures sample it
 
 
 def point(p):

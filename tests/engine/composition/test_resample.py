@@ -8,9 +8,9 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.asking import colours, even_directions
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, key_places, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseShape
-from fusedrf_cli.engine.kinds.sparse.filling import colours, even_directions
 from fusedrf_cli.engine.kinds.sparse.resample import frame_of, leaves, resampled
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr

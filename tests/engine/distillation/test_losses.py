@@ -10,8 +10,9 @@ from fusedrf_cli.engine.distillation.losses import OPAQUE, log_depth, mostly_see
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from tests.analytic.export import BANDED
 from tests.analytic.rays import affine, turn
-from tests.engine.conftest import BOX, THIRTY_TWO, random_vm, unit
+from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm, unit
 
 STEP = 0.05
 
@@ -40,8 +41,8 @@ def test_the_slope_of_the_density_loss_is_finite_differences():
 
 def test_the_gradient_of_a_step_is_finite_differences():
     """Of the loss that is told, by all numbers of a small float64 field in a random direction."""
-    teacher = random_vm(THIRTY_TWO, (5, 6, 7), torch.float64, seed=1)
-    student = random_vm(THIRTY_TWO, (5, 6, 7), torch.float64, seed=2)
+    teacher = random_vm(SIXTY_FOUR, (5, 6, 7), seed=1)
+    student = random_vm(SIXTY_FOUR, (5, 6, 7), seed=2)
     points = points_of(teacher, 300, 3)
     points.sigma = points.sigma.clamp_max(0.9 * OPAQUE / STEP)  # away from the kink
     optimiser = Adam(student, 1)
@@ -63,10 +64,10 @@ def test_what_is_hidden_counts_less_but_something():
 def test_the_colour_of_a_turned_teacher_is_learnt_without_loss(degrees):
     """Bands of spherical harmonics are closed under rotation: degree 2 holds a turned probe of degree 2 to a
     third of an 8-bit level, where degree 1 misses it by far."""
-    source = probe(VMShape(8, 8, 2), seed=5)
+    source = probe(BANDED, seed=5)
     teacher = ComposedField([Placed("probe", source, affine(turn(degrees)))])
-    assert colour_off(teacher, probe(VMShape(8, 8, 2), seed=6)) < 0.3 / 255
-    assert colour_off(teacher, probe(VMShape(8, 8, 1), seed=6)) > 5 / 255
+    assert colour_off(teacher, probe(BANDED, seed=6)) < 0.3 / 255
+    assert colour_off(teacher, probe(THIRTY_TWO, seed=6)) > 5 / 255
 
 
 def probe(shape: VMShape, seed: int) -> VMField:

@@ -11,13 +11,14 @@ from fusedrf_cli.engine.fields.occupancy import (
     cell_counts,
     harmless_depth,
     marked_cells,
+    overlapped,
     placed_cells,
     transformed_aabb,
 )
+from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import BOX, points_in
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 9, 2), (6, 5, 7)])
 @pytest.mark.parametrize("share", [0.02, 0.3])
@@ -125,3 +126,23 @@ def test_what_is_left_out_adds_up_to_little_along_every_line():
     depth[3, 3, 3] = 4e-3
     assert harmless_depth(depth, 0.01, 5e-3) == 0.01
     assert harmless_depth(np.full((400, 1, 1), 1e-3), 0.01, 0.0) < 1e-3
+
+
+@pytest.mark.parametrize("longest", [3, 7, 10])
+def test_cells_of_another_size_that_share_a_volume(longest):
+    """Against every pair of cells, in whole numbers."""
+    occupied = np.random.default_rng(4).random((7, 7, 7)) < 0.1
+    wanted = np.zeros((longest,) * 3, bool)
+    for cell in np.argwhere(occupied):
+        low, high = cell * longest, (cell + 1) * longest  # in 1 / (7 longest) of the box
+        for index in np.ndindex(wanted.shape):
+            wanted[index] |= ((low < 7 * np.add(index, 1)) & (7 * np.array(index) < high)).all()
+    assert np.array_equal(overlapped(OccupancyGrid(unbounded.WHOLE, occupied, unbounded), longest), wanted)
+    # a part of space that is cut out on faces of cells shares what its cells share
+    box = np.array([-2, -2 + 4 / 7, -2, 2 - 8 / 7, 2, 2])
+    part = OccupancyGrid(unbounded.WHOLE, occupied, unbounded).within(box)
+    kept = np.zeros_like(occupied)
+    kept[:5, 1:, :] = occupied[:5, 1:, :]
+    again = overlapped(OccupancyGrid(unbounded.WHOLE, kept, unbounded), longest)
+    assert np.array_equal(part.occupied, kept[:5, 1:, :])
+    assert np.array_equal(overlapped(part, longest), again)

@@ -17,7 +17,7 @@ from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, untrained
 from tests.analytic.rays import affine, turn
 
-from ..conftest import BOX, SIXTY_FOUR, random_vm
+from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm
 from .sparse_cases import random_sparse
 
 
@@ -29,10 +29,11 @@ def random_blocks():
 
 
 def random_vm_mlp(
-    dtype=torch.float64, seed=0, cells=None, matrix=None, shape=SIXTY_FOUR, width=8
+    dtype=torch.float64, seed=0, cells=None, matrix=None, width=8
 ) -> VMMLPField:
-    """A vm-mlp field of random numbers whose colours differ."""
-    shape = type(shape)(shape.density_rank, shape.colour_rank, 2)
+    """A vm-mlp field of random numbers whose colours differ; one shape for each type, since each is
+    compiled."""
+    shape = replace(SIXTY_FOUR if dtype == torch.float64 else THIRTY_TWO, sh_degree=2)
     generator = torch.Generator().manual_seed(seed)
     factors = random_vm(shape, dtype=dtype, seed=seed, cells=cells, matrix=matrix)
     weights = untrained(27, width, generator)

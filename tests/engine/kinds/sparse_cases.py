@@ -32,9 +32,10 @@ def random_tree(depth: int, seed: int = 0, filled: float = 0.7) -> BrickTree:
 
 
 def random_sparse(
-    degree: int = 1, depth: int = 2, dtype=torch.float64, seed: int = 0, scale: float = 4.0
+    degree: int = 2, depth: int = 2, dtype=torch.float64, seed: int = 0, scale: float = 4.0
 ) -> SparseField:
-    """A sparse field of random numbers, dense enough to see."""
+    """A sparse field of random numbers, dense enough to see. Tests ask for degrees 0 and 2 alone, since each
+    is compiled."""
     bare = SparseField(SparseShape(degree), Lattice(random_tree(depth, seed), SIDE), scale)
     generator = torch.Generator().manual_seed(seed)
     field = bare.with_params(torch.randn(bare.size, generator=generator, dtype=torch.float64).to(dtype))

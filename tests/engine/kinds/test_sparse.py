@@ -51,7 +51,7 @@ def mixed(lattice: Lattice, rows: torch.Tensor, brick: int, inside: np.ndarray) 
     return total
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 2])
 def test_answers_are_those_of_a_loop(degree, rng):
     field = random_sparse(degree)
     points = points_in(field.aabb, 150, margin=0.1)
@@ -102,7 +102,7 @@ def level_at(tree, points: np.ndarray) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("degree", [0, 2])
 def test_gradients_of_answers_are_finite_differences(degree, rng):
     field = random_sparse(degree)
     points = torch.from_numpy(points_in(field.aabb, 60))
@@ -118,7 +118,7 @@ def test_gradients_of_answers_are_finite_differences(degree, rng):
     check_differences(field, value, grads.sum(0), rng)
 
 
-@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("degree", [0, 2])
 def test_gradients_of_pictures_are_finite_differences(degree, rng):
     field = random_sparse(degree)
     rays_o, rays_d = rays_at(field.aabb, 12)
@@ -154,7 +154,7 @@ def check_differences(field: SparseField, value, gradient: np.ndarray, rng, rtol
 
 
 def test_the_loss_of_rays_is_that_of_their_pictures(rng):
-    field = random_sparse(1)
+    field = random_sparse()
     rays_o, rays_d = rays_at(field.aabb, 30)
     target, background = rng.random((30, 4)), rng.random((30, 3))
     loss = np.zeros((2, 3))
@@ -170,7 +170,7 @@ def test_the_loss_of_rays_is_that_of_their_pictures(rng):
 def test_pictures_are_those_of_the_general_renderer():
     """Of one level, where a sample stands for one step, the same samples; of several, nearly."""
     for depth, close in ((0, 2e-3), (2, 0.05)):
-        field = random_sparse(1, depth)
+        field = random_sparse(2, depth)
         rays_o, rays_d = rays_at(field.aabb, 200)
         step = 0.1 * field.voxel_size
         fast, slow = (render_rays(f, rays_o, rays_d, step=step) for f in (field, Slow(field)))
@@ -180,7 +180,7 @@ def test_pictures_are_those_of_the_general_renderer():
 
 def test_what_is_skipped_changes_no_picture():
     """With one occupied cell over everything, the samples of empty nodes alone are skipped."""
-    field, whole = random_sparse(1), random_sparse(1)
+    field, whole = random_sparse(), random_sparse()
     whole.occupancy = type(field.occupancy).full(field.aabb)
     rays_o, rays_d = rays_at(field.aabb, 100)
     rays_d[:3] = np.eye(3)
@@ -201,7 +201,7 @@ def test_stored_and_read_it_is_the_same(degree):
 
 
 def test_what_does_not_fit_is_refused_by_name():
-    arrays, metadata = random_sparse(1, dtype=torch.float32).state()
+    arrays, metadata = random_sparse(2, dtype=torch.float32).state()
     for name in arrays:
         with pytest.raises(ValueError, match=name):
             SparseField.from_state({k: a for k, a in arrays.items() if k != name}, metadata)
@@ -226,13 +226,13 @@ def test_what_does_not_fit_is_refused_by_name():
 
 
 def test_numbers_too_large_for_float32_are_refused():
-    arrays, metadata = random_sparse(1, dtype=torch.float32).state()
+    arrays, metadata = random_sparse(2, dtype=torch.float32).state()
     with pytest.raises(ValueError, match="rows"):
         SparseField.from_state(arrays | {"rows": arrays["rows"] + np.float32(3e38)}, metadata)
 
 
 def test_a_step_of_adam_leaves_hanging_vertices_on_their_voxels(rng):
-    field = random_sparse(1, dtype=torch.float32)
+    field = random_sparse(2, dtype=torch.float32)
     optimiser = Adam.of(field)
     points = torch.from_numpy(points_in(field.aabb, 500))
     dirs = torch.from_numpy(unit(rng.normal(size=(500, 3))))
@@ -272,6 +272,6 @@ def test_what_light_reaches():
 
 
 def test_bands_lie_on_a_lattice_of_wider_voxels():
-    field = random_sparse(1)
+    field = random_sparse()
     assert field.coarse.n == COARSE and field.coarse.free < 0.5 * field.fine.free
-    assert field.numbers == 4 * field.fine.free + 9 * field.coarse.free
+    assert field.numbers == 4 * field.fine.free + 24 * field.coarse.free

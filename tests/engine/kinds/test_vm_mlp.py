@@ -108,7 +108,7 @@ def test_resampling_keeps_the_network_and_the_basis():
 
 
 def test_rendering_equals_a_slow_loop():
-    """Samples too light to be shaded take the colour of the next that is."""
+    """Samples too light to be shaded take the colour of the next that is, at the end that of the last."""
     field = random_field(cells=4)
     rays_o, rays_d = rays_at(BOX, 12)
     step = 0.07
@@ -117,6 +117,7 @@ def test_rendering_equals_a_slow_loop():
     assert found[:, 3].max() > 0.5
     for ray in range(12):
         o, d, trans, rgb, waiting = rays_o[ray], rays_d[ray], 1.0, np.zeros(3), 0.0
+        shown, enough = np.zeros(3), loops.COLOUR_FROM
         faces = np.stack([(BOX[:3] - o) / d, (BOX[3:] - o) / d])
         start, end = faces.min(0).max(), faces.max(0).min()
         for t in np.arange(start + 0.5 * step, end, step):
@@ -125,9 +126,11 @@ def test_rendering_equals_a_slow_loop():
             weight = trans * (1 - np.exp(-float(sigma[0]) * step))
             trans -= weight
             waiting += weight
-            if waiting > loops.COLOUR_FROM:
-                rgb += waiting * colour[0].numpy()
+            if waiting > enough:
+                shown, enough = colour[0].numpy(), loops.LENT_FROM
+                rgb += waiting * shown
                 waiting = 0.0
+        rgb += waiting * shown
         np.testing.assert_allclose(found[ray, :4], [*rgb, 1 - trans], rtol=1e-9, atol=1e-12)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.rendering.metrics import PSNR_CAP, psnr, ssim
+from fusedrf_cli.engine.rendering.metrics import PSNR_CAP, colour_corrected, psnr, ssim
 
 
 def test_psnr_by_hand():
@@ -40,3 +40,31 @@ def test_ssim_of_noise():
 def test_ssim_needs_its_window(shape):
     assert np.isnan(ssim(np.zeros(shape), np.zeros(shape)))
     assert ssim(np.zeros((11, 11, 3)), np.zeros((11, 11, 3))) == pytest.approx(1.0)
+
+
+def test_ssim_of_the_pixels_that_are_kept():
+    """Where all are it is the plain one; what lies more than a window away from them changes nothing."""
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 40, 30, 3))
+    assert ssim(a, b, np.ones((40, 30), bool)) == pytest.approx(ssim(a, b), rel=1e-12)
+    kept = np.zeros((40, 30), bool)
+    kept[:12] = True
+    other = b.copy()
+    other[12 + 5 :] = 0.5
+    assert ssim(a, b, kept) == ssim(a, other, kept) != ssim(a, other)
+    assert np.isnan(ssim(a, b, np.zeros((40, 30), bool)))
+
+
+def test_a_colour_correction_undoes_any_affine_map():
+    rng = np.random.default_rng(2)
+    picture = rng.random((500, 3)) * 0.5
+    matrix, shift = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), np.array([0.2, 0.1, 0.15])
+    truth = picture @ matrix + shift
+    assert 0 < truth.min() and truth.max() < 1 and psnr(picture, truth) < 20
+    np.testing.assert_allclose(colour_corrected(picture, truth), truth, atol=1e-12)
+
+
+def test_a_colour_correction_of_one_colour_is_the_mean():
+    truth = np.random.default_rng(3).random((50, 3))
+    found = colour_corrected(np.full((50, 3), 0.3), truth)
+    np.testing.assert_allclose(found, np.broadcast_to(truth.mean(0), (50, 3)), atol=1e-12)

@@ -8,9 +8,7 @@ class CPKind(BoxKind):
     """See Kind."""
 
     name = "cp"
-    good_for = (
-        "Single objects in a few hundred kilobytes; more work per sample than vm."
-    )
+    good_for = "Single objects in a few hundred kilobytes; more work per sample than vm."
     field = CPField
     takes = frozenset({"ranks", "sh_degree"})
 

@@ -52,7 +52,7 @@ def sizes(field):
 def place_of(field, p):
     """The point in the unit cube of the box, and whether it lies inside."""
     real = field.params.dtype.type
-    u, v, w = (p[0] - field.lo[0]) / field.side[0], (p[1] - field.lo[1]) / field.side[1], 0.0
+    u, v = (p[0] - field.lo[0]) / field.side[0], (p[1] - field.lo[1]) / field.side[1]
     w = (p[2] - field.lo[2]) / field.side[2]
     inside = min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE
     return (real(u), real(v), real(w)), inside
@@ -66,13 +66,23 @@ def texels_of(count, field, section, axis, place):
     return lower, lower + np.uint64(count), share
 
 
-def product(params, x, y, z, r):
-    """X_r Y_r Z_r at the texels x, y, z (lower, upper, share)."""
-    return (
-        linear(params, x[0], x[1], x[2], r)
-        * linear(params, y[0], y[1], y[2], r)
-        * linear(params, z[0], z[1], z[2], r)
-    )
+def lines_of(count, field, section, place):
+    """`texels_of` on each of the three axes, for the section that begins with the line of x."""
+    x, y = texels_of(count, field, section, 0, place), texels_of(count, field, section, 1, place)
+    return x, y, texels_of(count, field, section, 2, place)
+
+
+def factors(params, lines, first, i):
+    """X_r, Y_r and Z_r between the texels of three lines, r the i-th component from the first on."""
+    (x, y, z), r = lines, first + np.uint64(i)
+    on_x, on_y = linear(params, x[0], x[1], x[2], r), linear(params, y[0], y[1], y[2], r)
+    return on_x, on_y, linear(params, z[0], z[1], z[2], r)
+
+
+def product(params, lines, first, i):
+    """X_r Y_r Z_r; see `factors`."""
+    x, y, z = factors(params, lines, first, i)
+    return x * y * z
 
 
 def density(field, grid, k, p, d, scratch):
@@ -80,11 +90,9 @@ def density(field, grid, k, p, d, scratch):
     place, inside = place_of(field, p)
     if not inside:
         return 0.0, 0.0, 0, place
-    x, y = texels_of(RANK, field, 0, 0, place), texels_of(RANK, field, 0, 1, place)
-    z = texels_of(RANK, field, 0, 2, place)
-    f = field.params.dtype.type(0)
+    lines, f = lines_of(RANK, field, 0, place), field.params.dtype.type(0)
     for r in range(np.uint64(RANK)):
-        f += product(field.params, x, y, z, r)
+        f += product(field.params, lines, r, 0)
     return float(field.density[0] * softplus(f + field.density[1])), float(f), 1, place
 
 
@@ -120,51 +128,42 @@ def end(field, frame, d, scratch, grad):
 
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py; keeps the colour's products."""
-    x, y = texels_of(COLOUR, field, 3, 0, place), texels_of(COLOUR, field, 3, 1, place)
-    z, params = texels_of(COLOUR, field, 3, 2, place), field.params
+    lines, params, features = lines_of(COLOUR, field, 3, place), field.params, np.uint64(at)
     for tile in range(np.uint64(COLOUR // 8)):
         r = tile * np.uint64(8)
-        e0, e1 = product(params, x, y, z, r), product(params, x, y, z, r + np.uint64(1))
-        e2, e3 = product(params, x, y, z, r + np.uint64(2)), product(params, x, y, z, r + np.uint64(3))
-        e4, e5 = product(params, x, y, z, r + np.uint64(4)), product(params, x, y, z, r + np.uint64(5))
-        e6, e7 = product(params, x, y, z, r + np.uint64(6)), product(params, x, y, z, r + np.uint64(7))
-        store_8(memory, np.uint64(at) + r, e0, e1, e2, e3, e4, e5, e6, e7)
-    features = np.uint64(at)
+        e0, e1, e2 = product(params, lines, r, 0), product(params, lines, r, 1), product(params, lines, r, 2)
+        e3, e4, e5 = product(params, lines, r, 3), product(params, lines, r, 4), product(params, lines, r, 5)
+        e6, e7 = product(params, lines, r, 6), product(params, lines, r, 7)
+        store_8(memory, features + r, e0, e1, e2, e3, e4, e5, e6, e7)
     red = dot(COLOUR, scratch, np.uint64(BASIS), memory, features)
     green = dot(COLOUR, scratch, np.uint64(BASIS + COLOUR), memory, features)
     blue = dot(COLOUR, scratch, np.uint64(BASIS + 2 * COLOUR), memory, features)
     return float(sigmoid(red)), float(sigmoid(green)), float(sigmoid(blue))
 
 
-def line_gradients(params, x, y, z, sent, r):
-    """What the gradient `sent` of a product sends to its three factors."""
-    a, b = linear(params, x[0], x[1], x[2], r), linear(params, y[0], y[1], y[2], r)
-    c = linear(params, z[0], z[1], z[2], r)
-    return sent * b * c, sent * a * c, sent * a * b
+def sent_on(params, lines, scratch, first, i):
+    """What the gradient of a product, scratch[D_FEATURES + r], sends to its factors; see `factors`."""
+    x, y, z = factors(params, lines, first, i)
+    sent = scratch[np.uint64(D_FEATURES) + first + np.uint64(i)]
+    return sent * y * z, sent * x * z, sent * x * y
 
 
 def scatter_products(count, field, section, place, scratch, grad):
     """Adjoint of the products of a section: scratch[D_FEATURES:] is their gradient."""
-    params, one = field.params, field.params.dtype.type(1)
-    x, y = texels_of(count, field, section, 0, place), texels_of(count, field, section, 1, place)
-    z, sent = texels_of(count, field, section, 2, place), np.uint64(D_FEATURES)
+    params, lines = field.params, lines_of(count, field, section, place)
     for tile in range(np.uint64(count // 8)):
         r = tile * np.uint64(8)
-        g0 = line_gradients(params, x, y, z, scratch[sent + r], r)
-        g1 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(1)], r + np.uint64(1))
-        g2 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(2)], r + np.uint64(2))
-        g3 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(3)], r + np.uint64(3))
-        g4 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(4)], r + np.uint64(4))
-        g5 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(5)], r + np.uint64(5))
-        g6 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(6)], r + np.uint64(6))
-        g7 = line_gradients(params, x, y, z, scratch[sent + r + np.uint64(7)], r + np.uint64(7))
+        g0, g1 = sent_on(params, lines, scratch, r, 0), sent_on(params, lines, scratch, r, 1)
+        g2, g3 = sent_on(params, lines, scratch, r, 2), sent_on(params, lines, scratch, r, 3)
+        g4, g5 = sent_on(params, lines, scratch, r, 4), sent_on(params, lines, scratch, r, 5)
+        g6, g7 = sent_on(params, lines, scratch, r, 6), sent_on(params, lines, scratch, r, 7)
         for a in range(3):
             line = np.uint64(D_LINES + a * count) + r
             store_8(scratch, line, g0[a], g1[a], g2[a], g3[a], g4[a], g5[a], g6[a], g7[a])
     for a in range(3):
-        lower, upper, share = x if a == 0 else (y if a == 1 else z)
+        lower, upper, share = lines[a]
         line = np.uint64(D_LINES + a * count)
-        scatter(count, grad, lower, one - share, scratch, line)
+        scatter(count, grad, lower, params.dtype.type(1) - share, scratch, line)
         scatter(count, grad, upper, share, scratch, line)
 
 

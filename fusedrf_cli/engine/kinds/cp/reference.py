@@ -13,13 +13,11 @@ def query(
     sections, kind = field.with_params(params).sections(), params.dtype
     points, box = exact(points, params.device), exact(field.box, params.device)
     unit = ((points - box[:3]) / (box[3:] - box[:3])).to(kind)
-    feature = products(sections, "density", unit).sum(1)
-    _, occupied = cell_at(field.occupancy, points)
+    feature, (_, occupied) = products(sections, "density", unit).sum(1), cell_at(field.occupancy, points)
     sigma = torch.where(occupied, density(feature, field.scale, field.shift), 0)
     shown = sh_basis(field.shape.coefficients, exact(dirs, params.device)).to(kind)
-    logits = torch.einsum(
-        "nk,ckr,nr->nc", shown, sections["colour_basis"], products(sections, "colour", unit)
-    )
+    features = products(sections, "colour", unit)
+    logits = torch.einsum("nk,ckr,nr->nc", shown, sections["colour_basis"], features)
     return sigma, torch.where((sigma > 0)[:, None], logits.sigmoid(), 0)
 
 

@@ -3,6 +3,7 @@ et al. CVPR 2022; DVGO, Sun et al. CVPR 2022), interpolated before the activatio
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import BoxField, Part
@@ -67,3 +68,9 @@ class DenseField(BoxField):
         peak = {name: float(view.abs().amax()) for name, view in self.sections().items()}
         self.check_density(peak["density"])
         self.check_logit(3 * self.shape.coefficients * peak["colour"])
+
+    def fill_vertices(self, index: np.ndarray, features: np.ndarray, colours: np.ndarray) -> None:
+        """See AskedStudent."""
+        sections, index = self.sections(), torch.from_numpy(index)
+        sections["density"].view(-1)[index] = torch.from_numpy(features - self.shift).float()
+        sections["colour"].view(-1, self.shape.width)[index, : self.shape.numbers] = torch.from_numpy(colours)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.asking import OCTANTS
 from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 
 MAX_LEVEL = 7
@@ -20,7 +21,7 @@ MAX_TOP_CELLS = 1 << 22
 LONGEST = (1 << 20) // (SIDE << MAX_LEVEL)  # top cells along an axis: places in units fit in 21 bits
 MAX_ENTRIES = 1 << 26  # of all top cells' tables: 256 MB
 MAX_BRICKS = 1 << 22
-OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+
 EMPTY, BRICK, SPLIT = 0, 1, 2
 
 

@@ -7,10 +7,10 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.region import MaxOf
+from fusedrf_cli.engine.kinds.asking import LEAST, OCTANTS, density
 from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
-    OCTANTS,
     BrickTree,
     Lattice,
     corner_offsets,
@@ -18,7 +18,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     node_keys,
 )
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.filling import LEAST, density, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.filling import fill, set_density
 from fusedrf_cli.engine.kinds.sparse.resample import FAINT, EmptyField, demanded, leaves, shown, thinned
 
 RefillMask = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -44,7 +44,7 @@ def added(field: SparseField, placed: Placed) -> SparseField:
 def emptied(field: SparseField, region: np.ndarray, rest: list[Placed]) -> SparseField | None:
     """The field whose vertices in a box (6,) show what the rest, placed in its frame, does there; nothing
     where there is no rest. None where nothing is left."""
-    inside = MaxOf([p for p in rest if meets(p.aabb[:3], p.aabb[3:], region)])
+    inside = MaxOf([p for p in rest if p.reaches(region)])
     tree, wanted = field.tree, [np.zeros(0, np.int64)] * (MAX_LEVEL + 1)
     for one in inside.placed:
         level = level_for(one.voxel_size, tree.top)

@@ -1,161 +1,38 @@
 """The numbers of a sparse field's vertices, asked of any other field and fitted, not learned."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import torch
 from scipy import sparse
 
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kernels.reference import sh_basis
+from fusedrf_cli.engine.kinds.asking import (
+    LEAST,
+    MOST,
+    OCTANTS,
+    density_features,
+    dilated,
+    inverse_softplus,
+    seen_colours,
+)
 from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
-from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice, corner_offsets
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, corner_offsets
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField
 
-LEAST, MOST = -12.0, 60.0  # of the density feature
-REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these
-COLOURED = 1e-2  # opacity of what a vertex stands for, from which its colour is asked and not its neighbours'
-DIRECTIONS = 32  # along which colours are asked
-ONE_SIDED = 0.4  # length of the mean direction a vertex is seen along, from which only that side is asked
-LOOKS = 9  # places along a look through the voxels before and behind a vertex
-RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
-LOGITS = 8.0  # colours are told apart up to sigmoid(8)
-DILATIONS = 3
 CORRECTIONS = 3
-AT_ONCE = 1 << 18  # points
-
-
-def placed_in(teacher: RadianceField) -> list[Placed]:
-    """The placed fields of a composed one; any other field by itself."""
-    return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
-
-
-def density(source, places: np.ndarray) -> np.ndarray:
-    """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends
-    on the direction."""
-    parts = [source] if isinstance(source, Placed) else placed_in(source)
-    stretched = any(p.condition > 1 + 1e-6 for p in parts)
-    found = np.zeros(len(places))
-    axes = np.eye(3)[: 3 if stretched else 1]
-    for part in pieces(len(places), AT_ONCE):
-        points = torch.from_numpy(places[part])
-        for axis in axes:
-            dirs = torch.from_numpy(np.broadcast_to(axis, points.shape).copy())
-            if isinstance(source, Placed):
-                x, d, stretch = source.to_object(points, dirs)
-                sigma = source.field.query(x, d, False)[0].double() * stretch
-            else:
-                sigma = source.query(points, dirs, False)[0].double()
-            found[part] += sigma.numpy() / len(axes)
-    return found
 
 
 def fill(field: SparseField, teacher: RadianceField, sigma: np.ndarray, facing: np.ndarray) -> None:
     """Give the vertices the numbers that show what the teacher does, whose σ there is known (V,), and the
-    directions along which they are seen (V, 3), as of `shown`.
-
-    What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour
-    from where a look along its facing ends.
-    """
+    directions along which they are seen (V, 3), as of `shown`."""
     fine, degree = field.fine, field.shape.sh_degree
-    fit_density(field, teacher, sigma)
-    places, opacity = look(teacher, fine, sigma, facing)
-    coefficients = np.zeros((len(sigma), 3, field.shape.coefficients), np.float32)
-    asked = np.flatnonzero(opacity > COLOURED)
-    coefficients[asked] = colours(teacher, places[asked], facing[asked], degree)
-    weight = np.where(opacity > COLOURED, opacity, 0)
+    field.rows[:, 0] = torch.from_numpy(density_features(teacher, fine, sigma, field.scale))
+    field.settle()
+    coefficients, weight = seen_colours(teacher, fine, sigma, facing, degree)
     field.rows[:, 1:] = torch.from_numpy(dilated(fine, coefficients[..., 0], weight)[0])
     if field.coarse:
         bands, held = coarser(fine, field.coarse, coefficients[..., 1:].reshape(len(sigma), -1), weight)
         field.bands[:] = torch.from_numpy(dilated(field.coarse, bands, held)[0])
     field.settle()
-
-
-def look(
-    teacher: RadianceField, lattice: Lattice, sigma: np.ndarray, facing: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """What is seen from a voxel before a vertex to a voxel behind, along its facing: where most of that is
-    (V, 3), and the opacity (V,) of it all. A vertex that is seen from all sides, or never, is all that it
-    sees."""
-    size, places = lattice.finest_voxel, lattice.places.copy()
-    opacity = -np.expm1(-sigma * size)
-    length = np.linalg.norm(facing, axis=1)
-    which = np.flatnonzero(length > ONE_SIDED)
-    along = facing[which] / length[which, None] * size[which, None]
-    spots = np.linspace(-1, 1, LOOKS)
-    trans, heaviest, end = np.ones(len(which)), np.zeros(len(which)), np.zeros(len(which))
-    for spot in spots:
-        depth = density(teacher, lattice.places[which] + spot * along) * size[which] * (spots[1] - spots[0])
-        weight = -trans * np.expm1(-depth)
-        end, heaviest = np.where(weight > heaviest, spot, end), np.maximum(weight, heaviest)
-        trans = trans - weight
-    places[which] += end[:, None] * along
-    opacity[which] = 1 - trans
-    return places, opacity
-
-
-def fit_density(field: SparseField, teacher: RadianceField, sigma: np.ndarray) -> None:
-    """Density features that, interpolated, come nearest to the teacher's in the squares of their differences
-    at eight points of every active voxel; sigma (V,) is what the teacher says at the vertices.
-
-    In a voxel that a surface runs through, features are told apart up to REACH on either side of the one at
-    which it is half opaque: so the surface comes to lie where it is, between vertices of which one knows only
-    that there is much and the other that there is nothing.
-    """
-    lattice = field.fine
-    corners = lattice.corners
-    first = lattice.places[corners[:, 0]]
-    extent = lattice.places[corners[:, 7]] - first
-    spots = 0.25 + 0.5 * OCTANTS
-    weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
-    answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
-    half, own = (half_opaque(field.scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
-    wanted = np.clip(inverse_softplus(answers / field.scale), LEAST, half + REACH)
-    wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - REACH), wanted)
-    found = np.clip(inverse_softplus(sigma / field.scale), own - REACH, own + REACH)
-    scatter = sparse.csr_matrix(
-        (np.ones(corners.size), (corners.ravel(), np.arange(corners.size))), (len(found), corners.size)
-    )
-
-    def adjoint(rest: np.ndarray) -> np.ndarray:
-        return scatter @ (rest @ weights).ravel()
-
-    found = conjugate_gradients(
-        lambda x: x[corners] @ weights.T,
-        adjoint,
-        scatter @ np.tile((weights**2).sum(0), len(corners)),
-        wanted,
-        found,
-    )
-    most = np.clip(inverse_softplus(sigma / field.scale), None, MOST)
-    field.rows[:, 0] = torch.from_numpy(np.where(found > own + 0.9 * REACH, np.maximum(found, most), found))
-    field.settle()
-
-
-def conjugate_gradients(
-    apply, adjoint, diagonal: np.ndarray, wanted: np.ndarray, start: np.ndarray
-) -> np.ndarray:
-    """x that makes the squares of apply(x) - wanted small, in FIT_STEPS steps from a start; the diagonal is
-    that of adjoint(apply(.))."""
-    x, diagonal = start, np.maximum(diagonal, 1e-12)
-    rest = adjoint(wanted - apply(x))
-    along = rest / diagonal
-    size = rest @ along
-    for _ in range(FIT_STEPS):
-        if size <= 0:
-            break
-        curved = adjoint(apply(along))
-        length = size / (along @ curved)
-        x, rest = x + length * along, rest - length * curved
-        new = rest @ (rest / diagonal)
-        along, size = rest / diagonal + new / size * along, new
-    return x
-
-
-def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:
-    """The feature at which light falls to HALF on its way through a voxel of a side."""
-    return inverse_softplus(-np.log(HALF) / (scale * side))
 
 
 def density_scale(tree: BrickTree) -> float:
@@ -167,63 +44,6 @@ def set_density(field: SparseField, sigma: np.ndarray) -> None:
     """Give the vertices densities (V,), as far as the feature's range goes."""
     field.rows[:, 0] = torch.from_numpy(np.clip(inverse_softplus(sigma / field.scale), LEAST, MOST))
     field.settle()
-
-
-def inverse_softplus(y: np.ndarray) -> np.ndarray:
-    """f with log(1 + e^f) = y; -inf at 0."""
-    with np.errstate(divide="ignore"):
-        return np.where(y > 15, y, np.log(np.expm1(np.minimum(y, 15))))
-
-
-def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
-    """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3), by least
-    squares over the directions along which they are seen (facing (N, 3), as `around` has it).
-
-    What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
-    is exact, however the teacher is turned, but for what ONE_SIDED leaves.
-    """
-    dirs = even_directions(DIRECTIONS)
-    basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
-    found = np.empty((len(places), 3, len(basis[0])), np.float32)
-    one_sided = np.linalg.norm(facing, axis=1) > ONE_SIDED
-    side = np.where(one_sided, (facing @ dirs.T).argmax(1), len(dirs))
-    for group in np.unique(side):
-        counts = np.ones(len(dirs)) if group == len(dirs) else np.maximum(dirs @ dirs[group], 0)
-        asked = np.flatnonzero(counts > 0.1)
-        weighted = basis[asked] * counts[asked, None]
-        ridge = RIDGE * np.diag([0.0] + [1.0] * (len(basis[0]) - 1))
-        solve = np.linalg.solve(weighted.T @ basis[asked] + ridge, weighted.T)
-        own = np.flatnonzero(side == group)
-        for part in pieces(len(own), AT_ONCE // len(asked)):
-            points = np.repeat(places[own[part]], len(asked), 0)
-            along = np.tile(dirs[asked], (len(points) // len(asked), 1))
-            rgb = teacher.query(torch.from_numpy(points), torch.from_numpy(along))[1].double().numpy()
-            edge = 1 / (1 + np.exp(LOGITS))
-            rgb = np.clip(rgb, edge, 1 - edge)
-            logits = np.log(rgb / (1 - rgb)).reshape(-1, len(asked), 3)
-            found[own[part]] = np.einsum("kd,ndc->nck", solve, logits)
-    return found
-
-
-def even_directions(count: int) -> np.ndarray:
-    """(count, 3) unit directions, evenly spread along a spiral."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.arange(count) * np.pi * (3 - 5**0.5)
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
-
-
-def dilated(lattice: Lattice, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (V, D) where their weight (V,) is 0 from the vertices around, step by step; and the weights
-    (V,) then."""
-    touches = touching(lattice)
-    values, weight = values.astype(np.float32).copy(), weight.astype(np.float32)
-    for _ in range(DILATIONS):
-        gathered = touches.T @ (touches @ np.concatenate([values * weight[:, None], weight[:, None]], 1))
-        new = (weight == 0) & (gathered[:, -1] > 0)
-        values[new] = gathered[new, :-1] / gathered[new, -1:]
-        weight[new] = 1e-3
-    return values, weight
 
 
 def coarser(
@@ -259,19 +79,4 @@ def interpolation(fine: Lattice, coarse: Lattice) -> sparse.csr_matrix:
     return sparse.csr_matrix(
         (data[kept].astype(np.float32), (np.broadcast_to(row[:, None], kept.shape)[kept], columns[kept])),
         (len(fine.vertices), len(coarse.vertices)),
-    )
-
-
-def pieces(count: int, size: int) -> Iterator[slice]:
-    """Slices of at most a size that cover 0 to count."""
-    for start in range(0, count, size):
-        yield slice(start, min(count, start + size))
-
-
-def touching(lattice: Lattice) -> sparse.csr_matrix:
-    """(K, V) ones where an active voxel has a vertex as a corner."""
-    count = len(lattice.corners)
-    start = np.arange(0, 8 * count + 1, 8)
-    return sparse.csr_matrix(
-        (np.ones(8 * count, np.float32), lattice.corners.ravel(), start), (count, len(lattice.vertices))
     )

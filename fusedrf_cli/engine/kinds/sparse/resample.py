@@ -8,6 +8,15 @@ import numpy as np
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.kinds.asking import (
+    AT_ONCE,
+    LEAST,
+    density,
+    even_directions,
+    pieces,
+    placed_in,
+    touching,
+)
 from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
@@ -20,18 +29,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     sides,
 )
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.filling import (
-    AT_ONCE,
-    LEAST,
-    density,
-    density_scale,
-    even_directions,
-    fill,
-    pieces,
-    placed_in,
-    set_density,
-    touching,
-)
+from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
 YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way

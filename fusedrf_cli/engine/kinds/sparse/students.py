@@ -31,7 +31,6 @@ from fusedrf_cli.engine.kinds.student import (
     Way,
 )
 
-POINTS = 3_000_000  # that are kept of the teachers' answers, about
 PADDED = 1.6  # floats in memory for each number that is stored: rows are padded, hanging vertices too
 WHOLE_BELOW = 0.8  # of the numbers allowed: fewer are taken where no object needs more
 PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squares of a vertex
@@ -171,7 +170,7 @@ class SparseStudent(MadeStudent):
         """Vertices while they are filled, padded rows afterwards."""
         numbers = self.numbers_within(self.request.limit, self.plain().precision)
         filling = {"vertices while they are found and filled": float(PER_NUMBER_FILLED * numbers)}
-        return Needs(int(PADDED * numbers), making=filling, points=POINTS)
+        return Needs(int(PADDED * numbers), making=filling, points=0)
 
 
 def shape_of(way: Way) -> SparseShape:

@@ -5,8 +5,9 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.asking import OCTANTS
 from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
-from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 
 UNTRAINED = -8.0  # density feature: with SCALE_PER_EXTENT 4 % opacity along the diagonal of an untrained box
 SCALE_PER_EXTENT = 75.0

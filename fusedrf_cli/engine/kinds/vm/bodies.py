@@ -48,10 +48,10 @@ class Arrays(NamedTuple):
     activation: object  # (T, 2) float, scale (1/length of the object frame) and shift of the softplus
     first: object  # (X, Y, Z) uint8, owning block of a cell; shape (0, 0, 0) when there is one block
     second: object  # (X, Y, Z) uint8, the other block that has matter in the cell, or NO_BLOCK
-    stride: object  # (B,) int64, steps of the finest block that one sample of this block may stand for
     occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
     crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
+    part: object  # (B, 6) float64, lower corner and 1 / sides of a tensor's box in its own unbounded space
 
 
 def sizes(field) -> dict[str, int]:
@@ -183,9 +183,10 @@ def affine(matrices, b, p):
     )
 
 
-def whole_unit(p):
-    """Coordinates of unbounded space, which lie between -2 and 2, in its unit cube."""
-    return 0.25 * p[0] + 0.5, 0.25 * p[1] + 0.5, 0.25 * p[2] + 0.5
+def part_unit(field, b, p):
+    """Coordinates of the unbounded space of block b in the unit cube of its tensor's box."""
+    box = field.part[b]
+    return (p[0] - box[0]) * box[3], (p[1] - box[1]) * box[4], (p[2] - box[2]) * box[5]
 
 
 def unit_point(field, b, p):
@@ -194,7 +195,7 @@ def unit_point(field, b, p):
     if CROSSING != 0 and field.crossing[b] != 0:
         u, v, w = affine(field.to_unit, b, frame_point(p))
         if field.crossing[b] == 2:
-            u, v, w = whole_unit(point((u, v, w)))
+            u, v, w = part_unit(field, b, point((u, v, w)))
     else:
         u, v, w = affine(field.to_unit, b, p)
     lo, hi = -EDGE, 1 + EDGE
@@ -290,11 +291,7 @@ def matter_at(field, t, u, v, w):
 
 
 def density(field, grid, k, p, d, scratch):
-    """(σ, pre-activation, steps, block) of the densest block at a point; ties go to the lower block (DESIGN).
-
-    `steps` says for how many steps of the ray the answer stands: where only coarse blocks have matter, a
-    sample per step of the finest block would see nothing new.
-    """
+    """(σ, pre-activation, 1, block) of the densest block at a point; ties go to the lower block (DESIGN)."""
     if field.first.shape[0] == 0:
         stretch = object_direction(field, 0, d)[3]
         sigma, f = block_density(field, 0, p, stretch)
@@ -306,15 +303,13 @@ def density(field, grid, k, p, d, scratch):
     b = int(field.first[i, j, m])
     if b == NO_BLOCK:
         return 0.0, 0.0, 1, 0
-    steps = field.stride[b]
     sigma, f = block_density(field, b, p, object_direction(field, b, d)[3])
     other = int(field.second[i, j, m])
     if other != NO_BLOCK:
-        steps = min(steps, field.stride[other])
         sigma2, f2 = block_density(field, other, p, object_direction(field, other, d)[3])
         if sigma2 > sigma:
-            return sigma2, f2, steps, other
-    return sigma, f, steps, b
+            return sigma2, f2, 1, other
+    return sigma, f, 1, b
 
 
 def unstretched(field, grid, frame, p, scratch):

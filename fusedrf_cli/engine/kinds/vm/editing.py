@@ -9,8 +9,8 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import ClippedField
-from fusedrf_cli.engine.fields.occupancy import transformed_aabb
-from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach, enclosing, overlaps
+from fusedrf_cli.engine.fields.occupancy import placement, seen_box, transformed_aabb
+from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach, enclosing
 from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
@@ -45,9 +45,7 @@ def as_vm(kind, placed: Placed, teach: Teach) -> Placed:
     teacher = ComposedField([Placed(placed.name, placed.field, np.eye(4))])
     student = kind.empty(teacher, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), placed.name)
     student, _ = teach(teacher, student, [teacher.occupancy.subject], True)
-    back = placed.object_to_world.copy()
-    back[:3, 3] += back[:3, :3] @ teacher.origin
-    return Placed(placed.name, student, back)
+    return Placed(placed.name, student, placed.object_to_world @ placement(teacher.origin))
 
 
 def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, teach: Teach) -> Edited | None:
@@ -55,16 +53,15 @@ def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, t
     holds what the rest shows there; None where nothing is left."""
     region = region_of(field, box)
     emptied = cleared(field, region)
-    rest = [p for p in rest or [] if overlaps(p.aabb, region)]
+    rest = [p for p in rest or [] if p.reaches(region)]
     teacher = ComposedField(rest) if rest else None
-    local = ClippedField(teacher, region - np.tile(teacher.origin, 2)) if rest else None
+    local = ClippedField(teacher, seen_box(region, teacher.origin)) if rest else None
     if local is None or not local.occupancy.occupied.any():
         left = emptied.occupancy.occupied.any()
         return Edited(emptied, region, "the cells of its box emptied") if left else None
     student = kind.empty(local, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), RESTORED)
     student, figures = teach(local, student, [local.occupancy.subject], True)
-    back = np.eye(4)
-    back[:3, 3] = teacher.origin
+    back = placement(teacher.origin)
     whole = blocks_of([Placed("", emptied, np.eye(4)), Placed(RESTORED, student, back)])
     how = "the cells of its box emptied, and what the other sources show there learnt into a block"
     return Edited(whole, region, how, figures=figures)

@@ -28,7 +28,9 @@ from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
     SCENE_CELLS,
     OccupancyGrid,
+    Pace,
     placed_cells,
+    squeezed,
     transformed_aabb,
     unbounded_cells,
 )
@@ -41,7 +43,6 @@ from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
-MAX_STRIDE = 64
 BASIS_RATE = 0.05  # TensoRF: 1e-3 for the colour basis where factors learn at 2e-2
 
 
@@ -75,6 +76,11 @@ class VMTensor:
     def voxel_size(self) -> np.ndarray:
         """(3,) spacing of texels in the object's frame."""
         return (self.aabb[3:] - self.aabb[:3]) / (np.asarray(self.resolution) - 1)
+
+    @property
+    def step(self) -> float:
+        """At which it is sampled."""
+        return self.space.STEP_PER_VOXEL * float(self.voxel_size.min())
 
 
 @dataclass(frozen=True)
@@ -178,14 +184,15 @@ class VMField(ComputedField):
     def with_occupancy(self, occupancy: OccupancyGrid) -> "VMField":
         """The same numbers of a one-block field under another occupancy grid of its box."""
         tensor = replace(self.tensors[0], occupied=occupancy.occupied, space=occupancy.space)
-        return VMField(self.shape, (tensor,), self.blocks, self.params, occupancy)
+        evenly = occupancy.marked(occupancy.occupied)
+        return VMField(self.shape, (tensor,), self.blocks, self.params, evenly)
 
     @classmethod
     def assembled(
         cls, shape: VMShape, tensors: tuple[VMTensor, ...], blocks: tuple[Block, ...], params: torch.Tensor
     ) -> "VMField":
         """A field whose occupancy and ownership follow from its blocks: each cell is owned by the one or two
-        densest there."""
+        densest there, and sampled as the finest there needs."""
         if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
         grids = [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks]
@@ -194,8 +201,10 @@ class VMField(ComputedField):
         else:
             boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
             space, (aabb, marks) = bounded, placed_cells(boxes, grids, OWNERSHIP_CELLS)
-        first, second, count = claimed_cells(marks)
-        occupancy = OccupancyGrid(aabb, count > 0, space)
+        steps = [tensors[b.tensor].step for b in blocks]
+        pace = Pace(OccupancyGrid.full(aabb, OWNERSHIP_CELLS, space))
+        first, second, count = claimed_cells(pace.kept(marks, grids, steps))
+        occupancy = pace.grid(count > 0)
         unsettled = cls(shape, tensors, blocks, params, occupancy, owners=(first, second))
         settle_crowded(unsettled, np.argwhere(count > 2), first, second)
         return unsettled
@@ -257,14 +266,10 @@ class VMField(ComputedField):
 
     def voxel_sizes(self) -> list[float]:
         """Finest texel spacing of every block, in the field's frame."""
-        squeezes = [np.linalg.svd(b.object_to_field[:3, :3], compute_uv=False)[-1] for b in self.blocks]
         finest = [self.tensors[b.tensor].voxel_size.min() for b in self.blocks]
-        return [float(size * squeeze) for size, squeeze in zip(finest, squeezes, strict=True)]
-
-    def _strides(self) -> np.ndarray:
-        """(B,) int64: a block's voxels over the finest block's, rounded down."""
-        sizes = np.asarray(self.voxel_sizes())
-        return np.clip(np.floor(sizes / sizes.min() + 1e-9), 1, MAX_STRIDE).astype(np.int64)
+        return [
+            float(size) * squeezed(b.object_to_field) for size, b in zip(finest, self.blocks, strict=True)
+        ]
 
     def sections(self, tensor: int) -> dict[str, torch.Tensor]:
         """Views of the parameters of one tensor, by name."""
@@ -294,7 +299,7 @@ class VMField(ComputedField):
             box = self.tensors[block.tensor].aabb
             field_to_object = np.linalg.inv(block.object_to_field)
             to_object.append(field_to_object[:3, :3])
-            if steps == 2:  # the box is that of all of space, which bodies.py knows
+            if steps == 2:  # the box is of coordinates, see `part`
                 to_unit.append(field_to_object[:3])
                 continue
             scale = np.diag(1.0 / (box[3:] - box[:3]))
@@ -304,6 +309,7 @@ class VMField(ComputedField):
                     1,
                 )
             )
+        boxes = [self.tensors[block.tensor].aabb for block in self.blocks]
         first, second = self.owners if self.owners is not None else NO_OWNERS
         return bodies.Arrays(
             params,
@@ -315,10 +321,10 @@ class VMField(ComputedField):
             np.asarray([[t.scale, t.shift] for t in self.tensors], self.real),
             first,
             second,
-            self._strides(),
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
             np.asarray(self.crossings, np.uint8),
+            np.stack([np.concatenate([box[:3], 1 / (box[3:] - box[:3])]) for box in boxes]),
         )
 
     @cached_property

@@ -1,0 +1,110 @@
+"""The visual hull of an object that masks cut out: where in a box it can be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, label, maximum
+
+from formats.captures import load_ignored
+from formats.views import View
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.rendering.cameras import bend, bend_angle
+
+CELLS = (32, 112)
+"""Along the longest axis, of a first look and of a second one into what that leaves."""
+VIEWS = 100
+"""At most so many masks, evenly spaced in the list, are looked at."""
+LOOKED_AT = 300
+"""Rows or columns of a mask, about: no fewer are looked at along its longer side."""
+AMISS = 0.1
+"""Share of the masks that may exclude a cell where the object is: some are not exact, or plain wrong."""
+RARELY = 0.5
+"""Of the median number of views that show a cell of the object: a piece of which fewer show every cell lies
+beside the object, and only photos tell of it in which it is in line with the object."""
+
+
+def visual_hull(views: Sequence[View], box: np.ndarray) -> OccupancyGrid:
+    """The smallest box, with cells in it, around those of a box (6,), in world units, that all but AMISS of
+    the views' masks leave room for an object in; a view says nothing of cells outside its picture, and cells
+    that no view shows are left out.
+
+    Every view has a mask. All cells are kept where the masks agree on none. Raises BadMask, BadImage,
+    MissingFile.
+    """
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), VIEWS)).astype(int))
+    masked = [mask for number in chosen if (mask := Mask.of(views[number]))]
+    coarse, fine = CELLS
+    around = cropped(carved(OccupancyGrid.full(box, coarse), masked))
+    grid = OccupancyGrid.full(around.aabb, fine)
+    return cropped(carved(grid.marked(around.contains(grid.centres()).reshape(grid.occupied.shape)), masked))
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """What the mask of a view keeps."""
+
+    view: View
+    stride: int
+    """Only every so many rows and columns are looked at."""
+    beside: np.ndarray
+    """Of those, the distance in pixels to the next one that is kept, float32."""
+
+    @classmethod
+    def of(cls, view: View) -> "Mask | None":
+        """A view's mask; None where that keeps nothing, which says nothing of the object."""
+        stride = max(1, max(view.width, view.height) // LOOKED_AT)
+        ignored = load_ignored(view)[::stride, ::stride]
+        if ignored.all():
+            return None
+        return cls(view, stride, (stride * distance_transform_edt(ignored)).astype(np.float32))
+
+    def distances(self, pixels: np.ndarray) -> np.ndarray:
+        """(N,) how far pixels (N, 2), column and row, are from the next one that is kept, at least about."""
+        column, row = (pixels // self.stride).astype(int).T
+        return self.beside[row, column] - (self.stride - 1)
+
+
+def carved(grid: OccupancyGrid, masked: Sequence[Mask]) -> OccupancyGrid:
+    """The occupied cells of a grid that most masks leave, as `visual_hull` says, in pieces that enough views
+    show."""
+    points, reach = grid.centres(), float(np.linalg.norm(grid.cell)) / 2
+    shown, excluded = np.zeros((2, len(points)), int)
+    for mask in masked:
+        left = np.flatnonzero(excluded <= AMISS * len(masked))
+        pixels, away, inside = projected(mask.view, points[left])
+        seen, in_pixels = left[inside], reach * max(mask.view.fl_x, mask.view.fl_y) / away[inside]
+        shown[seen] += 1
+        excluded[seen] += mask.distances(pixels[inside]) > in_pixels
+    left = (shown > 0) & (excluded <= AMISS * shown)
+    if not left.any():
+        return grid
+    held, times = np.zeros(grid.occupied.shape, bool), np.zeros(grid.occupied.shape, int)
+    held[grid.occupied], times[grid.occupied] = left, shown
+    pieces, count = label(held, np.ones((3, 3, 3)))
+    most = maximum(times, pieces, np.arange(count + 1))  # piece 0 is what is not held
+    return grid.marked(held & (most >= RARELY * np.median(shown[left]))[pieces])
+
+
+def cropped(grid: OccupancyGrid) -> OccupancyGrid:
+    """The same cells in the smallest box that holds the occupied ones and a cell around them, where the grid
+    has it."""
+    return grid.within(grid.tight_aabb(1))
+
+
+def projected(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where a view shows world points (N, 3): pixels (N, 2), column and row; how far they are (N,), along
+    its axis or, of a fisheye, in all; and which of them lie in the picture, (N,) bool."""
+    x, y, back = ((points - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]).T
+    if view.fisheye:
+        away, aside = np.linalg.norm([x, y, back], axis=0), np.hypot(x, y)
+        radius, slope = bend_angle(np.arctan2(aside, -back), view.distortion)
+        u, v = np.array([x, -y]) * radius / np.maximum(aside, 1e-12)
+    else:
+        away = -back
+        before = np.where(away > 0, away, np.inf)
+        u, v, (a, b, d) = bend(x / before, -y / before, view.distortion)
+        slope = a * d - b * b
+    pixels = np.stack([view.cx + view.fl_x * u, view.cy + view.fl_y * v], 1)
+    unfolded = (away > 0) & (slope > 0)  # beyond a fold of the lens points would come back into the picture
+    return pixels, away, unfolded & ((pixels >= 0) & (pixels < (view.width, view.height))).all(1)

@@ -1,0 +1,196 @@
+"""Students on the vertices of a grid that ask a scene what it is there, and so show it before they learn."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
+from fusedrf_cli.engine.fields.box import BoxField
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.asking import (
+    LEAST,
+    MOST,
+    OCTANTS,
+    colours,
+    density,
+    density_features,
+    dilated,
+    inverse_softplus,
+    seen_colours,
+)
+from fusedrf_cli.engine.kinds.boxes import GridStudent
+from fusedrf_cli.engine.kinds.student import DistillSettings, Made, MadeStudent, Needs, Plan, TooSmall, Way
+
+SMOOTHED = 0.7  # voxels: standard deviation of the opacity whose slope says where a surface faces
+DEEPEST = -40.0  # density feature of nothing at all, where a field is copied
+INSIDE = 1e-7  # of a box's sides: on its very faces a field may answer that it ends there
+SHOWN_RAYS, SHOWN_SEED = 1 << 19, 5
+SHOWN_FROM = 1e-3  # weight on a ray from which a cell shows
+FLOAT = 4.0  # bytes
+PER_VERTEX = 500.0  # bytes, as seen: corners, places, what is asked at eight points of a voxel, and matrices
+SLOPE = 0.2  # of opacity per voxel from which a vertex is seen from one side
+
+
+@dataclass(frozen=True)
+class GridVertices:
+    """The used vertices of a field over one box; see asking.Vertices."""
+
+    index: np.ndarray
+    """(V,) int64, of the vertices of the whole grid in order."""
+    places: np.ndarray
+    corners: np.ndarray
+    finest_voxel: np.ndarray
+    resolution: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, field: BoxField) -> "GridVertices":
+        """Of a field on a grid."""
+        used = field.used
+        index = np.flatnonzero(used)
+        numbers = np.full(used.size, -1)
+        numbers[index] = np.arange(len(index))
+        whole = numbers.reshape(used.shape)
+        corners = np.stack(
+            [whole[tuple(slice(o, n - 1 + o) for o, n in zip(octant, used.shape, strict=True))].ravel()
+             for octant in OCTANTS], 1,
+        )  # fmt: skip
+        corners = corners[(corners >= 0).all(1)]
+        _, low, side = field.corners
+        voxel = side / (np.asarray(field.resolution) - 1)
+        places = low + np.stack(np.unravel_index(index, used.shape), 1) * voxel
+        return cls(index, places, corners, np.full(len(places), voxel.min()), field.resolution)
+
+    def facing(self, sigma: np.ndarray) -> np.ndarray:
+        """(V, 3) unit directions along which surfaces at vertices with σ (V,) are seen; 0 where there is no
+        one side."""
+        opacity = np.zeros(self.resolution, np.float32)
+        opacity.ravel()[self.index] = -np.expm1(-sigma * self.finest_voxel)
+        slopes = np.gradient(gaussian_filter(opacity, SMOOTHED))
+        found = np.stack([slope.ravel()[self.index] for slope in slopes], 1).astype(np.float64)
+        length = np.linalg.norm(found, axis=1, keepdims=True)
+        return np.where(length > SLOPE, found / np.maximum(length, 1e-12), 0)
+
+
+class Lattice(NamedTuple):
+    """The only field of a scene, where that has numbers on texels along the scene's axes."""
+
+    field: RadianceField
+    """With nothing left out that lies in empty cells."""
+    origin: np.ndarray
+    """(3,) of its frame, in the scene's."""
+    aabb: np.ndarray
+    """(6,) box, in the scene's frame."""
+    resolution: tuple[int, int, int]
+    """Texels per axis, corners on the faces of the box."""
+
+
+def lattice_of(scene: ComposedField) -> Lattice | None:
+    """The lattice of a scene of one field that is neither turned nor stretched; None where there is none."""
+    placed = scene.placed[0]
+    matrix = placed.object_to_world
+    if len(scene.placed) > 1 or not np.array_equal(matrix[:3, :3], np.eye(3)):
+        return None
+    field = opened(placed.field)
+    if getattr(field, "resolution", None) is None:
+        return None
+    origin = matrix[:3, 3]
+    everywhere = field.with_occupancy(OccupancyGrid.full(field.aabb))
+    return Lattice(everywhere, origin, field.aabb + np.tile(origin, 2), tuple(field.resolution))
+
+
+class AskedStudent(MadeStudent, GridStudent):
+    """A field whose vertices can be given densities and colours: its class has
+
+        fill_vertices(index, features, colours)
+                            set vertices (V,), counted z first, to density features (V,), σ = scale
+                            softplus(f), and harmonics of their colours' logits (V, 3 coefficients)
+    """
+
+    lesson = DistillSettings(rays=400_000, steps=0, rgb_steps=1000, rgb_rate=0.0006)
+    compares = False
+    finer = 0.6  # a lattice that lies across a teacher's own needs finer voxels to hold as much
+    _shown: OccupancyGrid | None = None
+
+    @property
+    def cells(self) -> OccupancyGrid:
+        """The scene's that show anything, once that is known."""
+        return self._shown or self.scene.occupancy
+
+    def made(self, way: Way, limit: int) -> Made | None:
+        """See MadeStudent."""
+        try:
+            if self._shown is None:
+                self._shown = self.shown(*self.asked(self.largest_of(way, limit)))
+            plan = self.largest_of(way, limit)
+        except TooSmall:
+            return None
+        lattice = lattice_of(self.scene)
+        if lattice is not None:
+            along = replace(plan, box=lattice.aabb, resolution=lattice.resolution)
+            found = self.copied(along, lattice)
+            if self.bytes_of(found, way) <= limit:
+                return Made(found, self.bytes_of(found, way), True)
+        field = self.fitted(plan)
+        whole = field.voxel_size <= self.finer * self.scene.voxel_size * (1 + 1e-6)
+        return Made(field, self.bytes_of(field, way), whole)
+
+    def fitted(self, plan: Plan) -> BoxField:
+        """A field that comes near to the scene between its vertices."""
+        field, vertices, sigma = self.asked(plan)
+        facing = vertices.facing(sigma)
+        rows, weight = seen_colours(self.scene, vertices, sigma, facing, field.shape.sh_degree)
+        rows = dilated(vertices, rows.reshape(len(sigma), -1), weight)[0]
+        features = density_features(self.scene, vertices, sigma, field.scale)
+        field.fill_vertices(vertices.index, features, rows)
+        return field
+
+    def copied(self, plan: Plan, lattice: "Lattice") -> BoxField:
+        """A field with the vertices of the scene's only one and what that says at them: between them it says
+        the same as far as both interpolate alike."""
+        field = self.kind.create(plan, torch.Generator(), "fused").with_occupancy(self.cells)
+        vertices = GridVertices.of(field)
+        margin = INSIDE * (lattice.aabb[3:] - lattice.aabb[:3])
+        places = np.clip(vertices.places, lattice.aabb[:3] + margin, lattice.aabb[3:] - margin)
+        places -= lattice.origin
+        sigma = density(lattice.field, places)
+        features = np.clip(inverse_softplus(sigma / field.scale), DEEPEST, MOST)
+        rows = colours(lattice.field, places, vertices.facing(sigma), field.shape.sh_degree)
+        field.fill_vertices(vertices.index, features, rows.reshape(len(sigma), -1))
+        return field
+
+    def asked(self, plan: Plan) -> tuple[BoxField, GridVertices, np.ndarray]:
+        """An empty field as planned, its vertices, and the scene's σ (V,) at them."""
+        field = self.kind.create(plan, torch.Generator(), "fused").with_occupancy(self.cells)
+        vertices = GridVertices.of(field)
+        return field, vertices, density(self.scene, vertices.places)
+
+    def shown(self, field: BoxField, vertices: GridVertices, sigma: np.ndarray) -> OccupancyGrid:
+        """The field's cells of which some ray shows anything, when its vertices have σ (V,)."""
+        features = np.clip(inverse_softplus(sigma / field.scale), LEAST, MOST)
+        field.fill_vertices(vertices.index, features, np.zeros((len(sigma), field.shape.numbers), np.float32))
+        generator = torch.Generator().manual_seed(SHOWN_SEED)
+        rays_o, rays_d = random_rays([self.scene.occupancy.subject], SHOWN_RAYS, generator)
+        jitter = torch.rand(len(rays_o), generator=generator, dtype=torch.float64).numpy()
+        weights = field.weights(rays_o, rays_d, jitter, 0.0, sampling_step(field))
+        found = self.scene.occupancy.marked(weights > SHOWN_FROM)
+        return found if found.occupied.any() else self.scene.occupancy
+
+    def smallest(self) -> int:
+        """See MadeStudent."""
+        return self.bytes_of_plan(self.plan(self.plain(), 1), self.plain())
+
+    def needs(self) -> Needs:
+        """Vertices while they are asked, and the whole grid, of which one copy is what it started as."""
+        plan, lattice = self.largest(), lattice_of(self.scene)
+        vertices = sum(section.shape[0] for section in plan.sections[:1])
+        held = plan.numbers
+        if lattice is not None:
+            held = max(held, self.kind.numbers(plan.way, lattice.resolution))
+        making = {"vertices while they are asked": PER_VERTEX * vertices, "what it starts as": FLOAT * held}
+        return Needs(held, making=making, points=0)

@@ -1,0 +1,62 @@
+"""What of unbounded space a capture's photos are learnt in."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from formats.views import Capture, View
+from fusedrf_cli.bridge.extent import extent_of
+from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.bridge.training import texels_of_place
+from fusedrf_cli.engine.rendering.cameras import look_at
+from fusedrf_cli.engine.spaces.unbounded import WHOLE, contracted
+from fusedrf_cli.requests import TrainRequest
+
+BOX = np.array([-9.0] * 3 + [9.0] * 3)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def request() -> TrainRequest:
+    """`train` with unbounded space asked for."""
+    known = {name: None for name, field in TrainRequest.__dataclass_fields__.items()}
+    return TrainRequest(**known | {"source": "photos", "output": "out.rfpack", "unbounded": True})
+
+
+def photos(eyes: list, focus=(0.0, 0.0, 0.0)) -> Capture:
+    """Views from eyes (3,) towards a focus, 60° wide."""
+    views = [
+        View(f"v{i}", look_at(np.array(eye, float), np.array(focus), UP), 87.0, 87.0, 50.0, 50.0, 100, 100)
+        for i, eye in enumerate(eyes)
+    ]
+    return Capture(Path("photos"), "transforms", tuple(views), (), BOX, True)
+
+
+def test_photos_that_look_one_way_fill_the_box_that_they_are_learnt_in():
+    capture = photos([(4, y, z) for y in (-0.4, 0, 0.4) for z in (-0.3, 0.3)])
+    extent = extent_of(request(), capture, False)
+    assert extent.unbounded and (extent.box[3:] - extent.box[:3] < WHOLE[3:] - WHOLE[:3]).any()
+    rng = np.random.default_rng(0)
+    for view in capture.train:  # what a photo shows, near and far, lies in the box
+        camera = extent.camera(camera_of(view))
+        x, y = rng.uniform(-1, 1, (2, 500)) * 50 / 87
+        rays = np.stack([x, y, -np.ones(500)], 1) @ camera.camera_to_world[:3, :3].T
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        away = extent.near * 10 ** rng.uniform(0.02, 4, (500, 1))
+        at = contracted(torch.from_numpy(camera.camera_to_world[:3, 3] + away * rays)).numpy()
+        assert ((at >= extent.box[:3] - 1e-9) & (at <= extent.box[3:] + 1e-9)).all()
+
+
+def test_photos_from_all_around_are_learnt_in_all_of_space():
+    ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
+    box = extent_of(request(), photos(ring), False).box
+    assert np.array_equal(box[[0, 1, 3, 4]], WHOLE[[0, 1, 3, 4]])
+
+
+def test_planes_over_a_part_of_space_have_as_many_texels_as_over_all_of_it():
+    def texels(box: np.ndarray) -> float:
+        counts = texels_of_place(box, 224) * (box[3:] - box[:3]) / (box[3:] - box[:3]).max()
+        return counts[0] * counts[1] + counts[1] * counts[2] + counts[2] * counts[0]
+
+    part = np.array([-2.0, -1.0, -1.0, 1.0, 1.0, 1.0])
+    assert abs(texels(part) / texels(WHOLE) - 1) < 0.02

@@ -1,0 +1,164 @@
+"""A place that fills all of space, and objects in it: every command on such a scene."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from formats.images import read_image, write_png
+from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.spaces import unbounded
+from fusedrf_cli.engine.spaces.unbounded import WHOLE
+from fusedrf_cli.python import open_scene
+from tests.analytic.export import vm_field
+from tests.analytic.fields import Gaussian, Tint
+from tests.bridge.conftest import done
+
+BOX = np.array([-1.0, -1, -1, 1, 1, 1])
+LIES = np.array([[2.0, 0, 0, 0.1], [0, 2, 0, 0], [0, 0, 2, -0.2], [0, 0, 0, 1]])  # the core, in the world
+
+
+def walls(seed: int = 0) -> VMField:
+    """A closed room of mottled walls far around the core, and nothing in it."""
+    kind, generator = registry.kind("vm"), torch.Generator().manual_seed(seed)
+    field = kind.create(kind.plan_at(WHOLE, (17,) * 3, Way(ranks=(8, 8), sh_degree=0)), generator)
+    middles = OccupancyGrid.full(WHOLE, 32, unbounded)
+    there = (abs(middles.centres()).max(1) > 1.9).reshape(middles.occupied.shape)
+    field = field.with_occupancy(middles.marked(there))
+    tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
+    numbers = field.params * torch.tensor(2.0)
+    return VMField(field.shape, (tensor,), field.blocks, numbers, field.occupancy)
+
+
+@pytest.fixture(scope="module")
+def fused(shop, tmp_path_factory):
+    """The shop with a room, place.json of the room and the red box, and both fused."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("place") / "shop")
+    write_field(
+        str(folder / "room.rfpack"), walls(), "room", precision="float16", overwrite=False, origin=LIES
+    )
+    nodes = [
+        make_node("room", source="room.rfpack", background=True),
+        make_node("red", source="red.rfpack", translation=(-0.5, 0, 0)),
+    ]
+    write_scene(folder / "place.json", SceneGraph(tuple(nodes)))
+    done(folder, "fuse", "place.json", "-o", "fused.rfpack")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path, fused):
+    return shutil.copytree(fused, tmp_path / "shop")
+
+
+def blues(image: np.ndarray) -> int:
+    return int(((image[..., 2] > 0.6) & (image[..., 0] < 0.4) & (image[..., 1] < 0.45)).sum())
+
+
+def test_a_fused_place_shows_what_its_composition_does(picture, report):
+    assert psnr(picture("fused.rfpack"), picture("place.json")) > 45
+    assert report("eval", "fused.rfpack", "--against", "place.json", "--size", "16x16")["mean"]["psnr"] > 45
+    assert "unbounded" in json.dumps(report("info", "fused.rfpack"))
+    report("validate", "fused.rfpack")
+    report("render", "fused.rfpack", "--orbit", "2", "--size", "16x16", "-o", "round")
+
+
+def test_an_object_comes_into_a_place_and_goes_again(picture, report):
+    before = picture("fused.rfpack")
+    said = report(
+        "add", "fused.rfpack", "blue.rfpack", "--name", "blue", "-t", "0.7,0,0", "-o", "more.rfpack"
+    )
+    assert said["psnr"]["before_rgb"] > 35
+    np.testing.assert_allclose(said["touched"]["aabb"], [0.4, -0.3, -0.3, 1.0, 0.3, 0.3], atol=1e-6)
+    assert blues(before) == 0 and blues(picture("more.rfpack")) > 20
+    report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
+    assert psnr(picture("less.rfpack"), before) > 60
+
+
+def test_a_place_is_not_added_around_another(run, folder):
+    shutil.copy(folder / "room.rfpack", folder / "hall.rfpack")
+    result = run("add", "fused.rfpack", "hall.rfpack", "--name", "hall", "--scale", "3", "-o", "x.rfpack")
+    assert result.exit_code == 3 and "fills all of space" in result.stderr
+
+
+def test_one_place_in_the_core_of_another(folder, picture, report):
+    """A small room of its own unit inside the large one, which it hides from all that stands in it."""
+    nodes = [
+        make_node("room", source="room.rfpack", background=True),
+        make_node("red", source="red.rfpack", translation=(-0.5, 0, 0)),
+        make_node("nook", source="room.rfpack", translation=(0.1, 0.2, 0.3), scale=[0.7] * 3),
+    ]
+    write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
+    report("fuse", "two.json", "-o", "two.rfpack")
+    assert psnr(picture("two.rfpack"), picture("two.json")) > 40
+
+
+def test_the_python_face_answers_in_the_world(folder, picture, monkeypatch):
+    """σ of a scaled place is per length of the world, and rays' distances are the world's."""
+    monkeypatch.chdir(folder)
+    alone, both = open_scene("room.rfpack"), open_scene("place.json")
+    points = torch.tensor([[4.1, 0.3, 0.5], [-0.5, 0.0, 0.0]], dtype=torch.float64)
+    dirs = torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    one, two = alone.query(points, dirs)[0], both.query(points, dirs)[0]
+    assert one[0] == pytest.approx(float(two[0]), rel=1e-4) and one[1] == 0 and two[1] > 10
+    inner, _ = alone.fields["room"].query((points - torch.from_numpy(LIES[:3, 3])) / 2, dirs)
+    assert float(one[0]) == pytest.approx(float(inner[0]) / 2, rel=1e-5)
+    origin = torch.tensor([[-0.5, 0.0, -2.0]], dtype=torch.float64)
+    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    found = both.render_rays(origin, up)
+    assert float(found[0, 4] / found[0, 3]) == pytest.approx(1.75, abs=0.15)  # the red box begins at -0.3
+
+
+def test_gradients_reach_where_an_object_stands_in_a_place(folder, monkeypatch):
+    """A soft ball, which is nowhere cut: the derivative of its distance against differences."""
+    monkeypatch.chdir(folder)
+    ball = vm_field(Gaussian(20.0, (0, 0, 0), aabb=0.9 * BOX, tint=Tint.of(0.9, 0.1, 0.1)))
+    write_field("ball.rfpack", ball, "ball", precision="float16", overwrite=False)
+    nodes = [make_node("room", source="room.rfpack"), make_node("ball", source="ball.rfpack")]
+    write_scene(folder / "soft.json", SceneGraph(tuple(nodes)))
+    scene = open_scene("soft.json")
+    origin = torch.tensor([[0.0, 0.05, -1.8], [0.2, 0.0, -1.8]], dtype=torch.float64)
+    up = torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64)
+
+    def far() -> torch.Tensor:
+        return scene.render_rays(origin, up)[:, 4].sum()
+
+    pose = scene.placements["ball"].clone().requires_grad_()
+    scene.placements["ball"] = pose
+    far().backward()
+    seen = []
+    for step in (0.002, -0.002):
+        scene.placements["ball"] = pose.detach().clone()
+        scene.placements["ball"][2, 3] = step
+        seen.append(float(far()))
+    assert pose.grad[2, 3] == pytest.approx((seen[0] - seen[1]) / 0.004, rel=0.1)
+    assert abs(pose.grad[2, 3]) > 0.5
+
+
+def test_what_masks_exclude_does_not_count(report, folder):
+    """A photo spoilt where its mask is dark is as good as it was."""
+    clean = report("eval", "red.rfpack", "--against", "photos")["views"]
+    said = json.loads((folder / "photos" / "transforms_test.json").read_text())
+    for frame in said["frames"]:
+        name = folder / "photos" / frame["file_path"]
+        file = name if name.suffix else name.with_suffix(".png")
+        photo = read_image(file)
+        photo[:12] = 255 - photo[:12]
+        write_png(file, photo)
+        mask = np.full((24, 24, 3), 255, np.uint8)
+        mask[:12] = 0
+        write_png(file.with_name(f"{file.stem}_mask.png"), mask)
+        frame["mask_path"] = str(file.with_name(f"{file.stem}_mask.png").relative_to(folder / "photos"))
+    (folder / "photos" / "transforms_test.json").write_text(json.dumps(said))
+    found = report("eval", "red.rfpack", "--against", "photos")["views"]
+    assert [v["name"] for v in found] == [v["name"] for v in clean]
+    assert all(v["psnr"] > 35 and v["ssim"] > 0.95 for v in found)

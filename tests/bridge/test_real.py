@@ -1,0 +1,47 @@
+"""`make bench-real`, made small: what it writes can be read, and other captures' rows stay."""
+
+import csv
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from benchmarks import real
+from formats.images import read_image_header, write_png
+from tests.formats.test_captures import looking_at
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A folder with a capture of noise, one of rendered pictures, photos without poses, and no capture."""
+    for name in ("wall", "nothing", "loose"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+    frames = []
+    for i in range(9):
+        eye = np.array([4 * np.cos(i), 4 * np.sin(i), 1.0])
+        pixels = np.random.default_rng(i).integers(0, 256, (16, 24, 3), np.uint8)
+        write_png(tmp_path / f"data/wall/{i}.png", pixels)
+        write_png(tmp_path / f"data/loose/{i}.png", pixels)
+        frames.append({"file_path": f"{i}.png", "transform_matrix": looking_at(eye, np.zeros(3)), "fl_x": 20})
+    (tmp_path / "data/wall/transforms.json").write_text(json.dumps({"frames": frames}))
+    return tmp_path / "data"
+
+
+@pytest.mark.slow
+def test_the_page(data, shop, tmp_path, monkeypatch):
+    shutil.copytree(shop / "photos", data / "made")
+    out = tmp_path / "real"
+    monkeypatch.setattr(real, "OTHERS", (1.0, 2.0))
+    monkeypatch.setattr(real, "FRAME_WIDTH", 24)
+    monkeypatch.setattr(sys, "argv", ["real", str(data), "--out", str(out), "--share", "0.5"])
+    real.main()
+    with (out / "real.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["capture"], row["minutes"]) for row in rows] == [("wall", "0.008333"), ("wall", "0.01667")]
+    assert all(float(row["nearest photo"]) < 12 and float(row["seconds"]) > 0.5 for row in rows)
+    assert read_image_header(out / "wall.jpg")[:2] == (640, 213)
+    assert "![wall](wall.jpg)" in (out / "table.md").read_text() and (out / "psnr.svg").exists()
+    assert real.kept_rows(out / "real.csv", {"wall"}) == []
+    assert [row["capture"] for row in real.kept_rows(out / "real.csv", {"fox"})] == ["wall", "wall"]
