@@ -138,8 +138,7 @@ class OccupancyGrid:
 
 class Pace:
     """How far apart samples may lie in each cell of a grid over several placed fields: as the finest of those
-    that reach it needs, and no farther than a cell, so that none stands for what lies in finer ones: cells
-    are counted as reached up to one around matter."""
+    that reach it needs, and no farther than it is to cells that need finer ones."""
 
     def __init__(self, grid: OccupancyGrid):
         """grid: its box, cells and space."""
@@ -166,16 +165,38 @@ class Pace:
         """
         finest = step * squeezed(object_to_field)
         space, same = self.whole.space, np.array_equal(object_to_field, np.eye(4))
-        if grid.stride is None and space is grid.space and (space is bounded or same):
+        alike = space is grid.space and (space is bounded or same)
+        if grid.stride is None and alike:
             return finest
         back = np.linalg.inv(object_to_field)
         here = torch.from_numpy(self.whole.marked(mark).centres())
         frame = space.placed(here).numpy()
         there = grid.space.contracted(torch.from_numpy(frame @ back[:3, :3].T + back[:3, 3]))
+        if alike:
+            return finest * grid.strides_at(there.numpy())
         ratio = (space.rates(here) / grid.space.rates(there)).sqrt().numpy()
         if space is not bounded:  # to the far side of a cell
             ratio *= np.maximum(1 - self.whole.cell[0] / 2 / space.rates(here).sqrt().numpy(), 0.1)
         return finest * np.minimum(ratio, ratio**2) * grid.strides_at(there.numpy())
+
+    def stepping_over_nothing(self) -> np.ndarray:
+        """The spacing (X, Y, Z) with which no sample stands for what lies in cells that need finer ones: that
+        of a cell k cells away, or the k cells up to the matter in it, whichever is more. Cells are reached up
+        to one around matter, so matter k cells away is k whole cells away. In other spaces than bounded ones
+        lengths change from cell to cell: there it is a cell at most."""
+        from scipy.ndimage import minimum_filter
+
+        spacing, near, cell = self.spacing, self.spacing, self.whole.cell.min()
+        if self.whole.space is not bounded:
+            return np.minimum(spacing, cell)
+        known = np.isfinite(spacing)
+        most, least = spacing[known].max(), spacing[known].min()
+        if most <= max(cell, least):
+            return spacing
+        for away in range(1, int(np.ceil(most / cell))):
+            near = minimum_filter(near, 3)
+            spacing = np.minimum(spacing, np.maximum(near, away * cell))
+        return spacing
 
     def grid(self, occupied: np.ndarray) -> OccupancyGrid:
         """The grid with those cells (X, Y, Z) bool."""
@@ -183,7 +204,7 @@ class Pace:
         known = np.isfinite(self.spacing)
         if not known.any():
             return grid
-        spacing = np.minimum(self.spacing, self.whole.cell.min())
+        spacing = self.stepping_over_nothing()
         most, least = spacing[known].max(), spacing[known].min()
         unit = float(max(least, most / MAX_STRIDE))
         strides = np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
