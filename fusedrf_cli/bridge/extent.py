@@ -21,7 +21,8 @@ distances of the farthest camera from their middle."""
 NEAR = 0.1
 """Of the distance between cameras and focus: nothing is learnt closer to a camera."""
 NEAR_OF_POINTS = 0.6
-"""Of the distance of a camera's nearest sparse points, where there are any."""
+"""Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer than
+that is empty, for all other cameras too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,8 @@ def _unbounded(request: TrainRequest, capture: Capture) -> Extent:
     radius = CORE[frame.layout] * unit if request.radius is None else request.radius
     near = near_of(views, unit) / radius
     whole = Extent(WHOLE, centre, radius, True, near)
-    shown = shown_cells([whole.camera(camera_of(view)) for view in views], near)
+    clear = [max(near, NEAR_OF_POINTS * (view.near or 0) / radius) for view in views]
+    shown = shown_cells([whole.camera(camera_of(view)) for view in views], near, clear)
     box = shown.tight_aabb(0)  # texels that no photo shows would be lost
     return replace(whole, box=box, cells=shown.within(box))
 

@@ -1,4 +1,5 @@
-"""Which cells of unbounded space a capture's photos show: what no photo shows can only be learnt as fog."""
+"""Which cells of unbounded space can hold what a capture's photos show: what no photo shows, and what lies
+before all that a photo shows, can only be learnt as fog."""
 
 import numpy as np
 import torch
@@ -9,24 +10,53 @@ from fusedrf_cli.engine.spaces import unbounded
 
 CELLS = 64
 BEYOND = 0.06  # of a picture's side: how far outside a cell's centre may be seen that reaches into it
+HALF_DIAGONAL = 0.87  # of a cube, in its sides
 
 
-def shown_cells(cameras: list[Camera], near: float) -> OccupancyGrid:
-    """A grid over all of unbounded space whose cells at least one camera sees, farther away than `near`.
+def shown_cells(cameras: list[Camera], near: float, clear: list[float]) -> OccupancyGrid:
+    """A grid over all of unbounded space whose cells at least one camera sees, farther away than `near`, and
+    of which none lies wholly in a camera's picture and nearer to it than its `clear` distance.
 
-    Cameras are in the field's frame. Lenses count as pinholes, and cells are grown by one; a camera that
-    sees more than half of all directions counts as seeing everything.
+    Cameras and distances are in the field's frame. Lenses count as pinholes, and cells that are seen are
+    grown by one; a camera that sees more than half of all directions counts as seeing everything.
     """
     counts = cell_counts(unbounded.WHOLE, CELLS)
     grid = OccupancyGrid.full(unbounded.WHOLE, CELLS, unbounded)
     centres = grid.centres()
     real = (np.abs(centres) < 1).sum(1) >= 2  # beyond the core's edges coordinates stand for no place
     points = unbounded.placed(torch.from_numpy(centres)).numpy()
-    seen = np.zeros(len(points), bool)
-    for camera in cameras:
+    reach = HALF_DIAGONAL * grid.cell.max() / unbounded.rates(torch.from_numpy(centres)).numpy()
+    seen, empty = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    for camera, distance in zip(cameras, clear, strict=True):
         rest = np.flatnonzero(real & ~seen)
         seen[rest[seen_by(camera, points[rest], near)]] = True
-    return grid.marked(seen.reshape(counts)).dilated()
+        empty |= before(camera, points, reach, distance)
+    return grid.marked(grid.marked(seen.reshape(counts)).dilated().occupied & ~empty.reshape(counts))
+
+
+def before(camera: Camera, points: np.ndarray, reach: np.ndarray, distance: float) -> np.ndarray:
+    """(N,) bool: which balls around points (N, 3) of radii `reach` (N,) a camera shows whole, and nearer to
+    it than `distance`."""
+    found = np.zeros(len(points), bool)
+    if camera.fisheye:
+        return found
+    offsets = points - camera.camera_to_world[:3, 3]
+    near = np.flatnonzero(np.linalg.norm(offsets, axis=1) + reach < distance)
+    x, y, z = (offsets[near] @ camera.camera_to_world[:3, :3]).T
+    depth, r = -z, reach[near]
+    column, row = within(camera, x, y, np.maximum(depth - r, 1e-9))
+    across, down = r * camera.fl_x / camera.width, r * camera.fl_y / camera.height
+    nearest = np.maximum(depth - r, 1e-9)
+    whole = (column + across / nearest < 0.5 - BEYOND) & (row + down / nearest < 0.5 - BEYOND)
+    found[near] = whole & (depth > r)
+    return found
+
+
+def within(camera: Camera, x, y, depth) -> tuple[np.ndarray, np.ndarray]:
+    """How far from a picture's middle points of its camera's frame are shown, in widths and in heights."""
+    column = (camera.cx + camera.fl_x * x / depth) / camera.width
+    row = (camera.cy - camera.fl_y * y / depth) / camera.height
+    return abs(column - 0.5), abs(row - 0.5)
 
 
 def seen_by(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
@@ -36,7 +66,6 @@ def seen_by(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
     if camera.fisheye:
         return away > near
     depth = np.maximum(-local[:, 2], 1e-9)
-    column = (camera.cx + camera.fl_x * local[:, 0] / depth) / camera.width
-    row = (camera.cy - camera.fl_y * local[:, 1] / depth) / camera.height
-    inside = (abs(column - 0.5) < 0.5 + BEYOND) & (abs(row - 0.5) < 0.5 + BEYOND)
+    column, row = within(camera, local[:, 0], local[:, 1], depth)
+    inside = (column < 0.5 + BEYOND) & (row < 0.5 + BEYOND)
     return inside & (local[:, 2] < 0) & (away > near)

@@ -262,11 +262,27 @@ def test_the_largest_weight_of_each_cell():
 def test_cells_that_no_camera_sees_are_left_out():
     pose = look_at(np.array([2.5, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]))
     camera = Camera(pose, 50, 50, 25, 25, 50, 50)
-    grid = shown_cells([camera], 0.8)
+    grid = shown_cells([camera], 0.8, [0.8])
     seen = np.array([[0.0, 0, 0], [-50.0, 3, 2], [1.5, 0.2, 0]])  # the focus, behind it, before it
     unseen = np.array([[5.0, 0, 0], [0.0, 0, 40], [2.45, 0, 0], [-1.0, 5, 0]])
     assert grid.contains(np.array([mapped(x) for x in seen])).all()
     assert not grid.contains(np.array([mapped(x) for x in unseen])).any()
+
+
+def test_what_lies_before_all_that_a_photo_shows_is_empty():
+    """Two cameras that face each other: each would show what is right before the other. A cell of the core is
+    0.06 wide."""
+    poses = [look_at(np.array([x, 0, 0]), np.zeros(3), np.array([0.0, 0, 1])) for x in (0.9, -0.9)]
+    cameras = [Camera(pose, 50, 50, 25, 25, 50, 50) for pose in poses]
+    without, grid = (shown_cells(cameras, 0.1, clear) for clear in ([0.0, 0.0], [0.8, 0.0]))
+    at = np.stack(np.meshgrid(*[np.linspace(-0.99, 0.99, 45)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    lost = without.contains(at) & ~grid.contains(at)
+    depth = 0.9 - at[:, 0]
+    across = abs(at[:, 1:]).max(1)
+    away = np.linalg.norm(at - [0.9, 0, 0], axis=1)
+    assert lost.any() and (away[lost] < 0.8).all() and (across[lost] < 0.5 * depth[lost]).all()
+    sure = (away < 0.8 - 0.11) & (depth > 0.25) & (across < 0.4 * depth - 0.11)
+    assert sure.sum() > 10 and not grid.contains(at[sure]).any()
 
 
 def test_blocks_of_a_place_and_an_object_show_what_their_composition_does():
