@@ -21,8 +21,8 @@ distances of the farthest camera from their middle."""
 NEAR = 0.1
 """Of the distance between cameras and focus: nothing is learnt closer to a camera."""
 NEAR_OF_POINTS = 0.6
-"""Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer than
-that is empty, for all other cameras too."""
+"""Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer is
+empty, for all other cameras too."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from tests.promises.packs import GOLDEN
 WHITE = (1.0, 1.0, 1.0)
 
 
-FINE = 0.003  # a step at which these pictures no longer change: they show what a pack holds, not how it is drawn
+FINE = 0.003  # a step so small that pictures show what a pack holds, not how it is drawn
 
 
 def rendered(path) -> np.ndarray:

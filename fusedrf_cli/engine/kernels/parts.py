@@ -97,8 +97,11 @@ def next_sample(grid, origin, way, u0, u1, step, k):
         if s == 0:
             many = 1
             if grid.stride.shape[0] != 0:
-                spacing = grid.unit * grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)]
-                many = max(1, int(min(spacing, u1 - u + 0.5 * step) / step + FACE_TOLERANCE))
+                many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
+                if grid.unit != step:
+                    many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
+                while many > 1 and u + (many - 0.5) * step >= u1:
+                    many -= 1
             return k, many
         away = min(
             exit_distance(x, dx, lo[0], cell[0], i, s),
