@@ -182,8 +182,10 @@ def stages(
             step = 0.5 * student.largest().voxel
             points = points_kept(scene, boxes, settings.rays, step, request.seed)
         taught = teaching(settings, points)
+    # kept beside what learns: the field as it was made, and the numbers that its pictures have to surpass
+    kept = (not student.learnt) + (student.lesson is not None and request.rgb)
     learns = (
-        learning(numbers, torch.get_num_threads()) | taught | grids
+        learning(numbers, torch.get_num_threads()) | {"its starts": kept * numbers * FLOAT} | taught | grids
         if learning_is_asked(student, request)
         else {}
     )

@@ -33,7 +33,7 @@ INSIDE = 1e-7  # of a box's sides: on its very faces a field may answer that it 
 SHOWN_RAYS, SHOWN_SEED = 1 << 19, 5
 SHOWN_FROM = 1e-3  # weight on a ray from which a cell shows
 FLOAT = 4.0  # bytes
-PER_VERTEX = 500.0  # bytes, as seen: corners, places, what is asked at eight points of a voxel, and matrices
+PER_VERTEX = 500.0  # bytes, at most: corners, places, what is asked at eight points of a voxel, and matrices
 SLOPE = 0.2  # of opacity per voxel from which a vertex is seen from one side
 
 

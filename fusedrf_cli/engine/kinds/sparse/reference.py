@@ -1,12 +1,11 @@
 """What a `sparse` field answers, in plain torch: trilinear interpolation over the vertices of its voxels."""
 
-import numpy as np
 import torch
 
 from fusedrf_cli.engine.kernels.reference import density, exact, sh_basis, whole
+from fusedrf_cli.engine.kinds.asking import OCTANTS
 
 ROW = 4  # numbers of a vertex: density feature, three colours of degree 0
-OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
 
 
 def query(
