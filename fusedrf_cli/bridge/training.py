@@ -38,6 +38,9 @@ from fusedrf_cli.requests import TrainRequest
 
 UNBOUNDED_DEGREE = 1  # SH: with more, colours that depend on the view explain what places should
 UNBOUNDED_TEXELS = 2.0  # times those of a box, along an axis of all of space: half lie outside the core
+LARGEST_PLACE = 100_000_000
+"""Bytes of a place where no size is asked for: voxels of all of space, as fine as planes are, would take a
+hundred times those of the planes."""
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
@@ -61,7 +64,7 @@ def train(request: TrainRequest, progress) -> dict:
         plan = kind.untrained(extent.box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
         memory.expect(
-            fit_memory(capture, plan, settings), advice="use fewer or smaller photos, or a lower --quality"
+            fit_memory(capture, plan, settings), advice="use a smaller --max-size, fewer or smaller photos, or a lower --quality"
         )
         cameras = [extent.camera(camera_of(v)) for v in capture.train]
         pictures = pictures_of(request, capture)
@@ -181,7 +184,8 @@ def fit_settings(
     )
     if extent.unbounded:
         settings = replace(settings, longest=texels_of_place(extent.box, settings.longest))
-    room = request.max_size and max(1, request.max_size - besides)
+    asked = request.max_size or (LARGEST_PLACE if extent.unbounded else None)
+    room = asked and max(1, asked - besides)
     longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)

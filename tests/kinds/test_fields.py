@@ -1,12 +1,14 @@
 """Laws that a field of every kind keeps: rendering, learning, storing, moving."""
 
+from inspect import isfunction
+
 import numpy as np
 import pytest
 import torch
 
 from formats.records import FieldRecord, as_stored, decode_field, encode_field
 from fusedrf_cli.bridge.scene import make_field
-from fusedrf_cli.engine.fields.computed import Batch
+from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.volume import march_rays, render_rays
 from fusedrf_cli.errors import InvalidInput
@@ -30,6 +32,15 @@ def asked(field, count: int = 400):
 
 def test_every_kind_of_field_is_tried():
     assert {make().kind for make in FIELDS.values()} == set(registry.field_kinds())
+
+
+def test_no_kind_hides_what_every_computed_field_does():
+    """A property of the same name once did: weights in cells were a network's, and photos of a place failed."""
+    methods = [name for name, value in vars(ComputedField).items() if isfunction(value)]
+    assert len(methods) > 5
+    for make in FIELDS.values():
+        for name in methods:
+            assert isfunction(getattr(type(make()), name)), (make().kind, name)
 
 
 def test_one_pass_renders_what_the_general_renderer_does(field):

@@ -308,7 +308,7 @@ class FitRun:
             grid = field.occupancy  # bricks have counts of their own
         rays_o, rays_d, _ = self.pool.draw(WEIGHED_RAYS)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
-        weights = field.weights(rays_o, rays_d, jitter, self.settings.near, field.voxel_size)
+        weights = field.weights_in_cells(rays_o, rays_d, jitter, self.settings.near, field.voxel_size)
         return grid.marked(grid.marked(weights > SHOWN_FROM).dilated().occupied & grid.occupied)
 
     def occupy(self, occupancy: OccupancyGrid) -> None:

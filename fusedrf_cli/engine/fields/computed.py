@@ -215,7 +215,7 @@ class ComputedField:
         self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(cells), out)
         return out
 
-    def weights(
+    def weights_in_cells(
         self, rays_o: np.ndarray, rays_d: np.ndarray, jitter: np.ndarray, near: float, step: float
     ) -> np.ndarray:
         """(X, Y, Z) for each cell of the occupancy the largest weight (NeRF, eq. 3) that a sample in it has

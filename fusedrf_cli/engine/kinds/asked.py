@@ -177,7 +177,7 @@ class AskedStudent(MadeStudent, GridStudent):
         generator = torch.Generator().manual_seed(SHOWN_SEED)
         rays_o, rays_d = random_rays([self.scene.occupancy.subject], SHOWN_RAYS, generator)
         jitter = torch.rand(len(rays_o), generator=generator, dtype=torch.float64).numpy()
-        weights = field.weights(rays_o, rays_d, jitter, 0.0, sampling_step(field))
+        weights = field.weights_in_cells(rays_o, rays_d, jitter, 0.0, sampling_step(field))
         found = self.scene.occupancy.marked(weights > SHOWN_FROM)
         return found if found.occupied.any() else self.scene.occupancy
 

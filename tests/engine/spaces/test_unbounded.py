@@ -256,7 +256,7 @@ def test_the_largest_weight_of_each_cell():
             cell = tuple(np.clip(((mapped(x) - WHOLE[:3]) / grid.cell).astype(int), 0, 7))
             wanted[cell] = max(wanted[cell], weight)
     assert wanted.max() > 0.1
-    assert field.weights(o, d, jitter, 0.1, 0.05) == pytest.approx(wanted, abs=1e-5)
+    assert field.weights_in_cells(o, d, jitter, 0.1, 0.05) == pytest.approx(wanted, abs=1e-5)
 
 
 def test_cells_that_no_camera_sees_are_left_out():
