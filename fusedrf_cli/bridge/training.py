@@ -64,7 +64,8 @@ def train(request: TrainRequest, progress) -> dict:
         plan = kind.untrained(extent.box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
         memory.expect(
-            fit_memory(capture, plan, settings), advice="use a smaller --max-size, fewer or smaller photos, or a lower --quality"
+            fit_memory(capture, plan, settings),
+            advice="use a smaller --max-size, fewer or smaller photos, or a lower --quality",
         )
         cameras = [extent.camera(camera_of(v)) for v in capture.train]
         pictures = pictures_of(request, capture)

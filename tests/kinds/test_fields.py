@@ -35,7 +35,7 @@ def test_every_kind_of_field_is_tried():
 
 
 def test_no_kind_hides_what_every_computed_field_does():
-    """A property of the same name once did: weights in cells were a network's, and photos of a place failed."""
+    """A property of the same name once did: the weights of cells were those of a network."""
     methods = [name for name, value in vars(ComputedField).items() if isfunction(value)]
     assert len(methods) > 5
     for make in FIELDS.values():
