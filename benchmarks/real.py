@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell, write_csv
 from formats.captures import hold_out, is_capture, read_capture
@@ -127,20 +128,12 @@ def kept_rows(path: Path, names: set[str]) -> list[dict]:
 
 def chart(rows: list[dict], path: Path) -> None:
     """PSNR over minutes of each capture, and as a dotted line what a copy of the nearest photo reaches."""
-    figure, panel = plots.pyplot().subplots(figsize=(7, 4.2), layout="constrained")
-    for i, name in enumerate(dict.fromkeys(row["capture"] for row in rows)):
-        colour, marker = plots.LOOKS[i % len(plots.LOOKS)]
-        of_one = [row for row in rows if row["capture"] == name]
-        points = sorted((float(row["minutes"]), float(row["PSNR"])) for row in of_one)
-        panel.plot(*zip(*points, strict=True), marker=marker, color=colour, label=name)
-        panel.axhline(float(of_one[0]["nearest photo"]), color=colour, linewidth=1, linestyle=":")
-    panel.set_xscale("log")
-    panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    panel.set_xlabel("minutes of learning")
-    panel.set_ylabel("PSNR of held-out photos, dB (dotted: a copy of the nearest photo)")
-    panel.grid(alpha=0.3)
-    panel.legend(fontsize=8)
-    plots.save(figure, path)
+    lines, copies = {}, {}
+    for row in rows:
+        lines.setdefault(row["capture"], []).append((float(row["minutes"]), float(row["PSNR"])))
+        copies[row["capture"]] = float(row["nearest photo"])
+    words = ("minutes of learning", "PSNR of held-out photos, dB (dotted: a copy of the nearest photo)")
+    over_time(lines, copies, words, path)
 
 
 def write_page(out: Path, rows: list[dict]) -> None:

@@ -4,12 +4,11 @@ from pathlib import Path
 
 from fusedrf_cli import plots
 
-NAMES = {
+NAMES = {  # of the ways that are no kind to fuse with
     "background": "fuse --kind vm, from the background",
     "scratch": "fuse --kind vm --from-scratch --no-rgb",
     "retraining": "100 views of the composition, then train",
 }
-COLOURS = {"background": "#D55E00", "scratch": "#CC79A7", "retraining": "0.35"}
 
 
 def capacity(rows: list[dict], path: Path) -> None:
@@ -40,20 +39,35 @@ def capacity(rows: list[dict], path: Path) -> None:
 
 
 def times(rows: list[dict], wanted: float, path: Path) -> None:
-    """PSNR over seconds of each way, and the PSNR that is asked for as a line."""
+    """PSNR over seconds of each way, and the PSNR that is asked for as a level."""
+    lines = {}
+    for row in rows:
+        name = NAMES.get(row["way"], f"fuse --kind {row['way']}")
+        lines.setdefault(name, []).append((row["seconds"], row["psnr"]))
+    words = ("seconds, with the rendering of the views", "PSNR against the scene as composed, dB")
+    over_time(lines, {None: wanted}, words, path)
+
+
+def over_time(
+    lines: dict[str, list[tuple[float, float]]],
+    levels: dict[str | None, float],
+    words: tuple[str, str],
+    path: Path,
+) -> None:
+    """Points of each named line over a logarithmic time; a level is dotted, in its line's colour if it names
+    one. `words` are those of the two axes.
+    """
     figure, panel = plots.pyplot().subplots(figsize=(7, 4.2), layout="constrained")
-    for way in dict.fromkeys(r["way"] for r in rows):
-        points = sorted((r["seconds"], r["psnr"]) for r in rows if r["way"] == way)
-        if way in plots.LOOKS:
-            colour, marker = plots.LOOKS[way]
-            panel.plot(*zip(*points, strict=True), marker, color=colour, label=f"fuse --kind {way}")
-        else:
-            panel.plot(*zip(*points, strict=True), "s-", color=COLOURS[way], label=NAMES[way], markersize=4)
-    panel.axhline(wanted, color="0.6", linewidth=1, linestyle="--")
+    colours = {}
+    for i, (name, points) in enumerate(lines.items()):
+        colours[name], marker = plots.LOOKS[i % len(plots.LOOKS)]
+        panel.plot(*zip(*sorted(points), strict=True), marker=marker, color=colours[name], label=name)
+    for name, level in levels.items():
+        panel.axhline(level, color=colours.get(name, "0.5"), linewidth=1, linestyle=":")
     panel.set_xscale("log")
     panel.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    panel.set_xlabel("seconds, with the rendering of the views")
-    panel.set_ylabel("PSNR against the scene as composed, dB")
+    panel.set_xlabel(words[0])
+    panel.set_ylabel(words[1])
     panel.grid(alpha=0.3)
     panel.legend(fontsize=8)
     plots.save(figure, path)

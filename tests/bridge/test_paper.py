@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.paper import capacity, quality, smallest, sources, table, times
+from benchmarks.paper import capacity, figures, quality, smallest, sources, table, times
 from benchmarks.paper.__main__ import EXPERIMENTS
 from benchmarks.paper.work import Work, fusedrf
 from tests.bridge.conftest import write_scene_of
@@ -52,6 +52,15 @@ def test_a_close_up_frames_the_object_alone(work, folder, monkeypatch):
     quality.closeup(work)
     (row,) = rows_of(work, "closeup")
     assert float(row["psnr"]) > 30 and row["psnr"] != row["psnr of the whole"]
+
+
+def test_the_chart_of_times_names_every_way(tmp_path):
+    """Kinds of any name among them: none has a look of its own."""
+    ways = ("blocks", "background", "scratch", "retraining")
+    rows = [{"way": way, "seconds": s, "psnr": 30.0 + s} for way in ways for s in (1.0, 2.0)]
+    figures.times(rows, 37.0, tmp_path / "times.svg")
+    text = (tmp_path / "times.svg").read_text()
+    assert all(name in text for name in ("fuse --kind blocks", "--from-scratch", "then train"))
 
 
 @pytest.mark.slow
