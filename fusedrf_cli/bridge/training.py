@@ -104,6 +104,7 @@ def train(request: TrainRequest, progress) -> dict:
         "seconds": {"training": seconds},
         "training_psnr": run.psnr,
         "holdout": measured,
+        "exposure": exposure(run),
         "memory": memory.report(),
         **run.guard.figures(),
     }
@@ -115,6 +116,15 @@ def train(request: TrainRequest, progress) -> dict:
             report=report,
         )
     return report
+
+
+def exposure(run: FitRun) -> dict[str, float] | None:
+    """How bright the darkest and the brightest photo are, over their geometric mean, where photos were found
+    to differ; what was learnt, and every picture of it, is as bright as that mean."""
+    gains = run.pool.gains.double().log().mean(1).exp()
+    if bool((gains == 1).all()):
+        return None
+    return {"darkest": float(gains.min()), "brightest": float(gains.max())}
 
 
 def trained_kind(request: TrainRequest) -> Kind:
@@ -181,6 +191,7 @@ def fit_settings(
         opacity_weight=0.0 if capture.opaque and not cuts_out(request, capture) else 0.1,
         near=extent.near,
         unbounded=extent.unbounded,
+        exposure=extent.unbounded and capture.opaque,
         device=place,
     )
     if extent.unbounded:

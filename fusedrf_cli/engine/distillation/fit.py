@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.epochs import Epochs
+from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.base import StoredField, sampling_step
@@ -67,6 +68,9 @@ class FitSettings:
     """Distance from a camera, in units of the field's frame, before which nothing is learnt."""
     unbounded: bool = False
     """Whether the field fills all of space, seen in pictures without alpha."""
+    exposure: bool = False
+    """Whether pictures may differ in exposure and white balance, as a camera's own do. Not for views of an
+    object from all around: of a side that few of them see nothing tells how bright it is."""
     target_psnr: float | None = None
     """dB of the training rays, less a margin, at which the fit may stop early."""
     seed: int = 0
@@ -96,6 +100,7 @@ class RayPool:
         pictures = images if isinstance(images, Pictures) else Pictures(images.reshape(-1, 4))
         self.images = torch.from_numpy(pictures.pixels)
         self.first = torch.tensor(np.cumsum([0, *(camera.width * camera.height for camera in cameras)]))
+        self.ignored = None if pictures.ignored is None else torch.from_numpy(pictures.ignored)
         drawn = None if pictures.ignored is None else np.flatnonzero(~pictures.ignored)
         self.drawn = None if drawn is None else torch.from_numpy(drawn)
         keys = {camera.intrinsics: camera for camera in cameras}
@@ -106,6 +111,8 @@ class RayPool:
         poses = np.stack([c.camera_to_world for c in cameras])
         self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
         self.position = torch.from_numpy(poses[:, :3, 3].copy())
+        self.gains = torch.ones(len(cameras), 3)
+        """What the colours of each picture are divided by."""
         self.epochs = Epochs(len(self.images) if drawn is None else len(drawn), generator)
 
     def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
@@ -115,10 +122,30 @@ class RayPool:
         if self.drawn is not None:
             chosen = self.drawn[chosen]
         view = torch.searchsorted(self.first, chosen, right=True) - 1
+        pixels = self.images[chosen].float() / 255
+        pixels[:, :3] /= self.gains[view]
+        return *self.rays(chosen, view), pixels
+
+    def sample(self, count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+        """As many random pixels of each picture, one picture after the other: rays_o, rays_d (n * count, 3)
+        float64 and colours (n, count, 3) over the gains, nan where a pixel is ignored or not opaque."""
+        sizes = self.first.diff()[:, None]
+        places = (torch.rand(len(sizes), count, generator=generator, dtype=torch.float64) * sizes).long()
+        chosen = (self.first[:-1, None] + places).reshape(-1)
+        pixels = self.images[chosen]
+        colours = pixels[:, :3].float() / 255
+        colours[pixels[:, 3] < 255] = torch.nan
+        if self.ignored is not None:
+            colours[self.ignored[chosen]] = torch.nan
+        colours = colours.reshape(len(sizes), count, 3) / self.gains[:, None]
+        return *self.rays(chosen, torch.arange(len(sizes)).repeat_interleave(count)), colours
+
+    def rays(self, chosen: torch.Tensor, view: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """rays_o, rays_d (N, 3) float64 through pixels (N,) of pictures (N,)."""
         local = self.local[self.start[view] + chosen - self.first[view]].double()
         d = torch.einsum("nij,nj->ni", self.rotation[view], local)
         d /= d.norm(dim=1, keepdim=True)
-        return self.position[view].contiguous().numpy(), d.numpy(), self.images[chosen].float() / 255
+        return self.position[view].contiguous().numpy(), d.numpy()
 
 
 def fit(
@@ -156,6 +183,7 @@ class FitRun:
         self.optimiser = Adam.of(field)
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(settings.stages[1:]), [*OCCUPANCY_AT, 1.0]
+        self.exposures = list(MEASURED_AT) if settings.exposure else []
         self.mse, self.rays = None, RAYS_PER_STEP[0]
         self.found_matter, self.found_nothing = False, 0
         self.guard = Guard(lambda: self.optimiser.numbers())
@@ -213,6 +241,7 @@ class FitRun:
         arrays |= self.optimiser.state()
         arrays |= {
             "random": self.generator.get_state().numpy(),
+            "gains": self.pool.gains.numpy(),
         }
         order, drawn = self.pool.epochs.state()
         arrays |= order
@@ -225,6 +254,7 @@ class FitRun:
             "adam_steps": self.optimiser.steps,
             "stages": len(self.stages),
             "refreshes": self.refreshes,
+            "exposures": self.exposures,
             "found": [self.found_matter, self.found_nothing],
             "mse": self.mse,
             "rays": self.rays,
@@ -241,7 +271,8 @@ class FitRun:
         self.optimiser.restore(arrays, state["adam_steps"])
         self.steps = state["steps"]
         self.stages = self.stages[len(self.stages) - state["stages"] :]
-        self.refreshes = state["refreshes"]
+        self.refreshes, self.exposures = state["refreshes"], state["exposures"]
+        self.pool.gains.copy_(torch.from_numpy(arrays["gains"]))
         self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
         self.started = working_time() - state["elapsed"]
@@ -272,6 +303,18 @@ class FitRun:
             _, part = self.stages.pop(0)
             self.guard.check()
             self.resize(self.field.aabb, round(self.settings.longest * part))
+        if self.exposures and share >= self.exposures[0]:
+            self.exposures.pop(0)
+            self.measure_exposure()
+
+    def measure_exposure(self) -> None:
+        """Divide the pictures' colours by what they are brighter than the field, once they surely differ."""
+        pool = self.pool
+        *rays, colours = pool.sample(RAYS, self.generator)
+        known = bool((pool.gains != 1).any())
+        gains = gains_of(self.field, rays, colours, self.settings.near, 0.0 if known else SURE)
+        if known or spread(gains) > SAME:
+            pool.gains.copy_(torch.from_numpy(pool.gains.double().numpy() * gains**OVERSHOT))
 
     def refresh_occupancy(self) -> None:
         """Mark the cells that hold matter, and cut the box down to them where that saves much. Where none
