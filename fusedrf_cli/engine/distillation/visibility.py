@@ -15,7 +15,8 @@ HALF_DIAGONAL = 0.87  # of a cube, in its sides
 
 def shown_cells(cameras: list[Camera], near: float, clear: list[float]) -> OccupancyGrid:
     """A grid over all of unbounded space whose cells at least one camera sees, farther away than `near`, and
-    of which none lies wholly in a camera's picture and nearer to it than its `clear` distance.
+    of which none lies wholly within `near` of a camera, nor with its middle in a camera's picture and wholly
+    nearer to it than its `clear` distance.
 
     Cameras and distances are in the field's frame. Lenses count as pinholes, and cells that are seen are
     grown by one; a camera that sees more than half of all directions counts as seeing everything.
@@ -30,25 +31,24 @@ def shown_cells(cameras: list[Camera], near: float, clear: list[float]) -> Occup
     for camera, distance in zip(cameras, clear, strict=True):
         rest = np.flatnonzero(real & ~seen)
         seen[rest[seen_by(camera, points[rest], near)]] = True
-        empty |= before(camera, points, reach, distance)
+        empty |= before(camera, points, reach, near, distance)
     return grid.marked(grid.marked(seen.reshape(counts)).dilated().occupied & ~empty.reshape(counts))
 
 
-def before(camera: Camera, points: np.ndarray, reach: np.ndarray, distance: float) -> np.ndarray:
-    """(N,) bool: which balls around points (N, 3) of radii `reach` (N,) a camera shows whole, and nearer to
-    it than `distance`."""
-    found = np.zeros(len(points), bool)
+def before(
+    camera: Camera, points: np.ndarray, reach: np.ndarray, near: float, clear: float
+) -> np.ndarray:
+    """(N,) bool: which balls around points (N, 3) of radii `reach` (N,) lie within `near` of a camera, where
+    it could not have been held otherwise, or, with their middle in its picture, within `clear` of it."""
+    offsets = points - camera.camera_to_world[:3, 3]
+    farthest = np.linalg.norm(offsets, axis=1) + reach
+    found = farthest < near
     if camera.fisheye:
         return found
-    offsets = points - camera.camera_to_world[:3, 3]
-    near = np.flatnonzero(np.linalg.norm(offsets, axis=1) + reach < distance)
-    x, y, z = (offsets[near] @ camera.camera_to_world[:3, :3]).T
-    depth, r = -z, reach[near]
-    column, row = within(camera, x, y, np.maximum(depth - r, 1e-9))
-    across, down = r * camera.fl_x / camera.width, r * camera.fl_y / camera.height
-    nearest = np.maximum(depth - r, 1e-9)
-    whole = (column + across / nearest < 0.5 - BEYOND) & (row + down / nearest < 0.5 - BEYOND)
-    found[near] = whole & (depth > r)
+    rest = np.flatnonzero(~found & (farthest < clear))
+    x, y, z = (offsets[rest] @ camera.camera_to_world[:3, :3]).T
+    column, row = within(camera, x, y, np.maximum(-z, 1e-9))
+    found[rest] = (column < 0.5) & (row < 0.5) & (z < 0)
     return found
 
 

@@ -274,15 +274,29 @@ def test_what_lies_before_all_that_a_photo_shows_is_empty():
     0.06 wide."""
     poses = [look_at(np.array([x, 0, 0]), np.zeros(3), np.array([0.0, 0, 1])) for x in (0.9, -0.9)]
     cameras = [Camera(pose, 50, 50, 25, 25, 50, 50) for pose in poses]
-    without, grid = (shown_cells(cameras, 0.1, clear) for clear in ([0.0, 0.0], [0.8, 0.0]))
+    without, grid = (shown_cells(cameras, 0.05, clear) for clear in ([0.0, 0.0], [0.8, 0.0]))
     at = np.stack(np.meshgrid(*[np.linspace(-0.99, 0.99, 45)] * 3, indexing="ij"), -1).reshape(-1, 3)
     lost = without.contains(at) & ~grid.contains(at)
     depth = 0.9 - at[:, 0]
     across = abs(at[:, 1:]).max(1)
     away = np.linalg.norm(at - [0.9, 0, 0], axis=1)
-    assert lost.any() and (away[lost] < 0.8).all() and (across[lost] < 0.5 * depth[lost]).all()
-    sure = (away < 0.8 - 0.11) & (depth > 0.25) & (across < 0.4 * depth - 0.11)
-    assert sure.sum() > 10 and not grid.contains(at[sure]).any()
+    half = 0.5 * 0.0625  # of a cell: its middle is in the picture
+    assert lost.any() and (away[lost] < 0.8).all()
+    assert (across[lost] < 0.5 * (depth[lost] + half) + half).all()
+    sure = (away < 0.8 - 0.11) & (depth > half) & (across < 0.5 * (depth - half) - half)
+    assert sure.sum() > 50 and not grid.contains(at[sure]).any()
+
+
+@pytest.mark.parametrize("fisheye", (False, True))
+def test_around_a_camera_is_nothing(fisheye):
+    """Nor behind it, where other cameras would show it."""
+    poses = [look_at(np.array(x), np.zeros(3), np.array([0.0, 0, 1])) for x in ([0.4, 0.2, 0], [1.8, 0.2, 0])]
+    cameras = [Camera(pose, 20, 20, 25, 25, 50, 50, fisheye=fisheye) for pose in poses]
+    grid = shown_cells(cameras, 0.3, [0.0, 0.0])
+    away = np.random.default_rng(0).normal(size=(200, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    assert not grid.contains(np.array([0.4, 0.2, 0]) + 0.18 * away).any()  # 0.3 less a cell's diagonal
+    assert grid.contains(np.array([0.4, 0.2, 0]) + 0.36 * away).all()
 
 
 def test_blocks_of_a_place_and_an_object_show_what_their_composition_does():
