@@ -12,16 +12,18 @@ from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun
+from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds.student import DistillSettings, MadeStudent, Plan, Student, Way
+from fusedrf_cli.engine.kinds.student import NOTHING, DistillSettings, MadeStudent, Plan, Student, Way
+from fusedrf_cli.engine.spaces import unbounded
 from fusedrf_cli.requests import FuseRequest
 
 VIEWS_TO_CHOOSE_BY = 8
 RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
+RATE_IN_PLACE = 0.02  # of a student that begins as a place and has only to learn what stands in it: 3 dB
 TRIES = 6  # that a search for a target makes, about
 
 
@@ -174,7 +176,7 @@ class Maker:
         wanted = before is None and self.student.kind.takes_over and not self.request.from_scratch
         background = self.scene.background() if wanted else None
         field, start = self.student.begun(plan, before, background, generator)
-        if wanted and start == "nothing":
+        if wanted and start == NOTHING:
             self.progress.warn(
                 f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
                 "nothing"
@@ -189,8 +191,11 @@ class Maker:
         settings = replace(self.student.lesson, seed=request.seed, time_budget=seconds)
         if seconds is not None:  # more than there is time to learn from need not be asked
             settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * seconds) + 1))
+        recipe = DEFAULT_RECIPE
+        if start != NOTHING and field.occupancy.space is unbounded:  # the place's detail would be lost
+            recipe = replace(recipe, coarse=lambda student: False, rate=RATE_IN_PLACE)
         run = DistillRun(
-            self.scene.composed, field, self.scene.boxes, settings, request.rgb, judge=self.judge
+            self.scene.composed, field, self.scene.boxes, settings, request.rgb, recipe, self.judge
         )
         made_with = {  # with other words the saved numbers would go on to something else
             "kind": self.student.kind.name,

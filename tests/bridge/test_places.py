@@ -11,17 +11,22 @@ import torch
 from formats.images import read_image, write_png
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.students import place_of
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.spaces import unbounded
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.python import open_scene
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Gaussian, Tint
+from tests.analytic.rays import unit
 from tests.bridge.conftest import done
+from tests.engine.conftest import random_vm
 
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
 LIES = np.array([[2.0, 0, 0, 0.1], [0, 2, 0, 0], [0, 0, 2, -0.2], [0, 0, 0, 1]])  # the core, in the world
@@ -70,6 +75,53 @@ def test_a_fused_place_shows_what_its_composition_does(picture, report):
     assert "unbounded" in json.dumps(report("info", "fused.rfpack"))
     report("validate", "fused.rfpack")
     report("render", "fused.rfpack", "--orbit", "2", "--size", "16x16", "-o", "round")
+
+
+def test_a_vm_student_of_a_place_begins_as_the_place():
+    """To the bit in its numbers, over the cells of the scene; and not where more lies outside of it, where it
+    is not the scene's frame, or where its numbers are too many."""
+    room, thing = walls(), random_vm(dtype=torch.float32, cells=4)
+    kind, way = registry.kind("vm"), Way(ranks=(8, 8), sh_degree=0)
+    small = Placed("thing", thing, LIES @ np.diag([0.3, 0.3, 0.3, 1]))
+    scene = ComposedField([Placed("room", room, LIES), small])
+
+    def taken(room: Placed, scene: ComposedField, numbers: int = 10**7):
+        plan = kind.plan(scene.aabb, scene.voxel_size, way, numbers)
+        return place_of(room, plan, scene)
+
+    student = taken(scene.placed[0], scene)
+    assert student.shape == VMShape(8, 8, 0) and torch.equal(student.params, room.params)
+    at = 12 * unit(np.random.default_rng(0).normal(size=(2000, 3)))
+    points, dirs = torch.from_numpy(at * np.array([60, 1, 1])), torch.from_numpy(unit(at))
+    (sigma, rgb), (wanted, colour) = student.query(points, dirs), room.query(points, dirs)
+    shown = wanted > 0
+    assert shown.sum() > 50
+    assert torch.equal(sigma[shown], wanted[shown]) and torch.equal(rgb[shown], colour[shown])
+    assert student.occupancy.contains(np.zeros((1, 3))).all()  # where the thing stands
+    own = scene.placed[0]
+    assert taken(scene.placed[1], scene) is None and taken(own, scene, 1000) is None
+    assert taken(replace(own, field=thing), scene) is None
+    assert taken(replace(own, object_to_world=LIES), scene) is None
+    half = room.resampled(np.array([-2.0, -2, -2, 0.0, 2, 2]), (9, 17, 17))
+    cells = OccupancyGrid(half.aabb, np.ones((2, 4, 4), bool), unbounded)
+    part = Placed("room", half.with_occupancy(cells), np.eye(4))
+    assert taken(part, ComposedField([part, replace(small, object_to_world=np.eye(4))])) is None
+
+
+def test_a_place_is_fused_to_one_tensor(folder, picture, report):
+    """What stands around stays as it was, and the object comes in, where there are texels for it."""
+    coarse = walls()
+    fine = coarse.resampled(WHOLE, (65,) * 3).with_occupancy(coarse.occupancy)
+    path = str(folder / "room.rfpack")
+    write_field(path, fine, "room", precision="float16", overwrite=True, origin=LIES)
+    said = report("fuse", "place.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
+    assert said["chosen"]["start"] == "the weights of 'room'"
+    one, wanted = picture("one.rfpack"), picture("place.json")
+    red = (wanted[..., 0] > 0.6) & (wanted[..., 2] < 0.4)
+    near = np.pad(red, 2)
+    near = np.any([np.roll(near, (a, b), (0, 1)) for a in range(-2, 3) for b in range(-2, 3)], 0)[2:-2, 2:-2]
+    assert red.sum() > 5 and psnr(one[~near], wanted[~near]) > 28
+    assert ((one[red][:, 0] > 0.5) & (one[red][:, 2] < 0.5)).mean() > 0.6
 
 
 def test_an_object_comes_into_a_place_and_goes_again(picture, report):

@@ -282,14 +282,14 @@ def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int)
     return np.concatenate(found).reshape(wanted.occupied.shape)
 
 
-def overlapped(grid: OccupancyGrid, longest: int) -> np.ndarray:
-    """(X, Y, Z) bool: cells of all of unbounded space, `longest` along each axis, that share a volume with an
-    occupied cell of a grid over a part of it."""
+def overlapped(grid: OccupancyGrid, longest: int, aabb: np.ndarray = unbounded.WHOLE) -> np.ndarray:
+    """(X, Y, Z) bool: cells of a box (6,) in a grid's coordinates, `longest` along its longest axis, that
+    share a volume with an occupied cell of the grid; by default of all of unbounded space."""
     found, counts = grid.occupied, np.asarray(grid.occupied.shape)
-    whole = cell_counts(unbounded.WHOLE, longest)
+    wanted, sides = cell_counts(aabb, longest), aabb[3:] - aabb[:3]
     for axis, count in enumerate(counts):
         low, side = grid.aabb[axis], grid.aabb[axis + 3] - grid.aabb[axis]
-        edges = unbounded.WHOLE[axis] + 2 * unbounded.SIDE / whole[axis] * np.arange(whole[axis] + 1)
+        edges = aabb[axis] + sides[axis] / wanted[axis] * np.arange(wanted[axis] + 1)
         at = (edges - low) / side * count
         at = np.where(abs(at - np.rint(at)) < ROUNDED, np.rint(at), at)
         first, last = np.floor(at[:-1]).astype(int), np.ceil(at[1:]).astype(int)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LEAST_TEXELS = 16  # along the longest axis: no student is coarser
 GROWTH = 2  # of the numbers, from one size to the next
 SMALLEST = 32  # times fewer numbers than the limit allows: where growing begins
+NOTHING = "nothing"  # what a student starts from that takes over no numbers
 SHRINK = 0.98  # steps in which a size is looked for that fits
 
 
@@ -279,7 +280,7 @@ class Student:
                 return taken, f"the weights of '{background.name}'"
         box = scene.occupancy.aabb
         fresh = self.kind.create(replace(plan, box=box), generator, "fused")
-        return fresh.with_occupancy(scene.occupancy), "nothing"
+        return fresh.with_occupancy(scene.occupancy), NOTHING
 
     # -- telling ---------------------------------------------------------------------------------------------
 

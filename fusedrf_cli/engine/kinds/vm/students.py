@@ -8,7 +8,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import Contents, Plan, Section, Suits, Way, finest_within
@@ -56,7 +56,10 @@ class VMKind(Kind):
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
     ) -> VMField | None:
         """A tensor over the scene's box that begins as the background does, where that is one, placed upright
-        and scaled alike along all axes."""
+        and scaled alike along all axes; a place's own tensor as it is, where the scene lies in it."""
+        kept = place_of(background, plan, scene)
+        if kept is not None:
+            return kept
         moved = upright(background)
         if moved is None:
             return None
@@ -94,6 +97,24 @@ class VMKind(Kind):
     ) -> Edited | None:
         """Cells emptied, and a tensor for what the rest shows there."""
         return editing.refilled(self, field, box, rest, teach)
+
+
+def place_of(background: Placed, plan: Plan, scene: ComposedField) -> VMField | None:
+    """The numbers of a place that gives a scene its frame, over the cells of the scene; None where they are
+    more than planned, or matter of the scene lies outside of what they cover."""
+    field, cells = background.field, scene.occupancy
+    if type(field) is not VMField or len(field.blocks) != 1 or not background.unbounded:
+        return None
+    box, shape = field.tensors[0].aabb, common_shape([field.shape, shape_of(plan.way)])
+    beyond = np.maximum(box[:3] - cells.centres(), cells.centres() - box[3:]).max()
+    as_placed = np.allclose(background.object_to_world, np.eye(4), atol=1e-9)
+    if not as_placed or beyond > cells.cell.max() or shape.size(field.resolution) > plan.numbers:
+        return None
+    if plan.way.ranks is not None and shape != shape_of(plan.way):
+        return None
+    grid = OccupancyGrid(box, overlapped(cells, SCENE_CELLS, box), cells.space)
+    own = reshaped(field, shape)
+    return own.with_params(own.params.clone()).with_occupancy(grid)
 
 
 def upright(background: Placed) -> VMField | None:
