@@ -39,8 +39,8 @@ from fusedrf_cli.requests import TrainRequest
 UNBOUNDED_DEGREE = 1  # SH: with more, colours that depend on the view explain what places should
 UNBOUNDED_TEXELS = 2.0  # times those of a box, along an axis of all of space: half lie outside the core
 LARGEST_PLACE = 100_000_000
-"""Bytes of a place where no size is asked for: voxels of all of space, as fine as planes are, would take a
-hundred times those of the planes."""
+"""Bytes of a place, stored as its kind is by default, where no size is asked for: voxels of all of space, as
+fine as planes are, would take a hundred times those of the planes."""
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
@@ -196,9 +196,11 @@ def fit_settings(
     )
     if extent.unbounded:
         settings = replace(settings, longest=texels_of_place(extent.box, settings.longest))
-    asked = request.max_size or (LARGEST_PLACE if extent.unbounded else None)
-    room = asked and max(1, asked - besides)
-    longest = fitting_longest(kind, extent.box, settings, room, request.precision)
+    if request.max_size or not extent.unbounded:
+        room = request.max_size and max(1, request.max_size - besides)
+        longest = fitting_longest(kind, extent.box, settings, room, request.precision)
+    else:  # however its numbers are stored
+        longest = fitting_longest(kind, extent.box, settings, LARGEST_PLACE, kind.faithful)
     plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)

@@ -1,14 +1,19 @@
 """What of unbounded space a capture's photos are learnt in."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from formats.views import Capture, View
+from fusedrf_cli.bridge import training
 from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.pictures import camera_of
-from fusedrf_cli.bridge.training import texels_of_place
+from fusedrf_cli.bridge.training import fit_settings, texels_of_place
+from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import look_at
 from fusedrf_cli.engine.spaces.unbounded import WHOLE, contracted
 from fusedrf_cli.requests import TrainRequest
@@ -60,3 +65,20 @@ def test_planes_over_a_part_of_space_have_as_many_texels_as_over_all_of_it():
 
     part = np.array([-2.0, -1.0, -1.0, 1.0, 1.0, 1.0])
     assert abs(texels(part) / texels(WHOLE) - 1) < 0.02
+
+
+@pytest.mark.parametrize("precision", ("float16", "float32"))
+def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, monkeypatch):
+    """Where no size is asked for, however the numbers are stored; and within one that is."""
+    monkeypatch.setitem(training.QUALITY, "normal", FitSettings(longest=256))
+    ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
+    capture, asked = photos(ring), replace(request(), quality="normal", precision=precision)
+    extent = extent_of(asked, capture, False)
+
+    def longest(kind: str, size: int | None = None) -> int:
+        limited = replace(asked, max_size=size)
+        return fit_settings(limited, registry.kind(kind), capture, extent, "cpu").longest
+
+    assert longest("vm") == longest("cp") == texels_of_place(extent.box, 256)
+    assert 100 < longest("dense") < longest("vm")
+    assert longest("vm", 10_000_000) < longest("vm")
