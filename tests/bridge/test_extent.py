@@ -72,7 +72,8 @@ def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(prec
     """Where no size is asked for, however the numbers are stored; and within one that is."""
     monkeypatch.setitem(training.QUALITY, "normal", FitSettings(longest=256))
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
-    capture, asked = photos(ring), replace(request(), quality="normal", precision=precision)
+    capture = photos(ring)
+    asked = replace(request(), quality="normal", precision=precision, ranks=(16, 24))
     extent = extent_of(asked, capture, False)
 
     def longest(kind: str, size: int | None = None) -> int:
