@@ -26,7 +26,7 @@ from fusedrf_cli.engine.kernels import cpu, reference
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
 from fusedrf_cli.engine.rendering.cameras import framing_camera
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from fusedrf_cli.engine.spaces import bounded
 
 POINTS, RAYS, REPEATS, TEXELS, CELLS, FRAME = 1 << 17, 1 << 11, 5, 224, 96, 800
@@ -148,11 +148,11 @@ def march_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
     """All samples of rays that lie in occupied cells."""
     half, alive = np.full(RAYS, 0.5), np.ones(RAYS, bool)
     (ts, spans), found = np.zeros((2, RAYS, int(4 / STEP))), np.zeros(RAYS, np.int64)
-    loops = cpu.loops_for(None, (), bounded)
+    loops, reach = cpu.loops_for(None, (), bounded), reach_of(RAYS, 0.0, np.inf)
 
     def ours():
         start = np.zeros(RAYS, np.int64)
-        loops.march(field.grid, rays_o, rays_d, 0.0, half, STEP, start, alive, ts, spans, found)
+        loops.march(field.grid, rays_o, rays_d, reach, half, STEP, start, alive, ts, spans, found)
 
     tensors = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
 

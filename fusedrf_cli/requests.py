@@ -62,6 +62,8 @@ class TrainRequest(Learning):
     """How many times smaller a side of photos is made; None: until it is no longer than photos need be."""
     masks: str
     """What the pixels mean that masks exclude: "ignore" or "alpha"."""
+    refine_poses: bool
+    """Whether to look for where the photos were taken from, near where they are said to have been."""
     memory: int | None
     resume: bool
 
@@ -155,6 +157,10 @@ class RenderRequest(Running):
     """How many times nearer than the default."""
     up: tuple[float, float, float] | None
     """Which way of the world is up, of any length but 0; None: as the scene tells."""
+    near: float
+    """Distance from a camera, in the world's units, from which what stands there is shown."""
+    far: float
+    """Distance up to which it is shown."""
     size: tuple[int, int] | None
     background: tuple[float, float, float] | None
     """None: transparent."""

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from fusedrf_cli.bridge.budget import Budget
@@ -12,13 +13,12 @@ from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun
+from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.student import NOTHING, DistillSettings, MadeStudent, Plan, Student, Way
-from fusedrf_cli.engine.spaces import unbounded
 from fusedrf_cli.requests import FuseRequest
 
 VIEWS_TO_CHOOSE_BY = 8
@@ -60,6 +60,11 @@ class Kept:
     did: DistillReport | None = None
     start: str | None = None
     """What it started from."""
+
+
+def same_texels(field: StoredField, other: StoredField) -> bool:
+    """Whether a field has texels where another has them, so that all of that one's detail is in it."""
+    return field.voxel_size == other.voxel_size and np.array_equal(field.aabb, other.aabb)
 
 
 class Maker:
@@ -150,10 +155,10 @@ class Maker:
         for i, plan in enumerate(plans):
             if before is not None and self.budget.over:
                 return
-            begun, start = self.begun(plan, before)
+            begun, start, recipe = self.begun(plan, before)
             if saved is not None and len(plans) > 1 and saved[1].get("numbers") != begun.params.numel():
                 continue  # the run that was interrupted had grown further
-            field, did = self.taught(begun.to(self.place), start, saved, len(plans) - i)
+            field, did = self.taught(begun.to(self.place), start, recipe, saved, len(plans) - i)
             before, saved = field.to("cpu"), None
             for way in ways:
                 size = self.student.bytes_of_plan(plan, way)
@@ -170,8 +175,8 @@ class Maker:
         """Bytes of the file that were allowed."""
         return self.student.request.limit
 
-    def begun(self, plan: Plan, before: StoredField | None) -> tuple[StoredField, str]:
-        """A student before it learns, and what it starts from."""
+    def begun(self, plan: Plan, before: StoredField | None) -> tuple[StoredField, str, Recipe]:
+        """A student before it learns, what it starts from, and how it is to learn."""
         generator = torch.Generator().manual_seed(self.request.seed)
         wanted = before is None and self.student.kind.takes_over and not self.request.from_scratch
         background = self.scene.background() if wanted else None
@@ -181,19 +186,19 @@ class Maker:
                 f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
                 "nothing"
             )
-        return field, start
+        recipe = DEFAULT_RECIPE
+        if wanted and start != NOTHING and same_texels(field, background.field):
+            recipe = replace(recipe, coarse=lambda student: False, rate=RATE_IN_PLACE)
+        return field, start, recipe
 
     def taught(
-        self, field: StoredField, start: str, saved: Saved | None, tries: int
+        self, field: StoredField, start: str, recipe: Recipe, saved: Saved | None, tries: int
     ) -> tuple[StoredField, DistillReport]:
         """A student that has learnt; an interrupt saves a checkpoint."""
         request, seconds = self.request, self.budget.part(tries)
         settings = replace(self.student.lesson, seed=request.seed, time_budget=seconds)
         if seconds is not None:  # more than there is time to learn from need not be asked
             settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * seconds) + 1))
-        recipe = DEFAULT_RECIPE
-        if start != NOTHING and field.occupancy.space is unbounded:  # the place's detail would be lost
-            recipe = replace(recipe, coarse=lambda student: False, rate=RATE_IN_PLACE)
         run = DistillRun(
             self.scene.composed, field, self.scene.boxes, settings, request.rgb, recipe, self.judge
         )

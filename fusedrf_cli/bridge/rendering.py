@@ -49,7 +49,8 @@ def render(request: RenderRequest, progress) -> dict:
         loaded.shelf.resize(budget.room(needed))
         budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
         progress.phase("rendering", len(views))
-        shooting = _Shooting(field, origin, request.background, request.depth, progress)
+        how = {"origin": origin, "near": request.near, "far": request.far}
+        shooting = _Shooting(field, how, request.background, request.depth, progress)
         if suffix in FILMS:
             write_film(output, shooting.frames(views), request.fps)
             files = [output]
@@ -105,7 +106,8 @@ class _Shooting:
     """What all pictures of one command share."""
 
     field: object
-    origin: np.ndarray
+    how: dict
+    """Where the field's frame lies, and what is shown of it: words of `render_image`."""
     background: tuple[float, float, float] | None
     depth: bool
     progress: object
@@ -116,7 +118,7 @@ class _Shooting:
         """(H, W, 3) uint8, one for each view, made when it is asked for."""
         for view in views:
             started = time.monotonic()
-            yield to_pixels(render_image(self.field, view, origin=self.origin), self.background)
+            yield to_pixels(render_image(self.field, view, **self.how), self.background)
             self.count(started)
 
     def picture(self, path: Path, view: Camera) -> dict | str:
@@ -127,7 +129,7 @@ class _Shooting:
             add = stack.enter_context(png_writer(path, *size, channels))
             beside = path.with_name(f"{path.stem}_depth.png")
             deep = stack.enter_context(depth_png_writer(beside, *size)) if self.depth else None
-            for band in render_bands(self.field, view, origin=self.origin):
+            for band in render_bands(self.field, view, **self.how):
                 add(to_pixels(band, self.background))
                 if deep:
                     deep[0](band.depth)

@@ -16,6 +16,7 @@ from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
+from fusedrf_cli.bridge.refined import aligned, moved, with_poses
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.running import (
     checkpoint_mismatch,
@@ -76,10 +77,15 @@ def train(request: TrainRequest, progress) -> dict:
                 raise checkpoint_mismatch(request.output)
             run.restore(*saved)
         field, seconds = _run(run, request.output, progress)
+        if settings.poses:
+            capture = with_poses(capture, extent, run.pool.poses)
+            kept = cameras_of_capture(capture, cut_out, progress)
         progress.phase("measuring", None)
         measured = None
         if request.holdout:
             measured = measure(field, capture, pictures, extent.origin, run.psnr)
+            if settings.poses:
+                measured["aligned"] = aligned(field, capture, extent, settings.near, request.seed)
             if capture.kind != "mesh":
                 warn_of_holdout(request.output, measured, progress)
         size = write_field(
@@ -105,6 +111,7 @@ def train(request: TrainRequest, progress) -> dict:
         "training_psnr": run.psnr,
         "holdout": measured,
         "exposure": exposure(run),
+        "poses": moved(run, cameras, extent) if settings.poses else None,
         "memory": memory.report(),
         **run.guard.figures(),
     }
@@ -146,6 +153,8 @@ def trained_kind(request: TrainRequest) -> Kind:
 def read_views(request: TrainRequest, progress) -> Capture:
     """The photos, or the views of a mesh, some of them held out where that is asked."""
     source = request.source
+    if request.refine_poses and is_mesh(source):
+        raise UsageProblem(f"{source}: the views of a mesh have exact poses; leave --refine-poses out")
     capture = (
         mesh_capture(source, n_train=request.views, size=request.size, seed=request.seed)
         if is_mesh(source)
@@ -192,6 +201,7 @@ def fit_settings(
         near=extent.near,
         unbounded=extent.unbounded,
         exposure=extent.unbounded and capture.opaque,
+        poses=request.refine_poses,
         device=place,
     )
     if extent.unbounded:

@@ -1,5 +1,7 @@
 """`fusedrf render`: pictures and films of a field or scene."""
 
+import math
+
 import click
 
 from fusedrf_cli import options
@@ -35,6 +37,12 @@ from fusedrf_cli.requests import RenderRequest
     show_default=True,
     help="Which way of the world is up; auto: as photos were held, or +z.",
 )
+@click.option(
+    "--near", type=options.POSITIVE, metavar="D", help="Leave out what is nearer to the camera than D."
+)
+@click.option(
+    "--far", type=options.POSITIVE, metavar="D", help="Leave out what is farther from the camera than D."
+)
 @options.size
 @click.option(
     "--background",
@@ -69,6 +77,9 @@ def command(scene, output, progress, **words):
         raise UsageProblem(
             f"--look-at, --from, --zoom and --up do not apply to --{chosen[0]}; leave them out"
         )
+    near, far = words.pop("near") or 0.0, words.pop("far") or math.inf
+    if near >= far:
+        raise UsageProblem(f"--near {near:g} leaves nothing before --far {far:g}; give a greater --far")
     from fusedrf_cli import bridge
 
-    return bridge.render(RenderRequest(scene=scene, output=output, **words), progress)
+    return bridge.render(RenderRequest(scene=scene, output=output, near=near, far=far, **words), progress)

@@ -55,6 +55,9 @@ from fusedrf_cli.requests import TrainRequest
     show_default=True,
     help="Leave what masks exclude out of training, or learn it as transparent.",
 )
+@click.option(
+    "--refine-poses", is_flag=True, help="Look for where photos were taken from, near the poses they have."
+)
 @options.memory
 @options.precision
 @options.resume

@@ -8,8 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import real
-from formats.images import read_image_header, write_png
+from benchmarks import real, spoiled
+from formats.captures import hold_out, read_capture
+from formats.images import read_image, read_image_header, write_png
+from fusedrf_cli.bridge.pictures import over_white
 from tests.formats.test_captures import looking_at
 
 
@@ -45,3 +47,26 @@ def test_the_page(data, shop, tmp_path, monkeypatch):
     assert "![wall](wall.jpg)" in (out / "table.md").read_text() and (out / "psnr.svg").exists()
     assert real.kept_rows(out / "real.csv", {"wall"}) == []
     assert [row["capture"] for row in real.kept_rows(out / "real.csv", {"fox"})] == ["wall", "wall"]
+
+
+@pytest.mark.slow
+def test_the_table_of_spoiled_captures(data, monkeypatch, capsys):
+    """Held-out photos and their poses stay as they are, the others do not."""
+    seen = []
+
+    def watched(folder, name, seconds, *words):
+        capture = hold_out(read_capture(folder), spoiled.EVERY)
+        seen.append((name, capture, over_white(np.stack([read_image(v.image_path) for v in capture.train]))))
+        return row(folder, name, seconds, *words)
+
+    row = spoiled.row
+    monkeypatch.setattr(spoiled, "row", watched)
+    monkeypatch.setattr(sys, "argv", ["spoiled", str(data / "wall"), "--seconds", "1"])
+    spoiled.main()
+    assert [len(line.split("|")) for line in capsys.readouterr().out.strip().splitlines()] == [7] * 7
+    (_, whole, pixels), *_, (_, moved, _) = seen
+    assert not np.allclose(pixels, seen[2][2]) and np.array_equal(pixels, seen[3][2])
+    for one, other in zip(whole.train, moved.train, strict=True):
+        assert 0 < abs(one.camera_to_world - other.camera_to_world).max() < 2
+    for one, other in zip(whole.test, moved.test, strict=True):
+        assert np.array_equal(one.camera_to_world, other.camera_to_world)

@@ -106,6 +106,33 @@ def test_a_plain_keyboard_interrupt_leaves_a_checkpoint_too(run, folder, monkeyp
     assert (folder / "out.rfpack.checkpoint").exists()
 
 
+def test_refined_poses_are_told_kept_and_measured_apart(report, run, folder):
+    """The bundle keeps the training photos' cameras where they are now, the held-out ones where they were."""
+    train(report, "as_given.rfpack", "--holdout", "4")
+    said = train(report, "out.rfpack", "--holdout", "4", "--refine-poses")
+    assert said["poses"]["turned_degrees"] >= 0 and said["poses"]["moved"] >= 0
+    assert {"psnr", "unaligned", "views"} == set(said["holdout"]["aligned"])
+    given, kept = (read_bundle(folder / f"{n}.rfpack").scene.cameras for n in ("as_given", "out"))
+    assert set(given) == set(kept) and len(json.dumps(given)) > 100
+    (folder / "mesh.obj").write_bytes(b"")
+    result = run("train", "mesh.obj", "-o", "mesh.rfpack", "--refine-poses")
+    assert result.exit_code == 2 and "exact poses" in result.stderr
+
+
+@pytest.mark.parametrize("at", [6, 54])
+def test_poses_are_kept_over_an_interrupt(report, run, folder, interrupted_in_step, at):
+    words = ("train", "photos", *WORDS, "--refine-poses", "-o")
+    report(*words, "straight.rfpack")
+    with interrupted_in_step(at):
+        result = run(*words, "out.rfpack")
+    assert result.exit_code == 130
+    report(*words, "out.rfpack", "--resume")
+    assert (
+        read_bundle(folder / "out.rfpack").fields.keys()
+        == read_bundle(folder / "straight.rfpack").fields.keys()
+    )
+
+
 def test_holdout_measures_on_views_left_out(report):
     said = train(report, "out.rfpack", "--holdout", "4")
     assert said["views"] + said["holdout"]["views"] >= 8 and said["holdout"]["views"] >= 2

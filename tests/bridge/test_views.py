@@ -76,6 +76,7 @@ def views_of(folder, scene: str, **asked) -> list[Camera]:
     unset = ("cameras", "path", "views", "orbit", "look_at", "direction", "up", "size", "memory")
     words = dict.fromkeys(unset)
     words |= {"zoom": 1.0, "background": None, "depth": False, "fps": 24.0, "allow_outside": False}
+    words |= {"near": 0.0, "far": np.inf}
     words |= {"scene": str(folder / scene), "output": "out", "overwrite": False}
     request = RenderRequest(device="cpu", threads=None, **words | asked)
     loaded = load_scene(request.scene)
@@ -435,7 +436,9 @@ def test_cameras_count_in_the_size_that_is_allowed(folder, short):
     training, capture = part("training"), read_capture(folder / "photos")
     box = Extent(np.array([-1.0] * 3 + [1] * 3), np.zeros(3))
     words = dict.fromkeys(("ranks", "sh_degree", "time_budget", "target_psnr", "max_size"))
-    asked = SimpleNamespace(quality="draft", precision="float16", seed=0, masks="ignore", **words)
+    asked = SimpleNamespace(
+        quality="draft", precision="float16", seed=0, masks="ignore", refine_poses=False, **words
+    )
     kind = registry.kind("vm")
     whole = training.fit_settings(asked, kind, capture, box, "cpu")
     asked.max_size = training.bytes_of(kind.untrained(box.box, whole.longest, whole.way), "float16")

@@ -143,6 +143,7 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "centre": None,
         "radius": None,
         "masks": "ignore",
+        "refine_poses": False,
         "resume": False,
     }
 
@@ -202,6 +203,7 @@ def test_render_hands_on_a_background(run, bridge, colour, background):
     assert (name, asked["scene"], asked["output"]) == ("render", "chair.rfpack", "out.png")
     assert asked["background"] == background
     others = {"cameras", "path", "views", "orbit", "look_at", "direction", "zoom", "up", "size", "depth"}
+    others |= {"near", "far"}
     wanted = {*COMMON, "scene", "output", "background", "allow_outside", "fps", *others}
     assert set(asked) == wanted - {"seed"}
 

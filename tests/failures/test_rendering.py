@@ -10,7 +10,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 import torch
@@ -21,7 +20,7 @@ from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.fit import FitSettings, fit, occupancy_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
-from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
+from fusedrf_cli.engine.rendering.cameras import framing_camera, look_at, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import EARLY_STOP, render_image, render_rays
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
@@ -321,18 +320,57 @@ def test_d7_near_cuts_the_half_space(row, kind):
         found = render_rays(field, o, d, near=near, step=1e-3, early_stop=0.0)[:, 3]
         error = abs(found - (1 - np.exp(-tau * left))).max()
         row.check("D7", f"{kind}: opacity behind near = {near:g}", error, 2.1e-3, at_most=True)
+    for far, left in ((np.inf, 1.0), (3.5, 1.0), (3.25, 0.75), (2.75, 0.25), (2.0, 0.0)):
+        found = render_rays(field, o, d, far=far, step=1e-3, early_stop=0.0)[:, 3]
+        error = abs(found - (1 - np.exp(-tau * left))).max()
+        row.check("D7", f"{kind}: opacity before far = {far:g}", error, 2.1e-3, at_most=True)
 
 
-def option_names(name: str) -> set[str]:
-    """Words of a command's options."""
-    return {p.name for p in cli.get_command(click.Context(cli), name).params}
+def test_d7_nothing_before_near_has_no_depth_that_is_not_a_number(row, kind):
+    o, d = np.array([[-3.0, 0.01, 0.02]]), np.array([[1.0, 0, 0]])
+    found = render_rays(still(kind)[0], o, d, near=50.0, far=60.0)
+    row.check("D7", f"{kind}: numbers that are finite where all is cut away", np.isfinite(found).mean(), 1)
 
 
-@pytest.mark.skipif(not {"near", "far"} <= option_names("render"), reason="render has no --near and --far")
 def test_d7_near_beyond_far_is_a_usage_error(row, tmp_path):
     path = write(tmp_path, "cube", still("vm")[0])
     result = invoke(tmp_path, "render", path, "-o", "a.png", "--near", "2", "--far", "1")
     row.check("D7", "exit code of near > far", result.exit_code == 2, 1)
+    assert "--near 2 leaves nothing before --far 1" in result.stderr
+
+
+@pytest.mark.parametrize("size", [(3, 3, 3), (3, 1, 2)])
+def test_d7_distances_are_the_worlds(row, kind, size):
+    """A placed slab, 3 long and its middle 9 away, in a frame that is scaled or stretched: exp(-τ/2) and
+    exp(-τ/4) are left where it is cut."""
+    tau, field = 2.0, exported(Box(2.0, 0.5, tint=scenes.GREY), kind, (64,) * 3)
+    camera = replace(framing_camera(field.aabb, 0.0, 0.0, 9, 9), fl_x=900.0, fl_y=900.0)
+    camera = replace(
+        camera,
+        camera_to_world=look_at(
+            np.array([9.0, 0.01, 0.02]), np.array([0, 0.01, 0.02]), np.array([0, 0, 1.0])
+        ),
+    )
+    for near, far in ((9.0, np.inf), (0.0, 9.0), (8.25, 9.0)):
+        shot = render_image(
+            field, camera, origin=np.diag([*size, 1.0]), near=near, far=far, step=1e-3, early_stop=0.0
+        )
+        starts, ends = max(near, 7.5), min(far, 10.5)
+        lost = np.exp(-tau / 3 * (ends - starts))
+        error = abs(shot.opacity - (1 - lost)).max()
+        row.check("D7", f"{kind}, scaled by {size}, {near:g} to {far:g}: opacity", error, 4e-3, at_most=True)
+        deep = starts + 3 / tau - (ends - starts) * lost / (1 - lost)
+        error = abs(shot.depth - deep).max()
+        row.check("D7", f"{kind}, scaled by {size}, {near:g} to {far:g}: depth", error, 0.03, at_most=True)
+
+
+def test_d7_the_command_cuts(row, tmp_path):
+    path = write(tmp_path, "cube", still("vm")[0])
+    for words in (("--near", "1000"), ("--far", "0.01")):
+        done = invoke(tmp_path, "render", path, "-o", "a.png", "-w", "--size", "16x16", *words)
+        assert done.exit_code == 0, done.stderr
+        darkest = read_image(tmp_path / "a.png").min()
+        row.check("D7", f"darkest pixel of what {words[0]} leaves of a cube", darkest, 255)
 
 
 # -- D8: poses -----------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from formats.records import FieldRecord, as_stored, decode_field, encode_field
 from fusedrf_cli.bridge.scene import make_field
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.rendering.volume import march_rays, render_rays
+from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.errors import InvalidInput
 from tests.engine.conftest import points_in, rays_at, unit
 from tests.engine.kinds.cases import KINDS, coarse_ownership, random_vm_mlp  # noqa: F401  (a fixture)
@@ -50,7 +50,7 @@ def test_one_pass_renders_what_the_general_renderer_does(field):
     step = 0.05 * field.voxel_size
     fast = render_rays(field, rays_o, rays_d, step=step)
     slow = np.zeros_like(fast)
-    march_rays(field, rays_o, rays_d, 0.0, step, 1e-3, slow)
+    march_rays(field, rays_o, rays_d, reach_of(len(rays_o), 0.0, np.inf), step, 1e-3, slow)
     assert fast[:, 3].max() > 0.5
     np.testing.assert_allclose(fast, slow, atol=0.04)
 

@@ -13,6 +13,15 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.poses import (
+    RAYS_OF_ALL,
+    RAYS_OF_ONE,
+    REFINED_AT,
+    TRIED_BY,
+    Poses,
+    changed,
+    refined,
+)
 from fusedrf_cli.engine.fields.base import StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
@@ -71,6 +80,8 @@ class FitSettings:
     exposure: bool = False
     """Whether pictures may differ in exposure and white balance, as a camera's own do. Not for views of an
     object from all around: of a side that few of them see nothing tells how bright it is."""
+    poses: bool = False
+    """Whether to look for where the pictures were taken from, near where they are said to have been."""
     target_psnr: float | None = None
     """dB of the training rays, less a margin, at which the fit may stop early."""
     seed: int = 0
@@ -111,6 +122,8 @@ class RayPool:
         poses = np.stack([c.camera_to_world for c in cameras])
         self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
         self.position = torch.from_numpy(poses[:, :3, 3].copy())
+        self.pixel = np.array([1 / camera.fl_x for camera in cameras])
+        """(n,) the angle of a pixel in the middle of each picture, in radians."""
         self.gains = torch.ones(len(cameras), 3)
         """What the colours of each picture are divided by."""
         self.epochs = Epochs(len(self.images) if drawn is None else len(drawn), generator)
@@ -139,6 +152,15 @@ class RayPool:
             colours[self.ignored[chosen]] = torch.nan
         colours = colours.reshape(len(sizes), count, 3) / self.gains[:, None]
         return *self.rays(chosen, torch.arange(len(sizes)).repeat_interleave(count)), colours
+
+    @property
+    def poses(self) -> Poses:
+        """Where the pictures were taken from."""
+        return Poses(self.rotation.numpy(), self.position.numpy())
+
+    def place(self, poses: Poses) -> None:
+        """Have the pictures taken from elsewhere."""
+        self.rotation, self.position = (torch.from_numpy(part.copy()) for part in poses)
 
     def rays(self, chosen: torch.Tensor, view: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """rays_o, rays_d (N, 3) float64 through pixels (N,) of pictures (N,)."""
@@ -184,6 +206,7 @@ class FitRun:
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(settings.stages[1:]), [*OCCUPANCY_AT, 1.0]
         self.exposures = list(MEASURED_AT) if settings.exposure else []
+        self.refinements = list(REFINED_AT) if settings.poses else []
         self.mse, self.rays = None, RAYS_PER_STEP[0]
         self.found_matter, self.found_nothing = False, 0
         self.guard = Guard(lambda: self.optimiser.numbers())
@@ -242,6 +265,8 @@ class FitRun:
         arrays |= {
             "random": self.generator.get_state().numpy(),
             "gains": self.pool.gains.numpy(),
+            "rotation": self.pool.rotation.numpy(),
+            "position": self.pool.position.numpy(),
         }
         order, drawn = self.pool.epochs.state()
         arrays |= order
@@ -255,6 +280,7 @@ class FitRun:
             "stages": len(self.stages),
             "refreshes": self.refreshes,
             "exposures": self.exposures,
+            "refinements": self.refinements,
             "found": [self.found_matter, self.found_nothing],
             "mse": self.mse,
             "rays": self.rays,
@@ -272,7 +298,9 @@ class FitRun:
         self.steps = state["steps"]
         self.stages = self.stages[len(self.stages) - state["stages"] :]
         self.refreshes, self.exposures = state["refreshes"], state["exposures"]
+        self.refinements = state["refinements"]
         self.pool.gains.copy_(torch.from_numpy(arrays["gains"]))
+        self.pool.place(Poses(arrays["rotation"], arrays["position"]))
         self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
         self.started = working_time() - state["elapsed"]
@@ -306,6 +334,20 @@ class FitRun:
         if self.exposures and share >= self.exposures[0]:
             self.exposures.pop(0)
             self.measure_exposure()
+        if self.refinements and share >= self.refinements[0]:
+            self.refinements.pop(0)
+            if self.found_matter:
+                self.refine_poses(share)
+
+    def refine_poses(self, share: float) -> None:
+        """Move each picture's camera to where the field shows it better."""
+        pool = self.pool
+        most = int(np.clip(RAYS_OF_ALL // len(pool.pixel), *RAYS_OF_ONE))
+        *rays, colours = pool.sample(most, self.generator)
+        first, last = TRIED_BY
+        pixels = max(last, first * (last / first) ** (2 * share))
+        change = refined(self.field, rays, colours, self.settings.near, pixels * pool.pixel)
+        pool.place(changed(pool.poses, change))
 
     def measure_exposure(self) -> None:
         """Divide the pictures' colours by what they are brighter than the field, once they surely differ."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, waves, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, reach_of, waves, weights_from_depths
 
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
 MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
@@ -152,7 +152,8 @@ def _ask_part(
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
     place = torch.zeros(0, 3, dtype=torch.float64)
     kept = [(place, place, torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
-    for ray, ts, spans, counts in waves(teacher, rays_o, rays_d, 0.0, jitter, step, lambda: trans > 1e-3):
+    reach = reach_of(len(rays_o), 0.0, np.inf)
+    for ray, ts, spans, counts in waves(teacher, rays_o, rays_d, reach, jitter, step, lambda: trans > 1e-3):
         mask = np.arange(ts.shape[1]) < counts[:, None]
         points = torch.from_numpy((rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None])[mask])
         dirs = torch.from_numpy(np.broadcast_to(rays_d[ray][:, None], (*ts.shape, 3))[mask])

@@ -35,9 +35,7 @@ def shown_cells(cameras: list[Camera], near: float, clear: list[float]) -> Occup
     return grid.marked(grid.marked(seen.reshape(counts)).dilated().occupied & ~empty.reshape(counts))
 
 
-def before(
-    camera: Camera, points: np.ndarray, reach: np.ndarray, near: float, clear: float
-) -> np.ndarray:
+def before(camera: Camera, points: np.ndarray, reach: np.ndarray, near: float, clear: float) -> np.ndarray:
     """(N,) bool: which balls around points (N, 3) of radii `reach` (N,) lie within `near` of a camera, where
     it could not have been held otherwise, or, with their middle in its picture, within `clear` of it."""
     offsets = points - camera.camera_to_world[:3, 3]

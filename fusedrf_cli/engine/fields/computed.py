@@ -195,14 +195,14 @@ class ComputedField:
         self,
         rays_o: np.ndarray,
         rays_d: np.ndarray,
-        near: float,
+        reach: np.ndarray,
         step: float,
         early_stop: float,
         out: np.ndarray,
     ) -> None:
-        """March, shade and composite in one pass: the fast path of `render_rays` in volume.py, with the same
-        columns in out (N, 5)."""
-        rays = Rays(exact(rays_o), exact(rays_d), float(near), float(step), float(early_stop))
+        """March, shade and composite in one pass, each ray from and to its distances reach (N, 2): the fast
+        path of `render_rays` in volume.py, with the same columns in out (N, 5)."""
+        rays = Rays(exact(rays_o), exact(rays_d), exact(reach), float(step), float(early_stop))
         self.loops.each("render_ray", self.arrays, self.grid, rays, len(rays_o), out, RAYS_PER_TASK)
 
     def peaks(

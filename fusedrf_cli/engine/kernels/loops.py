@@ -74,7 +74,7 @@ class Rays(NamedTuple):
 
     rays_o: object  # (N, 3) float64
     rays_d: object  # (N, 3) float64, unit length
-    near: object  # float
+    reach: object  # (N, 2) float64, from which distance to which
     step: object  # float
     early_stop: object  # float, the transmittance at which a ray ends
 
@@ -264,7 +264,7 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
     trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
     current = -1
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near)
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
         u0 = u0 + 0.5 * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
@@ -302,7 +302,7 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     count, shaded, current = 0, 0, -1
     last = kept.memory.shape[0] - KEPT
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, batch.near)
+        origin, way, u0, u1, course = piece(number, grid, o, d, batch.near, math.inf)
         u0 = u0 + batch.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > batch.early_stop and count < kept.k.shape[0]:
@@ -366,11 +366,11 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         for q in range(count):
             before = before[0] + kept.weight[q], before[1] + kept.weight[q] * kept.along[q]
     number = kept.piece[count - 1]
-    origin, way, u0, _, course = piece(number, grid, o, d, batch.near)
+    origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
     for q in range(count - 1, -1, -1):
         if PIECES > 1 and kept.piece[q] != number:
             number = kept.piece[q]
-            origin, way, u0, _, course = piece(number, grid, o, d, batch.near)
+            origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
         u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
         p = along(origin, way, u)
         place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
@@ -412,7 +412,7 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
     nx, ny, nz = grid.skip.shape
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near)
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, math.inf)
         u0 = u0 + rays.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
@@ -486,12 +486,12 @@ def sweep(field, grid, batch, count, most, grads, loss):
 # -- marching, which needs no field --------------------------------------------------------------------------
 
 
-def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, spans, counts):
-    """The next samples of ray i, from start[i] (piece and number of the sample) on: distances ts[i], what
-    lengths of the ray they stand for, spans[i], as many as counts[i]."""
+def march_ray(grid, rays_o, rays_d, reach, jitter, step, i, start, ts, spans, counts):
+    """The next samples of ray i within reach[i], from start[i] (piece and number of the sample) on: distances
+    ts[i], what lengths of the ray they stand for, spans[i], as many as counts[i]."""
     o, d = triple(rays_o, i), triple(rays_d, i)
     for number in range(start[i] % PIECES, PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, near)
+        origin, way, u0, u1, course = piece(number, grid, o, d, reach[i, 0], reach[i, 1])
         u0 = u0 + jitter[i] * step
         first = start[i] // PIECES if number == start[i] % PIECES else 0
         k, many = next_sample(grid, origin, way, u0, u1, step, first)
@@ -506,10 +506,11 @@ def march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, spans, cou
     start[i] = -1
 
 
-def march(grid, rays_o, rays_d, near, jitter, step, start, alive, ts, spans, counts):
-    """The next samples of every living ray: ts (N, K) distances, spans (N, K) the lengths that they stand
-    for, counts (N,); start (N,) int64, 0 at first, is where to go on, -1 at the end."""
+def march(grid, rays_o, rays_d, reach, jitter, step, start, alive, ts, spans, counts):
+    """The next samples of every living ray, from and to the distances reach (N, 2): ts (N, K) distances,
+    spans (N, K) the lengths that they stand for, counts (N,); start (N,) int64, 0 at first, is where to go
+    on, -1 at the end."""
     for i in prange(rays_o.shape[0]):
         counts[i] = 0
         if alive[i] and start[i] >= 0:
-            march_ray(grid, rays_o, rays_d, near, jitter, step, i, start, ts, spans, counts)
+            march_ray(grid, rays_o, rays_d, reach, jitter, step, i, start, ts, spans, counts)

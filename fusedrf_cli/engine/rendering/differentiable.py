@@ -26,7 +26,7 @@ from fusedrf_cli.engine.fields.differentiable import settle
 from fusedrf_cli.engine.kernels.reference import exact, interval
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, waves, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import EARLY_STOP, reach_of, waves, weights_from_depths
 from fusedrf_cli.engine.spaces import bounded
 
 
@@ -146,8 +146,9 @@ def visible_samples(
     trans = np.ones(len(rays_o))
     rays, distances, lengths = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
     middle = np.full(len(rays_o), 0.5)
+    reach = reach_of(len(rays_o), near, np.inf)
     for ray, ts, spans, counts in waves(
-        field, rays_o, rays_d, near, middle, step, lambda: trans > early_stop
+        field, rays_o, rays_d, reach, middle, step, lambda: trans > early_stop
     ):
         row, slot = np.nonzero(np.arange(ts.shape[1]) < counts[:, None])
         dirs = rays_d[ray[row]]

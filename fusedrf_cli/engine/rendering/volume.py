@@ -40,32 +40,41 @@ def render_rays(
     rays_o: np.ndarray,
     rays_d: np.ndarray,
     *,
-    near: float = 0.0,
+    near: float | np.ndarray = 0.0,
+    far: float | np.ndarray = np.inf,
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> np.ndarray:
-    """Render rays (N, 3) float64 of the field's frame: (N, 5) float32 premultiplied rgb, opacity, Σ w t.
+    """Render rays (N, 3) float64 of the field's frame, from distance `near` to `far`, of all rays or of each
+    (N,): (N, 5) float32 premultiplied rgb, opacity, Σ w t.
 
     A ray's numbers do not depend on which others it is rendered with. Where memory is short, fewer rays are
     done at once; MemoryError (or torch's own) when even that does not help. Raises ValueError for a direction
     of no length, along which there is no end, or one that is not finite.
     """
     check_directions(rays_d)
-    step = step or sampling_step(field)
+    step, reach = step or sampling_step(field), reach_of(len(rays_o), near, far)
     out = np.zeros((len(rays_o), 5), np.float32)
     compiled = getattr(field, "device_loops", True) is not None
     fast = getattr(field, "render_rays", None) if compiled else None
 
     def render(part: slice) -> None:
         if fast is not None:
-            fast(rays_o[part], rays_d[part], near, step, early_stop, out[part])
+            fast(rays_o[part], rays_d[part], reach[part], step, early_stop, out[part])
         else:
-            march_rays(field, rays_o[part], rays_d[part], near, step, early_stop, out[part])
+            march_rays(field, rays_o[part], rays_d[part], reach[part], step, early_stop, out[part])
 
     at_once = RAYS_AT_ONCE if fast is None else max(1, len(rays_o))
     for start in range(0, len(rays_o), at_once):
         in_halves(render, start, min(start + at_once, len(rays_o)))
     return out
+
+
+def reach_of(rays: int, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
+    """(N, 2) float64: from which distance to which each of so many rays is followed."""
+    reach = np.empty((rays, 2))
+    reach[:, 0], reach[:, 1] = near, far
+    return reach
 
 
 def check_directions(rays_d: np.ndarray) -> None:
@@ -100,7 +109,7 @@ def march_rays(
     field: RadianceField,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    near: float,
+    reach: np.ndarray,
     step: float,
     early_stop: float,
     out: np.ndarray,
@@ -111,7 +120,7 @@ def march_rays(
     trans = np.ones(n, np.float32)
     total = np.zeros((n, 5), np.float32)
     for ray, ts, spans, counts in waves(
-        field, rays_o, rays_d, near, np.full(n, 0.5), step, lambda: trans > early_stop
+        field, rays_o, rays_d, reach, np.full(n, 0.5), step, lambda: trans > early_stop
     ):
         mask = np.arange(ts.shape[1]) < counts[:, None]
         points = rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None]
@@ -146,20 +155,21 @@ def waves(
     field: RadianceField,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
-    near: float,
+    reach: np.ndarray,
     jitter: np.ndarray,
     step: float,
     alive: Callable[[], np.ndarray],
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """March rays in waves: yields (indices of rays with samples (M,), distances (M, K), the lengths of the
-    ray that these samples stand for (M, K), how many of them count (M,))."""
+    """March rays, from and to their distances reach (N, 2), in waves: yields (indices of rays with samples
+    (M,), distances (M, K), the lengths of the ray that these samples stand for (M, K), how many of them count
+    (M,))."""
     n = len(rays_o)
     start = np.zeros(n, np.int64)
     ts, spans, counts = *np.zeros((2, n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
     loops = cpu.loops_for(None, (), field.occupancy.space)
     while True:
         places = ts, spans, counts
-        loops.march(field.occupancy.arrays, rays_o, rays_d, near, jitter, step, start, alive(), *places)
+        loops.march(field.occupancy.arrays, rays_o, rays_d, reach, jitter, step, start, alive(), *places)
         ray = np.flatnonzero(counts)
         if not len(ray):
             return
@@ -173,17 +183,20 @@ def render_image(
     *,
     origin: np.ndarray | None = None,
     near: float = 0.0,
+    far: float = np.inf,
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> RenderedImage:
-    """Render one view; origin is where the field's frame lies in the world: its origin's position (3,), or
-    its placement (4, 4); float64, so that scenes far away hold."""
+    """Render what one view shows from the distance `near` to `far` along its rays; origin is where the
+    field's frame lies in the world: its origin's position (3,), or its placement (4, 4); float64, so that
+    scenes far away hold."""
     shape = camera.height, camera.width
     picture = RenderedImage(
         np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
     )
     top = 0
-    for band in render_bands(field, camera, origin=origin, near=near, step=step, early_stop=early_stop):
+    how = {"origin": origin, "near": near, "far": far, "step": step, "early_stop": early_stop}
+    for band in render_bands(field, camera, **how):
         rows = slice(top, top := top + len(band.rgb))
         picture.rgb[rows], picture.opacity[rows], picture.depth[rows] = band.rgb, band.opacity, band.depth
     return picture
@@ -195,6 +208,7 @@ def render_bands(
     *,
     origin: np.ndarray | None = None,
     near: float = 0.0,
+    far: float = np.inf,
     step: float | None = None,
     early_stop: float = EARLY_STOP,
 ) -> Iterator[RenderedImage]:
@@ -205,7 +219,8 @@ def render_bands(
         order = tile_order(camera.width, min(rows, camera.height - top))
         rays_o, rays_d = camera.rays(slice(top, top + rows), order)
         rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
-        found = render_rays(field, rays_o, rays_d, near=near, step=step, early_stop=early_stop)
+        reach = {"near": near * per_length, "far": far * per_length}
+        found = render_rays(field, rays_o, rays_d, **reach, step=step, early_stop=early_stop)
         found[:, 4] /= per_length
         pixels = np.empty_like(found)
         pixels[order] = found

@@ -29,12 +29,12 @@ def rate(q):
     return 1.0
 
 
-def piece(number, grid, o, d, near):
-    """(origin, direction, u0, u1, course) of a piece of the ray o + t d for t >= near: positions are
+def piece(number, grid, o, d, near, far):
+    """(origin, direction, u0, u1, course) of a piece of the ray o + t d, t in [near, far): positions are
     origin + u direction for u in [u0, u1), empty where u1 <= u0. `course` is what `distance` and `span`
     need."""
     t0, t1 = hit_box(o, d, grid.lo, grid.hi)
-    return o, d, max(t0, near), t1, 0.0
+    return o, d, max(t0, near), min(t1, far), 0.0
 
 
 def distance(course, u):

@@ -109,7 +109,7 @@ def leaving(region, o, d, t):
     return max(end, t), after
 
 
-def piece(number, grid, o, d, near):
+def piece(number, grid, o, d, near, far):
     """See bounded.py; `course` is (t0, t1 - t0, n0, n1, 1 / L)."""
     t0 = near
     region = region_at(o, d, t0)
@@ -120,6 +120,9 @@ def piece(number, grid, o, d, near):
             t1, after = leaving(region, o, d, t0)
         else:
             region = NOWHERE
+    if t0 >= far:
+        region = NOWHERE
+    t1 = min(t1, far)
     p0 = (o[0] + t0 * d[0], o[1] + t0 * d[1], o[2] + t0 * d[2])
     p1 = (o[0] + t1 * d[0], o[1] + t1 * d[1], o[2] + t1 * d[2])
     n0, n1 = 1.0, 1.0

@@ -13,6 +13,7 @@ from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
+from fusedrf_cli.engine.rendering.volume import reach_of
 from fusedrf_cli.engine.spaces import bounded
 from tests.engine.conftest import (
     BOX,
@@ -391,11 +392,11 @@ def test_parts_only_split_the_work():
 # -- rendering -----------------------------------------------------------------------------------------------
 
 
-def render(field, rays_o, rays_d, near=0.0, step=0.05, early_stop=0.0, grid=None) -> np.ndarray:
+def render(field, rays_o, rays_d, near=0.0, far=np.inf, step=0.05, early_stop=0.0, grid=None) -> np.ndarray:
     out = np.full((len(rays_o), 5), np.nan)
     if grid is not None:
         field.grid = grid
-    field.render_rays(rays_o, rays_d, near, step, early_stop, out)
+    field.render_rays(rays_o, rays_d, reach_of(len(rays_o), near, far), step, early_stop, out)
     return out
 
 
@@ -429,12 +430,12 @@ def test_near_cuts_what_lies_before():
 def march(grid: GridArrays, rays_o, rays_d, step, near=0.0, jitter=0.5, wave=1000) -> list[np.ndarray]:
     """Every ray's sample distances, gathered in waves."""
     n = len(rays_o)
-    start, alive = np.zeros(n, np.int64), np.ones(n, bool)
+    start, alive, reach = np.zeros(n, np.int64), np.ones(n, bool), reach_of(n, near, np.inf)
     found = [[] for _ in range(n)]
     while (start >= 0).any():
         ts, counts = np.zeros((n, wave)), np.zeros(n, np.int64)
         MARCH(
-            grid, rays_o, rays_d, near, np.full(n, jitter), step, start, alive, ts, np.zeros_like(ts), counts
+            grid, rays_o, rays_d, reach, np.full(n, jitter), step, start, alive, ts, np.zeros_like(ts), counts
         )
         for i in range(n):
             found[i].append(ts[i, : counts[i]])

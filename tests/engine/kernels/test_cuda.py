@@ -15,7 +15,7 @@ from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import framing_camera
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.engine.conftest import BOX, points_in, random_vm, rays_at, unit
 from tests.engine.kernels.simulated import (
     EXACT,
@@ -109,7 +109,7 @@ def test_render(name, dtype):
 
     def picture(field):
         out = np.zeros((4, 5))
-        field.render_rays(rays_o, rays_d, 0.0, 0.1, 1e-3, out)
+        field.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
         return (out,)
 
     for wanted, found in twice(field, picture):

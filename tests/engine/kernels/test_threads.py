@@ -13,6 +13,7 @@ SCRIPT = """
 import numba, numpy as np, torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.computed import Batch
+from fusedrf_cli.engine.rendering.volume import reach_of
 from tests.engine.conftest import points_in, random_vm, rays_at, unit
 field, rng = random_vm(cells=4), np.random.default_rng(1)
 points, dirs = points_in(field.aabb, 20_000), unit(rng.normal(size=(20_000, 3)))
@@ -24,7 +25,7 @@ for threads in (1, 2, 4):
     kernels.set_threads(threads)
     out, grads, loss = np.zeros((count, 5)), np.zeros((4, field.params.numel())), np.zeros((4, 3))
     found = [x.numpy() for x in field.query(points, dirs)]
-    field.render_rays(*rays, 0.0, 0.1, 1e-3, out)
+    field.render_rays(*rays, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
     field.train_rays(batch, grads, loss)
     field.query_backward(points, dirs, d_sigma, d_rgb, grads)
     found += [out, grads, loss]

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.kinds.vm_mlp import bodies
 from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untrained
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.analytic.export import way_of
 
 from ..conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
@@ -113,7 +113,7 @@ def test_rendering_equals_a_slow_loop():
     rays_o, rays_d = rays_at(BOX, 12)
     step = 0.07
     found = np.zeros((12, 5))
-    field.render_rays(rays_o, rays_d, 0.0, step, 0.0, found)
+    field.render_rays(rays_o, rays_d, reach_of(len(found), 0.0, np.inf), step, 0.0, found)
     assert found[:, 3].max() > 0.5
     for ray in range(12):
         o, d, trans, rgb, waiting = rays_o[ray], rays_d[ray], 1.0, np.zeros(3), 0.0

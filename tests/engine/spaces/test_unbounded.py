@@ -20,7 +20,7 @@ from fusedrf_cli.engine.kinds.vm import field as vm_field
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at
-from fusedrf_cli.engine.rendering.volume import march_rays, render_rays
+from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import space_named, unbounded
 from fusedrf_cli.engine.spaces.unbounded import FAR, PIECES, WHOLE
 from tests.analytic.export import vm_field as exported
@@ -46,9 +46,9 @@ def rays(count: int):
             yield o, d / np.linalg.norm(d)
 
 
-def pieces(o, d, near=0.0):
+def pieces(o, d, near=0.0, far=np.inf):
     """The pieces of a ray that hold anything, in order."""
-    found = [SPACE["piece"](k, GRID.arrays, tuple(o), tuple(d), near) for k in range(PIECES)]
+    found = [SPACE["piece"](k, GRID.arrays, tuple(o), tuple(d), near, far) for k in range(PIECES)]
     return [piece for piece in found if piece[3] > piece[2]]
 
 
@@ -77,6 +77,17 @@ def test_pieces_are_straight_and_follow_each_other_out_to_the_end():
             end = SPACE["distance"](course, u1)
         if found:
             assert np.abs(o + end * d).max() == pytest.approx(FAR, rel=1e-6)
+
+
+def test_pieces_between_two_distances_are_what_lies_between_them():
+    for o, d in rays(500):
+        whole = [(SPACE["distance"](c, u0), SPACE["distance"](c, u1)) for _, _, u0, u1, c in pieces(o, d)]
+        for near, far in ((0.3, 2.0), (0.0, 0.7), (1.1, 40.0), (3.0, 3.0)):
+            part = pieces(o, d, near, far)
+            found = [(SPACE["distance"](c, u0), SPACE["distance"](c, u1)) for _, _, u0, u1, c in part]
+            wanted = [(max(a, near), min(b, far)) for a, b in whole if min(b, far) > max(a, near) + 1e-9]
+            found = [(a, b) for a, b in found if b > a + 1e-9]
+            assert np.ravel(found) == pytest.approx(np.ravel(wanted), rel=1e-7, abs=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.3, 1e-4])
@@ -158,7 +169,7 @@ def test_waves_and_the_one_pass_show_the_same():
     o = np.array([o for o, _ in rays(200)])
     d = np.array([d for _, d in rays(200)])
     out = np.zeros((len(o), 5), np.float32)
-    march_rays(field, o, d, 0.0, 0.02, 1e-3, out)
+    march_rays(field, o, d, reach_of(len(o), 0.0, np.inf), 0.02, 1e-3, out)
     whole = render_rays(field, o, d, step=0.02)
     assert whole[:, 3].max() > 0.5
     # up to LENT_FROM of the light is shown in another sample's colour
@@ -198,7 +209,19 @@ def distortion(field: VMField, o: np.ndarray, d: np.ndarray, jitter: np.ndarray,
     15)."""
     ts, spans, counts = *np.zeros((2, len(o), 4000)), np.zeros(len(o), np.int64)
     start, alive = np.zeros(len(o), np.int64), np.ones(len(o), bool)
-    SPACE["march"](field.occupancy.arrays, o, d, 0.0, jitter, step, start, alive, ts, spans, counts)
+    SPACE["march"](
+        field.occupancy.arrays,
+        o,
+        d,
+        reach_of(len(o), 0, np.inf),
+        jitter,
+        step,
+        start,
+        alive,
+        ts,
+        spans,
+        counts,
+    )
     assert (start < 0).all()
     total = 0.0
     for i in range(len(o)):
@@ -243,7 +266,8 @@ def test_the_largest_weight_of_each_cell():
     wanted = np.zeros(grid.occupied.shape)
     ts, spans, counts = *np.zeros((2, 20, 4000)), np.zeros(20, np.int64)
     start = np.zeros(20, np.int64)
-    SPACE["march"](grid.arrays, o, d, 0.1, jitter, 0.05, start, np.ones(20, bool), ts, spans, counts)
+    reach, alive = reach_of(20, 0.1, np.inf), np.ones(20, bool)
+    SPACE["march"](grid.arrays, o, d, reach, jitter, 0.05, start, alive, ts, spans, counts)
     for i in range(20):
         trans = 1.0
         for t, length in zip(ts[i, : counts[i]], spans[i, : counts[i]], strict=True):

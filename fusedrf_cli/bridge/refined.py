@@ -1,0 +1,84 @@
+"""Photos whose poses were refined while a field was learnt from them: where they were taken from now, and
+what that is worth on photos that the field has not seen, whose poses are as inexact."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from formats.views import Capture
+from fusedrf_cli.bridge.extent import Extent
+from fusedrf_cli.bridge.pictures import WHITE, camera_of, truth_of
+from fusedrf_cli.engine.distillation.fit import FitRun, Pictures, RayPool
+from fusedrf_cli.engine.distillation.poses import Poses, angles_between, changed_each, refined
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.rendering.volume import render_image
+
+ROUNDS = 12
+ALIGNED_BY = (4.0, 0.5)  # pixels by which poses are tried: at first, at last
+RAYS = 600  # of each photo
+
+
+def poses_of(cameras: list[Camera]) -> Poses:
+    """Where cameras are, in the frame that they are given in."""
+    placed = np.stack([camera.camera_to_world for camera in cameras])
+    return Poses(placed[:, :3, :3], placed[:, :3, 3])
+
+
+def with_poses(capture: Capture, extent: Extent, poses: Poses) -> Capture:
+    """A capture whose training photos were taken from poses in the field's frame."""
+    views = []
+    for view, rotation, position in zip(capture.train, *poses, strict=True):
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation, extent.unit * position + extent.centre
+        views.append(replace(view, camera_to_world=matrix))
+    return replace(capture, train=tuple(views))
+
+
+def moved(run: FitRun, cameras: list[Camera], extent: Extent) -> dict[str, float]:
+    """By how many degrees, and how far in the world, the median camera is from where it was said to be."""
+    before, now = poses_of(cameras), run.pool.poses
+    return {
+        "turned_degrees": float(np.degrees(np.median(angles_between(before, now)))),
+        "moved": float(np.median(np.linalg.norm(now.position - before.position, axis=1)) * extent.unit),
+    }
+
+
+def aligned(field, capture: Capture, extent: Extent, near: float, seed: int) -> dict[str, float] | None:
+    """PSNR in dB, means over the right halves of the held-out photos, in the pixels that their masks keep:
+    with the poses that suit their left halves best, and `unaligned` with those that they came with. None
+    where no photo has pixels in both halves."""
+    shots = [truth_of(view) for view in capture.test]
+    cameras = [extent.camera(camera_of(view)) for view in capture.test]
+    halves = [np.arange(kept.shape[1]) < kept.shape[1] // 2 for _, kept in shots]
+    usable = [
+        (kept & half).any() and (kept & ~half).any() for (_, kept), half in zip(shots, halves, strict=True)
+    ]
+    rows = []
+    for camera, (truth, kept), half, there in zip(cameras, shots, halves, usable, strict=True):
+        if there:
+            found = align(field, camera, truth, kept & half, near, seed)
+            judged = kept & ~half
+            row = [render_image(field, c, near=near).over(WHITE) for c in (found, camera)]
+            rows.append([psnr(shot[judged], truth[judged]) for shot in row])
+    if not rows:
+        return None
+    best, unaligned = np.mean(rows, 0)
+    return {"psnr": float(best), "unaligned": float(unaligned), "views": len(rows)}
+
+
+def align(field, camera: Camera, truth: np.ndarray, learnt: np.ndarray, near: float, seed: int) -> Camera:
+    """The camera near one of the field's frame from which the field shows the pixels `learnt` (H, W) of a
+    photo (H, W, 3) best."""
+    generator = torch.Generator().manual_seed(seed)
+    pixels = np.concatenate([np.rint(255 * truth), np.full((*learnt.shape, 1), 255)], -1).astype(np.uint8)
+    pool = RayPool([camera], Pictures(pixels.reshape(-1, 4), ~learnt.reshape(-1)), generator)
+    first, last = ALIGNED_BY
+    for number in range(ROUNDS):
+        *rays, colours = pool.sample(RAYS, generator)
+        probe = first * (last / first) ** (number / (ROUNDS - 1)) * pool.pixel
+        pool.place(changed_each(pool.poses, refined(field, rays, colours, near, probe)))
+    matrix = camera.camera_to_world.copy()
+    matrix[:3, :3], matrix[:3, 3] = pool.rotation[0].numpy(), pool.position[0].numpy()
+    return replace(camera, camera_to_world=matrix)

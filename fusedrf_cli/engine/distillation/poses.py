@@ -1,0 +1,129 @@
+"""Where photos were taken from, found anew by how a field shows what they show: structure from motion, or a
+phone's own tracking, is off by some pixels, which would be learnt as blur."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.rendering.volume import render_rays
+
+RAYS_OF_ALL = 20_000
+"""That one round renders seven times, and once more."""
+RAYS_OF_ONE = (150, 400)
+"""Of each photo: at least, at most."""
+REFINED_AT = (0.08, 0.11, 0.14, 0.18, 0.23, 0.29, 0.36, 0.44, 0.53, 0.63)
+"""Shares of a run: while the field is coarse, poses are found from afar."""
+TRIED_BY = (4.0, 1.0)
+"""Pixels by which a pose is changed to see what that changes in its picture: at first, at last."""
+OPAQUE = 0.98
+"""Opacity of a ray that shows the field, and no edge before what lies behind it."""
+FEW = 48
+"""Rays that tell too little."""
+DAMPING = 0.02
+"""Of the squared slopes, that are added to them: a parameter that changes little stays."""
+FAIR = 0.2
+"""Difference of colours that counts half: a photo shows things that the field does not hold."""
+SURE = 2.0
+"""Times what the noise of so few rays alone would change, under which a pose stays as it is; what is more is
+drawn towards that (the positive part of James and Stein's estimate)."""
+PARTS = (1.0, 0.3)
+"""Of a step that are tried, one after the other, until one helps."""
+LARGEST = 8.0
+"""Probes by which a pose changes in one round at most."""
+
+
+class Poses(NamedTuple):
+    """Of n photos, in the field's frame."""
+
+    rotation: np.ndarray
+    """(n, 3, 3) float64, camera to frame."""
+    position: np.ndarray
+    """(n, 3) float64."""
+
+
+def refined(
+    field: RadianceField,
+    rays: tuple[np.ndarray, np.ndarray],
+    photos: torch.Tensor,
+    near: float,
+    probe: np.ndarray,
+) -> np.ndarray:
+    """(n, 6) float64: by which angles about the frame's axes (3, radians) each of n photos' cameras is to be
+    turned, and by how much moved (3), so that the field shows their colours better: one damped step of Gauss
+    and Newton, with slopes from differences. All 0 where that does not help.
+
+    rays: origins and unit directions (n * m, 3), m of each photo in order; photos (n, m, 3) their colours in
+    [0, 1], not finite where they do not count. probe (n,): the angle in radians by which each is tried.
+    """
+    n, m, _ = photos.shape
+    o, d = (part.reshape(n, m, 3) for part in rays)
+    truth = photos.double().numpy()
+    counts = np.isfinite(truth).all(2)
+
+    def shown(change: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """(k, m, 5) what those photos' poses (k,) show when they are changed."""
+        turned = d[which] @ turns(change[which, :3]).transpose(0, 2, 1)
+        moved = o[which] + change[which, None, 3:]
+        found = render_rays(field, moved.reshape(-1, 3), turned.reshape(-1, 3), near=near)
+        return found.reshape(-1, m, 5).astype(np.float64)
+
+    every = np.arange(n)
+    now = shown(np.zeros((n, 6)), every)
+    counts &= now[..., 3] > OPAQUE
+    # moved by so much, what is seen moves about as if turned by one radian
+    afar = np.array(
+        [np.median(row[c, 4] / row[c, 3]) if c.any() else 1.0 for row, c in zip(now, counts, strict=True)]
+    )
+    missed = np.where(counts[..., None], now[..., :3] - np.nan_to_num(truth), 0)
+    fair = counts / (1 + (missed**2).sum(2) / FAIR**2)
+    scale = np.concatenate([np.tile(probe[:, None], 3), np.tile((probe * afar)[:, None], 3)], 1)
+    slopes = np.stack([shown(scale * axis, every)[..., :3] - now[..., :3] for axis in np.eye(6)], -1)
+    square = np.einsum("nm,nmcp,nmcq->npq", fair, slopes, slopes)
+    square += DAMPING * np.einsum("npp->np", square)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
+    step = -np.linalg.solve(square, np.einsum("nm,nmcp,nmc->np", fair, slopes, missed)[..., None])[..., 0]
+    told = np.einsum("np,npq,nq->n", step, square, step)
+    left = np.maximum((fair * (missed**2).sum(2)).sum(1) - told, 0)
+    noise = left / np.maximum(3 * counts.sum(1) - 6, 1)
+    step *= np.maximum(0, 1 - SURE * 6 * noise / np.maximum(told, 1e-300))[:, None]
+    step *= np.minimum(1, LARGEST / np.maximum(abs(step).max(1, keepdims=True), 1e-12))
+    change, open_yet = np.zeros((n, 6)), np.flatnonzero(counts.sum(1) >= FEW)
+    for part in PARTS:
+        if len(open_yet):
+            after = shown(part * scale * step, open_yet)[..., :3] - np.nan_to_num(truth[open_yet])
+            error = (fair[open_yet] * (after**2).sum(2)).sum(1)
+            helps = error < (fair * (missed**2).sum(2)).sum(1)[open_yet]
+            change[open_yet[helps]] = (part * scale * step)[open_yet[helps]]
+            open_yet = open_yet[~helps]
+    return change
+
+
+def turns(angles: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) rotations about axes (n, 3) whose lengths are the angles, in radians (Rodrigues)."""
+    angle = np.maximum(np.linalg.norm(angles, axis=1), 1e-300)[:, None, None]
+    x, y, z = (angles / angle[..., 0]).T
+    none = np.zeros_like(x)
+    across = np.array([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
+    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+
+
+def changed_each(poses: Poses, change: np.ndarray) -> Poses:
+    """Poses after changes (n, 6) as `refined` gives them."""
+    return Poses(turns(change[:, :3]) @ poses.rotation, poses.position + change[:, 3:])
+
+
+def changed(poses: Poses, change: np.ndarray) -> Poses:
+    """Poses after changes (n, 6), without the turn, the move and the scale that these have in common, in
+    first order: all cameras moved together show the same of a field that moves with them."""
+    offsets = poses.position - poses.position.mean(0)
+    turn = change[:, :3].mean(0)
+    move = change[:, 3:] - change[:, 3:].mean(0) - np.cross(turn, offsets)
+    move -= (move * offsets).sum() / max((offsets**2).sum(), 1e-300) * offsets
+    return changed_each(poses, np.concatenate([change[:, :3] - turn, move], 1))
+
+
+def angles_between(one: Poses, other: Poses) -> np.ndarray:
+    """(n,) by how many radians cameras are turned against each other."""
+    cosine = (np.einsum("nij,nij->n", one.rotation, other.rotation) - 1) / 2
+    return np.arccos(np.clip(cosine, -1, 1))
