@@ -214,3 +214,24 @@ def test_what_masks_exclude_does_not_count(report, folder):
     found = report("eval", "red.rfpack", "--against", "photos")["views"]
     assert [v["name"] for v in found] == [v["name"] for v in clean]
     assert all(v["psnr"] > 35 and v["ssim"] > 0.95 for v in found)
+
+
+@pytest.mark.parametrize("x", [-0.5, 4.0])
+def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
+    """As `sparse`, an object in the core and one far outside of it are there, and edits leave the rest."""
+    nodes = [
+        make_node("room", source="room.rfpack", background=True),
+        make_node("red", source="red.rfpack", translation=(x, 0, 0), scale=(2, 2, 2)),
+    ]
+    more = make_node("more", source="red.rfpack", translation=(0.6, 0.5, 0))
+    write_scene(fused / "one.json", SceneGraph(tuple(nodes)), overwrite=True)
+    write_scene(fused / "two.json", SceneGraph((*nodes, more)), overwrite=True)
+    words = ("--kind", "sparse", "--no-rgb", "--max-size", "3MB", "-w")
+    said = done(fused, "fuse", "one.json", *words, "-o", "bricks.rfpack")
+    assert said["psnr"]["stored"] > 35
+    place = ("red.rfpack", "--name", "more", "-t", "0.6,0.5,0")
+    done(fused, "add", "bricks.rfpack", *place, "-o", "more.rfpack", "-w")
+    done(fused, "delete", "more.rfpack", "more", "-o", "less.rfpack", "-w")
+    for bundle, against in (("more.rfpack", "two.json"), ("less.rfpack", "one.json")):
+        like = done(fused, "eval", bundle, "--against", against, "--size", "48x48")["mean"]
+        assert like["psnr"] > 35

@@ -60,8 +60,9 @@ class MaxOf:
 
     kind = "densest"
 
-    def __init__(self, placed: list[Placed]):
-        self.placed = placed
+    def __init__(self, placed: list[Placed], occupancy: OccupancyGrid | None = None):
+        """occupancy: of a field in the frame of all, whose space is that of this one too."""
+        self.placed, self.occupancy = placed, occupancy
 
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True

@@ -2,6 +2,7 @@
 learned."""
 
 from collections.abc import Iterator
+from types import ModuleType
 from typing import Protocol
 
 import numpy as np
@@ -42,15 +43,17 @@ def placed_in(teacher: RadianceField) -> list[Placed]:
     return getattr(teacher, "placed", None) or [Placed("", teacher, np.eye(4))]
 
 
-def density(source, places: np.ndarray) -> np.ndarray:
-    """(N,) float64 σ at places (N, 3) of a field or a placed one, the mean over three axes where that depends
-    on the direction."""
+def density(source, places: np.ndarray, space: ModuleType | None = None) -> np.ndarray:
+    """(N,) float64 σ, per length of a space's coordinates, at places (N, 3) in them, of a field or a placed
+    one: the mean over three axes where that depends on the direction. The space is a field's own where none
+    is given."""
+    space = space or source.occupancy.space
     parts = [source] if isinstance(source, Placed) else placed_in(source)
     stretched = any(p.condition > 1 + 1e-6 for p in parts)
     found = np.zeros(len(places))
     axes = np.eye(3)[: 3 if stretched else 1]
     for part in pieces(len(places), AT_ONCE):
-        points = torch.from_numpy(places[part])
+        points = space.placed(torch.from_numpy(places[part]))
         for axis in axes:
             dirs = torch.from_numpy(np.broadcast_to(axis, points.shape).copy())
             if isinstance(source, Placed):
@@ -59,7 +62,7 @@ def density(source, places: np.ndarray) -> np.ndarray:
             else:
                 sigma = source.query(points, dirs, False)[0].double()
             found[part] += sigma.numpy() / len(axes)
-    return found
+    return found / space.rates(torch.from_numpy(places)).numpy()
 
 
 def seen_colours(
@@ -173,13 +176,14 @@ def inverse_softplus(y: np.ndarray) -> np.ndarray:
 
 
 def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
-    """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3), by least
-    squares over the directions along which they are seen (facing (N, 3), as `around` has it).
+    """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at places (N, 3) in the
+    coordinates of its space, by least squares over the directions along which they are seen (facing (N, 3),
+    as `around` has it).
 
     What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
     is exact, however the teacher is turned, but for what ONE_SIDED leaves.
     """
-    dirs = even_directions(DIRECTIONS)
+    dirs, space = even_directions(DIRECTIONS), teacher.occupancy.space
     basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
     found = np.empty((len(places), 3, len(basis[0])), np.float32)
     one_sided = np.linalg.norm(facing, axis=1) > ONE_SIDED
@@ -192,9 +196,9 @@ def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degr
         solve = np.linalg.solve(weighted.T @ basis[asked] + ridge, weighted.T)
         own = np.flatnonzero(side == group)
         for part in pieces(len(own), AT_ONCE // len(asked)):
-            points = np.repeat(places[own[part]], len(asked), 0)
+            points = space.placed(torch.from_numpy(np.repeat(places[own[part]], len(asked), 0)))
             along = np.tile(dirs[asked], (len(points) // len(asked), 1))
-            rgb = teacher.query(torch.from_numpy(points), torch.from_numpy(along))[1].double().numpy()
+            rgb = teacher.query(points, torch.from_numpy(along))[1].double().numpy()
             edge = 1 / (1 + np.exp(LOGITS))
             rgb = np.clip(rgb, edge, 1 - edge)
             logits = np.log(rgb / (1 - rgb)).reshape(-1, len(asked), 3)

@@ -30,7 +30,7 @@ def added(field: SparseField, placed: Placed) -> SparseField:
     """The field with an object put in, placed in its frame: where that is the densest, at the level that it
     needs. Raises ValueError where it would be too large."""
     tree = field.tree.extended(placed.aabb)
-    both = MaxOf([Placed("", field, np.eye(4)), placed])
+    both = MaxOf([Placed("", field, np.eye(4)), placed], field.occupancy)
     level = level_for(placed.voxel_size, tree.top)
     wanted = [np.zeros(0, np.int64)] * (level + 1)
     wanted[level] = demanded(both, placed, level, tree.lo, tree.top, tree.counts)
@@ -44,7 +44,7 @@ def added(field: SparseField, placed: Placed) -> SparseField:
 def emptied(field: SparseField, region: np.ndarray, rest: list[Placed]) -> SparseField | None:
     """The field whose vertices in a box (6,) show what the rest, placed in its frame, does there; nothing
     where there is no rest. None where nothing is left."""
-    inside = MaxOf([p for p in rest if p.reaches(region)])
+    inside = MaxOf([p for p in rest if p.reaches(region)], field.occupancy)
     tree, wanted = field.tree, [np.zeros(0, np.int64)] * (MAX_LEVEL + 1)
     for one in inside.placed:
         level = level_for(one.voxel_size, tree.top)
@@ -192,7 +192,7 @@ def chosen(
     before = np.where(feature > LEAST, field.scale * np.logaddexp(0, feature), 0)
     near = meets(places, places, box)
     now = np.zeros(len(places))
-    now[near] = density(source, places[near])
+    now[near] = density(source, places[near], field.space)
     taken = near & takes(places, side, before, now)
     return taken, np.where(taken, now, before)
 

@@ -4,7 +4,10 @@ A place is about as fine as the object that is densest there needs in world unit
 much, what is finest gives way most. What no camera sees is not held. filling.py says what the vertices get.
 """
 
+from types import ModuleType
+
 import numpy as np
+import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
@@ -30,6 +33,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 )
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
+from fusedrf_cli.engine.spaces import bounded
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
 YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way
@@ -45,6 +49,7 @@ MOST_TRIED = 1 << 31  # bricks in a placed field's box
 ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has fitted yet
 AIMED, FULL_ENOUGH = 0.98, 0.88  # of the numbers allowed
 FIRST_WIDENING = 2.0  # what is tried first is cheap
+FIRST_IN_PLACE = 6.0  # the same of a place, of which much more shows
 USUAL_SLOPE = -2.7  # of the logarithm of numbers over that of the widening, as seen
 
 
@@ -57,7 +62,7 @@ def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> S
     teacher shows nothing, TooFewNumbers where not even the widest voxels fit.
     """
     lattice, known = fitted(teacher, shape, max_numbers)
-    field = SparseField(shape, lattice, density_scale(lattice.tree))
+    field = SparseField(shape, lattice, density_scale(lattice.tree), space=teacher.occupancy.space)
     fill(field, teacher, *known)
     return field
 
@@ -66,7 +71,8 @@ def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tupl
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
     own = [p.voxel_size for p in placed_in(teacher)]
     least = (min(own) / max(own)) ** YIELD  # no voxel is wider than needed then
-    widening, best, tried = max(FIRST_WIDENING, least), None, []
+    first = FIRST_WIDENING if teacher.occupancy.space is bounded else FIRST_IN_PLACE
+    widening, best, tried = max(first, least), None, []
     for attempt in range(MOST_ATTEMPTS):
         if attempt >= ATTEMPTS and best is not None:
             break
@@ -127,7 +133,7 @@ def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.
     sigma = density(teacher, lattice.places)
     dense = (sigma * lattice.finest_voxel > FAINT)[lattice.corners].any(1)
     lattice, (sigma,) = thinned(lattice, dense, sigma)
-    field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree))
+    field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree), space=teacher.occupancy.space)
     set_density(field, sigma)
     kept, facing = shown(field)
     return thinned(lattice, kept, sigma, facing)
@@ -179,25 +185,37 @@ def demanded(
     teacher: RadianceField, placed: Placed, level: int, lo: np.ndarray, top: np.ndarray, counts: tuple
 ) -> np.ndarray:
     """Keys of the bricks of a level at one of whose vertices the placed field is the densest there is."""
-    side = top / 2**level
-    bricks = touched(placed, side, lo, np.asarray(counts) << level)
+    side, space = top / 2**level, teacher.occupancy.space
+    bricks = touched(placed, side, lo, np.asarray(counts) << level, space)
     n = SIDE + 1
     inner = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
     keys, inverse = np.unique(node_keys((bricks[:, None] * SIDE + inner).reshape(-1, 3)), return_inverse=True)
     places = lo + key_places(keys) * (side / SIDE)
-    own = density(placed, places)
+    own = density(placed, places, space)
     dense = own * np.min(side) / SIDE > FAINT
     for other in placed_in(teacher):
-        beside = dense & (places >= other.aabb[:3]).all(1) & (places <= other.aabb[3:]).all(1)
+        beside = dense & holds(other, places, space)
         if other is not placed and beside.any():
-            dense[beside] = own[beside] >= density(other, places[beside])
+            dense[beside] = own[beside] >= density(other, places[beside], space)
     kept = dense[inverse].reshape(-1, n**3).any(1)
     return node_keys(bricks[kept])
 
 
-def touched(placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def holds(placed: Placed, places: np.ndarray, space: ModuleType) -> np.ndarray:
+    """(N,) bool: which places, in the coordinates of a scene's space, lie in a placed field's box."""
+    if placed.unbounded:
+        return np.ones(len(places), bool)
+    points = space.placed(torch.from_numpy(places)).numpy()
+    return (points >= placed.aabb[:3]).all(1) & (points <= placed.aabb[3:]).all(1)
+
+
+def touched(
+    placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray, space: ModuleType
+) -> np.ndarray:
     """(M, 3) the bricks of a side that the occupied cells of a placed field reach, and a voxel around
     them."""
+    if space is not bounded:
+        return touched_in_space(placed, side, lo, counts, space)
     grid, matrix = placed.field.occupancy, placed.object_to_world
     stretch = np.linalg.norm(matrix[:3, :3], axis=0)
     margin = np.max(side) / SIDE / np.maximum(stretch, 1e-30)
@@ -217,6 +235,42 @@ def touched(placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray
             index = np.clip((more[part] + offset).astype(np.int32), 0, last - first)
             found[index[:, 0], index[:, 1], index[:, 2]] = True
     return np.argwhere(found) + first
+
+
+def touched_in_space(
+    placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray, space: ModuleType
+) -> np.ndarray:
+    """As `touched`, for a scene whose coordinates are not those of its frame: the bricks at one of whose
+    points, a few per voxel apart, a cell of the placed field is occupied."""
+    first, last = reached(placed, side, lo, counts, space)
+    if np.prod(last - first + 1.0) > MOST_TRIED:
+        raise ValueError(f"'{placed.name}' is too large for voxels so fine")
+    spots = np.linspace(-1 / SIDE, 1 + 1 / SIDE, SIDE if placed.field.voxel_size < np.min(side) else 2)
+    inner = np.stack(np.meshgrid(spots, spots, spots, indexing="ij"), -1).reshape(-1, 3)
+    grid, into, found = placed.field.occupancy, np.linalg.inv(placed.object_to_world), []
+    for part in pieces(int(np.prod(last - first + 1)), AT_ONCE // len(inner)):
+        at = np.stack(np.unravel_index(np.arange(part.start, part.stop), last - first + 1), -1) + first
+        points = torch.from_numpy((lo + (at[:, None] + inner) * side).reshape(-1, 3))
+        points = space.placed(points).numpy() @ into[:3, :3].T + into[:3, 3]
+        points = grid.space.contracted(torch.from_numpy(points)).numpy()
+        found.append(at[grid.contains(points).reshape(len(at), -1).any(1)])
+    return np.concatenate(found)
+
+
+def reached(
+    placed: Placed, side: np.ndarray, lo: np.ndarray, counts: np.ndarray, space: ModuleType
+) -> tuple[np.ndarray, np.ndarray]:
+    """The first and the last (3,) of the bricks of a side, in a space's coordinates, in which there may be
+    anything of a placed field."""
+    if placed.unbounded:
+        return np.zeros(3, int), counts - 1
+    grid, matrix = placed.field.occupancy, placed.object_to_world
+    centres = torch.from_numpy(grid.centres() @ matrix[:3, :3].T + matrix[:3, 3])
+    centres = space.contracted(centres).numpy()
+    margin = np.linalg.norm(matrix[:3, :3], 2) * np.linalg.norm(grid.cell) + side  # the map lengthens nothing
+    first = np.clip(np.floor((centres.min(0) - margin - lo) / side).astype(int), 0, counts - 1)
+    last = np.clip(np.floor((centres.max(0) + margin - lo) / side).astype(int), 0, counts - 1)
+    return first, last
 
 
 def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
