@@ -529,8 +529,8 @@ def test_dead_rays_rest():
     grid = OccupancyGrid.full(BOX)
     rays_o, rays_d = rays_at(BOX, 4)
     places, counts, start = np.zeros((2, 4, 5)), np.ones(4, np.int64), np.zeros(4, np.int64)
-    alive = np.array([True, False, True, False])
-    MARCH(grid.arrays, rays_o, rays_d, 0.0, np.full(4, 0.5), 0.1, start, alive, *places, counts)
+    alive, reach = np.array([True, False, True, False]), reach_of(4, 0.0, np.inf)
+    MARCH(grid.arrays, rays_o, rays_d, reach, np.full(4, 0.5), 0.1, start, alive, *places, counts)
     assert counts.tolist() == [5, 0, 5, 0] and start.tolist() == [5, 0, 5, 0]
 
 
