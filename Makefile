@@ -51,6 +51,7 @@ bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder wit
 
 bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SHARE= for less time
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
+	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

@@ -54,7 +54,7 @@ def row(folder: Path, name: str, seconds: float, *words: str) -> dict:
     """Train on a capture and say what was reached."""
     tell(name)
     asked = ("--holdout", str(EVERY), "--time-budget", str(seconds), *words)
-    report = fusedrf(folder, "train", str(folder.resolve()), "-o", str(folder / "field.rfpack"), "-w", *asked)
+    report = fusedrf(folder, "train", str(folder.resolve()), "-o", str(folder / "field.rfpack"), *asked)
     held = report["holdout"]
     aligned = held.get("aligned")
     return {

@@ -114,6 +114,7 @@ def student_request(request: FuseRequest, loaded: LoadedScene, overhead: int) ->
         ranks=request.ranks,
         sh_degree=request.sh_degree,
         source_bytes=tuple(loaded.sizes),
+        from_scratch=request.from_scratch,
     )
 
 

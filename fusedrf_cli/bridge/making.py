@@ -34,15 +34,13 @@ class Scene:
     loaded: LoadedScene
     composed: ComposedField
     boxes: list
-    """(6,) the scene's and its objects', in an order that does not depend on the nodes', so that equal scenes
-    draw equal rays."""
+    """Of `boxes_of`."""
 
     @classmethod
     def of(cls, loaded: LoadedScene) -> "Scene":
         """A loaded scene."""
         composed = loaded.composed()
-        boxes = [composed.occupancy.subject, *sorted((p.aabb for p in composed.placed), key=list)]
-        return cls(loaded, composed, boxes)
+        return cls(loaded, composed, boxes_of(composed))
 
     def background(self) -> Placed:
         """The background in the composed scene's frame, its numbers on the CPU."""
@@ -60,6 +58,12 @@ class Kept:
     did: DistillReport | None = None
     start: str | None = None
     """What it started from."""
+
+
+def boxes_of(scene: ComposedField) -> list[np.ndarray]:
+    """(6,) a scene's and its objects', in an order that does not depend on the nodes', so that equal scenes
+    draw equal rays."""
+    return [scene.occupancy.subject, *sorted((p.aabb for p in scene.placed), key=list)]
 
 
 def same_texels(field: StoredField, other: StoredField) -> bool:
@@ -87,6 +91,10 @@ class Maker:
     def measured(self, field: StoredField, way: Way) -> float:
         """PSNR (dB) of the field as it will be read back."""
         return self.judge(stored(field, way.precision).to(self.place))
+
+    def judged_whole(self, field: StoredField) -> float:
+        """PSNR (dB) of the whole field, in float32, that a student is part of."""
+        return self.judge(self.student.whole(field).to(self.place))
 
     def offer(self, kept: Kept) -> None:
         """Keep a finished try where it is the best so far: what was measured is what will be written."""
@@ -160,12 +168,13 @@ class Maker:
                 continue  # the run that was interrupted had grown further
             field, did = self.taught(begun.to(self.place), start, recipe, saved, len(plans) - i)
             before, saved = field.to("cpu"), None
+            whole = self.student.whole(before)
             for way in ways:
                 size = self.student.bytes_of_plan(plan, way)
                 limit = self.request_limit if plan is plans[-1] and way == ways[-1] else size
-                psnr = self.measured(before, way)
+                psnr = self.measured(whole, way)
                 tried = Tried(way, limit, size, psnr, did.psnr_before_rgb, False)
-                self.offer(Kept(tried, before, did, start))
+                self.offer(Kept(tried, whole, did, start))
                 yield tried
         if before is None:
             raise checkpoint_mismatch(self.request.output)
@@ -199,9 +208,8 @@ class Maker:
         settings = replace(self.student.lesson, seed=request.seed, time_budget=seconds)
         if seconds is not None:  # more than there is time to learn from need not be asked
             settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * seconds) + 1))
-        run = DistillRun(
-            self.scene.composed, field, self.scene.boxes, settings, request.rgb, recipe, self.judge
-        )
+        teacher, boxes = self.student.scene, boxes_of(self.student.scene)
+        run = DistillRun(teacher, field, boxes, settings, request.rgb, recipe, self.judged_whole)
         made_with = {  # with other words the saved numbers would go on to something else
             "kind": self.student.kind.name,
             "numbers": field.params.numel(),
@@ -209,7 +217,7 @@ class Maker:
             "start": start if request.target_psnr is None else None,
             "rgb": request.rgb,
             "seed": request.seed,
-            "boxes": [box.tolist() for box in self.scene.boxes],
+            "boxes": [box.tolist() for box in boxes],
         }
         if saved is not None:
             if any(saved[1].get(word) != value for word, value in made_with.items()):

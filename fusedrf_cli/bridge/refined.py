@@ -10,7 +10,13 @@ from formats.views import Capture
 from fusedrf_cli.bridge.extent import Extent
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, truth_of
 from fusedrf_cli.engine.distillation.fit import FitRun, Pictures, RayPool
-from fusedrf_cli.engine.distillation.poses import Poses, angles_between, changed_each, refined
+from fusedrf_cli.engine.distillation.poses import (
+    Poses,
+    angles_between,
+    changed_each,
+    poses_of,
+    refined,
+)
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -18,12 +24,6 @@ from fusedrf_cli.engine.rendering.volume import render_image
 ROUNDS = 12
 ALIGNED_BY = (4.0, 0.5)  # pixels by which poses are tried: at first, at last
 RAYS = 600  # of each photo
-
-
-def poses_of(cameras: list[Camera]) -> Poses:
-    """Where cameras are, in the frame that they are given in."""
-    placed = np.stack([camera.camera_to_world for camera in cameras])
-    return Poses(placed[:, :3, :3], placed[:, :3, 3])
 
 
 def with_poses(capture: Capture, extent: Extent, poses: Poses) -> Capture:
@@ -60,7 +60,7 @@ def aligned(field, capture: Capture, extent: Extent, near: float, seed: int) -> 
         if there:
             found = align(field, camera, truth, kept & half, near, seed)
             judged = kept & ~half
-            row = [render_image(field, c, near=near).over(WHITE) for c in (found, camera)]
+            row = [render_image(field, c).over(WHITE) for c in (found, camera)]
             rows.append([psnr(shot[judged], truth[judged]) for shot in row])
     if not rows:
         return None

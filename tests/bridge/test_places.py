@@ -11,15 +11,18 @@ import torch
 from formats.images import read_image, write_png
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.student import Student, StudentRequest, Way
+from fusedrf_cli.engine.kinds.vm.blocks import reshaped
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.places import PlaceStudent
 from fusedrf_cli.engine.kinds.vm.students import place_of
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.spaces import unbounded
+from fusedrf_cli.engine.spaces import bounded, unbounded
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.python import open_scene
 from tests.analytic.export import vm_field
@@ -42,6 +45,12 @@ def walls(seed: int = 0) -> VMField:
     tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
     numbers = field.params * torch.tensor(2.0)
     return VMField(field.shape, (tensor,), field.blocks, numbers, field.occupancy)
+
+
+def fine_walls() -> VMField:
+    """The same walls, on more texels."""
+    coarse = walls()
+    return coarse.resampled(WHOLE, (65,) * 3).with_occupancy(coarse.occupancy)
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +117,65 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
     assert taken(part, ComposedField([part, replace(small, object_to_world=np.eye(4))])) is None
 
 
-def test_a_place_is_fused_to_one_tensor(folder, picture, report):
-    """What stands around stays as it was, and the object comes in, where there are texels for it."""
-    coarse = walls()
-    fine = coarse.resampled(WHOLE, (65,) * 3).with_occupancy(coarse.occupancy)
+def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report):
+    """The place stays as it is; what is deleted leaves it so, and all others stay."""
     path = str(folder / "room.rfpack")
-    write_field(path, fine, "room", precision="float16", overwrite=True, origin=LIES)
+    write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
+    places = {"room": (0, 0, 0), "red": (-0.5, 0, 0), "blue": (0.7, 0, 0)}
+    nodes = [
+        make_node(n, source=f"{n}.rfpack", translation=at, background=n == "room") for n, at in places.items()
+    ]
+    write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
+    words = ("fuse", "two.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
+    said = report(*words)
+    assert said["chosen"]["start"] == "'room' as it is" and len(said["chosen"]["resolution"]) == 2
+    assert said["bytes"] <= 25_000_000 and said["psnr"]["stored"] > 30
+    assert [d["name"] for d in said["objects"]] == ["room", "red", "blue"]
+    assert said["objects"][0]["held_voxel"] == said["objects"][0]["own_voxel"]
+    assert psnr(picture("one.rfpack"), picture("two.json")) > 28
+    report("delete", "one.rfpack", "red", "-o", "less.rfpack")
+    less, two = picture("less.rfpack"), blues(picture("two.json"))
+    assert two > 20 and abs(blues(less) - two) < 0.2 * two
+    report("delete", "less.rfpack", "blue", "-o", "none.rfpack")
+    assert psnr(picture("none.rfpack"), picture("room.rfpack")) > 35
+
+
+def test_a_place_takes_the_dearest_precision_that_leaves_room():
+    """And is held beside the objects' tensor in no more bytes than were planned; where it leaves none, one
+    tensor over all of space stands for the scene."""
+    room, thing = reshaped(fine_walls(), VMShape(16, 16, 1)), random_vm(dtype=torch.float32, cells=4)
+    small = Placed("thing", thing, LIES @ np.diag([0.3, 0.3, 0.3, 1]))
+    scene, kind = ComposedField([Placed("room", room, LIES), small]), registry.kind("vm")
+    sizes = BundleSizes()
+    whole = {p: sizes.exactly(room, p) for p in ("float16", "int8", "int4")}
+    taken = []
+    for limit in (2 * whole["float16"], whole["float16"], 1.5 * whole["int4"]):
+        student = kind.student(scene, StudentRequest(sizes, int(limit), ranks=(16, 16), sh_degree=1))
+        (((way,),), (plan,)) = student.ways(), student.plans()
+        taken.append(way.precision)
+        learnt, start = student.begun(plan, None, None, torch.Generator().manual_seed(0))
+        field = student.whole(learnt)
+        assert start == "'room' as it is" and learnt.space is bounded and field.space is unbounded
+        assert student.bytes_of(field, way) <= student.bytes_of_plan(plan, way) <= limit
+        at = unit(np.random.default_rng(0).normal(size=(2000, 3)))
+        points, dirs = torch.from_numpy(at * np.array([720, 12, 12])), torch.from_numpy(at)
+        for found, wanted in zip(field.query(points, dirs), room.query(points, dirs), strict=True):
+            assert wanted.any() and torch.equal(found, wanted)
+    assert taken == ["float16", "int8", "int4"]
+    for more in ({"limit": whole["int4"]}, {"from_scratch": True}, {"ranks": (8, 8)}, {"sh_degree": 0}):
+        request = StudentRequest(**({"sizes": sizes, "limit": 10**7} | more))
+        assert type(kind.student(scene, request)) is Student
+    assert type(kind.student(scene, StudentRequest(sizes, 10**7, sh_degree=2))) is PlaceStudent
+    summed = ComposedField(scene.placed, "add")
+    assert type(kind.student(summed, StudentRequest(sizes, 10**7))) is Student
+
+
+def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report):
+    """What stands around stays as it was, and the object comes in, where there are texels for it."""
+    path = str(folder / "room.rfpack")
+    write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
+    scene = json.loads((folder / "place.json").read_text()) | {"composition": "add"}
+    (folder / "place.json").write_text(json.dumps(scene))
     said = report("fuse", "place.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
     assert said["chosen"]["start"] == "the weights of 'room'"
     one, wanted = picture("one.rfpack"), picture("place.json")

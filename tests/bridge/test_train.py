@@ -11,7 +11,9 @@ from safetensors.numpy import save
 
 from formats import atomic
 from formats.bundle import read_bundle
+from formats.rig import read_rig
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.poses import changed_each, turns
 from fusedrf_cli.engine.fields.computed import ComputedField
 from tests.bridge.conftest import done, part
 
@@ -106,14 +108,32 @@ def test_a_plain_keyboard_interrupt_leaves_a_checkpoint_too(run, folder, monkeyp
     assert (folder / "out.rfpack.checkpoint").exists()
 
 
-def test_refined_poses_are_told_kept_and_measured_apart(report, run, folder):
-    """The bundle keeps the training photos' cameras where they are now, the held-out ones where they were."""
+def test_refined_poses_are_told_kept_and_measured_apart(report, folder, monkeypatch):
+    """Every round moves the cameras by known steps, which add up in the report and in the bundle; those held
+    out stay."""
     train(report, "as_given.rfpack", "--holdout", "4")
+
+    def refine_poses(run, share):
+        turn, move = (np.tile(axis, (len(run.pool.pixel), 1)) for axis in ((0, 0, 0.001), (0.002, 0, 0)))
+        run.pool.place(changed_each(run.pool.poses, np.concatenate([turn, move], 1)))
+
+    monkeypatch.setattr(FitRun, "refine_poses", refine_poses)
     said = train(report, "out.rfpack", "--holdout", "4", "--refine-poses")
-    assert said["poses"]["turned_degrees"] >= 0 and said["poses"]["moved"] >= 0
-    assert {"psnr", "unaligned", "views"} == set(said["holdout"]["aligned"])
-    given, kept = (read_bundle(folder / f"{n}.rfpack").scene.cameras for n in ("as_given", "out"))
-    assert set(given) == set(kept) and len(json.dumps(given)) > 100
+    given, kept = (read_rig(read_bundle(folder / f"{n}.rfpack").scene.cameras) for n in ("as_given", "out"))
+    rounds = round(said["poses"]["turned_degrees"] / np.degrees(0.001))
+    assert rounds >= 5
+    for before, after in zip(given.train, kept.train, strict=True):
+        expected = before.camera_to_world.copy()
+        expected[:3, :3] = turns(np.array([[0, 0, 0.001 * rounds]]))[0] @ expected[:3, :3]
+        expected[0, 3] += said["poses"]["moved"]
+        np.testing.assert_allclose(after.camera_to_world, expected, atol=1e-5)
+    for before, after in zip(given.test, kept.test, strict=True):
+        np.testing.assert_array_equal(after.camera_to_world, before.camera_to_world)
+    aligned = said["holdout"]["aligned"]
+    assert aligned["views"] == said["holdout"]["views"] and aligned["psnr"] > aligned["unaligned"] - 0.5
+
+
+def test_poses_of_a_mesh_are_exact(run, folder):
     (folder / "mesh.obj").write_bytes(b"")
     result = run("train", "mesh.obj", "-o", "mesh.rfpack", "--refine-poses")
     assert result.exit_code == 2 and "exact poses" in result.stderr

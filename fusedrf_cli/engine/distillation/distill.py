@@ -113,10 +113,10 @@ class DistillRun:
         settings: DistillSettings,
         rgb: bool = True,
         recipe: Recipe = DEFAULT_RECIPE,
-        judge: Judge | None = None,
+        judge: Callable[[StoredField], float] | None = None,
     ):
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge
-        of the same teacher and settings is taken where there is one.
+        says how near a student comes, in dB; None: one of the same teacher and settings.
         """
         self.teacher, self.boxes, self.rgb, self.judge = teacher, boxes, rgb, judge
         self.settings, self.recipe, self.step = settings, recipe, sampling_step(student)

@@ -20,6 +20,7 @@ from fusedrf_cli.engine.distillation.poses import (
     TRIED_BY,
     Poses,
     changed,
+    poses_of,
     refined,
 )
 from fusedrf_cli.engine.fields.base import StoredField, sampling_step
@@ -119,9 +120,7 @@ class RayPool:
         starts = dict(zip(keys, np.cumsum([0, *map(len, own[:-1])]).tolist(), strict=True))
         self.local = torch.cat(own)
         self.start = torch.tensor([starts[camera.intrinsics] for camera in cameras])
-        poses = np.stack([c.camera_to_world for c in cameras])
-        self.rotation = torch.from_numpy(poses[:, :3, :3].copy())
-        self.position = torch.from_numpy(poses[:, :3, 3].copy())
+        self.place(poses_of(cameras))
         self.pixel = np.array([1 / camera.fl_x for camera in cameras])
         """(n,) the angle of a pixel in the middle of each picture, in radians."""
         self.gains = torch.ones(len(cameras), 3)

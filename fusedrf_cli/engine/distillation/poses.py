@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_rays
 
 RAYS_OF_ALL = 20_000
@@ -43,6 +44,12 @@ class Poses(NamedTuple):
     """(n, 3) float64."""
 
 
+def poses_of(cameras: list[Camera]) -> Poses:
+    """Where cameras are, in the frame that they are given in."""
+    placed = np.stack([camera.camera_to_world for camera in cameras])
+    return Poses(placed[:, :3, :3], placed[:, :3, 3])
+
+
 def refined(
     field: RadianceField,
     rays: tuple[np.ndarray, np.ndarray],
@@ -60,7 +67,6 @@ def refined(
     n, m, _ = photos.shape
     o, d = (part.reshape(n, m, 3) for part in rays)
     truth = photos.double().numpy()
-    counts = np.isfinite(truth).all(2)
 
     def shown(change: np.ndarray, which: np.ndarray) -> np.ndarray:
         """(k, m, 5) what those photos' poses (k,) show when they are changed."""
@@ -71,32 +77,47 @@ def refined(
 
     every = np.arange(n)
     now = shown(np.zeros((n, 6)), every)
-    counts &= now[..., 3] > OPAQUE
+    counts = np.isfinite(truth).all(2) & (now[..., 3] > OPAQUE)
+    truth = np.nan_to_num(truth)
+    missed = np.where(counts[..., None], now[..., :3] - truth, 0)
+    fair = counts / (1 + (missed**2).sum(2) / FAIR**2)
     # moved by so much, what is seen moves about as if turned by one radian
     afar = np.array(
         [np.median(row[c, 4] / row[c, 3]) if c.any() else 1.0 for row, c in zip(now, counts, strict=True)]
     )
-    missed = np.where(counts[..., None], now[..., :3] - np.nan_to_num(truth), 0)
-    fair = counts / (1 + (missed**2).sum(2) / FAIR**2)
     scale = np.concatenate([np.tile(probe[:, None], 3), np.tile((probe * afar)[:, None], 3)], 1)
     slopes = np.stack([shown(scale * axis, every)[..., :3] - now[..., :3] for axis in np.eye(6)], -1)
+    step = scale * step_of(slopes, missed, fair)
+
+    def error(colours: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """(k,) of those photos, robust."""
+        return (fair[which] * ((colours - truth[which]) ** 2).sum(2)).sum(1)
+
+    before = error(now[..., :3], every)
+    change, untold = np.zeros((n, 6)), np.flatnonzero(counts.sum(1) >= FEW)
+    for part in PARTS:
+        if len(untold):
+            helps = error(shown(part * step, untold)[..., :3], untold) < before[untold]
+            change[untold[helps]] = part * step[untold[helps]]
+            untold = untold[~helps]
+    return change
+
+
+def step_of(slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray) -> np.ndarray:
+    """(n, 6) of n photos, in probes: by how much all six parameters change, damped, drawn towards none by as
+    much as noise alone would change, and held to LARGEST.
+
+    slopes (n, m, 3, 6) of the colours of their m rays, missed (n, m, 3) by how much these are off, fair
+    (n, m) how much each ray counts.
+    """
     square = np.einsum("nm,nmcp,nmcq->npq", fair, slopes, slopes)
     square += DAMPING * np.einsum("npp->np", square)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
     step = -np.linalg.solve(square, np.einsum("nm,nmcp,nmc->np", fair, slopes, missed)[..., None])[..., 0]
     told = np.einsum("np,npq,nq->n", step, square, step)
     left = np.maximum((fair * (missed**2).sum(2)).sum(1) - told, 0)
-    noise = left / np.maximum(3 * counts.sum(1) - 6, 1)
+    noise = left / np.maximum(3 * (fair > 0).sum(1) - 6, 1)
     step *= np.maximum(0, 1 - SURE * 6 * noise / np.maximum(told, 1e-300))[:, None]
-    step *= np.minimum(1, LARGEST / np.maximum(abs(step).max(1, keepdims=True), 1e-12))
-    change, open_yet = np.zeros((n, 6)), np.flatnonzero(counts.sum(1) >= FEW)
-    for part in PARTS:
-        if len(open_yet):
-            after = shown(part * scale * step, open_yet)[..., :3] - np.nan_to_num(truth[open_yet])
-            error = (fair[open_yet] * (after**2).sum(2)).sum(1)
-            helps = error < (fair * (missed**2).sum(2)).sum(1)[open_yet]
-            change[open_yet[helps]] = (part * scale * step)[open_yet[helps]]
-            open_yet = open_yet[~helps]
-    return change
+    return step * np.minimum(1, LARGEST / np.maximum(abs(step).max(1, keepdims=True), 1e-12))
 
 
 def turns(angles: np.ndarray) -> np.ndarray:

@@ -115,6 +115,8 @@ class StudentRequest:
     sh_degree: int | None = None
     source_bytes: tuple[int, ...] = ()
     """In memory, of the distinct sources."""
+    from_scratch: bool = False
+    """Whether to take over no numbers."""
 
 
 class TooSmall(ValueError):
@@ -212,6 +214,7 @@ class Student:
     """None: rays drawn once for all tries, from its own `teacher` (distillation/finish.py)."""
 
     def __init__(self, kind: "Kind", scene: ComposedField, request: StudentRequest):
+        """scene: what it learns from."""
         self.kind, self.scene, self.request = kind, scene, request
 
     # -- ways and sizes --------------------------------------------------------------------------------------
@@ -282,10 +285,14 @@ class Student:
         fresh = self.kind.create(replace(plan, box=box), generator, "fused")
         return fresh.with_occupancy(scene.occupancy), NOTHING
 
+    def whole(self, field: StoredField) -> StoredField:
+        """What is stored once a field has learnt: that field, with what it did not have to learn."""
+        return field
+
     # -- telling ---------------------------------------------------------------------------------------------
 
     def bytes_of(self, field: StoredField, way: Way) -> int:
-        """Bytes of the file with a field."""
+        """Bytes of the file with a whole field."""
         return self.request.overhead + self.request.sizes.exactly(field, way.precision)
 
     def why(self, field: StoredField) -> str:

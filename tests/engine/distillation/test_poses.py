@@ -8,7 +8,15 @@ import torch
 
 from fusedrf_cli.engine.distillation import poses
 from fusedrf_cli.engine.distillation.fit import FitRun, RayPool
-from fusedrf_cli.engine.distillation.poses import Poses, angles_between, changed, changed_each, refined, turns
+from fusedrf_cli.engine.distillation.poses import (
+    Poses,
+    angles_between,
+    changed,
+    changed_each,
+    poses_of,
+    refined,
+    turns,
+)
 from fusedrf_cli.engine.rendering.cameras import orbit
 from tests.engine.conftest import BOX
 from tests.engine.distillation.test_exposure import BALL, LONG
@@ -21,11 +29,6 @@ def placed(cameras, shift: Poses):
     for matrix, rotation, position in zip(matrices, *shift, strict=True):
         matrix[:3, :3], matrix[:3, 3] = rotation, position
     return [replace(c, camera_to_world=m) for c, m in zip(cameras, matrices, strict=True)]
-
-
-def poses_of(cameras) -> Poses:
-    matrices = np.stack([camera.camera_to_world for camera in cameras])
-    return Poses(matrices[:, :3, :3], matrices[:, :3, 3])
 
 
 def shaken(cameras, pixels: float, seed: int = 0):

@@ -267,7 +267,8 @@ def reached(
     grid, matrix = placed.field.occupancy, placed.object_to_world
     centres = torch.from_numpy(grid.centres() @ matrix[:3, :3].T + matrix[:3, 3])
     centres = space.contracted(centres).numpy()
-    margin = np.linalg.norm(matrix[:3, :3], 2) * np.linalg.norm(grid.cell) + side  # the map lengthens nothing
+    # half a cell's diagonal, which the map of space makes twice as long at most
+    margin = np.linalg.norm(matrix[:3, :3], 2) * np.linalg.norm(grid.cell) + side
     first = np.clip(np.floor((centres.min(0) - margin - lo) / side).astype(int), 0, counts - 1)
     last = np.clip(np.floor((centres.max(0) + margin - lo) / side).astype(int), 0, counts - 1)
     return first, last

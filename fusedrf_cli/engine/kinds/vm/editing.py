@@ -10,7 +10,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import ClippedField
 from fusedrf_cli.engine.fields.occupancy import placement, seen_box, transformed_aabb
-from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach, enclosing
+from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach, enclosing, goes_by
 from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
@@ -50,10 +50,11 @@ def as_vm(kind, placed: Placed, teach: Teach) -> Placed:
 
 def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, teach: Teach) -> Edited | None:
     """The field whose distilled tensor is empty in the cells of a box (6,), and a tensor of its own that
-    holds what the rest shows there; None where nothing is left."""
+    holds what the rest shows there, but for what the field holds apart; None where nothing is left."""
     region = region_of(field, box)
     emptied = cleared(field, region)
-    rest = [p for p in rest or [] if p.reaches(region)]
+    apart = [part.name for part in parts(field)]
+    rest = [p for p in rest or [] if p.reaches(region) and not any(goes_by(n, {p.name}) for n in apart)]
     teacher = ComposedField(rest) if rest else None
     local = ClippedField(teacher, seen_box(region, teacher.origin)) if rest else None
     if local is None or not local.occupancy.occupied.any():

@@ -11,10 +11,20 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import Contents, Plan, Section, Suits, Way, finest_within
+from fusedrf_cli.engine.kinds.student import (
+    Contents,
+    Plan,
+    Section,
+    Student,
+    StudentRequest,
+    Suits,
+    Way,
+    finest_within,
+)
 from fusedrf_cli.engine.kinds.vm import editing
 from fusedrf_cli.engine.kinds.vm.blocks import common_shape, reshaped, without
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.places import place_student
 from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
 
 SHAPE = VMShape(16, 24, 2)
@@ -51,6 +61,11 @@ class VMKind(Kind):
     def suits(self, scene: ComposedField) -> Suits:
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
         return Suits(1.0, "one tensor over the scene learns any sources by any rule")
+
+    def student(self, scene: ComposedField, request: StudentRequest) -> Student:
+        """See Kind; of objects that stand in a place one tensor beside it."""
+        asked = shape_of(Way("", request.ranks, request.sh_degree))
+        return place_student(self, scene, request, asked) or Student(self, scene, request)
 
     def taken_over(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
