@@ -297,7 +297,9 @@ debug = click.option(
 overwrite = click.option("-w", "--overwrite", is_flag=True, help="Replace the output if it exists.")
 PRECISION = click.Choice(["float16", "float32", "int8", "int4"])
 precision = click.option(
-    "--precision", type=PRECISION, default="float16", show_default=True, help="How numbers are stored."
+    "--precision",
+    type=PRECISION,
+    help="How numbers are stored; default: int8 of a place that fills all of space, else float16.",
 )
 edited_precision = click.option(
     "--precision", type=PRECISION, help="How numbers are stored; default: as those of FUSED are."

@@ -46,7 +46,8 @@ class TrainRequest(Learning):
     quality: str
     ranks: tuple[int, int] | None
     sh_degree: int | None
-    precision: str
+    precision: str | None
+    """None: as suits the space."""
     max_size: int | None
     target_psnr: float | None
     holdout: int | None

@@ -15,7 +15,7 @@ from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import TrainRequest
 
-CORE = {"inward": 0.45, "forward-facing": 0.6, "outward": 1.2}
+CORE = {"inward": 0.6, "forward-facing": 0.6, "outward": 1.2}
 """Half the side of the core: in distances between cameras and focus, or, of cameras that look outwards, in
 distances of the farthest camera from their middle."""
 NEAR = 0.1

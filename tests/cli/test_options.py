@@ -136,7 +136,7 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "views": 100,
         "size": 400,
         "holdout": 8,
-        "precision": "float16",
+        "precision": None,
         "aabb": (0, 0, 0, 1, 1, 1),
         "downscale": None,
         "unbounded": None,

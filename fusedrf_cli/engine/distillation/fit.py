@@ -23,6 +23,7 @@ from fusedrf_cli.engine.distillation.poses import (
     poses_of,
     refined,
 )
+from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
@@ -47,7 +48,7 @@ RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36,
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
 # explain each photo by itself: a start at a twentieth of the texels, not at a fifth, gained 3 dB held out.
 UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.7), (0.5, 1.0))
-UNBOUNDED_SAMPLES = 3  # times the samples of a step in a box: a ray has more of them
+UNBOUNDED_SAMPLES = 5  # times the samples of a step in a box: a ray has more of them
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
@@ -455,6 +456,9 @@ class FitRun:
     def learn(self, sums: np.ndarray, rays: int, decay: float) -> None:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
         of the next."""
+        if self.settings.unbounded:
+            strip = int(torch.randint(STRIPS, (), generator=self.generator))
+            add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)
         self.optimiser.step(RATE * decay)
         mse = sums[0] / rays
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse

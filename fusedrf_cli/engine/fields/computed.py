@@ -70,6 +70,11 @@ class ComputedField:
         """Parts of `params` that learn at rates of their own, in order, each of whole cache lines."""
         return [Group(0, self.params.numel())]
 
+    def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
+        """Views of numbers (P,), the field's own or their gradients, as planes (A, B, components) of which
+        neighbours lie side by side in space; most kinds have none."""
+        return []
+
     def settle(self) -> None:
         """Make those numbers follow that depend on others, after these have changed."""
 

@@ -280,6 +280,14 @@ class VMField(ComputedField):
             found[name] = self.params[int(offset) : int(offset) + int(np.prod(shape))].view(shape)
         return found
 
+    def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
+        """See ComputedField: three of density and three of colour, of each tensor."""
+        found = []
+        for t in range(len(self.tensors)):
+            own = self.with_params(numbers).sections(t)
+            found += [section for name, section in own.items() if "_plane_" in name]
+        return found
+
     @cached_property
     def layout(self) -> np.ndarray:
         """(T, 13) int64 offsets of the sections in params."""

@@ -90,6 +90,10 @@ class VMMLPField(ComputedField):
         """Texels per axis."""
         return self.factors.resolution
 
+    def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
+        """See ComputedField: the factors'."""
+        return self.factors.planes(numbers[: self.factors.params.numel()])
+
     @property
     def shape(self) -> VMShape:
         """Ranks; the degree stands for the number of features."""

@@ -1,0 +1,29 @@
+"""How smooth a field's planes are kept while photos of a place are learnt (total variation: TensoRF, Chen et
+al. 2022, section 4.4). Few photos see each far texel, and what they leave open would be noise, drawn out
+along the axes."""
+
+import torch
+
+from fusedrf_cli.engine.fields.computed import ComputedField
+
+WEIGHT = 8e-6  # against the squared error of a ray; four times that blurs what photos do show
+STRIPS = 8  # that planes are cut into: a step smooths one of them, and that by so many times as much
+
+
+def add_roughness(field: ComputedField, gradient: torch.Tensor, weight: float, strip: int) -> None:
+    """Add to gradients (P,) those of the roughness of one strip of each of a field's planes, times STRIPS.
+
+    Roughness is `weight` times twice the sum of the squared differences between neighbouring texels, of rows
+    and of columns, over the number of texels times components, summed over the planes.
+    """
+    for plane, slope in zip(field.planes(field.params), field.planes(gradient), strict=True):
+        height = -(-plane.shape[0] // STRIPS)
+        start, scale = strip * height, 4 * weight * STRIPS / plane.numel()
+        part = plane[start : start + height]
+        across = (part[:, 1:] - part[:, :-1]) * scale
+        slope[start : start + height, 1:] += across
+        slope[start : start + height, :-1] -= across
+        tall = plane[start : start + height + 1]
+        down = (tall[1:] - tall[:-1]) * scale
+        slope[start + 1 : start + 1 + len(down)] += down
+        slope[start : start + len(down)] -= down
