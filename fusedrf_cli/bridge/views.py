@@ -17,6 +17,7 @@ from fusedrf_cli.requests import RenderRequest
 
 DEFAULT_SIZE = (800, 800)
 LEANING = 0.7  # cosine: photos held within 45 degrees of +z leave +z upright
+ONE_SIDED = np.radians(120)  # without any camera: photos taken from one side
 LEAST_APART = 1e-9  # of a target's distance from the world's origin
 
 
@@ -37,7 +38,10 @@ def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.n
         lens = framing_lens(*(request.size or DEFAULT_SIZE))
         outlook = replace(framing(framed_box(scene, field, origin), lens), up=up)
     outlook = turned(outlook, request)
-    return outlook.orbit(lens, request.orbit) if request.orbit else [outlook.camera(lens)]
+    if request.orbit is None:
+        return [outlook.camera(lens)]
+    photographed = rig is not None and rig.surroundings and request.direction is None
+    return outlook.orbit(lens, request.orbit, arc_of(rig, up) if photographed else None)
 
 
 def aimed(request: RenderRequest) -> bool:
@@ -91,6 +95,18 @@ def standing(rig: Rig, up: np.ndarray) -> Outlook:
     eye = rig.typical.camera_to_world[:3, 3]
     elevation = float(np.arcsin(np.clip(rig.height(up) / rig.distance, -1, 1)))
     return Outlook(rig.focus, rig.distance, azimuth_of(eye - rig.focus, up), elevation, up)
+
+
+def arc_of(rig: Rig, up: np.ndarray) -> tuple[float, float] | None:
+    """The azimuths about `up` between which the cameras of a rig stand around its focus, the second the
+    larger; None where they stand all around. What no camera saw of a place is fog."""
+    around = np.sort([azimuth_of(eye - rig.focus, up) for eye in rig.poses[:, :3, 3]])
+    gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
+    widest = int(gaps.argmax())
+    if gaps[widest] < ONE_SIDED:
+        return None
+    end = float(around[widest])
+    return end + float(gaps[widest]) - 2 * np.pi, end
 
 
 def pinhole(camera: Camera) -> Camera:

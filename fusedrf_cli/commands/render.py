@@ -61,9 +61,9 @@ def command(scene, output, progress, **words):
     """Render pictures or a film.
 
     SCENE is a bundle, a scene.json, or - for a scene on stdin. What was learnt from photos of a place is
-    shown as one of them shows it, and --orbit circles what they look at, at their distance and height.
-    Anything else is framed from outside. --look-at, --from, --zoom and --up change that view or
-    orbit.
+    shown as one of them shows it, and --orbit circles what they look at, at their distance and height;
+    where they were taken from one side, it swings to and fro between them. Anything else is framed from
+    outside. --look-at, --from, --zoom and --up change that view or orbit.
 
     \b
     Example:

@@ -24,7 +24,7 @@ from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, orbit
+from fusedrf_cli.engine.rendering.cameras import Camera, azimuth_of, framing_camera, orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.python import open_scene
 from fusedrf_cli.requests import RenderRequest
@@ -137,6 +137,29 @@ def test_an_orbit_keeps_the_distance_and_the_height_of_the_photos(folder):
     np.testing.assert_allclose(flat.sum(0), 0, atol=1e-6)  # all around
     first, typical = flat[0], RIG.typical.camera_to_world[:3, 3] - RIG.focus
     assert np.linalg.norm(np.cross(first, typical - (typical @ up) * up)) < 1e-6  # it begins at that photo
+
+
+@pytest.mark.parametrize("turn", [0.0, 2.0, 3.1])
+def test_an_orbit_of_photos_from_one_side_swings_between_them(folder, turn):
+    """To and fro between the outermost cameras, from the photo's side on, wherever azimuth 0 lies; all the
+    way around where that is asked for by --from."""
+    spread = (-0.5, -0.2, 0.0, 0.3, 0.9)
+    eyes = [FOCUS + 2 * np.array([np.cos(turn + a), np.sin(turn + a), 0.4]) for a in spread]
+    keep(folder, "side.rfpack", rig_of([photo(i, eye) for i, eye in enumerate(eyes)], held_out=1))
+    rig = read_rig(read_bundle(folder / "side.rfpack").scene.cameras)
+    cameras = views_of(folder, "side.rfpack", orbit=40)
+    seen = azimuths(cameras, rig)
+    allowed = azimuths([camera_of(view) for view in rig.views], rig)
+    about = seen[0]
+    seen, allowed = ((a - about + np.pi) % (2 * np.pi) - np.pi for a in (seen, allowed))
+    assert allowed.min() - 1e-6 < seen.min() and seen.max() < allowed.max() + 1e-6
+    assert np.ptp(seen) > 0.98 * np.ptp(allowed) and abs(np.diff(np.append(seen, seen[0]))).max() < 0.2
+    asked = views_of(folder, "side.rfpack", orbit=40, direction=(10.0, 20.0))
+    assert np.ptp(azimuths(asked, rig)) > 5.8
+
+
+def azimuths(cameras: list[Camera], rig: Rig) -> np.ndarray:
+    return np.array([azimuth_of(eye_of(camera) - rig.focus, rig.up) for camera in cameras])
 
 
 def test_every_view_of_the_capture_is_rendered_under_its_name(report, folder):

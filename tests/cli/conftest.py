@@ -64,12 +64,14 @@ def bridge(monkeypatch) -> types.ModuleType:
 
 @pytest.fixture
 def process(folder):
-    """process(code, *words) -> a started Python process that runs `code` in `folder`, all streams pipes."""
+    """process(code, *words) -> a started Python process that runs `code` in `folder`, all streams pipes. It
+    hears an interrupt, also where these tests run in the background of a script, which ignores it."""
+    hears = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     started = []
 
     def start(code: str, *words: str, **options) -> subprocess.Popen:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-        code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{code}"
+        code = f"{hears}\nimport sys; sys.path.insert(0, {str(ROOT)!r})\n{code}"
         started.append(subprocess.Popen([sys.executable, "-c", code, *words], text=True, **pipes))
         return started[-1]
 

@@ -217,9 +217,15 @@ class Outlook:
         eye = self.target + (away + np.sin(self.elevation) * self.up) * self.distance
         return replace(lens, camera_to_world=look_at(eye, self.target, self.up), name=name)
 
-    def orbit(self, lens: Camera, count: int) -> list[Camera]:
-        """`count` cameras evenly around the target, all at one elevation."""
-        turns = (2 * np.pi * i / count for i in range(count))
+    def orbit(self, lens: Camera, count: int, arc: tuple[float, float] | None = None) -> list[Camera]:
+        """`count` cameras evenly around the target, all at one elevation; or, between two azimuths, the
+        second the larger, to and fro, so that the last comes back to the first."""
+        turns = [2 * np.pi * i / count for i in range(count)]
+        if arc is not None:
+            middle, half = (arc[0] + arc[1]) / 2, (arc[1] - arc[0]) / 2
+            ahead = (self.azimuth - middle + np.pi) % (2 * np.pi) - np.pi
+            first = np.arcsin(np.clip(ahead / max(half, 1e-9), -1, 1))
+            turns = [middle + half * np.sin(first + turn) - self.azimuth for turn in turns]
         return [self.camera(lens, turn, f"orbit_{i:04d}") for i, turn in enumerate(turns)]
 
 
