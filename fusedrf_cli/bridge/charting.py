@@ -16,6 +16,7 @@ from formats.atomic import atomic_folder, hidden_sibling
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
+from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
 from fusedrf_cli.bridge.pictures import WHITE
 from fusedrf_cli.bridge.rendering import renderable
@@ -24,7 +25,7 @@ from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
 from fusedrf_cli.engine.fields.occupancy import placed_box
-from fusedrf_cli.engine.rendering.cameras import framing_camera, scattered
+from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import FusedRFError, Interrupted, InvalidInput, UsageProblem
@@ -71,7 +72,9 @@ class Benchmark:
     allow_outside: bool
     place: str
     box: np.ndarray
-    """(6,) of the world, which the views frame."""
+    """(6,) of the world, which frames are timed of."""
+    cameras: list[Camera]
+    """In the world."""
     truth: list[np.ndarray]
     """(H, W, 3) float32 over white, of every camera."""
     source_bytes: int
@@ -86,23 +89,25 @@ class Benchmark:
         place: str = "cpu",
         box: np.ndarray | None = None,
     ):
-        """Render the scene as composed; the views frame a box (6,) of the world, by default all matter."""
+        """Render the scene as composed, by default from where the scene and its objects were photographed;
+        given a box (6,) of the world, from all around that."""
         loaded = load_scene(scene, allow_outside, memory, place)
         composed = loaded.composed()
         needed = sources(loaded.sizes) | picture(*size, composed=True) | measured(*size)
-        needed["the pictures to compare with"] = VIEWS * size[0] * size[1] * PER_PIXEL_KEPT
-        memory.expect(needed, advice="give a smaller --size")
         if box is None:
+            cameras = [look.camera for look in looks_of(loaded, composed, VIEWS, size, HELD_OUT)]
             box = placed_box(composed.occupancy.subject, composed.origin)
-        cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
+        else:
+            cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
+        needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * PER_PIXEL_KEPT
+        memory.expect(needed, advice="give a smaller --size")
         truth = [render_image(composed, c, origin=composed.origin).over(WHITE) for c in cameras]
-        return cls(scene, memory, size, allow_outside, place, box, truth, source_bytes(loaded))
+        return cls(scene, memory, size, allow_outside, place, box, cameras, truth, source_bytes(loaded))
 
     def quality(self, bundle: Path) -> tuple[float, float]:
         """Mean PSNR and SSIM of a fused bundle."""
         render, origin = renderable(load_scene(str(bundle), budget=self.memory, place=self.place))
-        cameras = scattered(self.box, VIEWS, *self.size, seed=HELD_OUT)
-        shots = [render_image(render, c, origin=origin).over(WHITE) for c in cameras]
+        shots = [render_image(render, c, origin=origin).over(WHITE) for c in self.cameras]
         pairs = list(zip(shots, self.truth, strict=True))
         return float(np.mean([psnr(*p) for p in pairs])), float(np.mean([ssim(*p) for p in pairs]))
 
@@ -170,7 +175,7 @@ def chart(request: ChartRequest, progress) -> dict:
     columns = ("flags", "psnr", "ssim", "bytes", "seconds", "ms")
     return {
         "output": output,
-        "views": f"{VIEWS} of {size[0]}x{size[1]}, which nothing was trained or chosen on",
+        "views": f"{len(benchmark.cameras)} of {size[0]}x{size[1]}, which nothing was trained or chosen on",
         "composed": composed,
         "tried": len(run.points),
         "frontier": [{"no": i} | {c: getattr(p, c) for c in columns} for i, p in enumerate(best, 1)],

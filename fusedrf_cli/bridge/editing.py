@@ -12,10 +12,13 @@ import numpy as np
 
 from formats.bundle import is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldRecord
+from formats.rig import read_rig
 from formats.scene import Leaf, Matrix4, SceneGraph
 from fusedrf_cli.bridge.budget import Budget
+from fusedrf_cli.bridge.looks import Subject, looks
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
+from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
@@ -30,14 +33,15 @@ from fusedrf_cli.bridge.scene import (
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
-from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.occupancy import placed_box, seen_box, transformed_aabb
+from fusedrf_cli.engine.fields.occupancy import placed_box, placement, seen_box, transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import Edited, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import DistillSettings
+from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import AddRequest, DeleteRequest, EditRequest
@@ -129,7 +133,8 @@ def add(request: AddRequest, progress) -> dict:
             raise InvalidInput(f"{request.fused}: there is a '{request.name}' already; choose another --name")
         new = load_scene(request.source, budget=memory, place=place)
         memory.expect(*addition_memory(fused.field, new), advice="add a smaller object")
-        objects = [placed_at(p, opened(p.field), request).moved(fused.origin) for p in new.placed]
+        placed = [placed_at(p, opened(p.field), request) for p in new.placed]
+        objects = [p.moved(fused.origin) for p in placed]
         truth = ComposedField([Placed("", fused.field.to(place), np.eye(4)), *objects])
         if truth.origin.shape == (4, 4) and not np.array_equal(truth.origin, np.eye(4)):
             raise InvalidInput(
@@ -142,7 +147,8 @@ def add(request: AddRequest, progress) -> dict:
         except ValueError as error:
             raise InvalidInput(f"{request.fused}: {error}") from error
         progress.phase("measuring", None)
-        judge = Judge(truth, REGION_SETTINGS.views, REGION_SETTINGS.view_size, request.seed)
+        origin = placement(fused.origin) @ placement(truth.origin)
+        judge = Judge(truth, cameras_of(request, fused, new, placed, truth, origin), origin)
         as_read = stored(edited.field, precision)
         if truth.origin.shape == (3,):
             as_read = as_read.moved(truth.origin)
@@ -315,6 +321,31 @@ def graph_nodes(scene: SceneGraph) -> list[dict]:
         for name in entry.get("names", ()):
             nodes.pop(name, None)
     return list(nodes.values())
+
+
+def cameras_of(
+    request: AddRequest,
+    fused: Fused,
+    new: LoadedScene,
+    placed: list[Placed],
+    truth: ComposedField,
+    origin: np.ndarray,
+) -> list[Camera]:
+    """The views that an addition is judged by: of the whole, whose frame lies at `origin` (4, 4), and of what
+    was added."""
+    kept = fused.scene.cameras
+    own = rig_of(new)
+    rig = own and own.placed(request.object_to_world)
+    subjects = [
+        Subject(p.name, placed_box(p.field.occupancy.subject, p.object_to_world), rig)
+        for p in placed
+        if not p.unbounded
+    ]
+    size = REGION_SETTINGS.view_size, REGION_SETTINGS.view_size
+    box = placed_box(truth.occupancy.subject, origin)
+    seed = JUDGED_SEED, 3, request.seed
+    whole = None if kept is None else read_rig(kept)
+    return [look.camera for look in looks(whole, box, subjects, REGION_SETTINGS.views, size, seed)]
 
 
 def placed_at(placed: Placed, field: StoredField, request: AddRequest) -> Placed:

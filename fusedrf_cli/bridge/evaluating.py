@@ -1,26 +1,27 @@
 """`eval`: PSNR and SSIM against photos or another scene."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from formats.captures import is_capture, read_capture
+from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
 from fusedrf_cli.bridge.rendering import picture_memory, renderable
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
-from fusedrf_cli.engine.fields.occupancy import placed_box
-from fusedrf_cli.engine.rendering.cameras import Camera, scattered
-from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW
+from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import EvaluateRequest
 
 SCENE_VIEWS = 8
 SCENE_SIZE = (400, 400)
-SCENE_SEED = 1_000
+SCENE_SEED = (JUDGED_SEED, 1)  # a stream of their own
 
 
 def evaluate(request: EvaluateRequest, progress) -> dict:
@@ -39,7 +40,8 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
             else scene_pairs(against, request.size, allow_outside, budget, place)
         )
         views = []
-        for i, (camera, (truth, kept), total) in enumerate(pairs):
+        for i, (pair, total) in enumerate(pairs):
+            camera = pair.camera
             if i == 0:
                 side = camera.width, camera.height
                 needed = picture_memory(field, [camera], film=False) | measured(*side)
@@ -51,22 +53,56 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
                         f"{side[0]}x{side[1]}: it is left out"
                     )
             shot = render_image(field, camera, origin=origin).over(WHITE)
-            views.append({"name": camera.name, **likeness(shot, truth, kept)})
+            views.append({"name": camera.name, **pair.likeness(shot)})
             progress.advance(i + 1, psnr=views[-1]["psnr"])
     return {
         "bundle": bundle,
         "against": against,
         "mean": {k: float(np.mean([v[k] for v in views])) for k in ("psnr", "ssim")},
+        **of_objects(views),
         "views": views,
         "memory": budget.report(),
     }
 
 
-def capture_pairs(
-    against: str, split: str, size: tuple[int, int] | None
-) -> Iterator[tuple[Camera, tuple[np.ndarray, np.ndarray], int]]:
-    """(camera, (H, W, 3) truth over white and (H, W) bool, which pixels count, how many) of a capture's
-    photos, without those of which masks exclude every pixel; InvalidInput where that is all of them."""
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What a bundle's picture is compared with."""
+
+    camera: Camera
+    truth: np.ndarray
+    """(H, W, 3) over white."""
+    kept: np.ndarray
+    """(H, W) bool: which pixels count."""
+    covered: np.ndarray | None = None
+    """(H, W) bool: those in which a scene shows something."""
+    of: str | None = None
+    """The object that the view is of."""
+
+    def likeness(self, shot: np.ndarray) -> dict:
+        """What the report says of a picture (H, W, 3)."""
+        said = likeness(shot, self.truth, self.kept)
+        if self.covered is not None and self.covered.any():
+            said["covered_psnr"] = psnr(shot[self.covered], self.truth[self.covered])
+            said["covered_share"] = float(self.covered.mean())
+        return said | ({"of": self.of} if self.of else {})
+
+
+def of_objects(views: list[dict]) -> dict:
+    """The mean PSNR of the pixels that a scene covers, and the object that is shown worst in a view of its
+    own; nothing where views were compared with photos."""
+    covered = [view["covered_psnr"] for view in views if "covered_psnr" in view]
+    said = {"covered": {"psnr": float(np.mean(covered))}} if covered else {}
+    objects = [(view["psnr"], view["of"]) for view in views if "of" in view]
+    if objects:
+        worst, name = min(objects)
+        said["worst_object"] = {"name": name, "psnr": worst}
+    return said
+
+
+def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Iterator[tuple[Pair, int]]:
+    """What a capture's photos give, and how many there are, without those of which masks exclude every pixel;
+    InvalidInput where that is all of them."""
     capture = read_capture(against)
     views = {"test": capture.test, "train": capture.train, "all": (*capture.train, *capture.test)}[split]
     if not views:
@@ -81,22 +117,23 @@ def capture_pairs(
         truth, kept = truth_of(view)
         if kept.any():
             found = True
-            yield camera_of(view), (truth, kept), len(views)
+            yield Pair(camera_of(view), truth, kept), len(views)
     if not found:
         raise InvalidInput(f"{against}: the masks exclude every pixel; they are black where to ignore")
 
 
 def scene_pairs(
     against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory, place: str
-) -> Iterator[tuple[Camera, tuple[np.ndarray, np.ndarray], int]]:
-    """The same of another scene, seen from views around it, of which every pixel counts."""
+) -> Iterator[tuple[Pair, int]]:
+    """The same of another scene, from where it and its objects were photographed; every pixel counts."""
     loaded = load_scene(against, allow_outside, budget, place)
     field, origin = renderable(loaded)
-    box = placed_box(field.occupancy.subject, origin)
     width, height = size or SCENE_SIZE
     composed = not hasattr(field, "render_rays")
     needed = sources(loaded.sizes) | picture(width, height, composed) | measured(width, height)
     budget.expect(needed, advice="give a smaller --size")
-    for camera in scattered(box, SCENE_VIEWS, width, height, seed=JUDGED_SEED + SCENE_SEED):
-        truth = render_image(field, camera, origin=origin).over(WHITE)
-        yield camera, (truth, np.ones(truth.shape[:2], bool)), SCENE_VIEWS
+    views = looks_of(loaded, loaded.composed(), SCENE_VIEWS, (width, height), SCENE_SEED)
+    for look in views:
+        shot = render_image(field, look.camera, origin=origin)
+        every = np.ones(shot.opacity.shape, bool)
+        yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > COVERED, look.of), len(views)

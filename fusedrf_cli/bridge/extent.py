@@ -1,10 +1,11 @@
 """What of a capture's world a field covers: a box, or all of it around a core."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from formats.frame import scene_frame
+from formats.frame import SceneFrame, scene_frame
 from formats.views import Capture, View
 from fusedrf_cli.bridge.hull import visual_hull
 from fusedrf_cli.bridge.pictures import camera_of
@@ -18,6 +19,12 @@ from fusedrf_cli.requests import TrainRequest
 CORE = {"inward": 0.6, "forward-facing": 0.6, "outward": 1.2}
 """Half the side of the core: in distances between cameras and focus, or, of cameras that look outwards, in
 distances of the farthest camera from their middle."""
+FAN_CORE, FAN_CORES = 0.65, (0.15, 0.4)
+"""Half the side of the core around cameras that all look one way, in distances of the nearest of their sparse
+points; the least and the most in distances of what they look at. Half as much, or half as much again, shows
+0.3 to 0.5 dB less."""
+FAN_CORE_UNKNOWN = 0.3
+"""The same in distances of what they look at, where there are no sparse points."""
 NEAR = 0.1
 """Of the distance between cameras and focus: nothing is learnt closer to a camera."""
 NEAR_OF_POINTS = 0.6
@@ -31,10 +38,8 @@ class Extent:
 
     box: np.ndarray
     """(6,) float64, in the coordinates of the field's space."""
-    centre: np.ndarray
-    """(3,) float64: the world position of its frame's origin."""
-    unit: float = 1.0
-    """How long its frame's unit is in the world."""
+    origin: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4) float64: where its frame lies in the world, turned and scaled alike along all axes."""
     unbounded: bool = False
     near: float = 0.0
     """In the frame's units, the distance from a camera before which nothing is learnt."""
@@ -44,14 +49,17 @@ class Extent:
 
     def camera(self, camera: Camera) -> Camera:
         """A camera of the world in the field's frame."""
-        return camera.seen_from(self.centre, self.unit) if self.unbounded else camera
+        return camera.seen_from(self.origin) if self.unbounded else camera
 
     @property
-    def origin(self) -> np.ndarray:
-        """(4, 4) where the field's frame lies in the world."""
-        matrix = np.diag([self.unit, self.unit, self.unit, 1.0])
-        matrix[:3, 3] = self.centre
-        return matrix
+    def centre(self) -> np.ndarray:
+        """(3,) the world position of its frame's origin."""
+        return self.origin[:3, 3]
+
+    @property
+    def unit(self) -> float:
+        """How long its frame's unit is in the world."""
+        return float(np.linalg.norm(self.origin[:3, 0]))
 
     def report(self) -> dict:
         """What was chosen, in world units."""
@@ -74,7 +82,7 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     if capture.object_aabb is not None:
         return _around_object(request, capture)
     box = capture.aabb if request.aabb is None else request.aabb
-    return Extent(np.asarray(box, np.float64), np.zeros(3))
+    return Extent(np.asarray(box, np.float64))
 
 
 def _around_object(request: TrainRequest, capture: Capture) -> Extent:
@@ -82,24 +90,58 @@ def _around_object(request: TrainRequest, capture: Capture) -> Extent:
     is asked for. Rays through pixels of the object alone do not tell what is empty around it."""
     box = capture.object_aabb if request.aabb is None else np.asarray(request.aabb, np.float64)
     hull = visual_hull(capture.train, box)
-    return Extent(hull.aabb, np.zeros(3), cells=hull)
+    return Extent(hull.aabb, cells=hull)
 
 
 def _unbounded(request: TrainRequest, capture: Capture) -> Extent:
     views = capture.train + capture.test
     poses = np.array([view.camera_to_world for view in views])
     frame = capture.frame or scene_frame(poses)
-    centre = frame.focus if request.centre is None else np.asarray(request.centre, np.float64)
-    unit = frame.distance
+    reach = frame.distance
     if frame.layout == "outward":
-        unit = max(unit, float(np.linalg.norm(poses[:, :3, 3] - frame.focus, axis=1).max()))
-    radius = CORE[frame.layout] * unit if request.radius is None else request.radius
-    near = near_of(views, unit) / radius
-    whole = Extent(WHOLE, centre, radius, True, near)
-    clear = [max(near, NEAR_OF_POINTS * (view.near or 0) / radius) for view in views]
+        reach = max(reach, float(np.linalg.norm(poses[:, :3, 3] - frame.focus, axis=1).max()))
+    near = near_of(views, reach)
+    if frame.layout == "forward-facing" and request.centre is None and request.radius is None:
+        origin = fan(frame, views)
+    else:
+        origin = core(frame, reach, request)
+    unit = Extent(WHOLE, origin).unit
+    near /= unit
+    whole = Extent(WHOLE, origin, True, near)
+    clear = [max(near, NEAR_OF_POINTS * (view.near or 0) / unit) for view in views]
     shown = shown_cells([whole.camera(camera_of(view)) for view in views], near, clear)
     box = shown.tight_aabb(0)  # texels that no photo shows would be lost
     return replace(whole, box=box, cells=shown.within(box))
+
+
+def core(frame: SceneFrame, reach: float, request: TrainRequest) -> np.ndarray:
+    """(4, 4) the frame of a field whose core lies around what cameras look at, `reach` from them, or as was
+    asked for; its axes are the world's."""
+    radius = CORE[frame.layout] * reach if request.radius is None else request.radius
+    matrix = np.diag([radius, radius, radius, 1.0])
+    matrix[:3, 3] = frame.focus if request.centre is None else request.centre
+    return matrix
+
+
+def fan(frame: SceneFrame, views: Sequence[View]) -> np.ndarray:
+    """(4, 4) the frame of a field before cameras that all look one way: its first axis is that way, and its
+    core lies around the cameras. What they show lies before the core, where the other two coordinates are
+    directions as seen from the middle of the cameras, so that texels are as fine as pixels near and far.
+    (The normalised device coordinates of NeRF, Mildenhall et al. 2020, appendix C, are such too.)
+    """
+    poses, known = np.array([view.camera_to_world for view in views]), [v.near for v in views if v.near]
+    nearest = FAN_CORE * min(known) if known else FAN_CORE_UNKNOWN * frame.distance
+    unit = float(np.clip(nearest, *(share * frame.distance for share in FAN_CORES)))
+    ahead = -poses[:, :3, 2].mean(0)
+    ahead /= np.linalg.norm(ahead)
+    left = np.cross(poses[:, :3, 1].mean(0), ahead)
+    left /= np.linalg.norm(left)
+    eyes = poses[:, :3, 3]
+    rearmost = eyes.mean(0) + ahead * ((eyes - eyes.mean(0)) @ ahead).min()
+    matrix = np.eye(4)
+    matrix[:3, :3] = unit * np.stack([ahead, left, np.cross(ahead, left)], 1)
+    matrix[:3, 3] = rearmost
+    return matrix
 
 
 def near_of(views: tuple[View, ...], distance: float) -> float:

@@ -218,7 +218,7 @@ def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str,
         seconds["neighbours"] = time.monotonic() - started
     psnr = {"before_rgb": tried.before, "after_rgb": after}
     psnr |= {"rgb_kept": did.rgb_kept} if learnt else {}
-    psnr |= {"stored": tried.psnr, "views": maker.views}
+    psnr |= {"stored": tried.psnr, **maker.verdict(found)}
     figures = {
         "psnr": psnr,
         "seconds": seconds | (did.seconds if did is not None else {}),

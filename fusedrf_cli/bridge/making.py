@@ -8,6 +8,7 @@ import torch
 
 from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.choose import FINALISTS, Tried
+from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
@@ -15,7 +16,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.finish import RayLesson
-from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.student import NOTHING, DistillSettings, MadeStudent, Plan, Student, Way
@@ -81,7 +82,10 @@ class Maker:
         lesson = student.lesson or DistillSettings()
         compares = request.target_psnr is not None and student.lesson is None
         self.views = VIEWS_TO_CHOOSE_BY if compares else lesson.views
-        self.judge = Judge(scene.composed, self.views, lesson.view_size, request.seed)
+        size = lesson.view_size, lesson.view_size
+        self.looks = looks_of(scene.loaded, scene.composed, self.views, size, (JUDGED_SEED, 3, request.seed))
+        cameras = [look.camera for look in self.looks]
+        self.judge = Judge(scene.composed, cameras, scene.composed.origin)
         self.best: Kept | None = None
         self.sources_in_memory = True
         """Whether all sources may be in memory at once, as a teacher."""
@@ -91,6 +95,17 @@ class Maker:
     def measured(self, field: StoredField, way: Way) -> float:
         """PSNR (dB) of the field as it will be read back."""
         return self.judge(stored(field, way.precision).to(self.place))
+
+    def verdict(self, kept: Kept) -> dict:
+        """What the report says of the views of a try as it will be read back: how many there are, the PSNR of
+        what the scene covers of them, and the object that is shown worst in a view of its own."""
+        found = self.judge.verdict(stored(kept.field, kept.tried.way.precision).to(self.place))
+        said = {"views": len(self.looks), "covered": found.covered, "covered_share": found.share}
+        objects = [(v, look.of) for v, look in zip(found.views, self.looks, strict=True) if look.of]
+        if not objects:
+            return said
+        worst, name = min(objects)
+        return said | {"worst_object": {"name": name, "psnr": worst}}
 
     def judged_whole(self, field: StoredField) -> float:
         """PSNR (dB) of the whole field, in float32, that a student is part of."""

@@ -31,7 +31,8 @@ def with_poses(capture: Capture, extent: Extent, poses: Poses) -> Capture:
     views = []
     for view, rotation, position in zip(capture.train, *poses, strict=True):
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation, extent.unit * position + extent.centre
+        turn = extent.origin[:3, :3]
+        matrix[:3, :3], matrix[:3, 3] = turn / extent.unit @ rotation, turn @ position + extent.centre
         views.append(replace(view, camera_to_world=matrix))
     return replace(capture, train=tuple(views))
 

@@ -209,6 +209,7 @@ def fit_settings(
         near=extent.near,
         unbounded=extent.unbounded,
         exposure=extent.unbounded and capture.opaque,
+        smooth=capture.opaque,
         poses=request.refine_poses,
         device=place,
     )

@@ -21,7 +21,6 @@ from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.distillation import distill, finish
 from fusedrf_cli.engine.distillation.fit import FitSettings
-from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.student import DistillSettings, Student
@@ -96,8 +95,8 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(vm, "OWNERSHIP_CELLS", 48)
     patch.setattr(composed, "OCCUPANCY_CELLS", 48)
     patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
-    for name in ("making", "editing"):
-        patch.setattr(part(name), "Judge", lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed))
+    patch.setattr(part("looks"), "WHOLE", 2)
+    patch.setattr(part("looks"), "MOST_OBJECTS", 0)
     patch.setattr(Student, "lesson", TinySettings())
     patch.setattr(students, "SHAPE", SHAPE)
     patch.setattr(blocks, "RANKS", (None,))  # others would be compiled

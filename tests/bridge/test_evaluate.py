@@ -53,7 +53,10 @@ def test_a_scene_against_itself_and_another(report):
     same = report("eval", "scene.json", "--against", "scene.json", "--size", "24x24")
     assert len(same["views"]) == 8 and same["mean"] == {"psnr": 100, "ssim": 1}
     less = report("eval", "pair.json", "--against", "scene.json", "--size", "24x24")
-    assert less["mean"]["psnr"] < 30
+    found = [view["psnr"] for view in less["views"]]
+    assert min(found) < 30 and less["mean"]["psnr"] == pytest.approx(np.mean(found))
+    assert less["worst_object"]["name"] == "blue"  # which the pair does not have
+    assert less["covered"]["psnr"] < less["mean"]["psnr"]
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,10 @@ from formats.views import Capture, View
 from fusedrf_cli.bridge import training
 from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.bridge.refined import with_poses
 from fusedrf_cli.bridge.training import fit_settings, texels_of_place
 from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import look_at
 from fusedrf_cli.engine.spaces.unbounded import WHOLE, contracted
@@ -50,6 +52,37 @@ def test_photos_that_look_one_way_fill_the_box_that_they_are_learnt_in():
         away = extent.near * 10 ** rng.uniform(0.02, 4, (500, 1))
         at = contracted(torch.from_numpy(camera.camera_to_world[:3, 3] + away * rays)).numpy()
         assert ((at >= extent.box[:3] - 1e-9) & (at <= extent.box[3:] + 1e-9)).all()
+
+
+def test_pixels_of_photos_that_look_one_way_are_as_wide_near_as_far():
+    """In the coordinates, along a picture's middle; in the world's own axes they differ more."""
+    capture = photos([(4, y, z) for y in (-0.4, 0, 0.4) for z in (-0.3, 0.3)], focus=(0.0, 1.0, 0.2))
+    camera = camera_of(capture.train[2])
+
+    def widths(extent) -> np.ndarray:
+        seen = extent.camera(camera)
+        ways = np.array([[0.0, 0.0, -1.0], [1 / 87, 0.0, -1.0]]) @ seen.camera_to_world[:3, :3].T
+        depths = np.array([1.5, 4.0, 20.0])[:, None, None] / extent.unit
+        at = torch.from_numpy(seen.camera_to_world[:3, 3] + depths * ways)
+        here, beside = contracted(at[:, 0]), contracted(at[:, 1])
+        return np.linalg.norm((beside - here).numpy(), axis=1)
+
+    fan = widths(extent_of(request(), capture, False))
+    assert fan.max() < 1.5 * fan.min()
+    asked = replace(request(), centre=(0.0, 1.0, 0.2), radius=2.4)
+    around = widths(extent_of(asked, capture, False))
+    assert around.max() > 2.5 * around.min()
+
+
+def test_cameras_come_back_from_the_frame_of_a_field():
+    capture = photos([(4, y, z) for y in (-0.4, 0, 0.4) for z in (-0.3, 0.3)], focus=(0.0, 1.0, 0.2))
+    extent = extent_of(request(), capture, False)
+    found = with_poses(capture, extent, poses_of([extent.camera(camera_of(v)) for v in capture.train]))
+    for view, back in zip(capture.train, found.train, strict=True):
+        assert np.allclose(view.camera_to_world, back.camera_to_world, atol=1e-9)
+    assert np.linalg.det(extent.origin[:3, :3]) > 0  # not mirrored
+    ahead = extent.origin[:3, :3] @ [1.0, 0.0, 0.0] / extent.unit
+    assert ahead @ [-0.97, 0.24, 0.05] > 0.98
 
 
 def test_photos_from_all_around_are_learnt_in_all_of_space():

@@ -57,6 +57,7 @@ def asked(**words) -> SimpleNamespace:
 def maker_of(monkeypatch, student, psnr, request) -> making.Maker:
     """A maker whose judge says psnr(field)."""
     monkeypatch.setattr(making, "Judge", lambda *words: psnr)
+    monkeypatch.setattr(making, "looks_of", lambda *words: [])
     monkeypatch.setattr(making, "stored", lambda field, precision: field)
     scene = making.Scene(None, SCENE, BOXES)
     return making.Maker(student, scene, request, "cpu", NullProgress())

@@ -457,7 +457,7 @@ def test_training_on_an_object_keeps_its_cameras_and_how_it_is_framed(report, fo
 def test_cameras_count_in_the_size_that_is_allowed(folder, short):
     """A field that just fits is made smaller where cameras come on top."""
     training, capture = part("training"), read_capture(folder / "photos")
-    box = Extent(np.array([-1.0] * 3 + [1] * 3), np.zeros(3))
+    box = Extent(np.array([-1.0] * 3 + [1] * 3))
     words = dict.fromkeys(("ranks", "sh_degree", "time_budget", "target_psnr", "max_size"))
     asked = SimpleNamespace(
         quality="draft", precision="float16", seed=0, masks="ignore", refine_poses=False, **words

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Student
 from tests.analytic.export import SHAPE, NotExportable
-from tests.bridge.conftest import TinySettings, part
+from tests.bridge.conftest import TinySettings
 
 ROW = re.compile(r"test_([a-z]+\d+)_")
 
@@ -82,9 +81,8 @@ def quick(monkeypatch) -> None:
     monkeypatch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.RAYS_PER_STEP", 500)
     monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.STEPS", 30)
-    for name in ("making", "editing"):
-        judge = lambda teacher, views, size, seed: Judge(teacher, 2, 32, seed)  # noqa: E731
-        monkeypatch.setattr(part(name), "Judge", judge)
+    monkeypatch.setattr("fusedrf_cli.bridge.looks.WHOLE", 2)
+    monkeypatch.setattr("fusedrf_cli.bridge.looks.MOST_OBJECTS", 0)
 
 
 def pytest_generate_tests(metafunc):

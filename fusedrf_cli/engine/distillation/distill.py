@@ -16,7 +16,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
-from fusedrf_cli.engine.distillation.judging import HeldOut, Judge
+from fusedrf_cli.engine.distillation.judging import HeldOut, scattered_judge
 from fusedrf_cli.engine.distillation.losses import (
     DensityLoss,
     Visibility,
@@ -152,7 +152,9 @@ class DistillRun:
         clock = _Clock(report.seconds)
         phase("asking the teachers")
         self.generator.manual_seed(settings.seed + 1)
-        judge = self.judge or Judge(self.teacher, settings.views, settings.view_size, settings.seed)
+        judge = self.judge or scattered_judge(
+            self.teacher, settings.views, settings.view_size, settings.seed
+        )
         rays_o, rays_d = random_rays(self.boxes, settings.rays, self.generator)
         chance = self.recipe.chance if settings.steps else no_point
         pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, chance)

@@ -82,6 +82,9 @@ class FitSettings:
     exposure: bool = False
     """Whether pictures may differ in exposure and white balance, as a camera's own do. Not for views of an
     object from all around: of a side that few of them see nothing tells how bright it is."""
+    smooth: bool = False
+    """Whether planes are kept smooth (smoothness.py): photos of the real world contradict each other by more
+    than a field of theirs should follow; rendered pictures do not, and lose by it."""
     poses: bool = False
     """Whether to look for where the pictures were taken from, near where they are said to have been."""
     target_psnr: float | None = None
@@ -456,7 +459,7 @@ class FitRun:
     def learn(self, sums: np.ndarray, rays: int, decay: float) -> None:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
         of the next."""
-        if self.settings.unbounded:
+        if self.settings.smooth:
             strip = int(torch.randint(STRIPS, (), generator=self.generator))
             add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)
         self.optimiser.step(RATE * decay)

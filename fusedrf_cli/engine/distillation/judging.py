@@ -1,33 +1,71 @@
 """PSNR of a student against its teacher: on views, to decide, and on rays, to follow."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.teacher import ask, random_rays
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.rendering.cameras import scattered
+from fusedrf_cli.engine.rendering.cameras import Camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 
 HELD_OUT = 1 << 12  # rays whose PSNR is the learning curve
 HELD_OUT_SEED = 9_000_001
 WHITE = np.ones(3)
+COVERED = 0.5  # of a pixel's light that a scene keeps from what is behind it
 JUDGED_SEED = 7_000_001  # views the student is judged on are drawn from a stream of their own
 
 
-class Judge:
-    """PSNR of a student against its teacher on seeded views that nothing was trained on."""
+@dataclass(frozen=True)
+class Verdict:
+    """How like its teacher a student is, PSNR in dB over white."""
 
-    def __init__(self, teacher: RadianceField, views: int, size: int, seed: int):
-        box = teacher.occupancy.subject
-        self.cameras = scattered(box, views, size, size, seed=JUDGED_SEED + seed)
-        self.truth = [render_image(teacher, c).over(WHITE) for c in self.cameras]
+    psnr: float
+    """Of all pixels of all views together."""
+    covered: float
+    """Of those in which the teacher shows something."""
+    share: float
+    """How much of the views is covered."""
+    views: tuple[float, ...]
+    """Of each view."""
+
+
+class Judge:
+    """PSNR of a student against its teacher on views that nothing was trained on."""
+
+    def __init__(
+        self, teacher: RadianceField, cameras: Sequence[Camera], origin: np.ndarray | None = None
+    ):
+        """Cameras of one size, in the world; origin: where the frame of teacher and student lies in it (see
+        `render_image`)."""
+        self.cameras, self.origin = cameras, origin
+        shots = [render_image(teacher, camera, origin=origin) for camera in cameras]
+        self.truth = np.stack([shot.over(WHITE) for shot in shots])
+        self.covered = np.stack([shot.opacity > COVERED for shot in shots])
+
+    def shots(self, student: RadianceField) -> np.ndarray:
+        """(views, H, W, 3) over white."""
+        return np.stack([render_image(student, c, origin=self.origin).over(WHITE) for c in self.cameras])
 
     def __call__(self, student: RadianceField) -> float:
         """PSNR in dB of all pixels of all views together, over white."""
-        return psnr(
-            np.stack([render_image(student, c).over(WHITE) for c in self.cameras]), np.stack(self.truth)
-        )
+        return psnr(self.shots(student), self.truth)
+
+    def verdict(self, student: RadianceField) -> Verdict:
+        """The same, and what it hides."""
+        shots, seen = self.shots(student), self.covered
+        covered = psnr(shots[seen], self.truth[seen]) if seen.any() else float("nan")
+        each = tuple(psnr(*pair) for pair in zip(shots, self.truth, strict=True))
+        return Verdict(psnr(shots, self.truth), covered, float(seen.mean()), each)
+
+
+def scattered_judge(teacher: RadianceField, views: int, size: int, seed: int) -> Judge:
+    """A judge by seeded views from around a teacher's matter."""
+    cameras = scattered(teacher.occupancy.subject, views, size, size, seed=JUDGED_SEED + seed)
+    return Judge(teacher, cameras)
 
 
 class HeldOut:

@@ -46,10 +46,10 @@ class Camera:
         """Whether rays are other than a pinhole's."""
         return self.fisheye or any(self.distortion)
 
-    def seen_from(self, centre: np.ndarray, unit: float) -> "Camera":
-        """The same camera in a frame with its origin at `centre` (3,) and its unit `unit` long."""
-        pose = np.array(self.camera_to_world, np.float64)
-        pose[:3, 3] = (pose[:3, 3] - centre) / unit
+    def seen_from(self, origin: np.ndarray) -> "Camera":
+        """The same camera in a frame that lies at `origin` (4, 4), turned and scaled alike along all axes."""
+        pose = np.linalg.inv(origin) @ self.camera_to_world
+        pose[:3, :3] /= np.linalg.norm(pose[:3, 0])
         return replace(self, camera_to_world=pose)
 
     def local_directions(self, rows: slice = slice(None)) -> np.ndarray:

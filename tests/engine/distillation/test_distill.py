@@ -12,7 +12,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import DistillRun, distill
-from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.distillation.judging import scattered_judge
 from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
 from fusedrf_cli.engine.kinds.student import DistillSettings, finest_within
@@ -46,7 +46,7 @@ def test_a_ball_is_learnt():
     """60 steps give 22 dB on views of its own, where an untrained student has less than 15."""
     told = []
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(0), "ball")
-    judge = Judge(TEACHER, 3, 32, 77)
+    judge = scattered_judge(TEACHER, 3, 32, 77)
     before = judge(student)
     student, report = distill(
         TEACHER,
@@ -76,7 +76,7 @@ def test_the_same_seed_gives_the_same_bits():
 def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
     brief = replace(SETTINGS, rays=1000, steps=40, rgb_steps=5)
     verdicts = iter([20.0, after, 20.0])
-    monkeypatch.setattr(module, "Judge", lambda *_: lambda student: next(verdicts))
+    monkeypatch.setattr(module, "scattered_judge", lambda *_: lambda student: next(verdicts))
     student, report = taught(brief)
     plain, _ = taught(brief, rgb=False)
     assert report.rgb_kept is kept and report.psnr_after_rgb == after and report.psnr_before_rgb == 20

@@ -1,0 +1,162 @@
+"""The views that a fused scene is judged by: all of it as it was photographed, and its objects one by one,
+from the distances and in the resolutions at which their sources were photographed.
+
+A view of everything shows objects small, before much that is empty, and what is lost of them does not show.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from formats.rig import Rig, read_rig
+from formats.views import View
+from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.bridge.rigs import rig_of
+from fusedrf_cli.bridge.scene import LoadedScene
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.occupancy import placed_box
+from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
+
+WHOLE = 3
+"""Of the views, at least so many show the whole scene; the others show objects."""
+MOST_OBJECTS = 6
+"""That get a view of their own, in addition to those that were asked for."""
+NEIGHBOURS = 4
+"""A view of a capture is taken somewhere between a camera and one of so many that are nearest to it."""
+UNPHOTOGRAPHED = 400
+"""Pixels a side of the pictures of an object that no photo shows, in which it is framed."""
+LOWEST, HIGHEST = 0.05, 1.3
+"""Radians above the horizon of such views."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What views look at."""
+
+    name: str
+    box: np.ndarray
+    """(6,) in the world, around its matter, or around what a place's cameras look at."""
+    rig: Rig | None
+    """The cameras that photographed it, in the world."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One view, and the object that it is of, if any."""
+
+    camera: Camera
+    """In the world."""
+    of: str | None = None
+
+
+def subjects_of(scene: LoadedScene) -> list[Subject]:
+    """The objects of a scene, which do not fill all of space."""
+    return [
+        Subject(p.name, placed_box(p.field.occupancy.subject, p.object_to_world), rig_around(scene, p.name))
+        for p in scene.placed
+        if not p.unbounded
+    ]
+
+
+def rig_around(scene: LoadedScene, name: str) -> Rig | None:
+    """The cameras that photographed a placed object, in the scene's world."""
+    for rig in scene.rigs:
+        if name == rig.name or name.startswith(f"{rig.name}/"):
+            return read_rig(rig.cameras).placed(rig.object_to_world)
+    return rig_of(scene) if scene.graph.cameras is not None else None
+
+
+def looks_of(
+    scene: LoadedScene, composed: ComposedField, count: int, size: tuple[int, int], seed: int | tuple
+) -> list[Look]:
+    """At least `count` seeded views (see `looks`) of a scene, which `composed` is as one field."""
+    box = placed_box(composed.occupancy.subject, composed.origin)
+    return looks(rig_of(scene), box, subjects_of(scene), count, size, seed)
+
+
+def looks(
+    rig: Rig | None,
+    box: np.ndarray,
+    objects: Sequence[Subject],
+    count: int,
+    size: tuple[int, int],
+    seed: int | tuple,
+) -> list[Look]:
+    """`count` seeded views of a size (width, height), or more where there are objects: of the whole scene, as
+    a rig that shows its surroundings saw it, else from around a box (6,) of the world; and of its objects in
+    turn, in an order drawn anew for every seed."""
+    rng = np.random.default_rng(seed)
+    close = max(min(len(objects), MOST_OBJECTS), count - WHOLE) if objects else 0
+    whole = max(count - close, WHOLE) if close else count
+    if rig is not None and rig.surroundings:
+        found = [Look(photographed(rig, None, size, rng, i % 2 == 1)) for i in range(whole)]
+    else:
+        drawn = scattered(box, whole, *size, seed=int(rng.integers(1 << 62)), lowest=LOWEST)
+        found = [Look(camera) for camera in drawn]
+    order = rng.permutation(len(objects)) if close else []
+    for number in range(close):
+        subject = objects[order[number % len(objects)]]
+        found.append(Look(close_up(subject, size, rng), subject.name))
+    named = enumerate(found)
+    return [replace(look, camera=replace(look.camera, name=f"view_{i:04d}")) for i, look in named]
+
+
+def close_up(subject: Subject, size: tuple[int, int], rng: np.random.Generator) -> Camera:
+    """A view of an object as its photos show it; of one without any, as large as it is framed in
+    UNPHOTOGRAPHED pixels."""
+    at = spot(subject.box, rng)
+    if subject.rig is not None:
+        return photographed(subject.rig, at, size, rng, True)
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(LOWEST, HIGHEST)
+    camera = framing_camera(subject.box, azimuth, elevation, UNPHOTOGRAPHED, UNPHOTOGRAPHED)
+    return window(camera, at, size, rng)
+
+
+def spot(box: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(3,) a point of the middle half of a box (6,)."""
+    return box[:3] + rng.uniform(0.25, 0.75, 3) * (box[3:] - box[:3])
+
+
+def photographed(
+    rig: Rig, at: np.ndarray | None, size: tuple[int, int], rng: np.random.Generator, full: bool
+) -> Camera:
+    """A view from between the cameras of a rig. In the photos' resolution (`full`) it shows a part of one,
+    around a point (3,) or anywhere; else all of it."""
+    view = between(rig.views, rng)
+    pinhole = replace(view, distortion=(), fisheye=False)
+    if not full or min(view.width / size[0], view.height / size[1]) <= 1:
+        return replace(camera_of(pinhole.reframed(*size)), distortion=(0.0,) * 5)
+    return window(replace(camera_of(pinhole), distortion=(0.0,) * 5), at, size, rng)
+
+
+def window(camera: Camera, at: np.ndarray | None, size: tuple[int, int], rng: np.random.Generator) -> Camera:
+    """The part of a camera's picture of a size, around where it shows a point (3,) as far as it does, or, of
+    None, anywhere."""
+    width, height = size
+    left, top = rng.uniform(0, 1, 2) * (camera.width - width, camera.height - height)
+    if at is not None:
+        x, y, back = (at - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
+        if back < 0:
+            left = camera.cx - camera.fl_x * x / back - width / 2
+            top = camera.cy + camera.fl_y * y / back - height / 2
+    left = round(float(np.clip(left, 0, max(0, camera.width - width))))
+    top = round(float(np.clip(top, 0, max(0, camera.height - height))))
+    return replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
+
+
+def between(views: Sequence[View], rng: np.random.Generator) -> View:
+    """A view with the lens of one of the views, from somewhere on the way to one near to it."""
+    poses = np.array([view.camera_to_world for view in views])
+    first = int(rng.integers(len(views)))
+    apart = np.linalg.norm(poses[:, :3, 3] - poses[first, :3, 3], axis=1)
+    alike = poses[:, :3, 2] @ poses[first, :3, 2] > 0.7
+    near = [i for i in np.argsort(apart, kind="stable") if alike[i] and i != first][:NEIGHBOURS]
+    second = near[int(rng.integers(len(near)))] if near else first
+    share = float(rng.uniform(0, 1))
+    pose = np.eye(4)
+    pose[:3, 3] = (1 - share) * poses[first, :3, 3] + share * poses[second, :3, 3]
+    turns = Rotation.from_matrix(poses[[first, second], :3, :3])
+    pose[:3, :3] = Slerp([0, 1], turns)(share).as_matrix()
+    return replace(views[first], camera_to_world=pose)

@@ -1,0 +1,117 @@
+"""The views that fused scenes are judged by, and what they say of a student."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusedrf_cli.bridge.looks import Subject, between, looks
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.judging import Judge
+from fusedrf_cli.engine.rendering.cameras import framing_camera
+from tests.analytic.fields import Box, Tint
+from tests.bridge.conftest import part
+from tests.bridge.test_views import FOCUS, photo
+from tests.formats.test_captures import looking_at
+from tests.formats.test_rig import rig_of
+
+WHOLE, MOST_OBJECTS = 3, 6
+BIG = (800, 600)
+BOX = np.array([-2.0, -2, -2, 2, 2, 2])
+PLACE = replace(
+    rig_of([photo(i, FOCUS + 3 * np.array([np.cos(i), np.sin(i), 0.3]), BIG) for i in range(6)]),
+    surroundings=True,
+)
+
+
+@pytest.fixture(autouse=True)
+def usual(monkeypatch):
+    """Other tests of this package look at less."""
+    monkeypatch.setattr(part("looks"), "WHOLE", WHOLE)
+    monkeypatch.setattr(part("looks"), "MOST_OBJECTS", MOST_OBJECTS)
+
+
+def subject(name: str, at, rig=None) -> Subject:
+    at = np.array(at, float)
+    return Subject(name, np.concatenate([at - 0.2, at + 0.2]), rig)
+
+
+OBJECTS = [subject("cup", (1, 0, 0)), subject("bowl", (0, 1, 0), replace(PLACE, surroundings=False))]
+
+
+def shown(camera, point) -> tuple[float, float]:
+    """Column and row at which a pinhole shows a point (3,), in widths and heights."""
+    x, y, back = (point - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
+    column, row = camera.cx - camera.fl_x * x / back, camera.cy + camera.fl_y * y / back
+    return column / camera.width, row / camera.height
+
+
+@pytest.mark.parametrize("rig", [None, PLACE])
+def test_the_whole_and_every_object_are_looked_at(rig):
+    found = looks(rig, BOX, OBJECTS, 4, (160, 160), 1)
+    assert [look.of for look in found[:WHOLE]] == [None] * WHOLE
+    assert {look.of for look in found[WHOLE:]} == {"cup", "bowl"}
+    assert len({look.camera.name for look in found}) == len(found)
+    assert {(look.camera.width, look.camera.height) for look in found} == {(160, 160)}
+    many = looks(rig, BOX, [subject(f"o{i}", (i, 0, 0)) for i in range(20)], 4, (16, 16), 1)
+    assert len(many) == WHOLE + MOST_OBJECTS == WHOLE + len({look.of for look in many if look.of})
+
+
+def test_objects_are_looked_at_as_they_were_photographed():
+    """In the photos' resolution and from where they were taken; framed where there are no photos."""
+    for seed in range(8):
+        found = {look.of: look.camera for look in looks(None, BOX, OBJECTS, 4, (160, 160), seed)}
+        column, row = shown(found["bowl"], np.array([0.0, 1.0, 0.0]))
+        assert -0.2 < column < 1.2 and -0.2 < row < 1.2
+        assert found["bowl"].fl_x == pytest.approx(1.2 * BIG[0])
+        assert np.linalg.norm(found["bowl"].camera_to_world[:3, 3] - FOCUS) < 3.2
+        column, row = shown(found["cup"], np.array([1.0, 0.0, 0.0]))
+        assert -0.2 < column < 1.2 and -0.2 < row < 1.2  # a part of it
+        whole = framing_camera(OBJECTS[0].box, 0, 0.4, 400, 400)
+        assert found["cup"].fl_x == pytest.approx(whole.fl_x)
+
+
+def test_a_place_is_looked_at_from_between_its_cameras():
+    """All of what a photo shows, and a part of it in full."""
+    eyes = PLACE.poses[:, :3, 3]
+    full, part = [], []
+    for seed in range(6):
+        for look in looks(PLACE, BOX, [], 4, (160, 160), seed):
+            eye = look.camera.camera_to_world[:3, 3]
+            assert np.linalg.norm(eyes - eye, axis=1).min() < 1.6 and abs(eye[2] - eyes[0, 2]) < 1e-6
+            (full if look.camera.fl_x > 500 else part).append(look.camera.fl_x)
+    assert len(full) == len(part) == 12
+    assert np.allclose(full, 1.2 * BIG[0]) and np.allclose(part, 1.2 * 160)
+
+
+def test_views_follow_their_seed():
+    found = (looks(PLACE, BOX, OBJECTS, 6, (32, 32), seed) for seed in (1, 1, 2))
+    poses = [[look.camera.camera_to_world for look in drawn] for drawn in found]
+    assert np.array_equal(poses[0], poses[1]) and not np.array_equal(poses[0], poses[2])
+
+
+def test_a_camera_between_two_looks_where_they_look():
+    views = [photo(i, FOCUS + 3 * np.array([np.cos(a), np.sin(a), 0.3]), BIG) for i, a in enumerate((0, 0.5))]
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        pose = between(views, rng).camera_to_world
+        assert np.allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-9)
+        towards = FOCUS - pose[:3, 3]
+        assert -pose[:3, 2] @ towards / np.linalg.norm(towards) > 0.999
+    assert np.allclose(between(views[:1], rng).camera_to_world, views[0].camera_to_world)
+
+
+def test_a_verdict_counts_the_covered_pixels_apart():
+    """A wall that covers a known part of the picture and is wrong by a known amount of each colour."""
+    teacher, student = (
+        ComposedField([Placed("wall", Box(500.0, (0.5, 0.01, 0.5), tint=Tint.of(g, g, g)), np.eye(4))])
+        for g in (0.5, 0.6)
+    )
+    pose = np.array(looking_at(np.array([0.0, -4.0, 0.0]), np.zeros(3)))
+    camera = replace(framing_camera(BOX, 0, 0, 64, 64), camera_to_world=pose)
+    judge = Judge(teacher, [camera], teacher.origin)
+    found = judge.verdict(student)
+    assert found.covered == pytest.approx(20, abs=0.3)
+    assert found.psnr == pytest.approx(found.covered - 10 * np.log10(found.share), abs=0.2)
+    assert 0.02 < found.share < 0.4 and found.views == pytest.approx([judge(student)])
