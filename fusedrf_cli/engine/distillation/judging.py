@@ -36,9 +36,7 @@ class Verdict:
 class Judge:
     """PSNR of a student against its teacher on views that nothing was trained on."""
 
-    def __init__(
-        self, teacher: RadianceField, cameras: Sequence[Camera], origin: np.ndarray | None = None
-    ):
+    def __init__(self, teacher: RadianceField, cameras: Sequence[Camera], origin: np.ndarray | None = None):
         """Cameras of one size, in the world; origin: where the frame of teacher and student lies in it (see
         `render_image`)."""
         self.cameras, self.origin = cameras, origin
