@@ -15,8 +15,8 @@ from fusedrf_cli import __version__, options
 from fusedrf_cli.errors import FusedRFError, Interrupted
 
 COMMANDS = (
-    *("pose", "train", "compose", "fuse", "convert", "add", "delete", "render", "eval", "chart"),
-    *("info", "kinds", "validate", "completion"),
+    *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
+    *("render", "eval", "chart", "info", "kinds", "validate", "completion"),
 )
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"
 

@@ -140,6 +140,23 @@ class DeleteRequest(EditRequest):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ArrangeRequest:
+    """An object that is moved, copied or renamed."""
+
+    fused: str
+    output: str
+    overwrite: bool
+    name: str
+    new_name: str | None
+    """None: the same."""
+    matrix: Any
+    """(4, 4) float64 of the world."""
+    absolute: bool
+    """Whether that turns and scales about the world's origin, not about the middle of the object."""
+    memory: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class RenderRequest(Running):
     """Pictures or a film of a scene."""
 
@@ -167,6 +184,8 @@ class RenderRequest(Running):
     """None: transparent."""
     depth: bool
     fps: float
+    naive: bool
+    """Ask every source of a scene at every sample."""
     memory: int | None
     allow_outside: bool
 

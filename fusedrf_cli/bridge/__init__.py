@@ -5,6 +5,7 @@ Every function takes one request (fusedrf_cli/requests.py) and somebody to tell 
 whole or not at all, and returns a JSON-able report.
 """
 
+from fusedrf_cli.bridge.arranging import duplicate, move, rename
 from fusedrf_cli.bridge.charting import chart
 from fusedrf_cli.bridge.converting import convert
 from fusedrf_cli.bridge.editing import add, delete
@@ -15,4 +16,18 @@ from fusedrf_cli.bridge.posing import pose
 from fusedrf_cli.bridge.rendering import render
 from fusedrf_cli.bridge.training import train
 
-__all__ = ["add", "chart", "convert", "delete", "evaluate", "fuse", "list_kinds", "pose", "render", "train"]
+__all__ = [
+    "add",
+    "chart",
+    "convert",
+    "delete",
+    "duplicate",
+    "evaluate",
+    "fuse",
+    "list_kinds",
+    "move",
+    "pose",
+    "rename",
+    "render",
+    "train",
+]

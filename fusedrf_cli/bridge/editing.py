@@ -15,6 +15,7 @@ from formats.records import FieldRecord
 from formats.rig import read_rig
 from formats.scene import Leaf, Matrix4, SceneGraph
 from fusedrf_cli.bridge.budget import Budget
+from fusedrf_cli.bridge.history import graph_nodes, summed_up
 from fusedrf_cli.bridge.looks import Subject, looks
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
@@ -258,7 +259,7 @@ def write_edited(request: EditRequest, fused: Fused, field: StoredField, precisi
         precision=precision,
         overwrite=request.overwrite,
         origin=fused.origin,
-        history=(*fused.scene.history, entry),
+        history=summed_up((*fused.scene.history, entry)),
         kept=dict.fromkeys(fused.others, fused.path),
         extras=fused.scene.extras,
         framing=fused.framing,
@@ -310,17 +311,6 @@ def check_history(scene: SceneGraph, path: str) -> None:
                     raise ValueError("a source that is no path")
         except ValueError as error:
             raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
-
-
-def graph_nodes(scene: SceneGraph) -> list[dict]:
-    """The named objects that the history says are in the field now."""
-    nodes: dict[str, dict] = {}
-    for entry in scene.history:
-        for node in entry.get("nodes", ()):
-            nodes[node["name"]] = node
-        for name in entry.get("names", ()):
-            nodes.pop(name, None)
-    return list(nodes.values())
 
 
 def cameras_of(

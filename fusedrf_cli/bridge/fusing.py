@@ -320,7 +320,7 @@ def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
         if d.lost > LOST_NOTED:
             progress.warn(
                 f"{d.lost:.0%} of '{d.name}' is not shown, since more than two objects meet there in one "
-                "cell of a grid over the whole scene; render the scene as it is, or fuse its parts apart"
+                "cell of a grid over the whole scene; render the scene itself, or fuse its parts apart"
             )
     coarse = [d for d in details if d.held_voxel > d.own_voxel * (1 + 1e-6)]
     if coarse:

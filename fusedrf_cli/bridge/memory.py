@@ -205,5 +205,5 @@ def learning_is_asked(student: Student, request: FuseRequest) -> bool:
 
 
 def judged() -> dict[str, float]:
-    """Looking at a scene to measure; it covers about half of a picture that frames it."""
-    return picture(DistillSettings.view_size, DistillSettings.view_size // 2, composed=True)
+    """Looking at a scene to measure; some views are filled by one of its objects."""
+    return picture(DistillSettings.view_size, DistillSettings.view_size, composed=True)

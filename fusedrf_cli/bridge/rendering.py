@@ -11,15 +11,18 @@ import numpy as np
 from formats.atomic import atomic_folder
 from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
-from fusedrf_cli.bridge.memory import Memory, picture, sources
+from fusedrf_cli.bridge.memory import Memory, ownership, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
+JOINING = 2.5  # copies of a source while it becomes a part of the whole
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
@@ -48,6 +51,8 @@ def render(request: RenderRequest, progress) -> dict:
         needed = picture_memory(field, views, suffix in FILMS)
         loaded.shelf.resize(budget.room(needed))
         budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
+        if loaded.lone() is None and not request.naive:
+            field = joined(loaded, field, needed, budget, place)
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
         shooting = _Shooting(field, how, request.background, request.depth, progress)
@@ -83,6 +88,26 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
         return lone
     composed = loaded.composed()
     return composed, composed.origin
+
+
+def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: Memory, place: str):
+    """A scene as one field with the numbers of its sources, which is looked at as fast as a fused one; the
+    scene itself where no kind of field can be that, or there is no memory for it."""
+    most = (
+        sources(loaded.sizes, copies=JOINING)
+        | {"the sources put together": sum(loaded.sizes)}
+        | ownership(composed.aabb)
+        | needed
+    )
+    if budget.room(most) < 0:
+        return composed
+    loaded.shelf.resize(sum(loaded.sizes))
+    for kind in registry.kinds():
+        field = kind.joined(composed)
+        if field is not None:
+            budget.expect(most, advice="use --naive")
+            return field.to(place)
+    return composed
 
 
 def check_sizes(output: str, views: list[Camera]) -> None:

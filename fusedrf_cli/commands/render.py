@@ -53,6 +53,11 @@ from fusedrf_cli.requests import RenderRequest
 )
 @click.option("--depth", is_flag=True, help="Write 16-bit depth pictures as well.")
 @click.option("--fps", type=options.POSITIVE, default=24.0, show_default=True, help="Frames per second.")
+@click.option(
+    "--naive",
+    is_flag=True,
+    help="Ask every field of a scene at every sample, as fused fields are measured against.",
+)
 @options.memory
 @options.allow_outside
 @options.running
@@ -64,6 +69,9 @@ def command(scene, output, progress, **words):
     shown as one of them shows it, and --orbit circles what they look at, at their distance and height;
     where they were taken from one side, it swings to and fro between them. Anything else is framed from
     outside. --look-at, --from, --zoom and --up change that view or orbit.
+
+    A scene.json of vm fields is put together in memory first, which takes a second or two, and is then as
+    fast to look at as a fused one.
 
     \b
     Example:

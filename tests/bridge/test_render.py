@@ -5,6 +5,8 @@ import pytest
 from PIL import Image
 
 from formats.images import read_image
+from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.engine.rendering.metrics import psnr
 
 SMALL = ("--size", "32x24")
 
@@ -56,6 +58,26 @@ def test_a_film_turns(report, folder):
     report("render", "scene.json", "-o", "turn.gif", "--orbit", "3", *SMALL, "--fps", "10")
     with Image.open(folder / "turn.gif") as film:
         assert film.n_frames == 3 and film.size == (32, 24) and film.info["duration"] == 100
+
+
+def test_a_scene_put_together_shows_what_its_fields_do(report, folder):
+    """Turned and stretched, at the numbers that the fields have; `--naive` asks each of them."""
+    matrix = np.diag([1.2, 0.8, 1.0, 1.0])
+    matrix[:2, :2] = [[0.9, -0.6], [0.5, 0.7]]
+    nodes = [make_node("floor", source="floor.rfpack"), make_node("red", source="red.rfpack", matrix=matrix)]
+    write_scene(folder / "turned.json", SceneGraph(tuple(nodes)))
+    pictures = []
+    for words in ((), ("--naive",)):
+        report("render", "turned.json", "-o", "a.png", "-w", "--size", "96x72", *words)
+        pictures.append(read_image(folder / "a.png")[..., :3] / 255)
+    assert 45 < psnr(*pictures) < 100
+
+
+def test_a_scene_of_which_blocks_would_hide_something_is_not_put_together(report, folder, monkeypatch):
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.blocks.students.LOST_NOTED", -1)  # any share is too much
+    for name, words in (("quick", ()), ("naive", ("--naive",))):
+        report("render", "scene.json", "-o", f"{name}.png", *SMALL, *words)
+    assert (folder / "quick.png").read_bytes() == (folder / "naive.png").read_bytes()
 
 
 def test_the_scene_is_the_sum_of_its_parts(picture):

@@ -76,6 +76,7 @@ def views_of(folder, scene: str, **asked) -> list[Camera]:
     unset = ("cameras", "path", "views", "orbit", "look_at", "direction", "up", "size", "memory")
     words = dict.fromkeys(unset)
     words |= {"zoom": 1.0, "background": None, "depth": False, "fps": 24.0, "allow_outside": False}
+    words |= {"naive": True}
     words |= {"near": 0.0, "far": np.inf}
     words |= {"scene": str(folder / scene), "output": "out", "overwrite": False}
     request = RenderRequest(device="cpu", threads=None, **words | asked)

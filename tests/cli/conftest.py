@@ -15,7 +15,10 @@ from formats.records import FieldRecord
 from fusedrf_cli.main import cli
 
 ROOT = Path(__file__).parents[2]
-BRIDGE_VERBS = ("pose", "train", "fuse", "convert", "add", "delete", "render", "evaluate", "chart")
+BRIDGE_VERBS = (
+    *("pose", "train", "fuse", "convert", "add", "delete", "move", "duplicate", "rename", "render"),
+    *("evaluate", "chart"),
+)
 
 
 @pytest.fixture

@@ -64,6 +64,9 @@ def test_a_missing_input_is_one_line_and_code_3(run, bridge, name):
     others = {
         "add": ["chair.rfpack", "--name", "a"],
         "delete": ["a"],
+        "move": ["a", "-t", "1,0,0"],
+        "duplicate": ["a", "b"],
+        "rename": ["a", "b"],
         "eval": ["--against", "chair.rfpack"],
         "convert": ["--kind", "cp"],
     }

@@ -56,6 +56,15 @@ class Teach(Protocol):
         ...
 
 
+class Becoming(Protocol):
+    """Says what becomes of the parts of a field."""
+
+    def __call__(self, name: str, object_to_field: np.ndarray) -> list[tuple[str, np.ndarray]]:
+        """The names and placements (4, 4) in the field's frame of what a part of a name and a placement
+        becomes."""
+        ...
+
+
 def enclosing(boxes: list[np.ndarray]) -> np.ndarray:
     """(6,) the box around boxes."""
     return np.concatenate([np.min([b[:3] for b in boxes], 0), np.max([b[3:] for b in boxes], 0)])

@@ -15,7 +15,7 @@ from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.kinds import refitting
-from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach
+from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
 from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
 from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Suits, Way, finest_within
 
@@ -94,6 +94,11 @@ class Kind:
         """Its stand for a scene that it suits."""
         return Student(self, scene, request)
 
+    def joined(self, scene: ComposedField) -> StoredField | None:
+        """A field in a scene's frame that shows what the scene does, with the very numbers of its sources, in
+        far less time than asking each of them; None where the kind has no such field."""
+        return None
+
     def taken_over(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
     ) -> StoredField | None:
@@ -135,6 +140,11 @@ class Kind:
 
     def without(self, field: StoredField, names: set[str]) -> StoredField | None:
         """A field without the parts that go by those names; None where nothing is left."""
+        return field
+
+    def arranged(self, field: StoredField, becoming: Becoming) -> StoredField:
+        """A field whose parts are named and placed anew, with the numbers that it has. Raises ValueError
+        where there would be too many, or one of them is singular."""
         return field
 
     def added(self, field: StoredField, objects: list[Placed], teach: Teach) -> Edited:

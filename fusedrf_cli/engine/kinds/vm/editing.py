@@ -10,9 +10,9 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import ClippedField
 from fusedrf_cli.engine.fields.occupancy import placement, seen_box, transformed_aabb
-from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach, enclosing, goes_by
+from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach, enclosing, goes_by
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.blocks import MAX_BLOCKS, blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
 
 RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
@@ -27,6 +27,24 @@ def parts(field: VMField) -> list[Part]:
         for b in field.blocks
         if b.name not in UNNAMED
     ]
+
+
+def arranged(field: VMField, becoming: Becoming) -> VMField:
+    """The field with the blocks that stand for an object named and placed as `becoming` says."""
+    blocks = [
+        replace(block, name=name, object_to_field=matrix)
+        for block in field.blocks
+        for name, matrix in (
+            [(block.name, block.object_to_field)]
+            if block.name in UNNAMED
+            else becoming(block.name, block.object_to_field)
+        )
+    ]
+    if len(blocks) > MAX_BLOCKS:
+        raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, and this would be {len(blocks)}")
+    for block in blocks:
+        Placed(block.name, None, block.object_to_field)  # raises where it is singular
+    return VMField.assembled(field.shape, field.tensors, tuple(blocks), field.params)
 
 
 def added(kind, field: VMField, objects: list[Placed], teach: Teach) -> Edited:

@@ -9,7 +9,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
-from fusedrf_cli.engine.kinds.editing import Edited, Part, Teach
+from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import (
     Contents,
@@ -102,6 +102,10 @@ class VMKind(Kind):
     def without(self, field: VMField, names: set[str]) -> VMField | None:
         """Without the blocks of those names."""
         return without(field, names)
+
+    def arranged(self, field: VMField, becoming: Becoming) -> VMField:
+        """Its named blocks, placed anew."""
+        return editing.arranged(field, becoming)
 
     def added(self, field: VMField, objects: list[Placed], teach: Teach) -> Edited:
         """Blocks appended."""

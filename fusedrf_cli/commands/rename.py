@@ -1,0 +1,40 @@
+"""`fusedrf rename`: another name for an object of a fused field."""
+
+import click
+
+from fusedrf_cli import options
+from fusedrf_cli.requests import ArrangeRequest
+
+
+@click.command("rename")
+@click.argument("fused", type=options.INPUT)
+@click.argument("name")
+@click.argument("new_name", metavar="NEW")
+@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.memory
+@options.reporting
+def command(fused, name, new_name, output, overwrite, memory, progress):
+    """Give an object of a fused field another name.
+
+    The object has to be held apart, as in fields of --kind blocks.
+
+    \b
+    Example:
+      fusedrf rename fused.rfpack chair red-chair -o named.rfpack
+    """
+    from formats.scene import make_node
+
+    node = make_node(new_name)
+    from fusedrf_cli import bridge
+
+    request = ArrangeRequest(
+        fused=fused,
+        output=output,
+        overwrite=overwrite,
+        name=name,
+        new_name=new_name,
+        matrix=node.node_to_parent,
+        absolute=True,
+        memory=memory,
+    )
+    return bridge.rename(request, progress)

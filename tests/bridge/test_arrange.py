@@ -1,0 +1,113 @@
+"""`move`, `duplicate` and `rename` for real."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from formats.bundle import read_bundle, read_field, read_headers
+from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.engine.rendering.metrics import psnr
+from tests.bridge.conftest import done
+
+UP = ("-t", "0.1,0.2,0.5")
+
+
+@pytest.fixture(scope="module")
+def fused(shop, tmp_path_factory):
+    """The shop with blocks.rfpack (floor and red) and vm.rfpack (the same in one tensor)."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("fused") / "shop")
+    done(folder, "fuse", "pair.json", "-o", "blocks.rfpack", "--precision", "int8")
+    done(folder, "fuse", "pair.json", "-o", "vm.rfpack", "--kind", "vm", "--no-rgb", "--max-size", "400kB")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path, fused):
+    return shutil.copytree(fused, tmp_path / "shop")
+
+
+def numbers(folder, bundle: str) -> dict[str, bytes]:
+    """The arrays of the one field of a bundle that are no grids over it."""
+    _, headers = read_headers(folder / bundle)
+    (member,) = headers
+    arrays = read_field(folder / bundle, member).arrays
+    return {name: array.tobytes() for name, array in arrays.items() if "plane" in name or "line" in name}
+
+
+def test_a_moved_object_is_where_the_scene_would_have_it(report, picture, folder):
+    nodes = [
+        make_node("floor", source="floor.rfpack", translation=(0, 0, -0.7), background=True),
+        make_node("red", source="red.rfpack", translation=(-0.4, 0.2, 0.5)),
+    ]
+    write_scene(folder / "wanted.json", SceneGraph(tuple(nodes)))
+    said = report("move", "blocks.rfpack", "red", *UP, "-o", "moved.rfpack")
+    assert (
+        psnr(picture("moved.rfpack"), picture("wanted.json"))
+        > 45
+        > psnr(picture("moved.rfpack"), picture("blocks.rfpack"))
+    )
+    np.testing.assert_allclose(said["touched"]["aabb"], [-0.8, -0.3, -0.3, -0.1, 0.5, 0.8], atol=1e-6)
+    assert numbers(folder, "moved.rfpack") == numbers(folder, "blocks.rfpack") != {}
+
+
+def test_there_and_back_is_as_before(report, picture, folder):
+    report("move", "blocks.rfpack", "red", *UP, "-r", "0,0,30", "-s", "1.5", "-o", "moved.rfpack")
+    matrix = "-t", "-0.1,-0.2,-0.5", "-r", "0,0,-30", "-s", "0.66666666666666667"
+    report("move", "moved.rfpack", "red", *matrix, "-o", "back.rfpack")
+    assert psnr(picture("back.rfpack"), picture("blocks.rfpack")) > 45
+    assert numbers(folder, "back.rfpack") == numbers(folder, "blocks.rfpack")
+
+
+def test_an_object_turns_about_its_middle(report, folder):
+    report("move", "blocks.rfpack", "red", "-r", "0,0,90", "-s", "2", "-o", "moved.rfpack")
+    (node,) = read_bundle(folder / "moved.rfpack").scene.history[-1]["nodes"]
+    np.testing.assert_allclose(node["aabb"], [-1.1, -0.6, -0.6, 0.1, 0.6, 0.6], atol=1e-6)
+    matrix = ",".join(map(str, np.diag([2.0, 2, 2, 1]).ravel()))
+    report("move", "blocks.rfpack", "red", "--matrix", matrix, "-o", "scaled.rfpack")
+    (node,) = read_bundle(folder / "scaled.rfpack").scene.history[-1]["nodes"]
+    np.testing.assert_allclose(node["aabb"], [-1.6, -0.6, -0.6, -0.4, 0.6, 0.6], atol=1e-6)
+
+
+def test_a_copy_shares_its_numbers_and_can_go_by_itself(report, picture, folder):
+    before = (folder / "blocks.rfpack").stat().st_size
+    said = report("duplicate", "blocks.rfpack", "red", "twin", *UP, "-o", "two.rfpack")
+    assert said["bytes"] - before < 4000 and said["touched"]["blocks"] == 3
+    assert numbers(folder, "two.rfpack") == numbers(folder, "blocks.rfpack")
+    assert psnr(picture("two.rfpack"), picture("blocks.rfpack")) < 40
+    report("delete", "two.rfpack", "twin", "-o", "one.rfpack")
+    assert psnr(picture("one.rfpack"), picture("blocks.rfpack")) > 45
+    report("delete", "two.rfpack", "red", "-o", "other.rfpack")
+    report("move", "blocks.rfpack", "red", *UP, "-o", "moved.rfpack")
+    assert psnr(picture("other.rfpack"), picture("moved.rfpack")) > 45
+
+
+def test_a_renamed_object_goes_by_its_new_name(report, run, picture, folder):
+    report("rename", "blocks.rfpack", "red", "box", "-o", "named.rfpack")
+    assert np.array_equal(picture("named.rfpack"), picture("blocks.rfpack"))
+    gone = run("delete", "named.rfpack", "red", "-o", "less.rfpack")
+    assert gone.exit_code == 3 and "there is no 'red' to delete; it holds box, floor" in gone.stderr
+    report("delete", "named.rfpack", "box", "-o", "less.rfpack")
+    history = read_bundle(folder / "less.rfpack").scene.history
+    assert [entry["event"] for entry in history] == ["fused", "renamed", "deleted"]
+
+
+@pytest.mark.parametrize(
+    "words, code, says",
+    [
+        (("move", "blocks.rfpack", "red"), 2, "say where to"),
+        (("move", "blocks.rfpack", "chair", *UP), 3, "there is no 'chair'; it holds floor, red"),
+        (("move", "vm.rfpack", "red", *UP), 3, "'red' is not held apart in its field of kind 'vm'"),
+        (("move", "red.rfpack", "blue", *UP), 3, "there is no 'blue'"),
+        (("duplicate", "blocks.rfpack", "red", "floor"), 3, "there is a 'floor' already"),
+        (("rename", "blocks.rfpack", "red", "red"), 3, "there is a 'red' already"),
+        (("rename", "blocks.rfpack", "red", ""), 3, "is empty"),
+        (("move", "pair.json", "red", *UP), 3, "not a bundle"),
+        (("move", "blocks.rfpack", "red", "--matrix", ",".join("0" * 16)), 2, "matrix"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence(run, folder, words, code, says):
+    before = sorted(folder.iterdir())
+    result = run(*words, "-o", "out.rfpack")
+    assert result.exit_code == code and says in result.stderr and result.stderr.count("\n") <= 2
+    assert sorted(folder.iterdir()) == before
