@@ -4,6 +4,7 @@ import time
 from dataclasses import asdict, replace
 
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
+from fusedrf_cli.bridge.looks import views_of_place
 from fusedrf_cli.bridge.making import Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
@@ -47,7 +48,7 @@ def fuse(request: FuseRequest, progress) -> dict:
         kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
         nodes = history_nodes(loaded, request.output, kept)
         cameras = kept_cameras(loaded, progress)
-        asked = student_request(request, loaded, graph_bytes(nodes, cameras))
+        asked = student_request(request, loaded, scene.composed, graph_bytes(nodes, cameras))
         try:
             student = kind.student(scene.composed, asked)
             held = make_room(memory, student, scene, request)
@@ -103,7 +104,9 @@ def fuse(request: FuseRequest, progress) -> dict:
     return report
 
 
-def student_request(request: FuseRequest, loaded: LoadedScene, overhead: int) -> StudentRequest:
+def student_request(
+    request: FuseRequest, loaded: LoadedScene, composed: ComposedField, overhead: int
+) -> StudentRequest:
     """What is asked of the kind's student; overhead: bytes of the bundle besides its field."""
     return StudentRequest(
         sizes=BundleSizes(),
@@ -115,6 +118,7 @@ def student_request(request: FuseRequest, loaded: LoadedScene, overhead: int) ->
         sh_degree=request.sh_degree,
         source_bytes=tuple(loaded.sizes),
         from_scratch=request.from_scratch,
+        views=views_of_place(loaded, composed),
     )
 
 

@@ -27,6 +27,9 @@ NEIGHBOURS = 4
 """A view of a capture is taken somewhere between a camera and one of so many that are nearest to it."""
 UNPHOTOGRAPHED = 400
 """Pixels a side of the pictures of an object that no photo shows, in which it is framed."""
+OWN_VIEWS, MORE_VIEWS, SMALL = 100, 60, 96
+"""Of `views_of_place`: so many cameras of the photos at most, so many between them, and pixels a side."""
+VIEWS_SEED = 5_000_011
 LOWEST, HIGHEST = 0.05, 1.3
 """Radians above the horizon of such views."""
 
@@ -101,6 +104,21 @@ def looks(
         found.append(Look(close_up(subject, size, rng), subject.name))
     named = enumerate(found)
     return [replace(look, camera=replace(look.camera, name=f"view_{i:04d}")) for i, look in named]
+
+
+def views_of_place(scene: LoadedScene, composed: ComposedField) -> tuple[Camera, ...]:
+    """Cameras of SMALL pixels a side in the frame of a scene: those of the photos of its place, and more from
+    between them; none where the scene keeps no cameras of a place."""
+    rig = rig_of(scene)
+    if rig is None or not rig.surroundings or composed.origin.shape == (3,):
+        return ()
+    rng = np.random.default_rng(VIEWS_SEED)
+    chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(len(rig.views), OWN_VIEWS)).astype(int))
+    views = [rig.views[i] for i in chosen] + [between(rig.views, rng) for _ in range(MORE_VIEWS)]
+    pictures = (replace(view, distortion=(), fisheye=False).reframed(SMALL, SMALL) for view in views)
+    return tuple(
+        replace(camera_of(view), distortion=(0.0,) * 5).seen_from(composed.origin) for view in pictures
+    )
 
 
 def close_up(subject: Subject, size: tuple[int, int], rng: np.random.Generator) -> Camera:

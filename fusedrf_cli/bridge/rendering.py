@@ -17,8 +17,10 @@ from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.editing import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
+from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
@@ -93,10 +95,12 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
 def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: Memory, place: str):
     """A scene as one field with the numbers of its sources, which is looked at as fast as a fused one; the
     scene itself where no kind of field can be that, or there is no memory for it."""
+    around = any(p.unbounded for p in composed.placed)
+    box = WHOLE if around else enclosing([p.aabb for p in composed.placed])  # no grid is made to know it
     most = (
         sources(loaded.sizes, copies=JOINING)
         | {"the sources put together": sum(loaded.sizes)}
-        | ownership(composed.aabb)
+        | ownership(box)
         | needed
     )
     if budget.room(most) < 0:

@@ -15,9 +15,10 @@ from fusedrf_cli.bridge.refined import with_poses
 from fusedrf_cli.bridge.training import fit_settings, texels_of_place
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.poses import poses_of
+from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import look_at
-from fusedrf_cli.engine.spaces.unbounded import WHOLE, contracted
+from fusedrf_cli.engine.spaces.unbounded import SUBJECT, WHOLE, contracted
 from fusedrf_cli.requests import TrainRequest
 
 BOX = np.array([-9.0] * 3 + [9.0] * 3)
@@ -72,6 +73,19 @@ def test_pixels_of_photos_that_look_one_way_are_as_wide_near_as_far():
     asked = replace(request(), centre=(0.0, 1.0, 0.2), radius=2.4)
     around = widths(extent_of(asked, capture, False))
     assert around.max() > 2.5 * around.min()
+
+
+def test_views_of_what_lies_before_cameras_look_there():
+    """Without the cameras of a capture, too: not at the middle of the core, where the cameras stand."""
+    near = {"near": 2.5, "far": 20.0}
+    capture = photos([(4, y, z) for y in (-0.4, 0, 0.4) for z in (-0.3, 0.3)], focus=(0.0, 1.0, 0.2))
+    capture = replace(capture, train=tuple(replace(view, **near) for view in capture.train))
+    extent = extent_of(request(), capture, False)
+    box = placed_box(extent.cells.subject, extent.origin)
+    ahead = ((box[:3] + box[3:]) / 2 - [4, 0, 0]) @ [-0.97, 0.24, 0.05]
+    assert 2 < ahead < 8
+    around = extent_of(replace(request(), radius=2.4), capture, False)
+    assert np.array_equal(around.cells.subject, SUBJECT)
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():

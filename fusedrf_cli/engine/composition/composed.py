@@ -14,6 +14,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     SCENE_CELLS,
     OccupancyGrid,
     Pace,
+    placed_box,
     placed_cells,
     unbounded_cells,
 )
@@ -45,10 +46,8 @@ class ComposedField:
             raise ValueError("a composed scene needs at least one field")
         if rule not in RULES:
             raise ValueError(f"composition should be one of {', '.join(RULES)}, found '{rule}'")
-        around = [p for p in placed if p.unbounded]
-        if around:
-            largest = max(around, key=lambda p: abs(np.linalg.det(p.object_to_world[:3, :3])))
-            self.origin = largest.object_to_world
+        if any(p.unbounded for p in placed):
+            self.origin = largest(placed).object_to_world
         else:
             boxes = np.stack([p.aabb for p in placed])
             self.origin = (boxes[:, :3].min(0) + boxes[:, 3:].max(0)) / 2
@@ -74,7 +73,9 @@ class ComposedField:
             steps = (sampling_step(p.field) for p in self.placed)
             pace = Pace(OccupancyGrid.full(unbounded.WHOLE, OCCUPANCY_CELLS, unbounded))
             marks = pace.kept(unbounded_cells(grids, OCCUPANCY_CELLS), again, steps)
-            return pace.grid(reduce(np.logical_or, marks))
+            grid, place = pace.grid(reduce(np.logical_or, marks)), largest(self.placed)
+            seen = placed_box(place.field.occupancy.subject, place.object_to_world)
+            return replace(grid, looked_at=seen)
         aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
@@ -123,6 +124,12 @@ class ComposedField:
         seen = inside[found > 0]
         if with_colour and len(seen):
             rgb[seen] += found[found > 0, None] * _colour(placed, points[seen], dirs[seen]).double()
+
+
+def largest(placed: list[Placed]) -> Placed:
+    """Of fields that fill all of space the one with the largest core."""
+    around = [p for p in placed if p.unbounded]
+    return max(around, key=lambda p: abs(np.linalg.det(p.object_to_world[:3, :3])))
 
 
 def _sigma(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:

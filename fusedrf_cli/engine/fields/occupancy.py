@@ -18,6 +18,7 @@ THINNEST = 12  # texels across a flat box
 MAX_STRIDE = 255
 ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
+NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -38,6 +39,8 @@ class OccupancyGrid:
     """(X, Y, Z) uint8: samples in a cell may lie so many times `unit` apart; None: a step everywhere."""
     unit: float = 0.0
     """The distance of samples where they lie closest; 0: it follows from the field's voxel."""
+    looked_at: np.ndarray | None = None
+    """(6,) box of the frame that views look at; None: it follows from the cells."""
 
     @classmethod
     def full(cls, aabb: np.ndarray, cells: int = 1, space: ModuleType = bounded) -> "OccupancyGrid":
@@ -84,8 +87,19 @@ class OccupancyGrid:
     @property
     def subject(self) -> np.ndarray:
         """(6,) box of the field's frame that views of it look at: that around the occupied cells, or, in
-        unbounded space, the middle of the core."""
-        return unbounded.SUBJECT if self.space is unbounded else self.tight_aabb(0)
+        unbounded space, the middle of the core; of a grid that does not reach there, since all cameras stand
+        in the core and look one way, the middle half of the cells that are no farther than NEARBY."""
+        if self.looked_at is not None:
+            return self.looked_at
+        if self.space is not unbounded:
+            return self.tight_aabb(0)
+        if (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
+            return unbounded.SUBJECT
+        centres = self.centres()
+        near = np.abs(centres).max(1) < 2 - 1 / NEARBY
+        chosen = centres[near] if near.any() else centres
+        points = unbounded.placed(torch.from_numpy(chosen)).numpy()
+        return np.concatenate(np.quantile(points, [0.25, 0.75], axis=0))
 
     def within(self, aabb: np.ndarray) -> "OccupancyGrid":
         """The cells of a box (6,) whose faces are, but for rounding, those of cells."""

@@ -15,6 +15,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import texels
+from fusedrf_cli.engine.rendering.cameras import Camera
 
 if TYPE_CHECKING:
     from fusedrf_cli.engine.kinds.kind import Kind
@@ -117,6 +118,8 @@ class StudentRequest:
     """In memory, of the distinct sources."""
     from_scratch: bool = False
     """Whether to take over no numbers."""
+    views: tuple[Camera, ...] = ()
+    """In the scene's frame, from where a place that stands in it was photographed, with few pixels each."""
 
 
 class TooSmall(ValueError):

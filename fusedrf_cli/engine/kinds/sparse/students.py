@@ -2,6 +2,7 @@
 rays."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from itertools import product
 from math import prod
 
@@ -18,6 +19,7 @@ from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, with_fringe
 from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
+from fusedrf_cli.engine.kinds.sparse.seen import as_seen
 from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
 from fusedrf_cli.engine.kinds.student import (
     Contents,
@@ -128,6 +130,11 @@ class SparseStudent(MadeStudent):
     lesson = DistillSettings(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
     compares = False
 
+    @cached_property
+    def seen(self) -> ComposedField:
+        """The scene without what no view of its place shows."""
+        return as_seen(self.scene, self.request.views)
+
     def ways(self) -> list[list[Way]]:
         """By precision, and degrees of the colour."""
         request = self.request
@@ -145,7 +152,7 @@ class SparseStudent(MadeStudent):
         """Bricks filled by asking the scene."""
         numbers = self.numbers_within(limit, way.precision)
         try:
-            field = resampled(self.scene, SparseShape(way.sh_degree), numbers)
+            field = resampled(self.seen, SparseShape(way.sh_degree), numbers)
         except TooFewNumbers:
             return None
         size = self.bytes_of(field, way)
