@@ -1,9 +1,9 @@
 """Objects on a real background: python -m benchmarks.placed DATA [--out docs/real] [--share 1]
 
 DATA is a folder with bear/, chair/, tankard/ and fuze/fuze.obj. Each is trained (--share multiplies the
-seconds), the objects are put onto the bear's rock, and the scene is fused under 50 MB as blocks, vm and sparse, or
-as each --kind. OUT gets placed.md: what each reaches by its own views of the whole scene, before finishing on
-rays and after, bytes, seconds, and a frame over the background's alone.
+seconds), the objects are put onto the bear's rock, and the scene is fused under 50 MB as blocks, vm and
+sparse, or as each --kind. OUT gets placed.md: what each reaches by its own views, before finishing on rays
+and after, bytes, seconds, and a frame over the background's alone.
 """
 
 import argparse
@@ -44,8 +44,9 @@ ABOUT = (
     "Written by `make bench-real`. The chair, the tankard and the bottle stand on the bear's rock; PSNR is "
     "that of the fused field against the composition, mean of views from where the photos were taken and of "
     "views of each object from where it was photographed, none of which anything was learnt from; *the worst "
-    f"object* is the mean of its own views. *frame* is the median of {FRAMES} pictures of {FRAME[0]}×{FRAME[1]} pixels "
-    "from one of the photos' cameras, and that over the background's alone, in turns."
+    f"object* is the mean of its own views. *frame* is the median of {FRAMES} pictures of "
+    f"{FRAME[0]}×{FRAME[1]} pixels from one of the photos' cameras, and that over the background's alone, in "
+    "turns."
 )
 
 

@@ -120,7 +120,7 @@ class _Mesh:
 
 
 def _load(path: Path | str) -> _Mesh:
-    placed, vertices, first_vertices = _placed_geometries(path), [], []
+    placed, vertices, first_vertices = placed_geometries(path), [], []
     for geometry, to_world in placed:
         first_vertices.append(sum(len(v) for v in vertices))
         vertices.append(geometry.vertices @ to_world[:3, :3].T + to_world[:3, 3])
@@ -139,7 +139,7 @@ def _load(path: Path | str) -> _Mesh:
     return _Mesh(used, surfaces, first_faces, _embree((points - centre) / radius, faces), centre, radius)
 
 
-def _placed_geometries(path: Path | str) -> list[tuple]:
+def placed_geometries(path: Path | str) -> list[tuple]:
     """(trimesh geometry, geometry_to_world) for every placed surface with faces."""
     import trimesh
 

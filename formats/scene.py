@@ -41,8 +41,9 @@ from formats.rig import FARTHEST, RigSchema, read_rig
 from formats.rotations import matrices
 
 FORMAT = "rfpack"
-VERSION = "1.1"
-PLAIN_VERSION = "1.0"  # of scenes that have neither cameras nor a framing
+VERSION = "1.2"
+FRAMED_VERSION = "1.1"  # of scenes with cameras or a framing
+PLAIN_VERSION = "1.0"  # of scenes that have neither
 MEMBER = r"fields/[0-9a-f]{16}\.safetensors"
 MAX_SCENE_BYTES = 4 << 20
 MAX_NODES = 10_000
@@ -61,6 +62,8 @@ Vector3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
 Vector4 = Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
 Matrix4 = Annotated[list[Vector4], msgspec.Meta(min_length=4, max_length=4)]
 Box = Annotated[list[float], msgspec.Meta(min_length=6, max_length=6)]
+Shape = Annotated[list[float], msgspec.Meta(min_length=4, max_length=6)]
+Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
 
 
@@ -75,6 +78,9 @@ class NodeSchema(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
     rotation: Vector4 | msgspec.UnsetType = msgspec.UNSET
     scale: Vector3 | msgspec.UnsetType = msgspec.UNSET
     matrix: Matrix4 | msgspec.UnsetType = msgspec.UNSET
+    visible: bool = True
+    crop: Shape | msgspec.UnsetType = msgspec.UNSET
+    opacity: Share | msgspec.UnsetType = msgspec.UNSET
     children: list["NodeSchema"] = []
 
 
@@ -94,6 +100,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
 
 NODE_KEYS = NodeSchema.__struct_fields__
 PLACEMENT_KEYS = ("translation", "rotation", "scale", "matrix")
+SHOWING_KEYS = ("visible", "crop", "opacity")
 SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history", "framing", "cameras")
 
 
@@ -108,6 +115,8 @@ class Node:
     background: bool = False
     children: tuple["Node", ...] = ()
     extras: dict = dataclasses.field(default_factory=dict)
+    showing: dict = dataclasses.field(default_factory=dict)
+    """What is shown of it and of its children, as it was written: see `Leaf`."""
     node_to_parent: np.ndarray = dataclasses.field(init=False, compare=False, repr=False)
 
     def __post_init__(self):
@@ -117,6 +126,7 @@ class Node:
         matrix = _placement_matrix(self.placement, self.name)
         _check_affine(matrix, f"node {self.name!r}")
         matrix.flags.writeable = False
+        _check_showing(self.showing, self.name)
         object.__setattr__(self, "node_to_parent", matrix)
 
 
@@ -129,6 +139,52 @@ class Leaf:
     source: str | None
     object_to_world: np.ndarray
     background: bool
+    visible: bool = True
+    opacity: float = 1.0
+    """Its density is multiplied by this."""
+    crops: tuple["Crop", ...] = ()
+    """It is empty outside of any of them."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it is shown as it is."""
+        return self.visible and self.opacity == 1 and not self.crops
+
+    def inside(self, outer: "Leaf") -> "Leaf":
+        """A leaf of a bundle that an outer one names as its source."""
+        return replace(
+            self,
+            object_to_world=outer.object_to_world @ self.object_to_world,
+            background=outer.background,
+            visible=outer.visible and self.visible,
+            opacity=outer.opacity * self.opacity,
+            crops=(*(crop.within(self.object_to_world) for crop in outer.crops), *self.crops),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """A box or a sphere in some frame."""
+
+    shape: tuple[float, ...]
+    """xmin to zmax, or x, y, z and a radius."""
+    object_to_shape: np.ndarray
+    """(4, 4) float64 from an object's frame to that of the shape."""
+
+    def __repr__(self) -> str:
+        return f"Crop({self.shape}, {self.object_to_shape.tolist()})"
+
+    def within(self, matrix: np.ndarray) -> "Crop":
+        """The crop for an object that lies in this one's by a (4, 4)."""
+        return replace(self, object_to_shape=self.object_to_shape @ matrix)
+
+    def holds(self, points: np.ndarray) -> np.ndarray:
+        """(N,) bool: which points (N, 3) of the object's frame it keeps."""
+        at = points @ self.object_to_shape[:3, :3].T + self.object_to_shape[:3, 3]
+        shape = np.array(self.shape)
+        if len(shape) == 4:
+            return ((at - shape[:3]) ** 2).sum(1) <= shape[3] ** 2
+        return ((at >= shape[:3]) & (at <= shape[3:])).all(1)
 
 
 @dataclass(frozen=True)
@@ -172,11 +228,23 @@ class SceneGraph:
 
     def leaves(self) -> list[Leaf]:
         """The nodes that hold a field or a source, in document order."""
-        return [
-            Leaf(node.name, node.field, node.source, object_to_world, node.background)
-            for node, _, object_to_world in self.walk()
-            if node.field is not None or node.source is not None
-        ]
+        found = []
+        stack = [(node, node.node_to_parent, True, 1.0, ()) for node in reversed(self.nodes)]
+        while stack:
+            node, object_to_world, visible, opacity, crops = stack.pop()
+            visible = visible and node.showing.get("visible", True)
+            opacity *= node.showing.get("opacity", 1.0)
+            if "crop" in node.showing:
+                crops = (*crops, Crop(tuple(node.showing["crop"]), np.eye(4)))
+            if node.field is not None or node.source is not None:
+                shown = visible, opacity, crops
+                found.append(
+                    Leaf(node.name, node.field, node.source, object_to_world, node.background, *shown)
+                )
+            for child in reversed(node.children):
+                own = tuple(crop.within(child.node_to_parent) for crop in crops)
+                stack.append((child, object_to_world @ child.node_to_parent, visible, opacity, own))
+        return found
 
 
 def make_node(
@@ -190,14 +258,16 @@ def make_node(
     matrix=None,
     background: bool = False,
     children: tuple[Node, ...] = (),
+    showing: dict | None = None,
 ) -> Node:
-    """A node by translation (3,), rotation (4,) quaternion xyzw and scale (3,), or by matrix (4, 4).
+    """A node by translation (3,), rotation (4,) quaternion xyzw and scale (3,), or by matrix (4, 4); showing
+    are its SHOWING_KEYS.
 
     Raises BadName, BadSchema, NotFinite, SingularTransform, LimitExceeded.
     """
     words = zip(PLACEMENT_KEYS, (translation, rotation, scale, matrix), strict=True)
     placement = {key: np.asarray(value).tolist() for key, value in words if value is not None}
-    return Node(name, field, source, placement, background, tuple(children))
+    return Node(name, field, source, placement, background, tuple(children), {}, showing or {})
 
 
 def read_scene(path: Path | str) -> SceneGraph:
@@ -246,9 +316,12 @@ def dump_scene(scene: SceneGraph) -> bytes:
     """
     shown = {"framing": scene.framing and list(scene.framing), "cameras": scene.cameras}
     shown = {key: value for key, value in shown.items() if value is not None}
+    least = FRAMED_VERSION if shown else PLAIN_VERSION
+    if any(node.showing for node, _, _ in scene.walk()):
+        least = VERSION
     content = {
         "format": FORMAT,
-        "version": max(scene.version, VERSION, key=_numbered) if shown else scene.version,
+        "version": max(scene.version, least, key=_numbered),
         "generator": scene.generator,
         "composition": scene.composition,
         "nodes": [_node_content(node) for node in scene.nodes],
@@ -396,6 +469,21 @@ def _check_name(name: str) -> None:
         raise BadName(f"node name {name!r} holds control characters; use printable ones")
 
 
+def _check_showing(showing: dict, name: str) -> None:
+    crop = showing.get("crop")
+    if crop is not None:
+        numbers = _numbers(crop, (len(crop),), name, "crop")
+        box = len(crop) == 6 and (numbers[:3] < numbers[3:]).all()
+        if not box and not (len(crop) == 4 and numbers[3] > 0):
+            raise BadSchema(
+                f"node {name!r}: crop {list(crop)} is neither a box, xmin,ymin,zmin,xmax,ymax,zmax with each "
+                "minimum below its maximum, nor a sphere, x,y,z and a radius above 0"
+            )
+    opacity = showing.get("opacity", 1.0)
+    if not 0 < opacity <= 1:
+        raise BadSchema(f"node {name!r}: opacity {opacity}, expected a number above 0 and at most 1")
+
+
 def _placement_matrix(placement: dict, name: str) -> np.ndarray:
     if set(placement) - set(PLACEMENT_KEYS):
         expected = ", ".join(PLACEMENT_KEYS)
@@ -529,6 +617,7 @@ def _build_node(content: dict) -> Node:
         content.get("background", False),
         tuple(_build_node(child) for child in content.get("children", ())),
         {key: value for key, value in content.items() if key not in NODE_KEYS},
+        {key: content[key] for key in SHOWING_KEYS if key in content},
     )
 
 
@@ -538,6 +627,7 @@ def _node_content(node: Node) -> dict:
     content |= {key: node.placement[key] for key in PLACEMENT_KEYS if key in node.placement}
     if node.background:
         content["background"] = True
+    content |= {key: node.showing[key] for key in SHOWING_KEYS if key in node.showing}
     content |= {key: node.extras[key] for key in sorted(node.extras)}
     if node.children:
         content["children"] = [_node_content(child) for child in node.children]

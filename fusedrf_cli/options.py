@@ -156,6 +156,53 @@ class BoxType(_Text):
         return box
 
 
+class CropType(_Text):
+    """Six numbers, a box as BoxType's, or four, a sphere as SphereType's."""
+
+    name, expected = "BOX|SPHERE", "a box xmin,ymin,zmin,xmax,ymax,zmax or a sphere x,y,z,r"
+
+    def parse(self, text):
+        return (BoxType() if len(_numbers(text, (4, 6))) == 6 else SphereType()).parse(text)
+
+
+class ShareType(_Text):
+    """A number above 0 and at most 1."""
+
+    name, expected = "SHARE", "a number above 0 and at most 1"
+
+    def parse(self, text):
+        (number,) = _numbers(text, (1,))
+        if not 0 < number <= 1:
+            raise ValueError(text)
+        return number
+
+
+class SphereType(_Text):
+    """'x,y,z,radius' -> four floats, the last above 0."""
+
+    name, expected = "x,y,z,r", "a centre and a radius above 0, x,y,z,r"
+
+    def parse(self, text):
+        sphere = _numbers(text, (4,))
+        if sphere[3] <= 0:
+            raise ValueError(text)
+        return sphere
+
+
+class PointType(_Text):
+    """'VIEW:x,y' or 'VIEW:x,y,out' -> name of the view, column and row, and whether it shows the object."""
+
+    name, expected = "VIEW:x,y[,out]", "a view's name and a pixel, VIEW:x,y, or VIEW:x,y,out"
+
+    def parse(self, text):
+        view, _, pixel = text.rpartition(":")
+        shows = not pixel.endswith(",out")
+        column, row = _numbers(pixel.removesuffix(",out"), (2,))
+        if not view or min(column, row) < 0:
+            raise ValueError(text)
+        return view, column, row, shows
+
+
 class ColourType(_Text):
     """A name or #rrggbb -> (r, g, b) in [0, 1]; transparent -> None."""
 
@@ -276,6 +323,7 @@ class KindsType(KindType):
 RANKS, DIRECTION, UP = RanksType(), DirectionType(), UpType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
+SPHERE, POINT, CROP, SHARE = SphereType(), PointType(), CropType(), ShareType()
 INPUT, SCENE, DOWNSCALE = InputType(), InputType(stdin=True), DownscaleType()
 
 
@@ -337,6 +385,11 @@ rgb = click.option("--rgb/--no-rgb", default=True, show_default=True, help="Fini
 size = click.option("--size", type=SIZE, help="Picture size in pixels; default: the cameras' own.")
 allow_outside = click.option(
     "--allow-outside", is_flag=True, help="Let a scene name sources outside its own folder."
+)
+extracted_precision = click.option(
+    "--precision",
+    type=PRECISION,
+    help="How numbers are stored; default: float16, with --invert as those of FIELD are.",
 )
 PLACEMENT = {  # flags -> what click.option takes; `compose` has them once per input
     ("-t", "--translate"): {"type": VECTOR, "help": "Move by x,y,z."},

@@ -157,6 +157,36 @@ class ArrangeRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExtractRequest(Running):
+    """An object out of a field; what tells of it is in world units and pixels."""
+
+    field: str
+    output: str
+    overwrite: bool
+    boxes: tuple[tuple[float, ...], ...]
+    """Each (6,)."""
+    spheres: tuple[tuple[float, ...], ...]
+    """Each (4,): centre and radius."""
+    mesh: str | None
+    """A closed hull."""
+    masks: str | None
+    """A folder."""
+    cameras: str | None
+    """Of the masked pictures; None: those that the bundle keeps."""
+    points: tuple[tuple[str, float, float, bool], ...]
+    """Each the name of a view, column and row of a pixel, and whether it shows the object."""
+    name: str | None
+    """Of a part that the field holds apart."""
+    invert: bool
+    """Write what is left instead."""
+    preview: str | None
+    """A folder of pictures."""
+    precision: str | None
+    """None: float16 of an object, the field's own of what is left."""
+    memory: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
 class RenderRequest(Running):
     """Pictures or a film of a scene."""
 

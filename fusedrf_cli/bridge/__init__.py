@@ -10,6 +10,7 @@ from fusedrf_cli.bridge.charting import chart
 from fusedrf_cli.bridge.converting import convert
 from fusedrf_cli.bridge.editing import add, delete
 from fusedrf_cli.bridge.evaluating import evaluate
+from fusedrf_cli.bridge.extracting import extract
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.listing import list_kinds
 from fusedrf_cli.bridge.posing import pose
@@ -23,6 +24,7 @@ __all__ = [
     "delete",
     "duplicate",
     "evaluate",
+    "extract",
     "fuse",
     "list_kinds",
     "move",

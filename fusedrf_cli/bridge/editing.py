@@ -277,8 +277,9 @@ def addition_memory(field: StoredField, new: LoadedScene) -> list[dict[str, floa
     ]
 
 
-def read_fused(path: str, memory: Memory) -> Fused:
-    """A bundle of one field; InvalidInput when it is something else."""
+def read_fused(path: str, memory: Memory, turned: bool = False) -> Fused:
+    """A bundle of one field, in a frame that may be turned or scaled; InvalidInput when it is something
+    else."""
     if not is_bundle(path):
         raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
     scene, headers = read_headers(path)
@@ -289,10 +290,14 @@ def read_fused(path: str, memory: Memory) -> Fused:
             f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
         )
     (leaf,) = leaves
+    if not leaf.whole:
+        raise InvalidInput(
+            f"{path}: its field is cropped, thinned or hidden, and cannot be edited; fuse it first"
+        )
     memory.expect(sources([held_size(headers[leaf.field])], copies=READING), advice="edit a smaller field")
     field = make_field(read_field(path, leaf.field), path)
     only_moved = np.array_equal(leaf.object_to_world[:3, :3], np.eye(3))
-    if not only_moved and field.occupancy.space is bounded:
+    if not only_moved and not turned and field.occupancy.space is bounded:
         raise InvalidInput(f"{path}: its field is turned or scaled, and cannot be edited; fuse it first")
     others = [member for member in headers if member != leaf.field]
     return Fused(path, scene, others, leaf, field, registry.kind(field.kind), headers[leaf.field].precision)

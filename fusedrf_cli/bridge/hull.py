@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt, label, maximum
 from formats.captures import load_ignored
 from formats.views import View
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.rendering.cameras import bend, bend_angle
+from fusedrf_cli.engine.rendering.cameras import projected
 
 CELLS = (32, 112)
 """Along the longest axis, of a first look and of a second one into what that leaves."""
@@ -90,21 +90,3 @@ def cropped(grid: OccupancyGrid) -> OccupancyGrid:
     """The same cells in the smallest box that holds the occupied ones and a cell around them, where the grid
     has it."""
     return grid.within(grid.tight_aabb(1))
-
-
-def projected(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where a view shows world points (N, 3): pixels (N, 2), column and row; how far they are (N,), along
-    its axis or, of a fisheye, in all; and which of them lie in the picture, (N,) bool."""
-    x, y, back = ((points - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]).T
-    if view.fisheye:
-        away, aside = np.linalg.norm([x, y, back], axis=0), np.hypot(x, y)
-        radius, slope = bend_angle(np.arctan2(aside, -back), view.distortion)
-        u, v = np.array([x, -y]) * radius / np.maximum(aside, 1e-12)
-    else:
-        away = -back
-        before = np.where(away > 0, away, np.inf)
-        u, v, (a, b, d) = bend(x / before, -y / before, view.distortion)
-        slope = a * d - b * b
-    pixels = np.stack([view.cx + view.fl_x * u, view.cy + view.fl_y * v], 1)
-    unfolded = (away > 0) & (slope > 0)  # beyond a fold of the lens points would come back into the picture
-    return pixels, away, unfolded & ((pixels >= 0) & (pixels < (view.width, view.height))).all(1)

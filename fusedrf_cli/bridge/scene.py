@@ -3,14 +3,22 @@
 import os
 import sys
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldHeader, FieldRecord, as_stored
-from formats.scene import SceneGraph, expand_scene, inline_scenes, make_node, parse_scene, resolve_source
+from formats.scene import (
+    Leaf,
+    SceneGraph,
+    expand_scene,
+    inline_scenes,
+    make_node,
+    parse_scene,
+    resolve_source,
+)
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import READING, Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
@@ -38,6 +46,8 @@ class SourceField:
     member: str
     size: int
     """Bytes of its numbers in memory."""
+    whole: bool = True
+    """Whether it is shown as the bundle has it."""
 
 
 @dataclass(frozen=True)
@@ -161,12 +171,16 @@ class _Loader:
         self, graph: SceneGraph, allow_outside: bool, headers: dict[str, FieldHeader] | None = None
     ) -> LoadedScene:
         found = []
-        for leaf in graph.leaves():
+        leaves = graph.leaves()
+        for leaf in leaves:
+            if not leaf.visible:
+                continue
             if leaf.field is not None:
-                where = leaf.name, leaf.object_to_world, leaf.background
-                found.append((*where, self.path, leaf.field, (headers or {})[leaf.field]))
+                found.append((leaf, self.path, leaf.field, (headers or {})[leaf.field]))
             elif leaf.source is not None:
                 found += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
+        if not found and leaves:
+            raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
         if not found:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
         if self.budget is not None:
@@ -186,7 +200,7 @@ class _Loader:
                 )
             self.bundles[path] = read_headers(path)
         scene, headers = self.bundles[path]
-        inner = [node for node in scene.leaves() if node.field is not None]
+        inner = [node for node in scene.leaves() if node.field is not None and node.visible]
         if not inner:
             raise InvalidInput(
                 f"{path}: the bundle holds no field, so node '{leaf.name}' would be empty; choose another "
@@ -196,38 +210,40 @@ class _Loader:
             self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
         return [
-            (
-                name,
-                leaf.object_to_world @ node.object_to_world,
-                leaf.background,
-                path,
-                node.field,
-                headers[node.field],
-            )
+            (replace(node.inside(leaf), name=name), path, node.field, headers[node.field])
             for name, node in zip(named, inner, strict=True)
         ]
 
-    def source(
-        self,
-        name: str,
-        object_to_world: np.ndarray,
-        background: bool,
-        path: Path,
-        member: str,
-        header: FieldHeader,
-    ) -> SourceField:
-        size = held_size(header)
+    def source(self, leaf: Leaf, path: Path, member: str, header: FieldHeader) -> SourceField:
+        """leaf: where the field lies, under which name, and what is shown of it."""
+        size, where = held_size(header), f"{path}: node '{leaf.name}'"
+        key = member if leaf.whole else f"{member} {leaf.opacity} {leaf.crops}"
 
         def read():
-            return make_field(read_field(path, member), f"{path}: node '{name}'").to(self.place)
+            return as_shown(make_field(read_field(path, member), where), leaf, where).to(self.place)
 
-        if member not in self.fields:
-            self.fields[member] = StreamedField(lambda: self.shelf.take(member, size, read))
+        if key not in self.fields:
+            self.fields[key] = StreamedField(lambda: self.shelf.take(key, size, read))
         try:
-            placed = Placed(name, self.fields[member], object_to_world)
+            placed = Placed(leaf.name, self.fields[key], leaf.object_to_world)
         except ValueError as error:
             raise InvalidInput(f"{path}: {error}; give an invertible placement") from error
-        return SourceField(placed, background, path, member, size)
+        return SourceField(placed, leaf.background, path, member, size, leaf.whole)
+
+
+def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
+    """What a leaf shows of its field: all of it, or what its crops hold, with its density times its opacity.
+    InvalidInput where that is nothing, or the kind of field has no such."""
+    kind = registry.kind(field.kind)
+    try:
+        shown = field if leaf.opacity == 1 else kind.thinned(field, leaf.opacity)
+        if leaf.crops:
+            shown = kind.cropped(shown, lambda points: np.all([c.holds(points) for c in leaf.crops], 0))
+    except ValueError as error:
+        raise InvalidInput(f"{where}: {error}") from error
+    if shown is None:
+        raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
+    return shown
 
 
 def background_of(scene: LoadedScene) -> SourceField:
@@ -255,9 +271,9 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
             "aabb": f.placed.aabb.tolist(),
             "field": f.member,
             "background": f.background,
-            "kept": f.member in kept,
+            "kept": f.member in kept and f.whole,
         }
-        if f.path in hashes:
+        if f.path in hashes and f.whole:  # an edit reads it again as it is
             node |= {"source": os.path.relpath(f.path.resolve(), folder), "sha256": hashes[f.path]}
         nodes.append(node)
     return nodes

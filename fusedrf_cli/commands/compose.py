@@ -42,6 +42,13 @@ def _placed_options(command):
         **options.PLACEMENT,
         ("--name",): {"help": "The node's name; default: the file's stem."},
         ("--background-node",): {"is_flag": True, "help": "This input is the background."},
+        ("--crop",): {
+            "type": options.CROP,
+            "help": "Show what lies in a box, xmin,ymin,zmin,xmax,ymax,zmax, or in a sphere, x,y,z,r, of its "
+            "own world.",
+        },
+        ("--opacity",): {"type": options.SHARE, "help": "Its density times this, above 0 and at most 1."},
+        ("--hidden",): {"is_flag": True, "help": "Leave it out, but keep its place in the scene."},
     }
     for names, words in reversed(flags.items()):
         command = click.option(*names, cls=PlacedOption, **words)(command)
@@ -111,8 +118,11 @@ def _nodes(inputs, output, allow_outside, words):
     for path, name, given in zip(inputs, names, words, strict=True):
         source = _relative(path, output)
         resolve_source(output, source, allow_outside)
-        background = bool(given.pop("background_node"))
-        yield make_node(name, source=source, background=background, **node_words(**given))
+        background, hidden = bool(given.pop("background_node")), bool(given.pop("hidden"))
+        showing = {key: value for key in ("crop", "opacity") if (value := given.pop(key)) is not None}
+        showing |= {"visible": False} if hidden else {}
+        words = node_words(**given)
+        yield make_node(name, source=source, background=background, showing=showing, **words)
 
 
 def _names(inputs: tuple[str, ...], given: list[str | None]) -> list[str]:

@@ -13,7 +13,16 @@ import torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Answers, Cells, Points, Rays, Sent, Weighed
+from fusedrf_cli.engine.kernels.loops import (
+    RAYS_PER_TASK,
+    Answers,
+    Cells,
+    Points,
+    Rays,
+    Sent,
+    Voting,
+    Weighed,
+)
 
 
 class Batch(NamedTuple):
@@ -232,6 +241,30 @@ class ComputedField:
             "weigh_ray", self.arrays, self.grid, asked, len(rays_o), 1, most, np.zeros((parts, 3))
         )
         return most.max(0).reshape(self.occupancy.occupied.shape)
+
+    def votes(
+        self,
+        rays_o: np.ndarray,
+        rays_d: np.ndarray,
+        jitter: np.ndarray,
+        inside: np.ndarray,
+        step: float,
+        cells: OccupancyGrid,
+    ) -> np.ndarray:
+        """(2, X, Y, Z) for each cell of a grid in the field's space, occupied or not, the sum of the weights
+        (NeRF, eq. 3) that samples in it have on those of rays (N, 3) that are not `inside` (N,), and on those
+        that are."""
+        counts = np.array(cells.occupied.shape, np.int64)
+        asked = Voting(
+            exact(rays_o), exact(rays_d), exact(jitter), np.ascontiguousarray(inside, np.uint8), float(step),
+            1e-3, exact(cells.aabb[:3]), exact(cells.cell), counts,
+        )  # fmt: skip
+        parts = torch.get_num_threads()
+        sums = np.zeros((parts, 2 * cells.occupied.size), np.float32)
+        self.loops.sweep(
+            "vote_ray", self.arrays, self.grid, asked, len(rays_o), 1, sums, np.zeros((parts, 3))
+        )
+        return np.moveaxis(sums.sum(0).reshape(*counts, 2), -1, 0)
 
     # -- learning ----------------------------------------------------------------------------------------
 

@@ -90,6 +90,20 @@ class Weighed(NamedTuple):
     early_stop: object  # float
 
 
+class Voting(NamedTuple):
+    """What `vote_ray` follows, and the cells it votes for."""
+
+    rays_o: object  # (N, 3) float64
+    rays_d: object  # (N, 3) float64, unit length
+    jitter: object  # (N,) float64 in [0, 1)
+    inside: object  # (N,) uint8, 1 for a vote in favour
+    step: object  # float
+    early_stop: object  # float
+    lo: object  # (3,) lower corner of cell (0, 0, 0), in the space's coordinates
+    cell: object  # (3,) size of a cell
+    counts: object  # (3,) int64 cells per axis
+
+
 class Cells(NamedTuple):
     """What `peak_of_cell` looks into."""
 
@@ -428,6 +442,33 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
                 z = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
                 c = (x * ny + y) * nz + z
                 most[c] = max(most[c], weight)
+            k = advance(field, place, many * steps, k, p, way, u, u0, step)
+            k, many = next_sample(grid, origin, way, u0, u1, step, k)
+
+
+def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
+    """Adds to votes[2 c], or, where `rays.inside[i]`, to votes[2 c + 1] the weight of each sample of ray i in
+    cell c of a box of cells, counted z first. Samples lie `rays.jitter[i]` of a step into each step."""
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
+    nx, ny, nz = rays.counts[0], rays.counts[1], rays.counts[2]
+    trans = 1.0
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, math.inf)
+        u0 = u0 + rays.jitter[i] * step
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and trans > rays.early_stop:
+            u = u0 + 0.5 * between(k, many) * step
+            p, opacity, _, steps, place = met(
+                field, grid, (origin, way, course), k, many, u, step, d, scratch
+            )
+            if steps > 0:
+                weight = trans * opacity
+                trans -= weight
+                x = math.floor((p[0] - rays.lo[0]) / rays.cell[0])
+                y = math.floor((p[1] - rays.lo[1]) / rays.cell[1])
+                z = math.floor((p[2] - rays.lo[2]) / rays.cell[2])
+                if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                    votes[2 * ((x * ny + y) * nz + z) + rays.inside[i]] += weight
             k = advance(field, place, many * steps, k, p, way, u, u0, step)
             k, many = next_sample(grid, origin, way, u0, u1, step, k)
 

@@ -5,6 +5,7 @@ it is here: it is then trained from photos, distilled from any scene, grown, edi
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 
 import numpy as np
 import torch
@@ -13,11 +14,14 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.occupancy import texels
-from fusedrf_cli.engine.kinds import refitting
+from fusedrf_cli.engine.kinds import refitting, splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
 from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
+from fusedrf_cli.engine.kinds.splitting import Holds
 from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Suits, Way, finest_within
+from fusedrf_cli.engine.selection.cells import Selection
 
 
 class Kind:
@@ -146,6 +150,33 @@ class Kind:
         """A field whose parts are named and placed anew, with the numbers that it has. Raises ValueError
         where there would be too many, or one of them is singular."""
         return field
+
+    def cut_out(self, field: StoredField, selection: Selection) -> StoredField | None:
+        """A selected object as a field in the frame of the field, with the numbers that it has there; None
+        where there is nothing of it. Raises ValueError where the kind cannot be taken apart."""
+        return splitting.cut_out(self.on_one_grid(field), field.box, selection)
+
+    def cut_away(self, field: StoredField, selection: Selection) -> StoredField | None:
+        """A field without a selected object, with its numbers; None where nothing is left. Raises ValueError
+        as `cut_out`."""
+        return splitting.cut_away(self.on_one_grid(field), selection)
+
+    def cropped(self, field: StoredField, holds: Holds) -> StoredField | None:
+        """What of a field lies in cells that lie wholly where `holds` says so, with the numbers that it has;
+        None where there is nothing. Raises ValueError as `cut_out`."""
+        return splitting.cropped(self.on_one_grid(field), field.box, holds)
+
+    def on_one_grid(self, field: StoredField) -> BoxField:
+        """The field, which can be taken apart as it is; ValueError where it cannot."""
+        if not isinstance(field, BoxField):
+            raise ValueError(f"a field of kind '{self.name}' cannot be taken apart; convert it to kind 'vm'")
+        return field
+
+    def thinned(self, field: StoredField, factor: float) -> StoredField:
+        """A field with so many times the density everywhere. Raises ValueError where the kind has no such."""
+        other = copy(self.on_one_grid(field))
+        other.scale = field.scale * factor
+        return other._afresh("arrays")
 
     def added(self, field: StoredField, objects: list[Placed], teach: Teach) -> Edited:
         """A field with objects placed in its frame put in, by the rule `max`. Raises ValueError where they

@@ -155,6 +155,24 @@ def bend_angle(angle: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.nda
     return radius, 1 + a2 * (3 * k1 + a2 * (5 * k2 + a2 * (7 * k3 + a2 * 9 * k4)))
 
 
+def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where a camera, or a view, shows points (N, 3): pixels (N, 2), column and row; how far they are (N,),
+    along its axis or, of a fisheye, in all; and which of them lie in the picture, (N,) bool."""
+    x, y, back = ((points - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]).T
+    if camera.fisheye:
+        away, aside = np.linalg.norm([x, y, back], axis=0), np.hypot(x, y)
+        radius, slope = bend_angle(np.arctan2(aside, -back), camera.distortion)
+        u, v = np.array([x, -y]) * radius / np.maximum(aside, 1e-12)
+    else:
+        away = -back
+        before = np.where(away > 0, away, np.inf)
+        u, v, (a, b, d) = bend(x / before, -y / before, camera.distortion)
+        slope = a * d - b * b
+    pixels = np.stack([camera.cx + camera.fl_x * u, camera.cy + camera.fl_y * v], 1)
+    unfolded = (away > 0) & (slope > 0)  # beyond a fold of the lens points would come back into the picture
+    return pixels, away, unfolded & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
+
+
 def fisheye_directions(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
     """(..., 3) float64 unit directions, OpenGL axes, of a fisheye's normalised image coordinates (y down).
 

@@ -87,9 +87,17 @@ class SparseField(ComputedField):
         """The same numbers without the voxels that lie in empty cells alone; itself where that would leave
         none."""
         lattice = training.within(self.fine, occupancy)
-        if lattice is None:
-            return self
-        other = SparseField(self.shape, lattice, self.scale, None, occupancy.space).to(self.params.device)
+        return self if lattice is None else self.on(lattice, occupancy.space)
+
+    def with_voxels(self, holds: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
+        """The same numbers of the voxels of whose corners (N, 3), in the coordinates of the space, `holds`
+        says (N,) that they are kept; None where there is none."""
+        lattice = training.wholly(self.fine, holds)
+        return None if lattice is None else self.on(lattice, self.lies_in)
+
+    def on(self, lattice: Lattice, space: ModuleType) -> "SparseField":
+        """The same numbers on a part of its voxels, in the coordinates of a space."""
+        other = SparseField(self.shape, lattice, self.scale, None, space).to(self.params.device)
         other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
         if other.coarse:
             other.bands[:] = self.bands[self.coarse.find(other.coarse.keys)[0]]

@@ -12,6 +12,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
+from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
@@ -32,6 +33,7 @@ from fusedrf_cli.engine.kinds.student import (
     StudentRequest,
     Way,
 )
+from fusedrf_cli.engine.selection.cells import Selection
 
 PADDED = 1.6  # floats in memory for each number that is stored: rows are padded, hanging vertices too
 WHOLE_BELOW = 0.8  # of the numbers allowed: fewer are taken where no object needs more
@@ -103,6 +105,22 @@ class SparseKind(Kind):
     def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
         """One ladder."""
         return {self.name: [bricks_ladder()]}
+
+    def cut_out(self, field: SparseField, selection: Selection) -> SparseField | None:
+        """The voxels that cells of the object reach into."""
+        return field.with_occupancy(selection.object) if selection.chosen.any() else None
+
+    def cut_away(self, field: SparseField, selection: Selection) -> SparseField | None:
+        """The voxels that any other cell reaches into."""
+        return splitting.cut_away(field, selection)
+
+    def cropped(self, field: SparseField, holds: splitting.Holds) -> SparseField | None:
+        """The voxels that lie there wholly."""
+        return field.with_voxels(lambda corners: holds(splitting.placed(corners, field.space)))
+
+    def thinned(self, field: SparseField, factor: float) -> SparseField:
+        """The same vertices, with another scale."""
+        return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)
 
     def added(self, field: SparseField, objects: list[Placed], teach: Teach) -> Edited:
         """Bricks of the objects, filled by asking them."""

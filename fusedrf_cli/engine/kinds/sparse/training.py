@@ -1,6 +1,8 @@
 """A sparse field while it learns from photos: bricks of one level over all of a box, ever finer, without
 those voxels in which nothing was found."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
@@ -29,6 +31,18 @@ def within(lattice: Lattice, grid: OccupancyGrid) -> Lattice | None:
     found = grid.contains((low + high) / 2)
     for octant in INSIDE + (1 - 2 * INSIDE) * OCTANTS:
         found |= grid.contains(low + (high - low) * octant)
+    return of_voxels(lattice, found)
+
+
+def wholly(lattice: Lattice, holds: Callable[[np.ndarray], np.ndarray]) -> Lattice | None:
+    """The lattice of those active voxels of which holds((N, 3)) says that all corners are kept; None where
+    there is none."""
+    kept = holds(lattice.places)
+    return of_voxels(lattice, kept[lattice.corners].all(1))
+
+
+def of_voxels(lattice: Lattice, found: np.ndarray) -> Lattice | None:
+    """The lattice of some of its active voxels, (N,) bool; None of none."""
     if not found.any():
         return None
     whole, mask = lattice.tree, np.zeros(lattice.active.shape, bool)

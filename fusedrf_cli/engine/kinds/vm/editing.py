@@ -1,6 +1,7 @@
 """Edits of a vm field: blocks come and go, and of a distilled tensor the cells of a box are emptied and
 filled by a tensor of their own. All other numbers stay as they are."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,12 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.region import ClippedField
 from fusedrf_cli.engine.fields.occupancy import placement, seen_box, transformed_aabb
+from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach, enclosing, goes_by
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.blocks import MAX_BLOCKS, blocks_of
-from fusedrf_cli.engine.kinds.vm.field import VMField, VMTensor
+from fusedrf_cli.engine.kinds.vm.blocks import MAX_BLOCKS, blocks_of, tensor_field
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMTensor
+from fusedrf_cli.engine.selection.cells import Selection
 
 RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
 UNNAMED = ("", "fused", RESTORED)  # blocks that stand for no object
@@ -45,6 +48,61 @@ def arranged(field: VMField, becoming: Becoming) -> VMField:
     for block in blocks:
         Placed(block.name, None, block.object_to_field)  # raises where it is singular
     return VMField.assembled(field.shape, field.tensors, tuple(blocks), field.params)
+
+
+def cut_out(field: VMField, selection: Selection) -> VMField | None:
+    """What of each block is a selected object's, see splitting.py."""
+    return apart(
+        field,
+        lambda own, block: splitting.cut_out(
+            own, own.tensors[0].aabb, selection, to_field(field, own, block)
+        ),
+    )
+
+
+def cut_away(field: VMField, selection: Selection) -> VMField | None:
+    """What of each block is not a selected object's, see splitting.py."""
+    return apart(
+        field, lambda own, block: splitting.cut_away(own, selection, to_field(field, own, block))
+    )
+
+
+def cropped(field: VMField, holds: splitting.Holds) -> VMField | None:
+    """What of each block lies where `holds` says so of points of the field's frame, see splitting.py."""
+
+    def part(own: VMField, block: Block) -> VMField | None:
+        def held(points: np.ndarray) -> np.ndarray:
+            return holds(points @ block.object_to_field[:3, :3].T + block.object_to_field[:3, 3])
+
+        return splitting.cropped(own, own.tensors[0].aabb, held)
+
+    return apart(field, part)
+
+
+def to_field(field: VMField, own: VMField, block: Block) -> splitting.ToField:
+    """The map from the coordinates of a block's tensor, alone in `own`, to those of the field."""
+    return splitting.placed_in(field, block.object_to_field, own.space)
+
+
+def apart(field: VMField, part_of: Callable[[VMField, Block], VMField | None]) -> VMField | None:
+    """A part of each block's tensor, placed as the block; None where none has any."""
+    found = []
+    for block in field.blocks:
+        part = part_of(tensor_field(field, block.tensor), block)
+        if part is not None:
+            found.append(Placed(block.name, part, block.object_to_field))
+    return joined(found)
+
+
+def joined(placed: list[Placed]) -> VMField | None:
+    """Placed fields of one tensor each as one field; None of none."""
+    if not placed:
+        return None
+    alone = placed[0].field if len(placed) == 1 else None
+    if alone is not None and np.array_equal(placed[0].object_to_world, np.eye(4)):
+        blocks = (replace(alone.blocks[0], name=placed[0].name),)
+        return VMField(alone.shape, alone.tensors, blocks, alone.params, alone.occupancy)
+    return blocks_of(placed)
 
 
 def added(kind, field: VMField, objects: list[Placed], teach: Teach) -> Edited:

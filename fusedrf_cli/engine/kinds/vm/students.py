@@ -2,6 +2,7 @@
 taken over."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
+from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import (
@@ -26,6 +28,7 @@ from fusedrf_cli.engine.kinds.vm.blocks import common_shape, reshaped, without
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.places import place_student
 from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
+from fusedrf_cli.engine.selection.cells import Selection
 
 SHAPE = VMShape(16, 24, 2)
 NOISE = 0.03  # of the factors of a student that takes over others' numbers
@@ -106,6 +109,23 @@ class VMKind(Kind):
     def arranged(self, field: VMField, becoming: Becoming) -> VMField:
         """Its named blocks, placed anew."""
         return editing.arranged(field, becoming)
+
+    def cut_out(self, field: VMField, selection: Selection) -> VMField | None:
+        """See vm/editing.py."""
+        return editing.cut_out(field, selection)
+
+    def cut_away(self, field: VMField, selection: Selection) -> VMField | None:
+        """See vm/editing.py."""
+        return editing.cut_away(field, selection)
+
+    def cropped(self, field: VMField, holds: splitting.Holds) -> VMField | None:
+        """See vm/editing.py."""
+        return editing.cropped(field, holds)
+
+    def thinned(self, field: VMField, factor: float) -> VMField:
+        """Each tensor has a scale of its own."""
+        tensors = tuple(replace(tensor, scale=tensor.scale * factor) for tensor in field.tensors)
+        return VMField(field.shape, tensors, field.blocks, field.params, field.occupancy, field.owners)
 
     def added(self, field: VMField, objects: list[Placed], teach: Teach) -> Edited:
         """Blocks appended."""

@@ -1,0 +1,432 @@
+"""`extract`: an object out of a field, told by masks, points or shapes, and what is left without it."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from formats.atomic import atomic_folder, check_writable
+from formats.captures import read_cameras
+from formats.errors import BadMask, FormatError
+from formats.hulls import Hull
+from formats.images import read_mask, write_png
+from formats.photos import pictures
+from formats.rig import Rig, read_rig
+from formats.views import View
+from fusedrf_cli.bridge.editing import Fused, read_fused
+from fusedrf_cli.bridge.history import summed_up
+from fusedrf_cli.bridge.memory import Memory, ownership
+from fusedrf_cli.bridge.memory import sources as in_memory
+from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.bridge.rendering import to_pixels
+from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import placed_box, placement
+from fusedrf_cli.engine.kinds.editing import enclosing
+from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
+from fusedrf_cli.engine.selection.growing import chosen_by_points
+from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, depths
+from fusedrf_cli.errors import InvalidInput, UsageProblem
+from fusedrf_cli.requests import ExtractRequest
+
+LONGEST = 512
+"""Pixels along the longer side of a view, in which masks are looked at."""
+SHOWN = 400
+"""Of a preview."""
+PREVIEWS = 4
+AROUND = 2
+"""Cells around an object that was found in a first look."""
+RADIUS = 3
+"""Pixels of LONGEST around a point that say what it does, beside masks."""
+MARKED = np.array([1.0, 0.2, 0.1])
+SEEN_SIDE, SEEN_FROM = 96, 2e-3
+"""Pixels a side of the views that tell what of an object was ever seen, and the weight of what was."""
+COPIES = 3.0
+"""Of the field in memory, while it is taken apart."""
+CELLS_BYTES = 400e6
+"""Of cells and votes."""
+UNSURE = 0.6
+
+
+@dataclass(frozen=True)
+class Told:
+    """What tells of the object, in the field's frame."""
+
+    shapes: Callable[[np.ndarray], np.ndarray] | None
+    """Which points (N, 3) may be its, (N,) bool; None: all."""
+    masks: list[Look]
+    pointed: list[Look]
+    inside: np.ndarray
+    """(K, 3) points on it."""
+    outside: np.ndarray
+    """(L, 3) points that are not."""
+
+
+def extract(request: ExtractRequest, progress) -> dict:
+    """Write an object of a field, or the field without it, as a bundle of its own."""
+    with engine(request.device, request.threads, progress):
+        started = time.monotonic()
+        if request.preview:
+            check_writable(request.preview, request.overwrite, folders=True)
+        progress.phase("reading", None)
+        memory = Memory(request.memory)
+        fused = read_fused(request.field, memory, turned=True)
+        held = fused.field.params.numel() * 4
+        memory.expect(
+            in_memory([held], copies=COPIES) | ownership(fused.field.aabb) | {"its cells": CELLS_BYTES},
+            advice="take an object out of a smaller field",
+        )
+        rig = rig_for(request, fused)
+        progress.phase("choosing", None)
+        figures = {}
+        if request.name is not None:
+            parts = named(request, fused)
+        else:
+            told = told_by(request, fused, rig, progress)
+            selection = selected(fused.field, told)
+            if not selection.shows:
+                raise InvalidInput(f"{request.field}: {nothing(request)}")
+            if selection.sure < UNSURE and (told.masks or len(told.inside)):
+                progress.warn(
+                    f"what tells of the object agrees by {selection.sure:.0%} only; look at --preview, and "
+                    "give more masks or points"
+                )
+            progress.phase("cutting", None)
+            try:
+                parts = cut(fused, selection)
+            except ValueError as error:
+                raise InvalidInput(f"{request.field}: {error}") from error
+            figures = {"sure": round(selection.sure, 3), "seen": seen_share(fused, rig, parts[0])}
+        found, rest = parts
+        wanted = rest if request.invert else found
+        if wanted is None:
+            raise InvalidInput(f"{request.field}: nothing is left beside the object; leave --invert out")
+        files = previews(request, fused, rig, parts, progress) if request.preview else []
+        size = write(request, fused, rig, wanted, found)
+        box = placed_box(found.occupancy.subject, fused.origin)
+    return {
+        "output": request.output,
+        "bytes": size,
+        "kind": wanted.kind,
+        "box": [float(x) for x in box],
+        **figures,
+        **({"preview": files} if files else {}),
+        "total_seconds": time.monotonic() - started,
+        "memory": memory.report(),
+    }
+
+
+# -- what tells of it ----------------------------------------------------------------------------------------
+
+
+def rig_for(request: ExtractRequest, fused: Fused) -> dict[str, View]:
+    """The views that masks and points are of, by name."""
+    if request.cameras is not None:
+        return {view.name: view for view in read_cameras(request.cameras)}
+    if fused.scene.cameras is None:
+        return {}
+    rig = read_rig(fused.scene.cameras)
+    return {view.name: view for view in rig.test + rig.train}
+
+
+def told_by(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress) -> Told:
+    """What a request says, read and checked."""
+    if not (request.masks or request.points or request.boxes or request.spheres or request.mesh):
+        raise UsageProblem("say which object: --masks, --points, --box, --sphere, --mesh or --name")
+    if (request.masks or request.points) and not rig:
+        raise InvalidInput(
+            f"{request.field}: it keeps no cameras that masks or points could be of; give --cameras"
+        )
+    masks = masked(request, fused, rig, progress) if request.masks else []
+    pointed = [pointed_at(one, request, fused, rig) for one in request.points]
+    if pointed and not masks and not any(shows for *_, shows in request.points):
+        raise UsageProblem("--points: none of them shows the object; give one without ,out")
+    places = {True: [], False: []}
+    for look, (view, column, row, shows) in zip(pointed, request.points, strict=True):
+        places[shows].append(surface_at(fused.field, look, f"--points {view}:{column:g},{row:g}"))
+    own, other = (np.array(places[shows]).reshape(-1, 3) for shows in (True, False))
+    return Told(within(request, fused), masks, pointed, own, other)
+
+
+def within(request: ExtractRequest, fused: Fused) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Which points of the frame lie in the shapes: in any of the boxes, if there are some, in any of the
+    spheres, and in the mesh."""
+    hull = Hull(request.mesh) if request.mesh else None
+    if not (request.boxes or request.spheres or hull):
+        return None
+    origin = placement(fused.origin)
+    boxes, spheres = np.array(request.boxes).reshape(-1, 6), np.array(request.spheres).reshape(-1, 4)
+
+    def holds(points: np.ndarray) -> np.ndarray:
+        at = points @ origin[:3, :3].T + origin[:3, 3]
+        found = np.ones(len(at), bool)
+        if len(boxes):
+            found &= np.any([((at >= b[:3]) & (at <= b[3:])).all(1) for b in boxes], 0)
+        if len(spheres):
+            found &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
+        return found & hull.contains(at) if hull else found
+
+    return holds
+
+
+def masked(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress) -> list[Look]:
+    """The masks of a folder, each with the view that is named as it."""
+    files = pictures(Path(request.masks))
+    pairs = [(path, rig.get(path.stem) or rig.get(Path(path.stem).stem)) for path in files]
+    known = [(path, view) for path, view in pairs if view is not None]
+    if not known:
+        names = ", ".join(list(rig)[:3])
+        raise InvalidInput(
+            f"{request.masks}: none of its {len(files)} pictures is named as a view; the views are {names}, "
+            f"… ({len(rig)} in all)"
+        )
+    if len(known) < len(files):
+        progress.warn(
+            f"{request.masks}: {len(files) - len(known)} pictures are named as no view, and left out"
+        )
+    found = [looked_at(view, path, fused) for path, view in known]
+    shares = [look.inside.mean() for look in found]
+    if not any(shares) or min(shares) == 1:
+        raise BadMask(
+            f"{request.masks}: the masks are {'black' if not any(shares) else 'white'} all over; paint the "
+            "object white and all else black"
+        )
+    return found
+
+
+def looked_at(view: View, path: Path, fused: Fused) -> Look:
+    """A mask and its view, at most LONGEST pixels a side. Raises BadMask where their shapes differ."""
+    mask = read_mask(path)
+    high, wide = mask.shape
+    if abs(wide * view.height - high * view.width) > 0.01 * wide * view.height:
+        raise BadMask(
+            f"{path}: {wide}x{high} pixels, but the view '{view.name}' has {view.width}x{view.height}; paint "
+            "masks on pictures of that size"
+        )
+    smaller = small(view, LONGEST)
+    rows = ((np.arange(smaller.height) + 0.5) * high / smaller.height).astype(int)
+    columns = ((np.arange(smaller.width) + 0.5) * wide / smaller.width).astype(int)
+    return Look(in_frame(smaller, fused), mask[np.ix_(rows, columns)])
+
+
+def small(view: View, longest: int) -> View:
+    """A view with at most so many pixels along its longer side."""
+    share = min(1.0, longest / max(view.width, view.height))
+    return (
+        view if share == 1 else view.reframed(*(max(1, round(n * share)) for n in (view.width, view.height)))
+    )
+
+
+def in_frame(view: View, fused: Fused) -> Camera:
+    """The camera of a view in the field's frame."""
+    return camera_of(view).seen_from(placement(fused.origin))
+
+
+def pointed_at(point: tuple, request: ExtractRequest, fused: Fused, rig: dict[str, View]) -> Look:
+    """The pixels around a point, which say whether they show the object."""
+    name, column, row, shows = point
+    if name not in rig:
+        names = ", ".join(list(rig)[:3])
+        raise InvalidInput(
+            f"{request.field}: there is no view '{name}'; the views are {names}, … ({len(rig)} in all)"
+        )
+    view = rig[name]
+    if column >= view.width or row >= view.height:
+        raise UsageProblem(
+            f"--points: {column:g},{row:g} lies outside of the view '{name}' of {view.width}x{view.height} "
+            "pixels"
+        )
+    smaller = small(view, LONGEST)
+    x, y = column * smaller.width / view.width, row * smaller.height / view.height
+    away = np.hypot(np.arange(smaller.width) + 0.5 - x, (np.arange(smaller.height) + 0.5 - y)[:, None])
+    near = away <= max(RADIUS, away.min() + 1e-9)
+    return Look(in_frame(smaller, fused), near & shows, near)
+
+
+def surface_at(field: StoredField, look: Look, what: str) -> np.ndarray:
+    """(3,) the point of the frame that the middle of a pointed look shows; InvalidInput where there is
+    nothing."""
+    rays_o, rays_d = look.camera.rays()
+    away = depths(field, look.camera).ravel()[look.counted.ravel()]
+    if not np.isfinite(away).any():
+        raise InvalidInput(f"{what}: there is nothing to be seen; point at what shows")
+    chosen = look.counted.ravel()
+    middle = np.median(away[np.isfinite(away)])
+    way = rays_d[chosen].mean(0)
+    return rays_o[chosen][0] + middle * way / np.linalg.norm(way)
+
+
+# -- choosing ------------------------------------------------------------------------------------------------
+
+
+def selected(field: StoredField, told: Told) -> Selection:
+    """The object in two looks: at all of the field in coarse cells, and at the box that it lies in."""
+    found = choice(Lattice.over(field, field.occupancy.aabb, COARSE), told)
+    if not found.shows:
+        return found
+    held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
+    return choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+
+
+def choice(lattice: Lattice, told: Told) -> Selection:
+    """What masks, points or, without these, the shapes alone say, within the shapes."""
+    allowed = np.ones(len(lattice.points), bool) if told.shapes is None else told.shapes(lattice.points)
+    if not allowed.any():
+        return Selection(lattice, allowed)
+    inner = lattice.kept(allowed)
+    if told.masks:
+        found = chosen_by_masks(inner, [*told.masks, *told.pointed])
+    elif len(told.inside):
+        found = chosen_by_points(inner, told.inside, told.outside, lattice.beside(allowed))
+    else:
+        found = Selection(inner, np.ones(len(inner.points), bool))
+    chosen = allowed.copy()
+    chosen[allowed] = found.chosen
+    return Selection(lattice, chosen, found.sure)
+
+
+def nothing(request: ExtractRequest) -> str:
+    """Why nothing was chosen."""
+    if request.masks or request.points:
+        return "what the masks or points show holds nothing of the field; look at it from those views"
+    return "there is nothing in the given shape; shapes are in the units of the world (see fusedrf info)"
+
+
+def named(request: ExtractRequest, fused: Fused) -> tuple[StoredField | None, StoredField | None]:
+    """The part that goes by a name, and what is left without it."""
+    if request.masks or request.points or request.boxes or request.spheres or request.mesh:
+        raise UsageProblem("--name takes a whole part; leave out what else tells of the object")
+    names = {part.name for part in fused.kind.parts(fused.field)}
+    own = {name for name in names if name == request.name or name.startswith(f"{request.name}/")}
+    if not own:
+        held = ", ".join(sorted(names)) or "no parts that are held apart"
+        raise InvalidInput(f"{request.field}: there is no part '{request.name}'; it holds {held}")
+    return fused.kind.without(fused.field, names - own), fused.kind.without(fused.field, own)
+
+
+def seen_share(fused: Fused, rig: dict[str, View], found: StoredField | None) -> float | None:
+    """Of the object's cells that some view around it shows, the share that the capture's views show; None
+    where there are no views."""
+    if not rig or found is None:
+        return None
+    chosen = [list(rig.values())[i] for i in np.unique(np.linspace(0, len(rig) - 1, 60).astype(int))]
+    own = [in_frame(small(view, SEEN_SIDE), fused) for view in chosen]
+    lens = framing_lens(SEEN_SIDE, SEEN_SIDE)
+    around = [
+        replace(framing(found.occupancy.subject, lens, azimuth, elevation).camera(lens), name="")
+        for elevation in (-0.6, 0.0, 0.6, 1.2)
+        for azimuth in np.arange(6) * np.pi / 3
+    ]
+    shown, all_round = (weighed(found, cameras) > SEEN_FROM for cameras in (own, around))
+    total = int(all_round.sum())
+    return round(float((shown & all_round).sum() / total), 3) if total else None
+
+
+def weighed(field: StoredField, cameras: list[Camera]) -> np.ndarray:
+    """(X, Y, Z) for each cell the sum of the weights that pixels of cameras in the frame give it."""
+    from fusedrf_cli.engine.fields.base import sampling_step
+
+    total = 0.0
+    for camera in cameras:
+        rays_o, rays_d = camera.rays()
+        half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), np.uint8)
+        total = total + field.votes(rays_o, rays_d, half, every, sampling_step(field), field.occupancy)[1]
+    return total
+
+
+def cut(fused: Fused, selection: Selection) -> tuple[StoredField | None, StoredField | None]:
+    """The object, and what is left."""
+    return fused.kind.cut_out(fused.field, selection), fused.kind.cut_away(fused.field, selection)
+
+
+# -- writing -------------------------------------------------------------------------------------------------
+
+
+def write(
+    request: ExtractRequest, fused: Fused, rig: dict[str, View], wanted: StoredField, found: StoredField
+) -> int:
+    """Write one of the two fields as a bundle; the bytes written."""
+    if request.invert:
+        history = summed_up((*fused.scene.history, {"event": "extracted", "names": [], "nodes": []}))
+        return write_field(
+            request.output, wanted, fused.node.name, precision=request.precision or fused.precision,
+            overwrite=request.overwrite, origin=fused.origin, history=history,
+            kept=dict.fromkeys(fused.others, fused.path), extras=fused.scene.extras, framing=fused.framing,
+            cameras=fused.scene.cameras,
+        )  # fmt: skip
+    return write_field(
+        request.output, found, request.name or "object", precision=request.precision or "float16",
+        overwrite=request.overwrite, origin=fused.origin,
+        framing=placed_box(found.occupancy.subject, fused.origin),
+        cameras=own_cameras(fused, found),
+    )  # fmt: skip
+
+
+def own_cameras(fused: Fused, found: StoredField) -> dict | None:
+    """The cameras that photographed the object, as of one that stands free."""
+    if fused.scene.cameras is None:
+        return None
+    rig: Rig = read_rig(fused.scene.cameras)
+    box = placed_box(found.occupancy.subject, fused.origin)
+    focus = (box[:3] + box[3:]) / 2
+    distance = float(np.median(np.linalg.norm(rig.poses[:, :3, 3] - focus, axis=1)))
+    try:
+        return replace(rig, focus=focus, distance=distance, surroundings=False).content()
+    except FormatError:
+        return None
+
+
+def previews(
+    request: ExtractRequest, fused: Fused, rig: dict[str, View], parts: tuple, progress
+) -> list[str]:
+    """Pictures of a few views: the object, the rest, and the whole with the object marked."""
+    views = [small(view, SHOWN) for view in shown_views(request, rig)]
+    cameras = [camera_of(view) for view in views] or [framed(fused, parts[0])]
+    progress.phase("previews", len(cameras))
+    files, folder = [], Path(request.preview)
+    with atomic_folder(folder, overwrite=request.overwrite) as temporary:
+        for number, camera in enumerate(cameras):
+            for what, pixels in pictures_of(fused, parts, camera).items():
+                name = f"{camera.name or 'view'}_{what}.png"
+                write_png(temporary / name, pixels)
+                files.append(str(folder / name))
+            progress.advance(number + 1)
+    return files
+
+
+def shown_views(request: ExtractRequest, rig: dict[str, View]) -> list[View]:
+    """The views that were masked or pointed at, else some of all."""
+    stems = {path.stem for path in pictures(Path(request.masks))} if request.masks else set()
+    stems |= {name for name, *_ in request.points}
+    named = [view for name, view in rig.items() if name in stems] or list(rig.values())
+    return (
+        [named[i] for i in np.unique(np.linspace(0, len(named) - 1, PREVIEWS).astype(int))] if named else []
+    )
+
+
+def framed(fused: Fused, found: StoredField) -> Camera:
+    """A view of where the object stands, for want of cameras."""
+    lens = framing_lens(SHOWN, SHOWN)
+    box = placed_box(found.occupancy.subject, fused.origin)
+    grown = enclosing([box + 0.5 * (box[3:] - box[:3]).max() * np.repeat([-1, 1], 3)])
+    return framing(grown, lens).camera(lens)
+
+
+def pictures_of(fused: Fused, parts: tuple, camera: Camera) -> dict[str, np.ndarray]:
+    """(H, W, 3 or 4) uint8 of the object alone, over nothing; of the rest; and of the whole, in which the
+    object is red."""
+    found, rest = parts
+    whole = render_image(fused.field, camera, origin=fused.origin)
+    alone = render_image(found, camera, origin=fused.origin)
+    before = (alone.opacity > 0.5) & ~(alone.depth > whole.depth * 1.05)
+    marked = whole.over((1, 1, 1))
+    marked[before] = 0.5 * marked[before] + 0.5 * MARKED
+    shown = {"object": to_pixels(alone, None), "marked": np.rint(255 * marked).astype(np.uint8)}
+    if rest is not None:
+        shown["rest"] = to_pixels(render_image(rest, camera, origin=fused.origin), (1.0, 1.0, 1.0))
+    return shown

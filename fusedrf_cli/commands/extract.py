@@ -1,0 +1,53 @@
+"""`fusedrf extract`: an object out of a field."""
+
+import click
+
+from fusedrf_cli import options
+from fusedrf_cli.requests import ExtractRequest
+
+
+@click.command("extract")
+@click.argument("field", type=options.INPUT)
+@options.writing("The object to write, OUT.rfpack.")
+@click.option(
+    "--masks",
+    type=options.INPUT,
+    help="A folder of masks, black where the object is not, each named as the view that it masks.",
+)
+@click.option("--cameras", type=options.INPUT, help="The views of --masks and --points: a transforms.json.")
+@click.option(
+    "--points",
+    multiple=True,
+    type=options.POINT,
+    help="A pixel of a view that shows the object, or, with ,out after it, that does not. Repeat it.",
+)
+@click.option(
+    "--box", "boxes", multiple=True, type=options.AABB, help="It lies in this box. Repeat it: in one of them."
+)
+@click.option("--sphere", "spheres", multiple=True, type=options.SPHERE, help="It lies in this sphere.")
+@click.option("--mesh", type=options.INPUT, help="It lies in this closed mesh.")
+@click.option("--name", help="The part of a fused field that goes by this name.")
+@click.option("--invert", is_flag=True, help="Write the field without the object.")
+@click.option(
+    "--preview",
+    type=click.Path(file_okay=False),
+    help="Write pictures to this folder: the object, the rest, and the object marked in the whole.",
+)
+@options.extracted_precision
+@options.memory
+@options.running
+@options.reporting
+def command(field, output, points, progress, **words):
+    """Cut an object out of a field.
+
+    The object is told by masks of a few views, by points, by a box, a sphere or a mesh around it, or by any
+    mix of them. Views are those of the photos that FIELD was learnt from, or of --cameras. It stays where it
+    stands in the world: composed with what --invert writes, it gives the field again.
+
+    \b
+    Example:
+      fusedrf extract fused.rfpack --masks masks -o object.rfpack --preview look
+    """
+    from fusedrf_cli import bridge
+
+    return bridge.extract(ExtractRequest(field=field, output=output, points=points, **words), progress)

@@ -1,0 +1,124 @@
+"""Which cells of a field are an object's."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.ndimage import label
+
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
+
+COARSE, FINE = 128, 192
+"""Cells along the longest side: of a first look at all of a field, of a second one at the object's box."""
+DENSE = 0.02
+"""Optical depth along a cell from which it holds matter that shows."""
+ASIDE = 0.05
+"""A piece with less than so much of the largest one's weight is not the object's."""
+ASKED_AT_ONCE = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Cells of a box in the coordinates of a field's space, those of them that the field has matter in."""
+
+    field: object
+    grid: OccupancyGrid
+    """Occupied where the field's own grid is, at the cell's middle."""
+
+    @classmethod
+    def over(cls, field, box: np.ndarray, longest: int) -> "Lattice":
+        """At most `longest` cells along the longest side of a box (6,), and no finer than a voxel of the
+        field."""
+        space, voxel = field.occupancy.space, field.voxel_size
+        longest = max(1, min(longest, int(np.ceil((box[3:] - box[:3]).max() / voxel))))
+        whole = OccupancyGrid.full(box, longest, space)
+        held = field.occupancy.contains(whole.centres()).reshape(cell_counts(box, longest))
+        return cls(field, whole.marked(held))
+
+    def kept(self, cells: np.ndarray) -> "Lattice":
+        """With those of its cells alone, (M,) bool, in order of `index`."""
+        return Lattice(self.field, self.grid.marked(self.spread(cells)))
+
+    @cached_property
+    def index(self) -> np.ndarray:
+        """(M, 3) of the occupied cells."""
+        return np.argwhere(self.grid.occupied)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """(M, 3) middles of the occupied cells in the field's frame."""
+        return self.grid.space.placed(torch.from_numpy(self.grid.centres())).numpy()
+
+    @cached_property
+    def widths(self) -> np.ndarray:
+        """(M,) how wide they are about, in the field's frame."""
+        rates = self.grid.space.rates(torch.from_numpy(self.grid.centres())).numpy()
+        return self.grid.cell.max() / np.sqrt(rates)
+
+    @cached_property
+    def dense(self) -> np.ndarray:
+        """(M,) bool: those with matter that shows."""
+        at = torch.from_numpy(self.points)
+        ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+        found = [
+            self.field.query(part, ahead.expand(len(part), 3), False)[0].numpy()
+            for part in at.split(ASKED_AT_ONCE)
+        ]
+        return np.concatenate([*found, np.zeros(0)]) * self.widths > DENSE
+
+    def colours(self) -> np.ndarray:
+        """(M, 3) colours in the middles of the cells, mean of what is seen along the axes."""
+        at, total = torch.from_numpy(self.points), 0.0
+        ways = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+        for way in ways:
+            total = total + self.field.query(at, way.expand(len(at), 3))[1].numpy()
+        return total / len(ways)
+
+    def beside(self, allowed: np.ndarray) -> np.ndarray:
+        """(K,) bool, of allowed cells (M,) with K of them: those next to matter in cells that are not."""
+        other = self.grid.marked(self.spread(~allowed & self.dense)).dilated().occupied
+        return other[self.grid.occupied][allowed]
+
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """(X, Y, Z) of what is known of the occupied cells, (M,); 0 elsewhere."""
+        whole = np.zeros(self.grid.occupied.shape, values.dtype)
+        whole[self.grid.occupied] = values
+        return whole
+
+    def pieces(self, chosen: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """(M,) bool: of chosen cells those of the piece of dense ones with the most weight, and of others
+        that are not much lighter, with the chosen cells around them."""
+        found, count = label(self.spread(chosen & self.dense), np.ones((3, 3, 3)))
+        if not count:
+            return chosen
+        sums = np.bincount(found[self.grid.occupied], weights, count + 1)
+        sums[0] = 0
+        kept = self.grid.marked((sums >= ASIDE * sums.max())[found] & (found > 0))
+        return chosen & kept.dilated(2).occupied[self.grid.occupied]
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """An object in a field: what is cut out."""
+
+    lattice: Lattice
+    chosen: np.ndarray
+    """(M,) bool: its cells."""
+    sure: float = 1.0
+    """How far those who chose agree, from 0 to 1."""
+
+    @cached_property
+    def object(self) -> OccupancyGrid:
+        """Its cells."""
+        return self.lattice.grid.marked(self.lattice.spread(self.chosen))
+
+    @cached_property
+    def other(self) -> OccupancyGrid:
+        """Cells with matter that shows and is not its."""
+        return self.lattice.grid.marked(self.lattice.spread(~self.chosen & self.lattice.dense))
+
+    @property
+    def shows(self) -> bool:
+        """Whether any of its cells has matter that shows."""
+        return bool((self.chosen & self.lattice.dense).any())

@@ -1,0 +1,117 @@
+"""Choosing by masks: every ray of a masked picture votes for the cells that it shows (FlashSplat, Shen et al.
+2024: with the weights of volume rendering the best labels are a majority of such votes, in closed form)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, uniform_filter
+
+from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.rendering.cameras import Camera, projected
+from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.selection.cells import Lattice, Selection
+
+ENOUGH = 0.02
+"""Votes from which a cell is decided by them."""
+BEHIND = 2.0
+"""Cells behind what a pixel shows, from which its mask says nothing."""
+POINTED = 50.0
+"""How many votes one of a pixel that was pointed at counts for."""
+SEED = 6_000_011
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A masked picture."""
+
+    camera: Camera
+    """In the field's frame."""
+    inside: np.ndarray
+    """(H, W) bool: which pixels show the object."""
+    counted: np.ndarray | None = None
+    """(H, W) bool: which pixels say so; None: all, and the object is nowhere outside of them."""
+
+
+def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
+    """The object that masks show: cells by the majority of votes; those that got none by whether the masks
+    leave room for them there and the nearest decided cell is its; smoothed, and in one piece."""
+    against, votes = tallied(lattice, looks)
+    total, share = smoothed(lattice, against, votes)
+    decided = total > ENOUGH
+    room, shut = hull(lattice, looks)
+    known = decided | shut
+    own = np.where(decided, share > 0.5, False)
+    own |= ~known & room & nearest(lattice, known, own)
+    chosen = lattice.pieces(own, votes)
+    return Selection(lattice, chosen, agreement(votes, against))
+
+
+def agreement(votes: np.ndarray, against: np.ndarray) -> float:
+    """How far the votes (M,) for and against cells agree: 1 where every cell has one sort alone, 0 where each
+    has as many of both."""
+    total = float((votes + against).sum())
+    return float(np.abs(votes - against).sum() / total) if total else 0.0
+
+
+def tallied(lattice: Lattice, looks: Sequence[Look]) -> np.ndarray:
+    """(2, M) what the pixels outside and inside of the masks show of each cell: sums of weights (NeRF,
+    eq. 3)."""
+    generator, field, found = np.random.default_rng(SEED), lattice.field, 0.0
+    for look in looks:
+        rays_o, rays_d = look.camera.rays()
+        jitter, inside, weight = generator.random(len(rays_o)), look.inside.ravel(), 1.0
+        if look.counted is not None:
+            rays_o, rays_d, jitter, inside = (
+                each[look.counted.ravel()] for each in (rays_o, rays_d, jitter, inside)
+            )
+            weight = POINTED
+        sums = field.votes(rays_o, rays_d, jitter, inside, sampling_step(field), lattice.grid)
+        found = found + weight * sums[:, lattice.grid.occupied]
+    return found
+
+
+def smoothed(lattice: Lattice, against: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M,) all votes of each cell, and the share of those for it, with those of the cells around it."""
+    for_it, not_it = (
+        uniform_filter(lattice.spread(sums.astype(np.float32)), 3)[lattice.grid.occupied]
+        for sums in (votes, against)
+    )
+    own = votes + against
+    share = (votes + for_it) / np.maximum(own + for_it + not_it, 1e-9)
+    return own + for_it + not_it, share
+
+
+def hull(lattice: Lattice, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray]:
+    """(M,) bool: cells that some mask leaves room for and none shuts out; and those that one does, of whose
+    picture they lie outside the mask and not hidden behind what it shows."""
+    room, shut = np.zeros((2, len(lattice.points)), bool)
+    for look in looks:
+        if look.counted is not None:
+            continue
+        pixels, away, shown = projected(look.camera, lattice.points)
+        row, column = pixels[shown].astype(int).T[::-1]
+        inside = look.inside[row, column]
+        room[np.flatnonzero(shown)[inside]] = True
+        outside = np.flatnonzero(shown)[~inside]
+        surface = depths(lattice.field, look.camera)[row[~inside], column[~inside]]
+        distance = np.linalg.norm(lattice.points[outside] - look.camera.camera_to_world[:3, 3], axis=1)
+        shut[outside[distance < surface + BEHIND * lattice.widths[outside]]] = True
+    return room & ~shut, shut
+
+
+def depths(field, camera: Camera) -> np.ndarray:
+    """(H, W) how far away what a camera shows is, in the field's frame; inf where it shows nothing."""
+    rays = camera.rays()
+    found = render_rays(field, *rays)
+    opacity, depth = found[:, 3], found[:, 4]
+    away = np.where(opacity > 0.5, depth / np.maximum(opacity, 1e-6), np.inf)
+    return away.reshape(camera.height, camera.width)
+
+
+def nearest(lattice: Lattice, known: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(M,) bool: what the nearest known cell is, for each cell."""
+    if not known.any():
+        return np.zeros_like(own)
+    at = distance_transform_edt(~lattice.spread(known), return_distances=False, return_indices=True)
+    return lattice.spread(own)[tuple(at)][lattice.grid.occupied]

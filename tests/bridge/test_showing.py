@@ -1,0 +1,139 @@
+"""`compose --crop`, `--opacity` and `--hidden`: what of a node is shown."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from formats.scene import read_scene
+from fusedrf_cli.bridge.scene import load_scene
+from tests.bridge.conftest import done
+
+PLACE = ("-t", "0.2,-0.1,0.3", "-s", "2", "-r", "0,0,30")
+CROP = [-0.3, -0.3, -0.3, 0.05, 0.3, 0.3]
+BALL = [0.0, 0.0, 0.0, 0.25]
+
+
+@pytest.fixture(scope="module")
+def kinds(shop, tmp_path_factory):
+    """The red box as several kinds."""
+    folder = shutil.copytree(shop, tmp_path_factory.mktemp("kinds") / "shop")
+    for kind, size in (("sparse", "300kB"), ("dense", "1MB")):
+        done(
+            folder,
+            "fuse",
+            "red.rfpack",
+            "-o",
+            f"{kind}.rfpack",
+            "--kind",
+            kind,
+            "--no-rgb",
+            "--max-size",
+            size,
+        )
+    shutil.copy(folder / "red.rfpack", folder / "vm.rfpack")
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path, kinds):
+    return shutil.copytree(kinds, tmp_path / "shop")
+
+
+def sigma(folder, scene: str, points: np.ndarray) -> np.ndarray:
+    """Of world points (N, 3), as it is asked naively."""
+    composed = load_scene(str(folder / scene)).composed()
+    at = torch.from_numpy(points - composed.origin)
+    return composed.query(at, torch.tensor([[0.0, 0.0, 1.0]]).double().expand(len(at), 3))[0].numpy()
+
+
+def written(flag: str, numbers: list[float]) -> tuple[str, str]:
+    return flag, ",".join(map(str, numbers))
+
+
+def points_of(scene) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the object's frame, and where its placement takes them."""
+    own = np.random.default_rng(3).uniform(-0.35, 0.35, (4000, 3))
+    matrix = scene.leaves()[0].object_to_world
+    return own, own @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@pytest.mark.parametrize("kind", ["vm", "sparse", "dense"])
+@pytest.mark.parametrize("shape", [CROP, BALL], ids=["box", "sphere"])
+def test_a_crop_lies_in_the_objects_own_frame_and_changes_nothing_inside(report, folder, kind, shape):
+    report("compose", f"{kind}.rfpack", *PLACE, "-o", "whole.json")
+    report("compose", f"{kind}.rfpack", *PLACE, *written("--crop", shape), "-o", "part.json")
+    own, world = points_of(read_scene(folder / "part.json"))
+    whole, part = (sigma(folder, name, world) for name in ("whole.json", "part.json"))
+    if len(shape) == 4:
+        depth = shape[3] - np.linalg.norm(own - shape[:3], axis=1)
+    else:
+        depth = np.minimum(own - shape[:3], np.array(shape[3:]) - own).min(1)
+    assert part[depth < 0].max() == 0 and whole[depth < 0].max() > 1
+    inside = depth > 0.09  # a voxel of the coarsest of the three, all over
+    np.testing.assert_allclose(part[inside], whole[inside], rtol=1e-5, atol=1e-5)
+    assert inside.sum() > 50 and whole[inside].min() > 1
+
+
+def test_crops_and_opacities_of_groups_hold_for_what_is_in_them(report, folder):
+    report("compose", "red.rfpack", *written("--crop", CROP), "--opacity", "0.5", "-o", "inner.json")
+    report("compose", "inner.json", *PLACE, *written("--crop", BALL), "--opacity", "0.5", "-o", "outer.json")
+    report("compose", "red.rfpack", *PLACE, "-o", "whole.json")
+    own, world = points_of(read_scene(folder / "outer.json"))
+    whole, part = (sigma(folder, name, world) for name in ("whole.json", "outer.json"))
+    out = (np.linalg.norm(own, axis=1) > BALL[3]) | (own[:, 0] > CROP[3])
+    assert part[out].max() == 0
+    inside = (np.linalg.norm(own, axis=1) < 0.16) & (own[:, 0] < -0.04)
+    np.testing.assert_allclose(part[inside], 0.25 * whole[inside], rtol=1e-4)
+
+
+def test_a_hidden_node_is_left_out_and_stays_in_the_scene(report, run, folder):
+    report("compose", "red.rfpack", "blue.rfpack", "-t", "1,0,0", "--hidden", "-o", "one.json")
+    assert [f.placed.name for f in load_scene(str(folder / "one.json")).fields] == ["red"]
+    assert [leaf.name for leaf in read_scene(folder / "one.json").leaves()] == ["red", "blue"]
+    assert json.loads((folder / "one.json").read_text())["version"] == "1.2"
+    report("compose", "red.rfpack", "--hidden", "-o", "none.json")
+    result = run("render", "none.json", "-o", "none.png")
+    assert result.exit_code == 3 and "nothing of the scene is visible" in result.stderr
+
+
+def test_a_fused_scene_holds_what_is_shown_and_an_edit_knows_no_more(report, folder):
+    report(
+        "compose", "floor.rfpack", "-t", "0,0,-0.7", "red.rfpack", *written("--crop", CROP), "-o", "s.json"
+    )
+    report("fuse", "s.json", "-o", "f.rfpack", "--kind", "vm", "--no-rgb", "--max-size", "600kB")
+    beyond = np.array([[0.15, y, 0.0] for y in np.linspace(-0.2, 0.2, 9)])
+    inside = beyond - [0.3, 0, 0]
+    assert sigma(folder, "f.rfpack", beyond).max() < 1 < sigma(folder, "f.rfpack", inside).min()
+    report("delete", "f.rfpack", "floor", "-o", "g.rfpack", "--no-rgb")
+    assert sigma(folder, "g.rfpack", beyond).max() < 1
+
+
+BAD = {
+    "crop": ([1, 2, 3], "crop"),
+    "crop of five": ([1, 2, 3, 4, 5], "is neither a box"),
+    "crop upside down": ([1, 0, 0, 0, 1, 1], "is neither a box"),
+    "ball without radius": ([0, 0, 0, 0], "is neither a box"),
+    "opacity": (2.0, "opacity"),
+    "visible": ("no", "visible"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_what_no_node_shows_is_refused(run, report, folder, what):
+    report("compose", "red.rfpack", "-o", "scene.json", "-w")
+    scene = json.loads((folder / "scene.json").read_text())
+    value, sentence = BAD[what]
+    scene |= {"version": "1.2"}
+    scene["nodes"][0]["opacity" if what == "opacity" else "visible" if what == "visible" else "crop"] = value
+    (folder / "scene.json").write_text(json.dumps(scene))
+    result = run("render", "scene.json", "-o", "x.png")
+    assert result.exit_code == 3 and sentence in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_a_crop_that_holds_nothing_says_so(run, report, folder):
+    report("compose", "red.rfpack", "--crop", "5,5,5,6,6,6", "-o", "scene.json", "-w")
+    result = run("render", "scene.json", "-o", "x.png")
+    assert result.exit_code == 3 and "its crop holds nothing of it" in result.stderr
