@@ -52,6 +52,8 @@ bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder wit
 bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SHARE= for less time
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
+	$(PYTHON) -m benchmarks.extraction $(DATA) --share $(SHARE)
+	$(PYTHON) -m benchmarks.edits $(DATA)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

@@ -380,7 +380,9 @@ smallest = click.option(
     metavar="DB",
     help="Take the fewest bytes that reach this quality; exit code 7 where none do.",
 )
-resume = click.option("--resume", is_flag=True, help="Go on from the checkpoint of an interrupted run.")
+resume = click.option(
+    "--resume", is_flag=True, help="Go on from the checkpoint that an interrupted or killed run left."
+)
 rgb = click.option("--rgb/--no-rgb", default=True, show_default=True, help="Finish on rendered views.")
 size = click.option("--size", type=SIZE, help="Picture size in pixels; default: the cameras' own.")
 allow_outside = click.option(

@@ -43,7 +43,8 @@ class TrainRequest(Learning):
     output: str
     overwrite: bool
     kind: str
-    quality: str
+    quality: str | None
+    """None: as the time budget allows."""
     ranks: tuple[int, int] | None
     sh_degree: int | None
     precision: str | None

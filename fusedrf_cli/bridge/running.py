@@ -6,7 +6,8 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from fusedrf_cli.report import readable_size
 
 Saved = tuple[dict[str, np.ndarray], dict]
 """Arrays and JSON-able state of an interrupted run."""
+SAVED_EVERY = 150.0
+"""Seconds of a run that a kill can lose."""
 FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
 
 
@@ -71,10 +74,12 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
 class Uninterrupted:
     """A context to go through once per step, in which an interrupt waits for the step's end: what is saved
     then is no half of one. A second interrupt does not wait, and `torn` tells that there is nothing to save.
+    Every SAVED_EVERY seconds it is saved after a step in any case, for runs that are killed.
     """
 
-    def __init__(self):
+    def __init__(self, save: Callable[[], object]):
         self.torn, self.waiting, self.previous = False, None, {}
+        self.save, self.due = save, time.monotonic() + SAVED_EVERY
 
     def __call__(self) -> "Uninterrupted":
         return self
@@ -98,13 +103,16 @@ class Uninterrupted:
             signal.signal(number, handler)
         if self.waiting is not None and kind is None:
             self.previous[self.waiting](self.waiting, None)
+        if kind is None and time.monotonic() >= self.due:
+            self.save()
+            self.due = time.monotonic() + SAVED_EVERY
 
 
 @contextlib.contextmanager
 def resumable(output: str, checkpoint) -> Iterator[Uninterrupted]:
     """Run steps inside the `Uninterrupted` that this gives; an interrupt leaves `checkpoint()` beside the
-    output and goes on its way, saying so."""
-    steps = Uninterrupted()
+    output and goes on its way, saying so, and every few minutes one is left there unasked."""
+    steps = Uninterrupted(lambda: save_checkpoint(output, *checkpoint()))
     try:
         yield steps
     except KeyboardInterrupt as interrupt:

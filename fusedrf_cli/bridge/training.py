@@ -52,7 +52,13 @@ QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
     "normal": FitSettings(longest=224, steps=4000, samples=1 << 14),
     "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
+    "best": FitSettings(longest=256, steps=24000, samples=1 << 15),
 }
+PATIENT = {"best": 200.0, "high": 90.0, "normal": 0.0}
+"""Seconds of a time budget from which an object is learnt so where no quality is asked for. Of places the
+texels follow the time budget (PATIENCE)."""
+PER_PIXEL, FINEST_OBJECT = 0.7, 512
+"""Texels, of the best quality, for each pixel of the photos that an object's box is wide, and at most."""
 
 
 def train(request: TrainRequest, progress) -> dict:
@@ -127,7 +133,7 @@ def train(request: TrainRequest, progress) -> dict:
     if target is not None and reached < target:
         raise QualityNotReached(
             f"{request.output}: reached {reached:.2f} dB where --target-psnr asked for {target:g}; give more "
-            "--time-budget or --quality high",
+            "--time-budget or --quality best",
             report=report,
         )
     return report
@@ -190,6 +196,23 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
     return Pictures(loaded.pixels, loaded.ignored)
 
 
+def quality_of(request: TrainRequest, capture: Capture, extent: Extent) -> FitSettings:
+    """The settings of the asked quality, or, of an object, of the one that the time budget is enough for; the
+    best has texels as fine as the photos' pixels ask for."""
+    name = request.quality or "normal"
+    if request.quality is None and request.time_budget and not extent.unbounded:
+        name = next(name for name, seconds in PATIENT.items() if request.time_budget >= seconds)
+    settings = QUALITY[name]
+    if name != "best" or extent.unbounded:
+        return settings
+    centre, side = (extent.box[:3] + extent.box[3:]) / 2, (extent.box[3:] - extent.box[:3]).max()
+    cameras = [extent.camera(camera_of(view)) for view in capture.train]
+    away = [np.linalg.norm(camera.camera_to_world[:3, 3] - centre) for camera in cameras]
+    pixels = np.median([c.fl_x * side / max(d, side / 2) for c, d in zip(cameras, away, strict=True)])
+    longest = int(np.clip(round(PER_PIXEL * pixels), settings.longest, FINEST_OBJECT))
+    return replace(settings, longest=longest)
+
+
 def fit_settings(
     request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str, besides: int = 0
 ) -> FitSettings:
@@ -199,7 +222,7 @@ def fit_settings(
     if degree is None and extent.unbounded and "sh_degree" in kind.takes:
         degree = UNBOUNDED_DEGREE
     settings = replace(
-        QUALITY[request.quality],
+        quality_of(request, capture, extent),
         kind=kind.name,
         way=Way(request.precision, request.ranks, degree),
         seed=request.seed,

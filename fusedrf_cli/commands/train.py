@@ -16,10 +16,8 @@ from fusedrf_cli.requests import TrainRequest
 @options.target_psnr
 @click.option(
     "--quality",
-    type=click.Choice(["draft", "normal", "high"]),
-    default="normal",
-    show_default=True,
-    help="How fine, and how long to train.",
+    type=click.Choice(["draft", "normal", "high", "best"]),
+    help="How fine, and how long to train; default: normal, or what --time-budget is enough for.",
 )
 @options.time_budget
 @click.option(

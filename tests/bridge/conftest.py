@@ -106,7 +106,7 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(part("editing"), "REGION_SETTINGS", TinySettings())
     patch.setattr(editing, "NUMBERS", SHAPE.size((20, 20, 20)))
     draft = FitSettings(longest=24, steps=60, samples=1 << 13)
-    patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high"), draft))
+    patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high", "best"), draft))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -12,7 +12,7 @@ from fusedrf_cli.bridge import training
 from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.refined import with_poses
-from fusedrf_cli.bridge.training import fit_settings, texels_of_place
+from fusedrf_cli.bridge.training import fit_settings, quality_of, texels_of_place
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.fields.occupancy import placed_box
@@ -20,6 +20,7 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import look_at
 from fusedrf_cli.engine.spaces.unbounded import SUBJECT, WHOLE, contracted
 from fusedrf_cli.requests import TrainRequest
+from tests.bridge.conftest import part
 
 BOX = np.array([-9.0] * 3 + [9.0] * 3)
 UP = np.array([0.0, 0.0, 1.0])
@@ -86,6 +87,24 @@ def test_views_of_what_lies_before_cameras_look_there():
     assert 2 < ahead < 8
     around = extent_of(replace(request(), radius=2.4), capture, False)
     assert np.array_equal(around.cells.subject, SUBJECT)
+
+
+def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(monkeypatch):
+    """At 4 units of distance a pixel of these lenses is 4/87 wide."""
+    known = {"normal": FitSettings(longest=224), "high": FitSettings(longest=256)}
+    monkeypatch.setattr(part("training"), "QUALITY", known | {"best": FitSettings(longest=256)})
+    capture = photos([(4, 0, 0), (0, 4, 0), (-4, 0, 0), (0, -4, 0), (0, 0.1, 4)])
+    words = replace(request(), unbounded=False, aabb=(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0))
+    extent = extent_of(words, capture, False)
+
+    def longest(seconds, quality=None, sharper=1.0):
+        views = tuple(replace(v, fl_x=v.fl_x * sharper, fl_y=v.fl_y * sharper) for v in capture.train)
+        asked = replace(words, time_budget=seconds, quality=quality)
+        return quality_of(asked, replace(capture, train=views), extent).longest
+
+    assert [longest(s) for s in (None, 20, 100, 300)] == [224, 224, 256, 256]
+    assert longest(300, sharper=10) == round(0.7 * 870 * 2 / 4) == longest(None, "best", 10)
+    assert longest(300, sharper=100) == 512 and longest(300, "normal", 100) == 224
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():

@@ -75,6 +75,30 @@ def test_an_interrupt_before_all_goes_on_to_the_same_bytes(report, run, folder, 
     assert list(read_bundle(folder / "out.rfpack").fields) == straight
 
 
+def test_a_run_that_is_killed_goes_on_from_where_it_was_saved_last(
+    report, run, folder, straight, monkeypatch
+):
+    class Killed(BaseException):
+        """Nothing that anyone catches."""
+
+    step, steps = FitRun.step, []
+
+    def killed(self, share):
+        steps.append(share)
+        if len(steps) == 30:
+            raise Killed
+        step(self, share)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(part("running"), "SAVED_EVERY", 0.0)
+        patch.setattr(FitRun, "step", killed)
+        with pytest.raises(Killed):
+            run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert not (folder / "out.rfpack").exists()
+    train(report, "out.rfpack", "--resume")
+    assert list(read_bundle(folder / "out.rfpack").fields) == straight
+
+
 def test_a_second_interrupt_does_not_wait(run, folder, interrupted_in_step):
     """It tears a step, so that nothing is left to go on from."""
     with interrupted_in_step(6, times=2):

@@ -132,7 +132,7 @@ def test_train_hands_on_what_was_asked(run, bridge):
         "max_size": 1_000_000,
         "target_psnr": None,
         "time_budget": None,
-        "quality": "normal",
+        "quality": None,
         "views": 100,
         "size": 400,
         "holdout": 8,
