@@ -107,46 +107,48 @@ def abreast(count: int, seed: int):
 @pytest.fixture(scope="module")
 def drifting():
     """Cameras before a ball, its pictures, and those as photos of drifting exposure and white balance."""
-    cameras = abreast(12, 0)
+    cameras = abreast(24, 0)
     images = pictures(cameras)
     images[..., :3] = np.rint(images[..., :3] * 0.7)
     k = np.arange(len(cameras))[:, None] + np.array([0, 0.5, 1])
-    gains = np.exp(0.25 * np.sin(2 * np.pi * k / 5))
+    gains = np.exp(0.4 * np.sin(2 * np.pi * k / 5))
     photos = images.copy()
     photos[..., :3] = np.rint(np.clip(images[..., :3] * gains[:, None, None], 0, 255))
-    return cameras, photos, gauged(gains)
+    return cameras, images, photos, gauged(gains)
 
 
-def run(capture, exposure: bool) -> FitRun:
-    cameras, photos, _ = capture
+def run(cameras, photos, exposure: bool) -> FitRun:
     fitting = FitRun.start(cameras, photos, BOX, replace(LONG, exposure=exposure))
     fitting.finish()
     return fitting
 
 
 def test_what_is_learnt_from_drifting_photos_is_neutral(drifting):
-    """Gains are found that are nearer to the true ones than none, and unseen views are nearer to the ball."""
+    """Gains are found that are nearer to the true ones than none, and of what unseen views lose by the drift
+    most is regained."""
+    cameras, images, photos, gains = drifting
     unseen = abreast(4, 1)
     truth = pictures(unseen) / 255
     wanted = 0.7 * truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
     reached = []
-    for exposure in (False, True):
-        fitting = run(drifting, exposure)
+    for learnt, exposure in ((images, False), (photos, False), (photos, True)):
+        fitting = run(cameras, learnt, exposure)
         seen = np.stack([render_image(fitting.field, c).over((1, 1, 1)) for c in unseen])
         reached.append(psnr(seen, wanted))
-    assert spread(fitting.pool.gains.numpy() / drifting[2]) < 0.8 * spread(drifting[2])
-    assert reached[1] > reached[0] + 1
+    assert spread(fitting.pool.gains.numpy() / gains) < 0.95 * spread(gains)
+    even, drifted, mended = reached
+    assert even - drifted > 1 and mended - drifted > 0.5 * (even - drifted)
 
 
 def test_photos_that_do_not_differ_stay_as_they_are():
     cameras = abreast(12, 0)
-    same = run((cameras, pictures(cameras), None), True)
+    same = run(cameras, pictures(cameras), True)
     assert (same.pool.gains == 1).all()
 
 
 def test_a_run_is_taken_up_with_its_gains(drifting):
     """Saved half way and taken up again it ends with the same bits."""
-    cameras, photos, _ = drifting
+    cameras, _, photos, _ = drifting
     settings = replace(LONG, exposure=True, steps=300)
     whole = FitRun.start(cameras, photos, BOX, settings)
     whole.finish()
