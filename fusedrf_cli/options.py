@@ -430,6 +430,14 @@ def _stack(options: tuple[Callable, ...]) -> Callable:
     return lambda command: functools.reduce(lambda inner, option: option(inner), reversed(options), command)
 
 
+mending = _stack(
+    (
+        click.option(
+            "--refit", type=INPUT, metavar="PHOTOS", help="Learn what was behind from photos of the place."
+        ),
+        click.option("--fill", is_flag=True, help="Fill the hole smoothly where nobody saw what was behind."),
+    )
+)
 placement = _stack(tuple(click.option(*flags, **words) for flags, words in PLACEMENT.items()))
 running = _stack(_RUNNING)
 seeded = _stack((*_RUNNING, _seed))

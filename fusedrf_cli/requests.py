@@ -133,7 +133,20 @@ class AddRequest(EditRequest):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeleteRequest(EditRequest):
+class MendingRequest(Learning):
+    """What becomes of the hole that an object leaves."""
+
+    output: str
+    overwrite: bool
+    memory: int | None
+    refit: str | None
+    """A capture of what was behind it."""
+    fill: bool
+    """Whether what is seen nowhere is filled smoothly."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeleteRequest(EditRequest, MendingRequest):
     """Objects to be taken out."""
 
     names: tuple[str, ...]
@@ -158,12 +171,10 @@ class ArrangeRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtractRequest(Running):
+class ExtractRequest(MendingRequest):
     """An object out of a field; what tells of it is in world units and pixels."""
 
     field: str
-    output: str
-    overwrite: bool
     boxes: tuple[tuple[float, ...], ...]
     """Each (6,)."""
     spheres: tuple[tuple[float, ...], ...]
@@ -184,7 +195,6 @@ class ExtractRequest(Running):
     """A folder of pictures."""
     precision: str | None
     """None: float16 of an object, the field's own of what is left."""
-    memory: int | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,7 +8,8 @@ whole or not at all, and returns a JSON-able report.
 from fusedrf_cli.bridge.arranging import duplicate, move, rename
 from fusedrf_cli.bridge.charting import chart
 from fusedrf_cli.bridge.converting import convert
-from fusedrf_cli.bridge.editing import add, delete
+from fusedrf_cli.bridge.deleting import delete
+from fusedrf_cli.bridge.editing import add
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.extracting import extract
 from fusedrf_cli.bridge.fusing import fuse

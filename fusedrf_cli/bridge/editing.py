@@ -1,7 +1,6 @@
 """`add` and `delete`: edits of a fused bundle that leave everything outside the touched region as it was, or
 as near to it as its kind of field can."""
 
-import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,8 +9,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from formats.bundle import is_bundle, read_field, read_headers, sha256_of
-from formats.records import FieldRecord
+from formats.bundle import is_bundle, read_field, read_headers
 from formats.rig import read_rig
 from formats.scene import Leaf, Matrix4, SceneGraph
 from fusedrf_cli.bridge.budget import Budget
@@ -36,16 +34,16 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.occupancy import placed_box, placement, seen_box, transformed_aabb
+from fusedrf_cli.engine.fields.occupancy import placed_box, placement, transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.editing import Edited, enclosing
+from fusedrf_cli.engine.kinds.editing import Edited
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import DistillSettings
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput
-from fusedrf_cli.requests import AddRequest, DeleteRequest, EditRequest
+from fusedrf_cli.requests import AddRequest, EditRequest, Learning
 
 REGION_SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
 SAME_BITS = "outside of it all numbers are the same bits"
@@ -100,9 +98,9 @@ class Fused:
 class Teacher:
     """Teaches students for an edit (engine/kinds/editing.py: Teach), within one command's budget."""
 
-    def __init__(self, request: EditRequest, place: str, progress, tries: int = 1):
-        """tries: how many times it may be asked, about."""
-        self.seed, self.rgb, self.place, self.progress = request.seed, request.rgb, place, progress
+    def __init__(self, request: Learning, rgb: bool, place: str, progress, tries: int = 1):
+        """rgb: whether it finishes on pictures; tries: how many times it may be asked, about."""
+        self.seed, self.rgb, self.place, self.progress = request.seed, rgb, place, progress
         self.budget, self.tries = Budget(request.time_budget), tries
 
     def __call__(
@@ -144,7 +142,8 @@ def add(request: AddRequest, progress) -> dict:
             )
         progress.phase("adding", 1.0)
         try:
-            edited = fused.kind.added(fused.field, objects, Teacher(request, place, progress, len(objects)))
+            teach = Teacher(request, request.rgb, place, progress, len(objects))
+            edited = fused.kind.added(fused.field, objects, teach)
         except ValueError as error:
             raise InvalidInput(f"{request.fused}: {error}") from error
         progress.phase("measuring", None)
@@ -163,91 +162,6 @@ def add(request: AddRequest, progress) -> dict:
         size = write_edited(request, fused, edited.field, precision, entry)
     figures = {**edited.figures, "psnr": {"before_rgb": reached}, "memory": memory.report()}
     return edit_report(request, size, request.name, fused, edited, figures, started)
-
-
-def delete(request: DeleteRequest, progress) -> dict:
-    """Take objects out of a fused field: those that it holds apart are dropped; the region of another is
-    emptied or learnt again.
-
-    What an object hid is taken from the remaining sources where these are known, else left empty. Without a
-    precision the field keeps its own.
-    """
-    with engine(request.device, request.threads, progress) as place:
-        started = time.monotonic()
-        progress.phase("reading", None)
-        memory = Memory(request.memory)
-        fused = read_fused(request.fused, memory)
-        names = set(request.names)
-        check_names(request, fused)
-        edited, restored = without_objects(request, fused, names, place, progress)
-        if edited is None:
-            raise nothing_left(request)
-        entry = {"event": "deleted", "names": list(request.names), "restored": restored}
-        size = write_edited(request, fused, edited.field, request.precision or fused.precision, entry)
-    figures = {"restored": restored, "seconds": {}} | edited.figures | {"memory": memory.report()}
-    return edit_report(request, size, ", ".join(request.names), fused, edited, figures, started)
-
-
-def without_objects(
-    request: DeleteRequest, fused: Fused, names: set[str], place: str, progress
-) -> tuple[Edited | None, bool]:
-    """The field without some objects, None where nothing is left; and whether what they hid is shown."""
-    kind, field, restored = fused.kind, fused.field, True
-    apart = [part for part in kind.parts(field) if part.belongs(names)]
-    edits: list[Edited] = []
-    if apart:
-        field = kind.without(field, names)
-        if field is None:
-            return None, True
-        how = "taken out, since it was held apart"
-        edits.append(Edited(field, enclosing([part.box for part in apart]), how))
-    inside = [
-        node
-        for node in graph_nodes(fused.scene)
-        if node["name"] in names and not any(part.belongs({node["name"]}) for part in apart)
-    ]
-    teach = Teacher(request, place, progress, len(inside))
-    for node in inside:
-        progress.phase(f"deleting {node['name']}", 1.0)
-        box = seen_box(np.asarray(node["aabb"], np.float64), fused.origin)
-        rest = remaining(request, fused, place, progress)
-        restored &= rest is not None
-        edited = kind.refilled(field, box, rest, teach)
-        if edited is None:
-            return None, restored
-        field = edited.field
-        edits.append(edited)
-    return joined(edits), restored
-
-
-def joined(edits: list[Edited]) -> Edited:
-    """One edit that tells of several, one after the other."""
-    figures = {}
-    for edit in edits:
-        figures |= edit.figures
-    how = "; ".join(dict.fromkeys(edit.how for edit in edits))
-    box, local = enclosing([edit.box for edit in edits]), all(edit.local for edit in edits)
-    return Edited(edits[-1].field, box, how, local, figures)
-
-
-def check_names(request: DeleteRequest, fused: Fused) -> None:
-    """InvalidInput for a name that is not there, or where all of them are to go."""
-    for name in request.names:
-        if name not in fused.names:
-            raise InvalidInput(
-                f"{request.fused}: there is no '{name}' to delete; it holds "
-                f"{', '.join(sorted(fused.names)) or 'nothing that has a name'}"
-            )
-    if set(request.names) == fused.names:
-        raise nothing_left(request)
-
-
-def nothing_left(request: DeleteRequest) -> InvalidInput:
-    """The refusal of a deletion that would empty the field."""
-    return InvalidInput(
-        f"{request.fused}: deleting {', '.join(sorted(request.names))} would leave nothing; keep one object, "
-        "or delete the file"
-    )
 
 
 def write_edited(request: EditRequest, fused: Fused, field: StoredField, precision: str, entry: dict) -> int:
@@ -359,44 +273,6 @@ def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
         "object_to_world": (object_to_world @ np.asarray(node["object_to_world"])).tolist(),
         "aabb": transformed_aabb(np.asarray(node["aabb"]), object_to_world).tolist(),
     }
-
-
-def remaining(request: DeleteRequest, fused: Fused, place: str, progress) -> list[Placed] | None:
-    """The other objects of the graph as placed fields, from inside the bundle or from their files; None, with
-    a warning, where one of them is not found as it was."""
-    found, path = [], Path(fused.path)
-    for node in graph_nodes(fused.scene):
-        name = node["name"]
-        if name in request.names:
-            continue
-        if node["field"] in fused.others:
-            record = read_field(path, node["field"])
-        else:
-            record = record_from_file(node, path, request.allow_outside)
-        if record is None:
-            progress.warn(
-                f"the source of '{name}' is gone, has changed, or lies outside of the folder, so what the "
-                "deleted objects hid stays empty"
-            )
-            return None
-        field = make_field(record, name).to(place)
-        placed = Placed(name, field, np.asarray(node["object_to_world"], np.float64))
-        found.append(placed.moved(fused.origin))
-    return found
-
-
-def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord | None:
-    """A source's field from the file the history names, if it is still there, unchanged, and may be read."""
-    source = (path.resolve().parent / node.get("source", "")).resolve()
-    inside = source.is_relative_to(path.resolve().parent)
-    if (
-        "source" not in node
-        or not os.path.isfile(source)
-        or not (inside or allow_outside)
-        or sha256_of(source) != node["sha256"]
-    ):
-        return None
-    return read_field(source, node["field"]) if node["field"] in read_headers(source)[1] else None
 
 
 def edit_report(

@@ -19,6 +19,7 @@ from fusedrf_cli.bridge.editing import Fused, read_fused
 from fusedrf_cli.bridge.history import summed_up
 from fusedrf_cli.bridge.memory import Memory, ownership
 from fusedrf_cli.bridge.memory import sources as in_memory
+from fusedrf_cli.bridge.mending import mended
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import to_pixels
 from fusedrf_cli.bridge.running import engine
@@ -44,6 +45,9 @@ AROUND = 2
 RADIUS = 3
 """Pixels of LONGEST around a point that say what it does, beside masks."""
 MARKED = np.array([1.0, 0.2, 0.1])
+BEFORE, ALIKE = 1.05, 0.1
+"""A pixel of the whole shows something before the object where its distance is less by so much, and its
+colour another."""
 SEEN_SIDE, SEEN_FROM = 96, 2e-3
 """Pixels a side of the views that tell what of an object was ever seen, and the weight of what was."""
 COPIES = 3.0
@@ -69,8 +73,10 @@ class Told:
 
 def extract(request: ExtractRequest, progress) -> dict:
     """Write an object of a field, or the field without it, as a bundle of its own."""
-    with engine(request.device, request.threads, progress):
+    with engine(request.device, request.threads, progress) as place:
         started = time.monotonic()
+        if (request.refit or request.fill) and not request.invert:
+            raise UsageProblem("--refit and --fill mend what is left of the field; give --invert too")
         if request.preview:
             check_writable(request.preview, request.overwrite, folders=True)
         progress.phase("reading", None)
@@ -106,6 +112,9 @@ def extract(request: ExtractRequest, progress) -> dict:
         wanted = rest if request.invert else found
         if wanted is None:
             raise InvalidInput(f"{request.field}: nothing is left beside the object; leave --invert out")
+        if request.invert:
+            wanted, figures["hole"] = mended(request, fused, wanted, found, memory, place, progress)
+            parts = found, wanted
         files = previews(request, fused, rig, parts, progress) if request.preview else []
         size = write(request, fused, rig, wanted, found)
         box = placed_box(found.occupancy.subject, fused.origin)
@@ -340,8 +349,9 @@ def weighed(field: StoredField, cameras: list[Camera]) -> np.ndarray:
 
 
 def cut(fused: Fused, selection: Selection) -> tuple[StoredField | None, StoredField | None]:
-    """The object, and what is left."""
-    return fused.kind.cut_out(fused.field, selection), fused.kind.cut_away(fused.field, selection)
+    """The object, and what is left, which is without what would hang in the air where the object was."""
+    left = fused.kind.cut_away(fused.field, selection.with_islands())
+    return fused.kind.cut_out(fused.field, selection), left
 
 
 # -- writing -------------------------------------------------------------------------------------------------
@@ -423,8 +433,9 @@ def pictures_of(fused: Fused, parts: tuple, camera: Camera) -> dict[str, np.ndar
     found, rest = parts
     whole = render_image(fused.field, camera, origin=fused.origin)
     alone = render_image(found, camera, origin=fused.origin)
-    before = (alone.opacity > 0.5) & ~(alone.depth > whole.depth * 1.05)
-    marked = whole.over((1, 1, 1))
+    marked, own = whole.over((1, 1, 1)), alone.over((1, 1, 1))
+    hidden = (alone.depth > whole.depth * BEFORE) & (np.abs(marked - own).mean(-1) > ALIKE)
+    before = (alone.opacity > 0.5) & ~hidden
     marked[before] = 0.5 * marked[before] + 0.5 * MARKED
     shown = {"object": to_pixels(alone, None), "marked": np.rint(255 * marked).astype(np.uint8)}
     if rest is not None:

@@ -50,7 +50,7 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
     memory failures become sentences with an exit code.
     """
     place = place_for(device)
-    count = threads or available_cores()
+    count, before = threads or available_cores(), torch.get_num_threads()
     from fusedrf_cli.engine import kernels
 
     torch.set_num_threads(count)
@@ -69,6 +69,8 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
                 f"{readable_size(available())} are free; try a smaller --max-size or --size"
             ) from error
         raise
+    finally:
+        torch.set_num_threads(before)
 
 
 class Uninterrupted:
@@ -123,10 +125,11 @@ def resumable(output: str, checkpoint) -> Iterator[Uninterrupted]:
 
 
 def available_cores() -> int:
-    """Cores this process may run on; the system's own count where it cannot be asked."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Cores this process may run on (the system's own count where it cannot be asked), or as many as
+    OMP_NUM_THREADS allows where that says fewer: more threads than cores wait for each other."""
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    return min(own, int(asked)) if asked.isdecimal() and int(asked) > 0 else own
 
 
 def checkpoint_path(output: str) -> Path:

@@ -10,6 +10,7 @@ from fusedrf_cli.requests import DeleteRequest
 @click.argument("fused", type=options.INPUT)
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.mending
 @options.time_budget
 @options.rgb
 @options.memory
@@ -21,7 +22,8 @@ def command(fused, names, output, progress, **words):
     """Take objects out of a fused field.
 
     An object that the field holds apart is taken out as it is. Of others the region is emptied, and shows
-    what they hid where the other sources are known.
+    what they hid where the other sources are known, or --refit gives photos of it. With --fill what nobody
+    saw goes on smoothly with what is seen around it.
 
     \b
     Example:

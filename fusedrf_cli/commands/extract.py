@@ -33,16 +33,20 @@ from fusedrf_cli.requests import ExtractRequest
     type=click.Path(file_okay=False),
     help="Write pictures to this folder: the object, the rest, and the object marked in the whole.",
 )
+@options.mending
+@options.time_budget
 @options.extracted_precision
 @options.memory
-@options.running
+@options.seeded
 @options.reporting
 def command(field, output, points, progress, **words):
     """Cut an object out of a field.
 
     The object is told by masks of a few views, by points, by a box, a sphere or a mesh around it, or by any
     mix of them. Views are those of the photos that FIELD was learnt from, or of --cameras. It stays where it
-    stands in the world: composed with what --invert writes, it gives the field again.
+    stands in the world: composed with what --invert writes, it gives the field again. What it hid is empty
+    then, and is filled on request: --refit learns it from photos, --fill goes on smoothly with what is seen
+    around it.
 
     \b
     Example:

@@ -68,6 +68,6 @@ def test_what_an_edit_learns_is_learnt_there(sent):
     scene = ComposedField([Placed("red", FIELDS["red"], np.eye(4))])
     student = VM.empty(scene, way_of(SHAPE), SHAPE.size((16,) * 3), torch.Generator().manual_seed(0), "")
     asked = SimpleNamespace(seed=0, rgb=False, time_budget=None)
-    teach = part("editing").Teacher(asked, "cuda", NullProgress())
+    teach = part("editing").Teacher(asked, False, "cuda", NullProgress())
     teach(scene, student, [scene.occupancy.tight_aabb(0)], True)
     assert sent == [("vm", "cuda"), ("vm", "cpu")]

@@ -116,7 +116,6 @@ def trained():
         straight = found[..., :3] / np.maximum(found[..., 3:], 1e-9)
         pixels = np.concatenate([straight, found[..., 3:]], -1)
         pictures.append(np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
-    torch.set_num_threads(2)
     settings = FitSettings(way=way_of(SHAPE), longest=40, steps=200, samples=1 << 12)
     field = fit(cameras, np.stack(pictures), box, settings)
     unseen = scattered(box, 3, 40, 40, seed=9, lowest=-0.6)

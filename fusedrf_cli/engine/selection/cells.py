@@ -15,6 +15,9 @@ DENSE = 0.02
 """Optical depth along a cell from which it holds matter that shows."""
 ASIDE = 0.05
 """A piece with less than so much of the largest one's weight is not the object's."""
+ISLAND = 0.05
+"""Of the object's cells: a piece of other matter with fewer, inside of its box and touching nothing outside,
+cannot stand without it."""
 ASKED_AT_ONCE = 1 << 20
 
 
@@ -117,6 +120,17 @@ class Selection:
     def other(self) -> OccupancyGrid:
         """Cells with matter that shows and is not its."""
         return self.lattice.grid.marked(self.lattice.spread(~self.chosen & self.lattice.dense))
+
+    def with_islands(self) -> "Selection":
+        """The object with small pieces of other matter that hang in its box."""
+        found, count = label(self.other.occupied, np.ones((3, 3, 3)))
+        sizes = np.bincount(found.ravel(), minlength=count + 1)
+        lost = sizes < ISLAND * (self.chosen & self.lattice.dense).sum()
+        lost[0] = False
+        for side in (found[[0, -1]], found[:, [0, -1]], found[:, :, [0, -1]]):
+            lost[side.ravel()] = False
+        chosen = self.chosen | lost[found][self.lattice.grid.occupied]
+        return Selection(self.lattice, chosen, self.sure)
 
     @property
     def shows(self) -> bool:

@@ -1,0 +1,258 @@
+"""The hole that an object leaves in what it stood on or hung at: a surface that goes on smoothly there.
+
+Nobody saw what was behind the object, so the surface and its colours are the smoothest ones that fit what is
+seen around it: both solve Laplace's equation over the hole (a membrane; Bertalmio et al. 2000 name it the
+simplest inpainting), the surface as its distance from the plane that most of its surroundings lie in.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_dilation
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
+
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
+from fusedrf_cli.engine.rendering.volume import render_rays
+
+COLUMNS = 96
+"""Along the longer side of what is looked at: the object's box and what is beside it."""
+BESIDE = 0.4
+"""How far beside, in the box's longer side."""
+SHOWS = 0.5
+"""Opacity from which a column has a surface."""
+FLAT = 0.04
+"""Of the box's longest side: how far from a plane surfaces may lie that it counts as theirs."""
+NEAR_BACK = 0.3
+"""Of the box's depth: how far from its back face that plane may lie in the middle of the box."""
+AGREEING = 0.4
+"""Share of the columns beside the object that must lie in the plane."""
+LEAST_HOLE = 0.01
+"""Share of the columns of the box: fewer are no hole."""
+DRAWS = 300
+THICK = 2.0
+"""Columns that a filled surface is thick."""
+OPTICAL_DEPTH = 12.0
+"""Through it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A surface over a rectangle: a radiance field of the frame of the field that it mends."""
+
+    frame: np.ndarray
+    """(4, 4): columns run along its third axis; the first corner of the rectangle is its origin."""
+    pitch: float
+    """The distance of columns."""
+    heights: np.ndarray
+    """(A, B) of the surface along the third axis."""
+    colours: np.ndarray
+    """(A, B, 3)."""
+    filled: np.ndarray
+    """(A, B) bool: where there is any."""
+    kind = "patch"
+
+    @property
+    def voxel_size(self) -> float:
+        """The distance of columns."""
+        return self.pitch
+
+    @property
+    def thickness(self) -> float:
+        """Of the surface, along its columns."""
+        return THICK * self.pitch
+
+    @cached_property
+    def aabb(self) -> np.ndarray:
+        """(6,) in the field's frame."""
+        at = np.argwhere(self.filled)
+        sides = np.concatenate([at, at + 1]) * self.pitch
+        z = np.tile(self.heights[self.filled], 2)
+        local = np.concatenate([np.c_[sides, z], np.c_[sides, z - self.thickness]])
+        points = local @ self.frame[:3, :3].T + self.frame[:3, 3]
+        return np.concatenate([points.min(0) - self.pitch, points.max(0) + self.pitch])
+
+    @cached_property
+    def occupancy(self) -> OccupancyGrid:
+        """Cells of two columns' width near the surface."""
+        box = self.aabb
+        longest = max(1, int(np.ceil((box[3:] - box[:3]).max() / (2 * self.pitch))))
+        grid = OccupancyGrid.full(box, longest)
+        u, v, depth, inside = self.local(grid.centres(), 1)
+        reach = np.linalg.norm(grid.cell)
+        at = self.heights[u, v]
+        near = inside & (depth < at + reach) & (depth > at - self.thickness - reach)
+        return grid.marked(near.reshape(cell_counts(box, longest)))
+
+    def local(self, points: np.ndarray, grown: int = 0) -> tuple[np.ndarray, ...]:
+        """Columns (N,), (N,) that points (N, 3) lie in, their heights (N,), and whether the surface, `grown`
+        by so many columns, is there."""
+        at = (points - self.frame[:3, 3]) @ self.frame[:3, :3]
+        column = np.floor(at[:, :2] / self.pitch).astype(int)
+        size = np.array(self.filled.shape)
+        held = ((column >= 0) & (column < size)).all(1)
+        column = np.clip(column, 0, size - 1)
+        there = binary_dilation(self.filled, iterations=grown) if grown else self.filled
+        return column[:, 0], column[:, 1], at[:, 2], held & there[column[:, 0], column[:, 1]]
+
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) and rgb (N, 3), the same along all directions."""
+        u, v, height, inside = self.local(points.numpy())
+        below = self.heights[u, v] - height
+        solid = inside & (below >= 0) & (below <= self.thickness)
+        sigma = np.where(solid, OPTICAL_DEPTH / self.thickness, 0.0)
+        return torch.from_numpy(sigma).float(), torch.from_numpy(self.colours[u, v]).float()
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """What a field shows in columns that look at the back face of a box, in a frame of their own."""
+
+    frame: np.ndarray
+    pitch: float
+    size: tuple[float, float, float]
+    """Of the box along the frame's axes."""
+    beside: float
+    """From the frame's origin to the box, along the first two axes."""
+    heights: np.ndarray
+    """(A, B) of the first surface above the back face; nan where there is none."""
+    colours: np.ndarray
+
+    @cached_property
+    def of_box(self) -> np.ndarray:
+        """(A, B) bool: columns through the box."""
+        u, v = ((np.arange(n) + 0.5) * self.pitch - self.beside for n in self.heights.shape)
+        return np.outer((u >= 0) & (u < self.size[0]), (v >= 0) & (v < self.size[1]))
+
+
+def patches(rest: RadianceField, box: np.ndarray, up: np.ndarray) -> tuple[list[Patch], float]:
+    """Surfaces that fill the holes that an object of a box (6,) leaves in `rest`: in what it stood on, by the
+    unit vector `up` (3,), and what it leant or hung at; and the share of the columns that look for them
+    which found a hole. All in the frame of `rest`."""
+    found, holes, looked = [], 0, 0
+    for way in ways(up):
+        seen = columns(rest, box, way)
+        patch = mended(seen)
+        if patch is not None:
+            found.append(patch)
+            holes += int(patch.filled.sum())
+            looked += int(seen.of_box.sum())
+    return found, holes / looked if looked else 0.0
+
+
+def ways(up: np.ndarray) -> list[np.ndarray]:
+    """Directions (3,) from surfaces that an object may touch: up, and four level ones."""
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    side /= np.linalg.norm(side)
+    other = np.cross(up, side)
+    return [up, side, -side, other, -other]
+
+
+def columns(rest: RadianceField, box: np.ndarray, way: np.ndarray) -> Columns:
+    """Look along -way at the back of a box (6,) and at what is beside it."""
+    first = np.cross(way, np.eye(3)[np.abs(way).argmin()])
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(way, first), way], 1)
+    corners = np.stack(np.meshgrid(*box.reshape(2, 3).T, indexing="ij"), -1).reshape(-1, 3) @ axes
+    low, size = corners.min(0), np.ptp(corners, 0)
+    beside = BESIDE * float(size[:2].max())
+    pitch = float((size[:2].max() + 2 * beside) / COLUMNS)
+    counts = np.ceil((size[:2] + 2 * beside) / pitch).astype(int)
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = axes, axes @ (low - [beside, beside, 0])
+    deepest, top = -NEAR_BACK * size[2] - 2 * pitch, size[2] * 1.02
+    u, v = np.meshgrid(*((np.arange(n) + 0.5) * pitch for n in counts), indexing="ij")
+    starts = np.stack([u, v, np.full_like(u, top)], -1).reshape(-1, 3) @ axes.T + frame[:3, 3]
+    down = np.broadcast_to(-way, starts.shape).copy()
+    shown = render_rays(rest, starts, down, far=float(top - deepest)).reshape(*counts, 5)
+    opacity = shown[..., 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        heights = np.where(opacity > SHOWS, top - shown[..., 4] / opacity, np.nan)
+        colours = np.where(opacity[..., None] > SHOWS, shown[..., :3] / opacity[..., None], 0)
+    return Columns(frame, pitch, tuple(size), beside, heights.astype(np.float64), colours)
+
+
+def mended(seen: Columns) -> Patch | None:
+    """The surface that fills the columns of the box where none is seen; None where what is beside it lies in
+    no plane near the back of the box, or there is no hole."""
+    known = np.isfinite(seen.heights)
+    around = known & ~seen.of_box
+    plane = plane_of(seen, around)
+    if plane is None:
+        return None
+    u, v = np.indices(seen.heights.shape)
+    level = plane[0] * u + plane[1] * v + plane[2]
+    flat = FLAT * max(seen.size)
+    own = known & (np.abs(np.where(known, seen.heights, np.inf) - level) < flat)
+    # Seen from outside of a hole its rim is thin, and shows what is behind it.
+    hole = seen.of_box & ~known
+    if hole.sum() < LEAST_HOLE * seen.of_box.sum():
+        return None
+    hole = binary_dilation(hole, iterations=2) & seen.of_box
+    own &= ~hole
+    values = np.concatenate([np.where(own, seen.heights - level, 0)[..., None], seen.colours], -1)
+    smooth = membrane(values, own, hole)
+    heights, colours = level + smooth[..., 0], np.clip(smooth[..., 1:], 0, 1)
+    return Patch(seen.frame, seen.pitch, heights, colours, hole)
+
+
+def plane_of(seen: Columns, around: np.ndarray) -> np.ndarray | None:
+    """(3,) a, b, c of the plane a u + b v + c, by columns, in which most surfaces beside the box lie near its
+    back (RANSAC, Fischler and Bolles 1981); None where too few do."""
+    places = np.argwhere(around)
+    heights = seen.heights[around]
+    beside = int((~seen.of_box).sum())
+    if len(places) < 3:
+        return None
+    rows = np.c_[places, np.ones(len(places))]
+    middle = np.array([*(np.array(seen.heights.shape) - 1) / 2, 1.0])
+    flat, deepest = FLAT * max(seen.size), NEAR_BACK * seen.size[2]
+    g, best = np.random.default_rng(0), np.zeros(len(places), bool)
+    for _ in range(DRAWS):
+        three = g.choice(len(places), 3, replace=False)
+        try:
+            plane = np.linalg.solve(rows[three], heights[three])
+        except np.linalg.LinAlgError:
+            continue
+        if abs(plane @ middle) > deepest:
+            continue
+        near = np.abs(rows @ plane - heights) < flat
+        best = near if near.sum() > best.sum() else best
+    if best.sum() < max(3, AGREEING * beside):
+        return None
+    return np.linalg.lstsq(rows[best], heights[best], rcond=None)[0]
+
+
+def membrane(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """(A, B, C) values where they are known, and where they are wanted the solution of Laplace's equation
+    between: each cell the mean of those of its four neighbours that are known or wanted."""
+    number = np.full(wanted.shape, -1)
+    number[wanted] = np.arange(wanted.sum())
+    rows, columns, entries = [], [], []
+    right = np.zeros((int(wanted.sum()), values.shape[-1]))
+    for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        beside = np.roll(number, shift, axis)
+        held = np.roll(known, shift, axis)
+        edge = [slice(None)] * 2
+        edge[axis] = 0 if shift == 1 else -1
+        beside[tuple(edge)], held[tuple(edge)] = -1, False
+        to_known, to_wanted = wanted & held, wanted & (beside >= 0)
+        right[number[to_known]] += np.roll(values, shift, axis)[to_known]
+        for here in (number[to_known], number[to_wanted]):
+            rows.append(here), columns.append(here), entries.append(np.ones(len(here)))
+        rows.append(number[to_wanted]), columns.append(beside[to_wanted])
+        entries.append(-np.ones(int(to_wanted.sum())))
+    n = len(right)
+    rows, columns = np.concatenate([*rows, np.arange(n)]), np.concatenate([*columns, np.arange(n)])
+    # A piece without any known neighbour has no solution but the smallest.
+    entries = np.concatenate([*entries, np.full(n, 1e-9)])
+    matrix = coo_matrix((entries, (rows, columns)), shape=(n, n)).tocsc()
+    found = values.copy()
+    if n:
+        found[wanted] = np.stack([spsolve(matrix, part) for part in right.T], -1)
+    return found
