@@ -31,7 +31,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
-from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, depths
+from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, depths, shown_by, well_shown
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest
 
@@ -50,6 +50,15 @@ BEFORE, ALIKE = 1.05, 0.1
 colour another."""
 SEEN_SIDE, SEEN_FROM = 96, 2e-3
 """Pixels a side of the views that tell what of an object was ever seen, and the weight of what was."""
+WATCHING = 48
+"""Cameras of a capture that tell what was seen, at most."""
+SEEN = 0.1
+"""Of how much cameras see of a cell that they see well (`well_shown`): less is not seen, and what a field has
+there it has by chance."""
+VEILED = 0.2
+"""Of how much cameras see of a cell without the object: it was hidden where they saw less before."""
+LAYERS, FEW_REVEALED = 4, 1e-4
+"""How often what was hidden is taken away, at most, and the share of cells from which it is."""
 COPIES = 3.0
 """Of the field in memory, while it is taken apart."""
 CELLS_BYTES = 400e6
@@ -95,6 +104,10 @@ def extract(request: ExtractRequest, progress) -> dict:
         else:
             told = told_by(request, fused, rig, progress)
             selection = selected(fused.field, told)
+            cameras = watching(fused)
+            shown = shown_by(fused.field, selection.lattice, cameras)
+            well = SEEN * well_shown(selection, shown)
+            selection = selection.without(shown < well)
             if not selection.shows:
                 raise InvalidInput(f"{request.field}: {nothing(request)}")
             if selection.sure < UNSURE and (told.masks or len(told.inside)):
@@ -104,7 +117,7 @@ def extract(request: ExtractRequest, progress) -> dict:
                 )
             progress.phase("cutting", None)
             try:
-                parts = cut(fused, selection)
+                parts = cut(fused, selection, shown, well, cameras if request.invert else [])
             except ValueError as error:
                 raise InvalidInput(f"{request.field}: {error}") from error
             figures = {"sure": round(selection.sure, 3), "seen": seen_share(fused, rig, parts[0])}
@@ -348,10 +361,33 @@ def weighed(field: StoredField, cameras: list[Camera]) -> np.ndarray:
     return total
 
 
-def cut(fused: Fused, selection: Selection) -> tuple[StoredField | None, StoredField | None]:
-    """The object, and what is left, which is without what would hang in the air where the object was."""
-    left = fused.kind.cut_away(fused.field, selection.with_islands())
-    return fused.kind.cut_out(fused.field, selection), left
+def watching(fused: Fused) -> list[Camera]:
+    """Cameras of the capture, in the field's frame, that tell what of it was ever seen; of a field that
+    keeps none, none."""
+    views = [] if fused.scene.cameras is None else read_rig(fused.scene.cameras).views
+    chosen = np.unique(np.linspace(0, len(views) - 1, WATCHING).astype(int)) if views else []
+    return [in_frame(small(views[i], SEEN_SIDE), fused) for i in chosen]
+
+
+def cut(
+    fused: Fused, selection: Selection, shown: np.ndarray, least: float, cameras: list[Camera]
+) -> tuple[StoredField | None, StoredField | None]:
+    """The object, and what is left, without what shows where the object was to cameras that did not see it
+    before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it lies
+    more of it."""
+    found = fused.kind.cut_out(fused.field, selection)
+    gone = selection.with_islands() if cameras else selection  # of photos: what hangs in the air is an error
+    left = fused.kind.cut_away(fused.field, gone)
+    for _ in range(LAYERS if cameras else 0):
+        if left is None:
+            break
+        now = shown_by(left, selection.lattice, cameras)
+        revealed = ~gone.chosen & (now > least) & (shown < VEILED * now)
+        if revealed.mean() < FEW_REVEALED:
+            break
+        gone = gone.joined(revealed)
+        left = fused.kind.cut_away(fused.field, gone)
+    return found, left
 
 
 # -- writing -------------------------------------------------------------------------------------------------

@@ -41,10 +41,12 @@ LEARNT, FILLED = "refit", "filled"
 """Names of what is put into the hole."""
 
 
-def hole_of(rest: StoredField, box: np.ndarray, up: np.ndarray) -> tuple[list[Placed], float]:
+def hole_of(
+    rest: StoredField, box: np.ndarray, up: np.ndarray, gone: StoredField | None = None
+) -> tuple[list[Placed], float]:
     """Smooth surfaces for the hole that an object of a box (6,) leaves, placed in the frame of `rest`, and
-    the share of what was behind it that is seen nowhere (engine/selection/holes.py)."""
-    found, share = patches(rest, box, up)
+    the share of what was behind it that is seen nowhere (`patches`)."""
+    found, share = patches(rest, box, up, gone)
     return [Placed(FILLED, patch, np.eye(4)) for patch in found], share
 
 
@@ -86,14 +88,14 @@ def mended(
             progress.warn(f"{request.refit}: its photos show nothing in the place of the object")
         else:
             rest = put_in(fused, rest, [Placed(LEARNT, behind, np.eye(4))], teach)
-    surfaces, unseen = hole_of(rest, box, up_of(fused))
+    surfaces, unseen = hole_of(rest, box, up_of(fused), found)
     if request.fill and surfaces:
         progress.phase("filling", None)
         rest = put_in(fused, rest, surfaces, teach)
     return rest, told | {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}
 
 
-def in_hole(learnt: StoredField, rest: StoredField, found: StoredField) -> StoredField | None:
+def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredField | None:
     """What a field learnt anew has in the box of an object where what is left has nothing."""
     box, same = found.occupancy.aabb, found.space is learnt.space
 
@@ -106,7 +108,7 @@ def in_hole(learnt: StoredField, rest: StoredField, found: StoredField) -> Store
         at = splitting.placed(points, learnt.space)
         return ((at >= box[:3]) & (at <= box[3:])).all(1)
 
-    return splitting.within(learnt, learnt.box, learnt.voxel_size, inside)
+    return splitting.within(learnt, learnt.tensors[0].aabb, learnt.voxel_size, inside)
 
 
 # -- learning from photos ------------------------------------------------------------------------------------

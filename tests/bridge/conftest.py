@@ -74,19 +74,22 @@ def write_scene_of(folder: Path, *names: str, file: str = "scene.json", **more) 
     write_scene(folder / file, SceneGraph(tuple(nodes), **more))
 
 
-def write_views(folder: Path, field=None) -> None:
-    """A capture of 8 train and 2 test views, 24 x 24, of a field (the red box)."""
-    field = field or FIELDS["red"]
-    box = np.array([-0.4, -0.4, -0.4, 0.4, 0.4, 0.4])
-    cameras = orbit(box, 5, 24, 24) + orbit(box, 5, 24, 24, elevation=-0.5)
+def write_views(folder: Path, field=None, at=(0.0, 0.0, 0.0), side: int = 24, around: int = 5) -> None:
+    """A capture of views of a field (the red box) that stands somewhere, `around` it from above and as many
+    from below; of each the last is a test view."""
+    field, at = field or FIELDS["red"], np.array(at, np.float64)
+    box = 4 / 3 * field.aabb + np.tile(at, 2)
+    cameras = orbit(box, around, side, side) + orbit(box, around, side, side, elevation=-0.5)
     views, pixels = [], []
     for i, c in enumerate(cameras):
-        shot = render_image(field, c)
+        shot = render_image(field, c, origin=at)
         alpha = shot.opacity[..., None]
         straight = shot.rgb / np.maximum(alpha, 1e-6)
         pixels.append(np.rint(255 * np.clip(np.concatenate([straight, alpha], -1), 0, 1)).astype(np.uint8))
-        views.append(View(f"r_{i}", c.camera_to_world, c.fl_x, c.fl_y, c.cx, c.cy, 24, 24))
-    for split, chosen in (("train", [0, 1, 2, 3, 5, 6, 7, 8]), ("test", [4, 9])):
+        views.append(View(f"r_{i}", c.camera_to_world, c.fl_x, c.fl_y, c.cx, c.cy, side, side))
+    test = [around - 1, 2 * around - 1]
+    train = [i for i in range(len(views)) if i not in test]
+    for split, chosen in (("train", train), ("test", test)):
         write_capture(folder, [views[i] for i in chosen], np.stack([pixels[i] for i in chosen]), split)
 
 

@@ -8,7 +8,7 @@ import pytest
 from formats.bundle import read_bundle
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import FIELDS, PLACES, done
+from tests.bridge.conftest import FIELDS, PLACES, done, write_views
 
 VM = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
 AT = ("--name", "blue", "-t", "0.7,0,0")
@@ -151,3 +151,16 @@ def test_no_cuda_and_no_silent_overwriting(run, folder):
     size = (folder / "vm.rfpack").stat().st_size
     assert run("delete", "blocks.rfpack", "red", "-o", "vm.rfpack").exit_code != 0
     assert (folder / "vm.rfpack").stat().st_size == size
+
+
+def test_photos_of_the_place_show_what_an_object_hid(report, picture, folder):
+    """Where a source is gone, and so is what it hid, its photos will do."""
+    gone, wanted, before = covered("blue", -0.1), picture("pair.json"), picture("vm.rfpack")
+    write_views(folder / "place", FIELDS["floor"], PLACES["floor"], 48, 16)
+    (folder / "floor.rfpack").write_bytes(b"another file")
+    words = ("--refit", "place", "--time-budget", "4", "--no-rgb")
+    said = report("delete", "vm.rfpack", "blue", *words, "-o", "less.rfpack")
+    assert said["restored"] is True and said["photos"] == 32
+    after, away = picture("less.rfpack"), ~covered("blue", 0.3)
+    assert psnr(after[gone], wanted[gone]) > psnr(before[gone], wanted[gone]) + 3
+    assert psnr(after[away], before[away]) >= 40

@@ -8,14 +8,18 @@ import pytest
 import trimesh
 
 from formats.bundle import read_bundle
+from formats.captures import read_capture
 from formats.images import write_png
+from formats.photos import load_photos
 from formats.rig import read_rig
 from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.cameras import framing, framing_lens
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
-from tests.bridge.conftest import PLACES, done
+from fusedrf_cli.progress import NullProgress
+from tests.bridge.conftest import FIELDS, PLACES, done, part, write_views
 
 AROUND = "-0.9,-0.4,-0.4,-0.1,0.4,0.4"
 SIDE = 64
@@ -170,6 +174,7 @@ BAD = {
     ),
     "masks of another shape": (("--masks", "wide", "--cameras", "cameras.json"), 3, "paint masks on"),
     "black masks": (("--masks", "black", "--cameras", "cameras.json"), 3, "black all over"),
+    "nothing to mend": (("--box", AROUND, "--fill"), 2, "give --invert too"),
     "a name and more": (("--name", "red", "--box", AROUND), 2, "--name takes a whole part"),
 }
 
@@ -186,3 +191,39 @@ def test_bad_words_get_one_sentence(run, folder, what):
     assert result.exit_code == code and sentence in result.stderr, result.stderr
     assert result.stderr.count("\n") <= 2 and not (folder / "object.rfpack").exists()
     assert not (folder / "look").exists()
+
+
+
+COLUMN = ("--box", "-0.9,-0.4,-0.95,-0.1,0.4,0.4")  # the red box, and the floor below it
+
+
+def test_what_was_under_it_is_left_empty_or_filled_smoothly(report, folder, picture):
+    report("compose", "floor.rfpack", "--translate", "0,0,-0.7", "-o", "floor.json")
+    said = report("extract", "blocks.rfpack", *COLUMN, "--invert", "-o", "rest.rfpack")
+    assert said["hole"]["unseen"] > 0.5 and not said["hole"]["filled"]
+    said = report("extract", "blocks.rfpack", *COLUMN, "--invert", "--fill", "-o", "filled.rfpack")
+    assert said["hole"]["filled"]
+    floor, rest, filled = (picture(name) for name in ("floor.json", "rest.rfpack", "filled.rfpack"))
+    assert psnr(filled, floor) > psnr(rest, floor) + 5
+
+
+def test_what_was_under_it_is_learnt_from_photos(report, folder, picture):
+    """Of photos that show the red box too, whose pixels are left out; of the floor they show enough."""
+    report("compose", "floor.rfpack", "--translate", "0,0,-0.7", "-o", "floor.json")
+    write_views(folder / "floor", FIELDS["floor"], PLACES["floor"], 48, 16)
+    words = ("--invert", "--refit", "floor", "--time-budget", "4")
+    said = report("extract", "blocks.rfpack", *COLUMN, *words, "-o", "learnt.rfpack")
+    assert said["hole"]["photos"] == 32
+    report("extract", "blocks.rfpack", *COLUMN, "--invert", "-o", "rest.rfpack")
+    floor, rest, learnt = (picture(name) for name in ("floor.json", "rest.rfpack", "learnt.rfpack"))
+    assert psnr(learnt, floor) > psnr(rest, floor) + 2
+
+
+def test_photos_do_not_teach_what_they_do_not_show(tmp_path):
+    """Pixels that show the object, and those close to them, are never drawn."""
+    write_views(tmp_path / "red")
+    capture = read_capture(tmp_path / "red", None)
+    cameras = [camera_of(view) for view in capture.train]
+    pictures = part("mending").without(FIELDS["red"], capture, cameras, NullProgress())
+    shown = load_photos(capture.train).pixels[:, 3] > 8
+    assert shown.mean() > 0.1 and pictures.ignored[shown].all() and not pictures.ignored.all()

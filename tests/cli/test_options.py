@@ -191,7 +191,7 @@ def test_delete_hands_on_its_names(run, bridge):
     run("delete", "chair.rfpack", "a", "b", "-o", "out")
     name, asked = bridge.call
     assert (name, asked["fused"], asked["names"]) == ("delete", "chair.rfpack", ("a", "b"))
-    assert set(asked) == {*COMMON, *EDIT, "names", "allow_outside"}
+    assert set(asked) == {*COMMON, *EDIT, "names", "allow_outside", "refit", "fill"}
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ import pytest
 from click.testing import CliRunner
 
 from formats.errors import FormatError
-from fusedrf_cli.bridge import editing, scene
+from fusedrf_cli.bridge import deleting, editing, scene
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.errors import FusedRFError
@@ -78,7 +78,7 @@ def edited(path: str) -> None:
     fused = editing.read_fused(path, Memory())
     assert isinstance(fused.names, set)
     asked = SimpleNamespace(names=(), allow_outside=False)
-    editing.remaining(asked, fused, "cpu", Silence())
+    deleting.remaining(asked, fused, "cpu", Silence())
 
 
 class Silence:

@@ -109,15 +109,15 @@ def test_a_hard_link_is_a_file_like_any_other(folder):
 @pytest.mark.parametrize("source", ["../secret.rfpack", "/etc/passwd", "a\0b", "x" * 5000, "\u202e"])
 def test_a_history_cannot_send_an_edit_outside(folder, source, monkeypatch):
     """P9: `delete` looks for the sources that a history names, where these lie inside alone."""
-    from fusedrf_cli.bridge import editing
+    from fusedrf_cli.bridge import deleting
 
     def opened(*_):
         raise AssertionError("a file outside was read")
 
-    monkeypatch.setattr(editing, "sha256_of", opened)
+    monkeypatch.setattr(deleting, "sha256_of", opened)
     node = {"source": source, "sha256": "0" * 64, "field": "f"}
     try:
-        assert editing.record_from_file(node, folder / "fused.rfpack", False) is None
+        assert deleting.record_from_file(node, folder / "fused.rfpack", False) is None
     except ValueError:
         assert not source.isprintable()  # such a history is refused before; see below
 

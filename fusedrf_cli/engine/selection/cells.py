@@ -129,8 +129,16 @@ class Selection:
         lost[0] = False
         for side in (found[[0, -1]], found[:, [0, -1]], found[:, :, [0, -1]]):
             lost[side.ravel()] = False
-        chosen = self.chosen | lost[found][self.lattice.grid.occupied]
-        return Selection(self.lattice, chosen, self.sure)
+        return self.joined(lost[found][self.lattice.grid.occupied])
+
+    def without(self, cells: np.ndarray) -> "Selection":
+        """The object without some cells, (M,) bool, and without small pieces that then lie apart."""
+        left = self.chosen & ~cells
+        return Selection(self.lattice, self.lattice.pieces(left, np.ones(len(left))), self.sure)
+
+    def joined(self, cells: np.ndarray) -> "Selection":
+        """The object with some cells, (M,) bool."""
+        return Selection(self.lattice, self.chosen | cells, self.sure)
 
     @property
     def shows(self) -> bool:

@@ -5,7 +5,7 @@ seen around it: both solve Laplace's equation over the hole (a membrane; Bertalm
 simplest inpainting), the surface as its distance from the plane that most of its surroundings lie in.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,10 +26,14 @@ SHOWS = 0.5
 """Opacity from which a column has a surface."""
 FLAT = 0.04
 """Of the box's longest side: how far from a plane surfaces may lie that it counts as theirs."""
-NEAR_BACK = 0.3
-"""Of the box's depth: how far from its back face that plane may lie in the middle of the box."""
+BEHIND = 0.3
+"""Of the box's depth: how far behind it surfaces are looked for."""
+RING = (2, 10)
+"""Columns from what the object covered: those between tell what it touched."""
 AGREEING = 0.4
-"""Share of the columns beside the object that must lie in the plane."""
+"""Share of these that must lie in one plane."""
+BEFORE = 0.8
+"""Share of the covered columns in which the object must not lie behind that plane."""
 LEAST_HOLE = 0.01
 """Share of the columns of the box: fewer are no hole."""
 DRAWS = 300
@@ -122,6 +126,10 @@ class Columns:
     heights: np.ndarray
     """(A, B) of the first surface above the back face; nan where there is none."""
     colours: np.ndarray
+    covered: np.ndarray
+    """(A, B) bool: columns that the object was in."""
+    tops: np.ndarray
+    """(A, B) how high it was there, or half the box where that is not known."""
 
     @cached_property
     def of_box(self) -> np.ndarray:
@@ -130,19 +138,22 @@ class Columns:
         return np.outer((u >= 0) & (u < self.size[0]), (v >= 0) & (v < self.size[1]))
 
 
-def patches(rest: RadianceField, box: np.ndarray, up: np.ndarray) -> tuple[list[Patch], float]:
+
+def patches(
+    rest: RadianceField, box: np.ndarray, up: np.ndarray, gone: RadianceField | None = None
+) -> tuple[list[Patch], float]:
     """Surfaces that fill the holes that an object of a box (6,) leaves in `rest`: in what it stood on, by the
-    unit vector `up` (3,), and what it leant or hung at; and the share of the columns that look for them
-    which found a hole. All in the frame of `rest`."""
+    unit vector `up` (3,), and what it leant or hung at; and the share of what it covered there that is a
+    hole. All in the frame of `rest`. gone: the object; None: it covered what is in the box."""
     found, holes, looked = [], 0, 0
     for way in ways(up):
-        seen = columns(rest, box, way)
-        patch = mended(seen)
+        seen = columns(rest, box, way, gone)
+        patch, share = mended(seen)
         if patch is not None:
             found.append(patch)
-            holes += int(patch.filled.sum())
-            looked += int(seen.of_box.sum())
-    return found, holes / looked if looked else 0.0
+            holes += share * seen.covered.sum()
+            looked += int(seen.covered.sum())
+    return found, float(holes / looked) if looked else 0.0
 
 
 def ways(up: np.ndarray) -> list[np.ndarray]:
@@ -153,7 +164,9 @@ def ways(up: np.ndarray) -> list[np.ndarray]:
     return [up, side, -side, other, -other]
 
 
-def columns(rest: RadianceField, box: np.ndarray, way: np.ndarray) -> Columns:
+def columns(
+    rest: RadianceField, box: np.ndarray, way: np.ndarray, gone: RadianceField | None = None
+) -> Columns:
     """Look along -way at the back of a box (6,) and at what is beside it."""
     first = np.cross(way, np.eye(3)[np.abs(way).argmin()])
     first /= np.linalg.norm(first)
@@ -165,7 +178,7 @@ def columns(rest: RadianceField, box: np.ndarray, way: np.ndarray) -> Columns:
     counts = np.ceil((size[:2] + 2 * beside) / pitch).astype(int)
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = axes, axes @ (low - [beside, beside, 0])
-    deepest, top = -NEAR_BACK * size[2] - 2 * pitch, size[2] * 1.02
+    deepest, top = -BEHIND * size[2] - 2 * pitch, size[2] * 1.02
     u, v = np.meshgrid(*((np.arange(n) + 0.5) * pitch for n in counts), indexing="ij")
     starts = np.stack([u, v, np.full_like(u, top)], -1).reshape(-1, 3) @ axes.T + frame[:3, 3]
     down = np.broadcast_to(-way, starts.shape).copy()
@@ -174,44 +187,50 @@ def columns(rest: RadianceField, box: np.ndarray, way: np.ndarray) -> Columns:
     with np.errstate(divide="ignore", invalid="ignore"):
         heights = np.where(opacity > SHOWS, top - shown[..., 4] / opacity, np.nan)
         colours = np.where(opacity[..., None] > SHOWS, shown[..., :3] / opacity[..., None], 0)
-    return Columns(frame, pitch, tuple(size), beside, heights.astype(np.float64), colours)
+    seen = Columns(frame, pitch, tuple(size), beside, heights.astype(np.float64), colours, None, None)
+    covered, tops = seen.of_box, np.full(tuple(counts), size[2] / 2)
+    if gone is not None:
+        there = render_rays(gone, starts, down).reshape(*counts, 5)
+        covered = covered & (there[..., 3] > SHOWS)
+        tops[covered] = top - there[covered, 4] / there[covered, 3]
+    return replace(seen, covered=covered, tops=tops)
 
 
-def mended(seen: Columns) -> Patch | None:
-    """The surface that fills the columns of the box where none is seen; None where what is beside it lies in
-    no plane near the back of the box, or there is no hole."""
-    known = np.isfinite(seen.heights)
-    around = known & ~seen.of_box
-    plane = plane_of(seen, around)
+def mended(seen: Columns) -> tuple[Patch | None, float]:
+    """The surface that fills the covered columns where none is seen near the plane of what is beside them,
+    and their share; None where what is beside lies in no plane near the back of the box, or there is no
+    hole."""
+    plane = plane_of(seen)
     if plane is None:
-        return None
+        return None, 0.0
     u, v = np.indices(seen.heights.shape)
     level = plane[0] * u + plane[1] * v + plane[2]
-    flat = FLAT * max(seen.size)
-    own = known & (np.abs(np.where(known, seen.heights, np.inf) - level) < flat)
-    # Seen from outside of a hole its rim is thin, and shows what is behind it.
-    hole = seen.of_box & ~known
-    if hole.sum() < LEAST_HOLE * seen.of_box.sum():
-        return None
+    own = np.abs(np.nan_to_num(seen.heights, nan=np.inf) - level) < FLAT * max(seen.size)
+    hole = seen.covered & ~own
+    share = float(hole.sum() / max(1, seen.covered.sum()))
+    if share < LEAST_HOLE:
+        return None, 0.0
+    # The rim of a hole is thin, and shows what is behind it.
     hole = binary_dilation(hole, iterations=2) & seen.of_box
     own &= ~hole
     values = np.concatenate([np.where(own, seen.heights - level, 0)[..., None], seen.colours], -1)
     smooth = membrane(values, own, hole)
     heights, colours = level + smooth[..., 0], np.clip(smooth[..., 1:], 0, 1)
-    return Patch(seen.frame, seen.pitch, heights, colours, hole)
+    return Patch(seen.frame, seen.pitch, heights, colours, hole), share
 
 
-def plane_of(seen: Columns, around: np.ndarray) -> np.ndarray | None:
-    """(3,) a, b, c of the plane a u + b v + c, by columns, in which most surfaces beside the box lie near its
-    back (RANSAC, Fischler and Bolles 1981); None where too few do."""
-    places = np.argwhere(around)
-    heights = seen.heights[around]
-    beside = int((~seen.of_box).sum())
+def plane_of(seen: Columns) -> np.ndarray | None:
+    """(3,) a, b, c of the plane a u + b v + c, by columns, in which most surfaces lie that are seen close
+    beside the object and do not hide it (RANSAC, Fischler and Bolles 1981); None where too few do."""
+    near, far = (binary_dilation(seen.covered, iterations=n) for n in RING)
+    ring = far & ~near
+    places = np.argwhere(ring & np.isfinite(seen.heights))
+    heights = seen.heights[tuple(places.T)]
     if len(places) < 3:
         return None
     rows = np.c_[places, np.ones(len(places))]
-    middle = np.array([*(np.array(seen.heights.shape) - 1) / 2, 1.0])
-    flat, deepest = FLAT * max(seen.size), NEAR_BACK * seen.size[2]
+    under = np.c_[np.argwhere(seen.covered), np.ones(int(seen.covered.sum()))]
+    tops, flat = seen.tops[seen.covered], FLAT * max(seen.size)
     g, best = np.random.default_rng(0), np.zeros(len(places), bool)
     for _ in range(DRAWS):
         three = g.choice(len(places), 3, replace=False)
@@ -219,11 +238,10 @@ def plane_of(seen: Columns, around: np.ndarray) -> np.ndarray | None:
             plane = np.linalg.solve(rows[three], heights[three])
         except np.linalg.LinAlgError:
             continue
-        if abs(plane @ middle) > deepest:
-            continue
         near = np.abs(rows @ plane - heights) < flat
-        best = near if near.sum() > best.sum() else best
-    if best.sum() < max(3, AGREEING * beside):
+        if near.sum() > best.sum() and (under @ plane < tops + flat).mean() >= BEFORE:
+            best = near
+    if best.sum() < max(3, AGREEING * ring.sum()):
         return None
     return np.linalg.lstsq(rows[best], heights[best], rcond=None)[0]
 

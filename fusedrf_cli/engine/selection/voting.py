@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, uniform_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.rendering.cameras import Camera, projected
@@ -18,6 +18,8 @@ BEHIND = 2.0
 """Cells behind what a pixel shows, from which its mask says nothing."""
 POINTED = 50.0
 """How many votes one of a pixel that was pointed at counts for."""
+WELL_SEEN = 90
+"""Percentile of an object's cells, by the weight that cameras give them, from which one is well seen."""
 SEED = 6_000_011
 
 
@@ -45,6 +47,30 @@ def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
     own |= ~known & room & nearest(lattice, known, own)
     chosen = lattice.pieces(own, votes)
     return Selection(lattice, chosen, agreement(votes, against))
+
+
+def shown_by(field, lattice: Lattice, cameras: Sequence[Camera]) -> np.ndarray:
+    """(M,) how much cameras in the frame see of each cell in a field, which may be the lattice's own without
+    something: the largest sum of weights (NeRF, eq. 3) in the cell or one beside it."""
+    found = np.zeros(len(lattice.index))
+    low, high = lattice.points.min(0, initial=np.inf), lattice.points.max(0, initial=-np.inf)
+    wide, step = lattice.widths.max(initial=0), sampling_step(lattice.field)
+    for camera in cameras:
+        rays_o, rays_d = camera.rays()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([(low - wide - rays_o) / rays_d, (high + wide - rays_o) / rays_d])
+        meets = np.nanmax(ends.min(0), 1).clip(0) <= np.nanmin(ends.max(0), 1)
+        rays_o, rays_d = rays_o[meets], rays_d[meets]
+        half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), np.uint8)
+        sums = field.votes(rays_o, rays_d, half, every, step, lattice.grid)
+        found += sums[1][lattice.grid.occupied]
+    return maximum_filter(lattice.spread(found), 3)[lattice.grid.occupied]
+
+
+def well_shown(selection: Selection, shown: np.ndarray) -> float:
+    """How much (`shown_by`, (M,)) cameras see of a cell of a selected object that they see well."""
+    own = shown[selection.chosen & selection.lattice.dense]
+    return float(np.percentile(own, WELL_SEEN)) if len(own) else 0.0
 
 
 def agreement(votes: np.ndarray, against: np.ndarray) -> float:
