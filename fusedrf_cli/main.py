@@ -16,7 +16,7 @@ from fusedrf_cli.errors import FusedRFError, Interrupted
 
 COMMANDS = (
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
-    "extract",
+    *("replace", "extract", "history", "undo"),
     *("render", "eval", "chart", "info", "kinds", "validate", "completion"),
 )
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"

@@ -439,6 +439,9 @@ mending = _stack(
     )
 )
 placement = _stack(tuple(click.option(*flags, **words) for flags, words in PLACEMENT.items()))
+keep_history = click.option(
+    "--keep-history", is_flag=True, help="Keep FUSED as it was in OUT.history, for `fusedrf undo`."
+)
 running = _stack(_RUNNING)
 seeded = _stack((*_RUNNING, _seed))
 

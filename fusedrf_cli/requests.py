@@ -120,6 +120,8 @@ class EditRequest(Learning):
     """None: the field's own."""
     rgb: bool
     memory: int | None
+    keep_history: bool
+    """Whether to keep the bundle as it was, for `undo`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +156,14 @@ class DeleteRequest(EditRequest, MendingRequest):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplaceRequest(DeleteRequest):
+    """Another object in the place of one, which `names` holds alone."""
+
+    name: str
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class ArrangeRequest:
     """An object that is moved, copied or renamed."""
 
@@ -168,6 +178,7 @@ class ArrangeRequest:
     absolute: bool
     """Whether that turns and scales about the world's origin, not about the middle of the object."""
     memory: int | None
+    keep_history: bool
 
 
 @dataclass(frozen=True, kw_only=True)

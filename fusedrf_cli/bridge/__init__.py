@@ -16,6 +16,7 @@ from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.listing import list_kinds
 from fusedrf_cli.bridge.posing import pose
 from fusedrf_cli.bridge.rendering import render
+from fusedrf_cli.bridge.replacing import replace
 from fusedrf_cli.bridge.training import train
 
 __all__ = [
@@ -32,5 +33,6 @@ __all__ = [
     "pose",
     "rename",
     "render",
+    "replace",
     "train",
 ]

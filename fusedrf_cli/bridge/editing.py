@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from formats.bundle import is_bundle, read_field, read_headers
+from formats.past import keep
 from formats.rig import read_rig
 from formats.scene import Leaf, Matrix4, SceneGraph
 from fusedrf_cli.bridge.budget import Budget
@@ -166,6 +167,8 @@ def add(request: AddRequest, progress) -> dict:
 
 def write_edited(request: EditRequest, fused: Fused, field: StoredField, precision: str, entry: dict) -> int:
     """Write the edited field with one more entry of history; the bytes written."""
+    if request.keep_history:
+        entry = entry | {"before": keep(fused.path, request.output)}
     return write_field(
         request.output,
         field,

@@ -14,13 +14,14 @@ def graph_nodes(scene: SceneGraph) -> list[dict]:
 
 
 def nodes_of(history: Iterable[dict]) -> dict[str, dict]:
-    """By name, the objects that entries put in and did not take out again."""
+    """By name, the objects that entries put in and did not take out again; one that does both, as where an
+    object is replaced, takes out first."""
     nodes: dict[str, dict] = {}
     for entry in history:
-        for node in entry.get("nodes", ()):
-            nodes[node["name"]] = node
         for name in entry.get("names", ()):
             nodes.pop(name, None)
+        for node in entry.get("nodes", ()):
+            nodes[node["name"]] = node
     return nodes
 
 

@@ -13,6 +13,7 @@ from fusedrf_cli.requests import AddRequest
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @click.option("--name", required=True, help="The object's name in the scene.")
 @options.placement
+@options.keep_history
 @options.time_budget
 @options.rgb
 @options.memory

@@ -11,6 +11,7 @@ from fusedrf_cli.requests import DeleteRequest
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @options.mending
+@options.keep_history
 @options.time_budget
 @options.rgb
 @options.memory

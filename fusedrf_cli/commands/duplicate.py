@@ -13,9 +13,10 @@ from fusedrf_cli.requests import ArrangeRequest
 @click.argument("new_name", metavar="NEW")
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @options.placement
+@options.keep_history
 @options.memory
 @options.reporting
-def command(fused, name, new_name, output, overwrite, translate, rotate, scale, matrix, memory, progress):
+def command(fused, name, new_name, translate, rotate, scale, matrix, progress, **words):
     """Put a copy of an object of a fused field beside it.
 
     The copy, NEW, is placed from where NAME stands as `fusedrf move` does, and shares its numbers: a copy
@@ -32,12 +33,10 @@ def command(fused, name, new_name, output, overwrite, translate, rotate, scale, 
 
     request = ArrangeRequest(
         fused=fused,
-        output=output,
-        overwrite=overwrite,
         name=name,
         new_name=new_name,
         matrix=node.node_to_parent,
         absolute=matrix is not None,
-        memory=memory,
+        **words,
     )
     return bridge.duplicate(request, progress)

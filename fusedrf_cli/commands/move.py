@@ -13,9 +13,10 @@ from fusedrf_cli.requests import ArrangeRequest
 @click.argument("name")
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
 @options.placement
+@options.keep_history
 @options.memory
 @options.reporting
-def command(fused, name, output, overwrite, translate, rotate, scale, matrix, memory, progress):
+def command(fused, name, translate, rotate, scale, matrix, progress, **words):
     """Move, turn or scale an object of a fused field.
 
     From where it stands: it is scaled and turned about the middle of its box, then moved by -t; or --matrix
@@ -28,20 +29,18 @@ def command(fused, name, output, overwrite, translate, rotate, scale, matrix, me
     """
     from formats.scene import make_node
 
-    words = node_words(translate, rotate, scale, matrix)
-    if not words:
+    placed = node_words(translate, rotate, scale, matrix)
+    if not placed:
         raise UsageProblem("say where to: -t, -r, -s or --matrix")
-    node = make_node(name, **words)
+    node = make_node(name, **placed)
     from fusedrf_cli import bridge
 
     request = ArrangeRequest(
         fused=fused,
-        output=output,
-        overwrite=overwrite,
         name=name,
         new_name=None,
         matrix=node.node_to_parent,
         absolute=matrix is not None,
-        memory=memory,
+        **words,
     )
     return bridge.move(request, progress)

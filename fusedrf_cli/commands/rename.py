@@ -11,9 +11,10 @@ from fusedrf_cli.requests import ArrangeRequest
 @click.argument("name")
 @click.argument("new_name", metavar="NEW")
 @options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.keep_history
 @options.memory
 @options.reporting
-def command(fused, name, new_name, output, overwrite, memory, progress):
+def command(fused, name, new_name, progress, **words):
     """Give an object of a fused field another name.
 
     The object has to be held apart, as in fields of --kind blocks.
@@ -29,12 +30,10 @@ def command(fused, name, new_name, output, overwrite, memory, progress):
 
     request = ArrangeRequest(
         fused=fused,
-        output=output,
-        overwrite=overwrite,
         name=name,
         new_name=new_name,
         matrix=node.node_to_parent,
         absolute=True,
-        memory=memory,
+        **words,
     )
     return bridge.rename(request, progress)

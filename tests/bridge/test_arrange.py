@@ -111,3 +111,37 @@ def test_what_cannot_be_done_is_one_sentence(run, folder, words, code, says):
     result = run(*words, "-o", "out.rfpack")
     assert result.exit_code == code and says in result.stderr and result.stderr.count("\n") <= 2
     assert sorted(folder.iterdir()) == before
+
+
+def test_edits_are_undone_as_they_were_made(report, run, folder):
+    report("fuse", "scene.json", "-o", "fused.rfpack", "--kind", "blocks")
+    was = [(folder / "fused.rfpack").read_bytes()]
+    edits = [
+        ("move", "fused.rfpack", "red", "-t", "0.1,0,0"),
+        ("delete", "fused.rfpack", "blue"),
+        ("add", "fused.rfpack", "blue.rfpack", "--name", "azure", "-t", "0.5,0,0"),
+        ("replace", "fused.rfpack", "red", "blue.rfpack"),
+    ]
+    for words in edits:
+        report(*words, "-o", "fused.rfpack", "-w", "--keep-history")
+        was.append((folder / "fused.rfpack").read_bytes())
+    told = report("history", "fused.rfpack")
+    assert [entry["event"] for entry in told["history"]][1:] == ["moved", "deleted", "added", "replaced"]
+    assert told["undoable"] == 4 and told["history"][3]["objects"] == ["azure"]
+    for before in reversed(was[:-1]):
+        report("undo", "fused.rfpack", "-o", "fused.rfpack", "-w")
+        assert (folder / "fused.rfpack").read_bytes() == before
+    result = run("undo", "fused.rfpack", "-o", "fused.rfpack", "-w")
+    assert result.exit_code == 3 and "--keep-history" in result.stderr
+
+
+def test_what_replaces_an_object_stands_as_it_did(report, run, folder, picture):
+    report("fuse", "scene.json", "-o", "fused.rfpack", "--kind", "blocks")
+    report("move", "fused.rfpack", "red", "-t", "0,0.1,0.2", "-s", "1.2", "-o", "moved.rfpack")
+    report("replace", "moved.rfpack", "red", "blue.rfpack", "-o", "other.rfpack")
+    report("delete", "moved.rfpack", "red", "-o", "without.rfpack")
+    words = ("--name", "red", "-t", "-0.5,0.1,0.2", "-s", "1.2", "-o", "again.rfpack")
+    report("add", "without.rfpack", "blue.rfpack", *words)
+    np.testing.assert_array_equal(picture("other.rfpack"), picture("again.rfpack"))
+    result = run("replace", "fused.rfpack", "green", "blue.rfpack", "-o", "x.rfpack")
+    assert result.exit_code == 3 and "there is no 'green'" in result.stderr

@@ -17,7 +17,7 @@ from fusedrf_cli.main import cli
 ROOT = Path(__file__).parents[2]
 BRIDGE_VERBS = (
     *("pose", "train", "fuse", "convert", "add", "delete", "move", "duplicate", "rename", "render"),
-    *("evaluate", "chart", "extract"),
+    *("evaluate", "chart", "extract", "replace"),
 )
 
 

@@ -4,7 +4,9 @@ import shlex
 import click
 import pytest
 
+from formats.bundle import read_bundle, single_field_bundle
 from formats.errors import MissingFile
+from formats.past import keep
 from fusedrf_cli.main import COMMANDS, cli
 
 WITH_INPUT = [name for name in COMMANDS if name not in ("completion", "kinds")]
@@ -44,6 +46,12 @@ def test_help_shows_an_example_that_runs(run, bridge, folder, name):
     for file in ("scene.json", "fused.rfpack", "lamp.rfpack", "photos", "masks"):
         (folder / file).write_bytes((folder / "chair.rfpack").read_bytes())
     assert run("compose", "chair.rfpack", "-w", "-o", "scene.json").exit_code == 0
+    if name == "undo":
+        single_field_bundle(
+            read_bundle(folder / "chair.rfpack").fields.popitem()[1],
+            "chair",
+            history=[{"event": "moved", "before": keep(folder / "chair.rfpack", folder / "fused.rfpack")}],
+        ).write(folder / "fused.rfpack", overwrite=True)
     for example in examples(result.stdout):
         words = [word.rstrip("/") for word in shlex.split(example)]
         assert words[0] == name
@@ -67,10 +75,11 @@ def test_a_missing_input_is_one_line_and_code_3(run, bridge, name):
         "move": ["a", "-t", "1,0,0"],
         "duplicate": ["a", "b"],
         "rename": ["a", "b"],
+        "replace": ["a", "chair.rfpack"],
         "eval": ["--against", "chair.rfpack"],
         "convert": ["--kind", "cp"],
     }
-    output = [] if name in ("eval", "info", "validate") else ["-o", "out"]
+    output = [] if name in ("eval", "history", "info", "validate") else ["-o", "out"]
     result = run(name, "nowhere.rfpack", *others.get(name, []), *output)
     assert result.exit_code == MissingFile.exit_code
     assert result.stderr.startswith("Error: nowhere.rfpack: ") and result.stderr.count("\n") == 1

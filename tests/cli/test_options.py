@@ -115,7 +115,7 @@ def test_a_matrix_goes_with_no_other_word():
 
 # --- commands and their bridge ------------------------------------------------------------------------------
 
-EDIT = ("fused", "output", "precision", "rgb", "time_budget")
+EDIT = ("fused", "output", "precision", "rgb", "time_budget", "keep_history")
 COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False, "memory": None}
 
 

@@ -1,0 +1,24 @@
+"""`fusedrf undo`: a fused field as it was before its last edit."""
+
+import click
+
+from fusedrf_cli import options
+
+
+@click.command("undo")
+@click.argument("fused", type=options.INPUT)
+@options.writing("The field to write, OUT.rfpack.", edits="fused")
+@options.reporting
+def command(fused, output, overwrite, progress):
+    """Undo the last edit of a fused field.
+
+    What is written has the bytes that were there before. The edit must have been made with --keep-history,
+    which keeps them in FUSED.history.
+
+    \b
+    Example:
+      fusedrf undo fused.rfpack -o fused.rfpack -w
+    """
+    from formats.past import undo
+
+    return undo(fused, output)

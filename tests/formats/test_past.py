@@ -1,0 +1,116 @@
+"""What a bundle was before it was edited: kept, bounded, given back to the byte, and not believed blindly."""
+
+import os
+
+import numpy as np
+import pytest
+
+from formats import past
+from formats.bundle import single_field_bundle
+from formats.errors import BadSchema, FormatError, MissingFile
+from formats.past import history, keep, past_of, undo
+from formats.records import FieldRecord
+
+
+def write(path, value: int, *entries) -> bytes:
+    """A bundle of one field of a value; its bytes."""
+    record = FieldRecord(
+        "vm", {"planes": np.full((3, 2, 4, 4), value, np.float32)}, {"aabb": [0] * 3 + [1] * 3}
+    )
+    single_field_bundle(record, "one", history=entries).write(path, overwrite=True)
+    return path.read_bytes()
+
+
+def edited(path, value: int, *entries, onto=None) -> tuple[bytes, tuple]:
+    """The bundle after an edit that keeps what was; its bytes and its history."""
+    onto = onto or path
+    entry = {"event": "moved", "names": [], "nodes": [], "before": keep(path, onto)}
+    return write(onto, value, *entries, entry), (*entries, entry)
+
+
+def test_edits_are_undone_one_after_the_other_to_the_byte(tmp_path):
+    path = tmp_path / "one.rfpack"
+    was, entries = [write(path, 0)], ()
+    for value in (1, 2, 3):
+        data, entries = edited(path, value, *entries)
+        was.append(data)
+    assert history(path)["undoable"] == 3
+    for left in (2, 1, 0):
+        said = undo(path, path)
+        assert path.read_bytes() == was[left]
+        assert (said["more"], said["undone"]) == (left, "moved")
+    with pytest.raises(BadSchema, match="was not kept; edit with --keep-history"):
+        undo(path, path)
+
+
+def test_a_chain_over_several_files_can_be_undone(tmp_path):
+    """Each output knows all that came before, and shares its bytes with the files that are there."""
+    a, b, c, back, start = (tmp_path / f"{name}.rfpack" for name in ("a", "b", "c", "back", "start"))
+    first = write(a, 0)
+    second, entries = edited(a, 1, onto=b)
+    edited(b, 2, *entries, onto=c)
+    assert sum(os.path.samefile(a, one) for one in past_of(c).iterdir()) == 1
+    undo(c, back)
+    assert back.read_bytes() == second
+    undo(back, start)
+    assert start.read_bytes() == first
+
+
+def test_where_nothing_can_be_linked_bytes_are_copied(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError("no links here")
+
+    monkeypatch.setattr(past.os, "link", refuse)
+    path = tmp_path / "one.rfpack"
+    was = write(path, 0)
+    edited(path, 1)
+    undo(path, path)
+    assert path.read_bytes() == was
+
+
+def test_the_oldest_go(tmp_path, monkeypatch):
+    monkeypatch.setattr(past, "KEPT", 3)
+    path = tmp_path / "one.rfpack"
+    write(path, 0)
+    entries = ()
+    for value in range(1, 7):
+        os.utime(path, (value, value))
+        _, entries = edited(path, value, *entries)
+    assert len(list(past_of(path).iterdir())) == 3 and history(path)["undoable"] == 3
+
+
+@pytest.mark.parametrize("harm", ["gone", "another"])
+def test_what_is_not_there_as_it_was_is_not_given_back(tmp_path, harm):
+    path = tmp_path / "one.rfpack"
+    write(path, 0)
+    edited(path, 1)
+    (kept,) = past_of(path).iterdir()
+    kept.unlink()
+    if harm == "another":
+        kept.write_bytes(b"another")
+    now = path.read_bytes()
+    with pytest.raises(MissingFile, match="is not there as it was"):
+        undo(path, path)
+    assert path.read_bytes() == now
+
+
+@pytest.mark.parametrize("said", ["../../secret", "a" * 63, 7, None, ["a"], "A" * 64])
+def test_a_history_cannot_name_another_file(tmp_path, said):
+    path = tmp_path / "one.rfpack"
+    write(path, 0, {"event": "moved", "before": said})
+    with pytest.raises(BadSchema, match="was not kept"):
+        undo(path, path)
+
+
+@pytest.mark.parametrize("entry", [{}, {"names": 3}, {"nodes": [4, {"name": 5}]}, {"event": None}])
+def test_odd_histories_are_listed(tmp_path, entry):
+    path = tmp_path / "one.rfpack"
+    write(path, 0, entry)
+    assert history(path)["history"][0]["objects"] == []
+
+
+def test_a_scene_has_none(tmp_path):
+    (tmp_path / "scene.json").write_text("{}")
+    for act in (lambda path: undo(path, tmp_path / "out"), history):
+        with pytest.raises(FormatError, match="not a bundle"):
+            act(tmp_path / "scene.json")
