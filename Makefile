@@ -53,6 +53,7 @@ bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SH
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.extraction $(DATA) --share $(SHARE)
+	$(PYTHON) -m benchmarks.strip $(DATA)
 	$(PYTHON) -m benchmarks.edits $(DATA)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
