@@ -164,3 +164,16 @@ def test_photos_of_the_place_show_what_an_object_hid(report, picture, folder):
     after, away = picture("less.rfpack"), ~covered("blue", 0.3)
     assert psnr(after[gone], wanted[gone]) > psnr(before[gone], wanted[gone]) + 3
     assert psnr(after[away], before[away]) >= 40
+
+
+def test_one_more_of_the_same_object_costs_a_placement(report, picture, folder):
+    """As where both were fused at once: its numbers are stored once."""
+    report("fuse", "pair.json", "-o", "one.rfpack", "--kind", "blocks")
+    report("add", "one.rfpack", "red.rfpack", "--name", "second", "-t", "0.7,0,0", "-o", "two.rfpack")
+    before, after = ((folder / name).stat().st_size for name in ("one.rfpack", "two.rfpack"))
+    assert after - before < 2000
+    report("add", "one.rfpack", "blue.rfpack", "--name", "second", "-t", "0.7,0,0", "-o", "other.rfpack")
+    assert (folder / "other.rfpack").stat().st_size - before > 10_000
+    words = ("floor.rfpack", "-t", "0,0,-0.7", "red.rfpack", "-t", "-0.5,0,0", "red.rfpack", "-t", "0.7,0,0")
+    report("compose", *words, "-o", "three.json")
+    assert psnr(picture("two.rfpack"), picture("three.json")) > 40

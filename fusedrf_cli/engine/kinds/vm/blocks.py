@@ -65,7 +65,37 @@ def blocks_of(
             numbers = truncated(tensor_field(field, t, tensors[first[key] + t].resolution), shape).params
             params[at : at + len(numbers)] = numbers
             at += len(numbers)
-    return VMField.assembled(shape, tuple(tensors), tuple(blocks), params)
+    return VMField.assembled(shape, *shared(shape, tensors, blocks, params))
+
+
+def shared(
+    shape: VMShape, tensors: list[VMTensor], blocks: list[Block], params: torch.Tensor
+) -> tuple[tuple[VMTensor, ...], tuple[Block, ...], torch.Tensor]:
+    """Tensors, blocks and numbers, of tensors that are equal to the bit the first alone: one more of an
+    object that is there already costs a placement."""
+    ends = np.cumsum([shape.size(tensor.resolution) for tensor in tensors])
+    parts = [params[end - shape.size(t.resolution) : end] for end, t in zip(ends, tensors, strict=True)]
+    first, kept = [], []
+    for i, tensor in enumerate(tensors):
+        same = (j for j in kept if equal(tensor, tensors[j]) and torch.equal(parts[i], parts[j]))
+        first.append(next(same, i))
+        kept += [i] if first[i] == i else []
+    if len(kept) == len(tensors):
+        return tuple(tensors), tuple(blocks), params
+    blocks = [replace(block, tensor=kept.index(first[block.tensor])) for block in blocks]
+    return tuple(tensors[i] for i in kept), tuple(blocks), torch.cat([parts[i] for i in kept])
+
+
+def equal(one: VMTensor, other: VMTensor) -> bool:
+    """Whether two tensors lie alike: all but their numbers."""
+    grids = one.occupancy, other.occupancy
+    facts = [(t.resolution, t.scale, t.shift, t.space) for t in (one, other)]
+    return (
+        facts[0] == facts[1]
+        and np.array_equal(one.aabb, other.aabb)
+        and np.array_equal(grids[0].aabb, grids[1].aabb)
+        and np.array_equal(grids[0].occupied, grids[1].occupied)
+    )
 
 
 def block_name(placed: Placed, block: Block, own: dict[int, tuple[Block, ...]]) -> str:
