@@ -122,6 +122,13 @@ def names_of(entry: dict) -> list[str]:
     return [name for name in dict.fromkeys([*said, *names]) if isinstance(name, str)]
 
 
+def psnr_of(entry: dict) -> float | None:
+    """The dB that an edit or a fuse reached, as its entry of history says."""
+    said = entry.get("psnr")
+    said = said.get("stored", said.get("psnr")) if isinstance(said, dict) else said
+    return float(said) if isinstance(said, int | float) else None
+
+
 def history(bundle: Path | str) -> dict:
     """What was done to a bundle, the earliest first, and how many of its edits can be undone. Raises
     BadSchema where it is no bundle."""
@@ -132,7 +139,7 @@ def history(bundle: Path | str) -> dict:
         {
             "event": entry.get("event", "edited"),
             "objects": names_of(entry),
-            "psnr": entry.get("psnr"),
+            "psnr": psnr_of(entry),
             "edits": entry.get("edits"),
         }
         for entry in scene.history
