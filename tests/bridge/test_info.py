@@ -22,9 +22,12 @@ def test_blocks_are_listed_with_their_bytes_through_edits(report, folder):
         "red": pytest.approx(PLACES["red"]),
         "twin": pytest.approx([0.5, 0.5, 0]),
     }
-    header = said["fields"][0]["bytes"] - sum(o["bytes"] for o in said["objects"])
-    assert 0 < header < 8192  # the blocks' numbers are all of the field but its header
+    sharing = {o["name"]: o.pop("shared_by") for o in said["objects"]}
+    assert sharing == {"floor": 1, "red": 2, "twin": 2}
+    header = said["fields"][0]["bytes"] - sum(o["bytes"] / sharing[o["name"]] for o in said["objects"])
+    assert 0 < header < 8192  # equal objects are stored once, and else there is but the field's header
     left = report("info", "h.rfpack")["objects"]
+    assert [o.pop("shared_by") for o in left] == [1, 1]
     assert left == [o for o in said["objects"] if o["name"] != "red"]
 
 
