@@ -1,11 +1,13 @@
 """Edits of fused scenes: python -m benchmarks.edits DATA [--out docs/real] [--keep FOLDER]
 
-DATA is a folder with chair/ and fuze/fuze.obj. OUT gets edits.md: for each kind of field what many additions
-one by one come to against one fuse of all, what an edit changes outside of its region, what is left after an
-addition was deleted again, what the order of additions changes, and how long an edit takes.
+DATA is a folder with chair/ and fuze/fuze.obj. OUT gets edits.md, edits.svg and edits.json that they are made
+of (a kind that is there and not asked for stays): for each kind of field what many additions one by one come
+to against one fuse of all, what an edit changes outside of its region, what is left after an addition was
+deleted again, what the order of additions changes, and how long an edit takes.
 """
 
 import argparse
+import json
 import random
 import tempfile
 import time
@@ -14,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell
 from fusedrf_cli.bridge.rendering import renderable
@@ -55,16 +58,20 @@ def compose(folder: Path, objects, scene: str) -> None:
     fusedrf(folder, "compose", *words, "-o", scene)
 
 
-def added(folder: Path, kind: str, objects, output: str) -> list[float]:
-    """One fuse of the first, and an addition of each other; the seconds of each addition."""
+def added(folder: Path, kind: str, objects, output: str, every: int = 0) -> tuple[list[float], list[list]]:
+    """One fuse of the first, and an addition of each other; the seconds of each addition, and after every so
+    many objects their number and the PSNR to the scene of them."""
     compose(folder, objects[:1], "first.json")
     fusedrf(folder, "fuse", "first.json", "--kind", kind, "-o", output)
-    seconds = []
-    for name, source, place in objects[1:]:
+    seconds, along = [], []
+    for i, (name, source, place) in enumerate(objects[1:], 2):
         started = time.monotonic()
         fusedrf(folder, "add", output, source, "--name", name, *place, "-o", output)
         seconds.append(time.monotonic() - started)
-    return seconds
+        if every and i % every == 0:
+            compose(folder, objects[:i], "some.json")
+            along.append([i, psnr(pictures(folder, output), pictures(folder, "some.json"))])
+    return seconds, along
 
 
 def pictures(folder: Path, bundle: str, views: int = 4) -> np.ndarray:
@@ -82,8 +89,8 @@ def densities(folder: Path, bundle: str, points: np.ndarray) -> np.ndarray:
     return field.query(torch.from_numpy(points - origin), ahead, False)[0].numpy()
 
 
-def row(folder: Path, kind: str) -> dict:
-    """All of it for one kind."""
+def row(folder: Path, kind: str) -> tuple[dict, list[list]]:
+    """All of it for one kind: the table's row, and number of objects and dB along the additions."""
     tell(kind)
     objects = nodes(OBJECTS[kind] + 1)
     before, extra = objects[:-1], objects[-1]
@@ -91,7 +98,7 @@ def row(folder: Path, kind: str) -> dict:
     started = time.monotonic()
     fusedrf(folder, "fuse", "all.json", "--kind", kind, "-o", "once.rfpack")
     whole = time.monotonic() - started
-    seconds = added(folder, kind, before, "many.rfpack")
+    seconds, along = added(folder, kind, before, "many.rfpack", every=len(before) // 8 or 1)
     truth, once, many = (pictures(folder, name) for name in ("all.json", "once.rfpack", "many.rfpack"))
 
     name, source, place = extra
@@ -117,7 +124,21 @@ def row(folder: Path, kind: str) -> dict:
         "fuse, s": f"{whole:.1f}",
     }
     tell(str(found))
-    return found
+    return found, along
+
+
+def write_page(out: Path, found: dict[str, tuple[dict, list[list]]]) -> None:
+    """edits.json, edits.svg and edits.md; kinds that an earlier run measured stay."""
+    path = out / "edits.json"
+    kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    found = {kind: found.get(kind) or kept[kind] for kind in OBJECTS if kind in found or kind in kept}
+    path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    lines = {kind: along for kind, (_, along) in found.items()}
+    words = ("objects, added one by one", "PSNR to the scene of them, dB")
+    over_time(lines, {}, words, out / "edits.svg")
+    table = markdown([row for row, _ in found.values()])
+    text = f"# Edits\n\n{ABOUT}\n\n{table}\n![PSNR along additions](edits.svg)\n"
+    (out / "edits.md").write_text(text, encoding="utf-8")
 
 
 def main() -> None:
@@ -135,8 +156,8 @@ def main() -> None:
             if not (folder / f"{source}.rfpack").exists():
                 words = ("-o", f"{source}.rfpack", "--time-budget", "15")
                 fusedrf(folder, "train", str(asked.data.resolve() / where), *words)
-        rows = [row(folder, kind) for kind in asked.kind or OBJECTS]
-    (asked.out / "edits.md").write_text(f"# Edits\n\n{ABOUT}\n\n{markdown(rows)}", encoding="utf-8")
+        for kind in asked.kind or OBJECTS:
+            write_page(asked.out, {kind: row(folder, kind)})
 
 
 if __name__ == "__main__":
