@@ -16,7 +16,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from formats.errors import FormatWarning, MissingFile, printable
-from fusedrf_cli.errors import FusedRFError
+from fusedrf_cli.errors import FusedRFError, UsageProblem
 from fusedrf_cli.progress import Progress
 from fusedrf_cli.report import emit
 
@@ -252,6 +252,17 @@ class InputType(click.Path):
         return value
 
 
+class FolderType(InputType):
+    """A folder that must be there."""
+
+    name = "DIR"
+
+    def convert(self, value, param, ctx):
+        if not os.path.isdir(super().convert(value, param, ctx)):
+            raise UsageProblem(f"{value}: no folder; {param.opts[0]} takes one")
+        return value
+
+
 class RanksType(_Text):
     """'D,C' -> components per mode of density and of colour."""
 
@@ -324,7 +335,7 @@ RANKS, DIRECTION, UP = RanksType(), DirectionType(), UpType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
 SPHERE, POINT, CROP, SHARE = SphereType(), PointType(), CropType(), ShareType()
-INPUT, SCENE, DOWNSCALE = InputType(), InputType(stdin=True), DownscaleType()
+INPUT, SCENE, FOLDER, DOWNSCALE = InputType(), InputType(stdin=True), FolderType(), DownscaleType()
 
 
 # --- options ------------------------------------------------------------------------------------------------

@@ -91,6 +91,8 @@ class FuseRequest(Learning):
     memory: int | None
     allow_outside: bool
     resume: bool
+    sources: str | None = None
+    """A folder in which sources of a fused bundle are looked for."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from formats.atomic import atomic_folder, hidden_sibling
 from fusedrf_cli import plots
+from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
 from fusedrf_cli.bridge.looks import looks_of
@@ -316,7 +317,7 @@ class Charting:
             device=own.device,
             threads=own.threads,
         )
-        return fuse(wanted, heard), heard.warnings
+        return fuse(wanted, heard, load=as_it_is), heard.warnings
 
 
 def mark_frontiers(points: list[Point]) -> None:

@@ -1,6 +1,7 @@
 """`convert`: a field of any kind to one of any other."""
 
 from formats.bundle import is_bundle, read_headers
+from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.scene import unusable_kind
@@ -33,6 +34,7 @@ def convert(request: ConvertRequest, progress) -> dict:
             **words,
         ),  # fmt: skip
         progress,
+        load=as_it_is,
     )
     progress.phase("comparing", None)
     compared = evaluate(

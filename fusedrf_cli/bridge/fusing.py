@@ -1,8 +1,10 @@
 """`fuse`: a scene to one field, of any kind, by one search over the ways and sizes it can be made in."""
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, replace
 
+from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.looks import views_of_place
 from fusedrf_cli.bridge.making import Kept, Maker, Scene
@@ -13,7 +15,6 @@ from fusedrf_cli.bridge.running import Saved, checkpoint_path, engine, load_chec
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
     history_nodes,
-    load_scene,
     refuse_options,
     unusable_kind,
     write_field,
@@ -33,13 +34,17 @@ DEFAULT_MAX_SIZE = 25_000_000
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
-def fuse(request: FuseRequest, progress) -> dict:
+Load = Callable[[FuseRequest, Memory, str, object], LoadedScene]
+"""What is to be fused, within a memory, on a device, with a progress that is told of what goes on."""
+
+
+def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
     """Turn a composed scene into one field and write it with the scene's history."""
     with engine(request.device, request.threads, progress) as place:
         progress.phase("reading", None)
         saved = load_checkpoint(request.output, "fuse") if request.resume else None
         memory = Memory(request.memory)
-        loaded = load_scene(request.scene, request.allow_outside, memory, place)
+        loaded = load(request, memory, place, progress)
         loaded = without_empty(loaded, request.scene, progress)
         scene = Scene.of(loaded)
         kind, suits = choose_kind(request.kind, loaded, scene.composed)

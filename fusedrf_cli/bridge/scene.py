@@ -50,6 +50,10 @@ class SourceField:
     """Whether it is shown as the bundle has it."""
 
 
+FoundField = tuple[Leaf, Path, str, FieldHeader]
+"""Where a field lies in a scene, the bundle that it is in, its member and that member's header."""
+
+
 @dataclass(frozen=True)
 class PlacedRig:
     """Cameras that a source of a scene keeps."""
@@ -158,6 +162,13 @@ def load_scene(
     return _Loader(Path(path), budget, place).load(expand_scene(path, allow_outside), allow_outside)
 
 
+def load_found(
+    path: Path, graph: SceneGraph, found: Sequence[FoundField], budget: Memory | None, place: str = "cpu"
+) -> LoadedScene:
+    """As `load_scene`, of fields that were found already."""
+    return _Loader(path, budget, place).read(graph, found)
+
+
 class _Loader:
     """Finds the fields of one scene; every bundle's headers are read once."""
 
@@ -183,6 +194,10 @@ class _Loader:
             raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
         if not found:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
+        return self.read(graph, found)
+
+    def read(self, graph: SceneGraph, found: Sequence[FoundField]) -> LoadedScene:
+        """A scene of fields, within the budget."""
         if self.budget is not None:
             sizes = list({member: held_size(header) for *_, member, header in found}.values())
             self.shelf.resize(self.budget.room({}))
@@ -190,7 +205,7 @@ class _Loader:
         fields = tuple(self.source(*where) for where in found)
         return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs))
 
-    def sources(self, leaf, path: Path) -> list[tuple]:
+    def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
         if path not in self.bundles:
             if not is_bundle(path):

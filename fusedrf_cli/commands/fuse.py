@@ -29,6 +29,12 @@ def brief(report: dict) -> dict:
 @click.option(
     "--keep-sources", is_flag=True, help="Keep the sources inside; delete then restores what was hidden."
 )
+@click.option(
+    "--sources",
+    metavar="DIR",
+    type=options.FOLDER,
+    help="Where the sources of a fused bundle are looked for, by checksum, if not where its history says.",
+)
 @options.memory
 @options.fused_precision
 @options.ranks
@@ -40,7 +46,8 @@ def brief(report: dict) -> dict:
 def command(scene, output, progress, **words):
     """Turn a whole scene into one field.
 
-    SCENE is a scene.json, a bundle, or - for a scene on stdin.
+    SCENE is a scene.json, a bundle, or - for a scene on stdin. A fused bundle is built anew from its sources,
+    where these are found as they were.
 
     \b
     Example:
