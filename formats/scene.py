@@ -12,7 +12,7 @@ import os
 import re
 import unicodedata
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -64,6 +64,8 @@ Matrix4 = Annotated[list[Vector4], msgspec.Meta(min_length=4, max_length=4)]
 Box = Annotated[list[float], msgspec.Meta(min_length=6, max_length=6)]
 Shape = Annotated[list[float], msgspec.Meta(min_length=4, max_length=6)]
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
+Tint = Annotated[list[Annotated[float, msgspec.Meta(ge=0, le=1)]], msgspec.Meta(min_length=3, max_length=3)]
+WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
 
 
@@ -81,6 +83,7 @@ class NodeSchema(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
     visible: bool = True
     crop: Shape | msgspec.UnsetType = msgspec.UNSET
     opacity: Share | msgspec.UnsetType = msgspec.UNSET
+    tint: Tint | msgspec.UnsetType = msgspec.UNSET
     children: list["NodeSchema"] = []
 
 
@@ -100,7 +103,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
 
 NODE_KEYS = NodeSchema.__struct_fields__
 PLACEMENT_KEYS = ("translation", "rotation", "scale", "matrix")
-SHOWING_KEYS = ("visible", "crop", "opacity")
+SHOWING_KEYS = ("visible", "crop", "opacity", "tint")
 SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history", "framing", "cameras")
 
 
@@ -130,6 +133,12 @@ class Node:
         object.__setattr__(self, "node_to_parent", matrix)
 
 
+def multiplied(one: Sequence[float], other: Sequence[float]) -> tuple[float, float, float]:
+    """Two tints, one upon the other."""
+    red, green, blue = (a * b for a, b in zip(one, other, strict=True))
+    return red, green, blue
+
+
 @dataclass(frozen=True)
 class Leaf:
     """A node with a field or a source; `object_to_world` is (4, 4) float64."""
@@ -142,13 +151,15 @@ class Leaf:
     visible: bool = True
     opacity: float = 1.0
     """Its density is multiplied by this."""
+    tint: tuple[float, float, float] = WHITE
+    """Its colours are multiplied by these, red, green and blue."""
     crops: tuple["Crop", ...] = ()
     """It is empty outside of any of them."""
 
     @property
     def whole(self) -> bool:
         """Whether all of it is shown as it is."""
-        return self.visible and self.opacity == 1 and not self.crops
+        return self.visible and self.opacity == 1 and self.tint == WHITE and not self.crops
 
     def inside(self, outer: "Leaf") -> "Leaf":
         """A leaf of a bundle that an outer one names as its source."""
@@ -158,6 +169,7 @@ class Leaf:
             background=outer.background,
             visible=outer.visible and self.visible,
             opacity=outer.opacity * self.opacity,
+            tint=multiplied(outer.tint, self.tint),
             crops=(*(crop.within(self.object_to_world) for crop in outer.crops), *self.crops),
         )
 
@@ -229,21 +241,21 @@ class SceneGraph:
     def leaves(self) -> list[Leaf]:
         """The nodes that hold a field or a source, in document order."""
         found = []
-        stack = [(node, node.node_to_parent, True, 1.0, ()) for node in reversed(self.nodes)]
+        stack = [(node, node.node_to_parent, True, 1.0, WHITE, ()) for node in reversed(self.nodes)]
         while stack:
-            node, object_to_world, visible, opacity, crops = stack.pop()
+            node, object_to_world, visible, opacity, tint, crops = stack.pop()
             visible = visible and node.showing.get("visible", True)
             opacity *= node.showing.get("opacity", 1.0)
+            tint = multiplied(tint, node.showing.get("tint", WHITE))
             if "crop" in node.showing:
                 crops = (*crops, Crop(tuple(node.showing["crop"]), np.eye(4)))
             if node.field is not None or node.source is not None:
-                shown = visible, opacity, crops
-                found.append(
-                    Leaf(node.name, node.field, node.source, object_to_world, node.background, *shown)
-                )
+                placed = node.name, node.field, node.source, object_to_world, node.background
+                found.append(Leaf(*placed, visible, opacity, tint, crops))
             for child in reversed(node.children):
                 own = tuple(crop.within(child.node_to_parent) for crop in crops)
-                stack.append((child, object_to_world @ child.node_to_parent, visible, opacity, own))
+                shown = visible, opacity, tint, own
+                stack.append((child, object_to_world @ child.node_to_parent, *shown))
         return found
 
 
@@ -482,6 +494,9 @@ def _check_showing(showing: dict, name: str) -> None:
     opacity = showing.get("opacity", 1.0)
     if not 0 < opacity <= 1:
         raise BadSchema(f"node {name!r}: opacity {opacity}, expected a number above 0 and at most 1")
+    tint = showing.get("tint")
+    if tint is not None and not (len(tint) == 3 and all(0 <= share <= 1 for share in tint)):
+        raise BadSchema(f"node {name!r}: tint {list(tint)}, expected red, green and blue from 0 to 1")
 
 
 def _placement_matrix(placement: dict, name: str) -> np.ndarray:

@@ -177,6 +177,18 @@ class ShareType(_Text):
         return number
 
 
+class TintType(_Text):
+    """'r,g,b' -> three floats from 0 to 1."""
+
+    name, expected = "r,g,b", "red, green and blue from 0 to 1, r,g,b"
+
+    def parse(self, text):
+        tint = _numbers(text, (3,))
+        if not all(0 <= share <= 1 for share in tint):
+            raise ValueError(text)
+        return tint
+
+
 class SphereType(_Text):
     """'x,y,z,radius' -> four floats, the last above 0."""
 
@@ -334,7 +346,7 @@ class KindsType(KindType):
 RANKS, DIRECTION, UP = RanksType(), DirectionType(), UpType()
 POSITIVE, SIZE, BYTES, VECTOR, SCALE = PositiveType(), SizeType(), BytesType(), VectorType(), ScaleType()
 AABB, COLOUR, AFFINE = BoxType(), ColourType(), AffineType()
-SPHERE, POINT, CROP, SHARE = SphereType(), PointType(), CropType(), ShareType()
+SPHERE, POINT, CROP, SHARE, TINT = SphereType(), PointType(), CropType(), ShareType(), TintType()
 INPUT, SCENE, FOLDER, DOWNSCALE = InputType(), InputType(stdin=True), FolderType(), DownscaleType()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
 from formats.records import FieldHeader, FieldRecord, as_stored
 from formats.scene import (
+    WHITE,
     Leaf,
     SceneGraph,
     expand_scene,
@@ -232,7 +233,7 @@ class _Loader:
     def source(self, leaf: Leaf, path: Path, member: str, header: FieldHeader) -> SourceField:
         """leaf: where the field lies, under which name, and what is shown of it."""
         size, where = held_size(header), f"{path}: node '{leaf.name}'"
-        key = member if leaf.whole else f"{member} {leaf.opacity} {leaf.crops}"
+        key = member if leaf.whole else f"{member} {leaf.opacity} {leaf.tint} {leaf.crops}"
 
         def read():
             return as_shown(make_field(read_field(path, member), where), leaf, where).to(self.place)
@@ -247,8 +248,8 @@ class _Loader:
 
 
 def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
-    """What a leaf shows of its field: all of it, or what its crops hold, with its density times its opacity.
-    InvalidInput where that is nothing, or the kind of field has no such."""
+    """What a leaf shows of its field: all of it, or what its crops hold, with its density times its opacity
+    and its colours times its tint. InvalidInput where that is nothing, or the kind of field has no such."""
     kind = registry.kind(field.kind)
     try:
         shown = field if leaf.opacity == 1 else kind.thinned(field, leaf.opacity)
@@ -258,7 +259,7 @@ def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
         raise InvalidInput(f"{where}: {error}") from error
     if shown is None:
         raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
-    return shown
+    return shown if leaf.tint == WHITE else kind.tinted(shown, leaf.tint)
 
 
 def background_of(scene: LoadedScene) -> SourceField:

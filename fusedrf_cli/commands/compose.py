@@ -48,6 +48,7 @@ def _placed_options(command):
             "own world.",
         },
         ("--opacity",): {"type": options.SHARE, "help": "Its density times this, above 0 and at most 1."},
+        ("--tint",): {"type": options.TINT, "help": "Its colours times red, green and blue from 0 to 1."},
         ("--hidden",): {"is_flag": True, "help": "Leave it out, but keep its place in the scene."},
     }
     for names, words in reversed(flags.items()):
@@ -119,7 +120,7 @@ def _nodes(inputs, output, allow_outside, words):
         source = _relative(path, output)
         resolve_source(output, source, allow_outside)
         background, hidden = bool(given.pop("background_node")), bool(given.pop("hidden"))
-        showing = {key: value for key in ("crop", "opacity") if (value := given.pop(key)) is not None}
+        showing = {key: value for key in ("crop", "opacity", "tint") if (value := given.pop(key)) is not None}
         showing |= {"visible": False} if hidden else {}
         words = node_words(**given)
         yield make_node(name, source=source, background=background, showing=showing, **words)

@@ -1,4 +1,4 @@
-"""`compose --crop`, `--opacity` and `--hidden`: what of a node is shown."""
+"""`compose --crop`, `--opacity`, `--tint` and `--hidden`: what of a node is shown."""
 
 import json
 import shutil
@@ -49,6 +49,18 @@ def sigma(folder, scene: str, points: np.ndarray) -> np.ndarray:
     return composed.query(at, torch.tensor([[0.0, 0.0, 1.0]]).double().expand(len(at), 3))[0].numpy()
 
 
+def colour(folder, scene: str, points: np.ndarray) -> np.ndarray:
+    """(N, 3), as `sigma`."""
+    composed = load_scene(str(folder / scene)).composed()
+    at = torch.from_numpy(points - composed.origin)
+    return composed.query(at, torch.tensor([[0.0, 0.0, 1.0]]).double().expand(len(at), 3))[1].numpy()
+
+
+def alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether pictures are the same but for some pixels of an outline."""
+    return (np.abs(one - other).max(2) < 0.02).mean() > 0.99
+
+
 def written(flag: str, numbers: list[float]) -> tuple[str, str]:
     return flag, ",".join(map(str, numbers))
 
@@ -89,6 +101,31 @@ def test_crops_and_opacities_of_groups_hold_for_what_is_in_them(report, folder):
     np.testing.assert_allclose(part[inside], 0.25 * whole[inside], rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["vm", "sparse", "dense"])
+def test_a_tint_multiplies_what_is_seen(report, folder, kind):
+    report("compose", f"{kind}.rfpack", *PLACE, "-o", "plain.json")
+    report("compose", f"{kind}.rfpack", "--tint", "0.5,1,0", "-o", "inner.json")
+    report("compose", "inner.json", *PLACE, "--tint", "0.5,0.5,1", "-o", "tinted.json")
+    _, world = points_of(read_scene(folder / "plain.json"))
+    plain, tinted = (colour(folder, name, world) for name in ("plain.json", "tinted.json"))
+    assert plain.max() > 0.5
+    np.testing.assert_allclose(tinted, plain * (0.25, 0.5, 0), rtol=1e-5, atol=1e-6)
+
+
+def test_a_fused_scene_keeps_tints_through_edits(report, folder, picture):
+    words = ("red.rfpack", "--name", "dark", "-t", "0.8,0,0", "--tint", "0.3,0.3,0.3")
+    report("compose", "red.rfpack", *words, "-o", "s.json")
+    for kind in ("blocks", "vm"):
+        said = report("fuse", "s.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-rgb", "-w")
+        assert said["psnr"]["before_rgb"] > (45 if kind == "blocks" else 20)
+    report("move", "blocks.rfpack", "dark", "-t", "0,0.4,0", "-o", "moved.rfpack")
+    report("compose", "red.rfpack", *words[:4], "0.8,0.4,0", *words[5:], "-o", "there.json")
+    assert alike(picture("moved.rfpack"), picture("there.json"))
+    report("delete", "blocks.rfpack", "red", "-o", "left.rfpack")
+    report("compose", *words, "-o", "alone.json")
+    assert alike(picture("left.rfpack"), picture("alone.json"))
+
+
 def test_a_hidden_node_is_left_out_and_stays_in_the_scene(report, run, folder):
     report("compose", "red.rfpack", "blue.rfpack", "-t", "1,0,0", "--hidden", "-o", "one.json")
     assert [f.placed.name for f in load_scene(str(folder / "one.json")).fields] == ["red"]
@@ -118,6 +155,8 @@ BAD = {
     "ball without radius": ([0, 0, 0, 0], "is neither a box"),
     "opacity": (2.0, "opacity"),
     "visible": ("no", "visible"),
+    "tint": ([1, 0.5, -0.1], "tint"),
+    "tint of two": ([1, 0.5], "tint"),
 }
 
 
@@ -127,7 +166,8 @@ def test_what_no_node_shows_is_refused(run, report, folder, what):
     scene = json.loads((folder / "scene.json").read_text())
     value, sentence = BAD[what]
     scene |= {"version": "1.2"}
-    scene["nodes"][0]["opacity" if what == "opacity" else "visible" if what == "visible" else "crop"] = value
+    key = next((key for key in ("opacity", "visible", "tint") if what.startswith(key)), "crop")
+    scene["nodes"][0][key] = value
     (folder / "scene.json").write_text(json.dumps(scene))
     result = run("render", "scene.json", "-o", "x.png")
     assert result.exit_code == 3 and sentence in result.stderr and result.stderr.count("\n") == 1

@@ -23,6 +23,8 @@ from fusedrf_cli.engine.kernels.loops import (
     Voting,
     Weighed,
 )
+from fusedrf_cli.engine.kernels.specialise import TINTED
+from fusedrf_cli.engine.kernels.tinting import with_tints
 
 
 class Batch(NamedTuple):
@@ -38,6 +40,9 @@ class Batch(NamedTuple):
     step: float
     early_stop: float
     distortion: float = 0.0  # weight of the loss by which a ray's matter draws together
+
+
+WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
 
 
 @dataclass(frozen=True)
@@ -65,6 +70,9 @@ class ComputedField:
     params: torch.Tensor
     occupancy: OccupancyGrid
 
+    tint: tuple[float, float, float] | None = None
+    """That the colours of all of it are multiplied by; None: none. It is not stored, but where a kind has
+    tints of its own."""
     resolution: tuple[int, int, int] | None = None
     """Texels per axis of a field on one grid over its box; None: it has none, and cells are not its to give
     up."""
@@ -111,6 +119,8 @@ class ComputedField:
         """σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it, by `reference`."""
         at = self.space.contracted(points)
         sigma, rgb = self.reference(params, at, dirs)
+        if self.tint is not None:
+            rgb = rgb * torch.tensor(self.tint, dtype=rgb.dtype, device=rgb.device)
         return sigma * self.space.rates(at).to(sigma.dtype), rgb
 
     # -- the same field otherwise ------------------------------------------------------------------------
@@ -162,6 +172,12 @@ class ComputedField:
         return self.occupancy.space
 
     @property
+    def tints(self) -> np.ndarray | None:
+        """(frames, 3) what colours are multiplied by, for each frame that the kernels tell apart; None where
+        that changes nothing."""
+        return None if self.tint is None else np.array([self.tint])
+
+    @property
     def device_loops(self) -> ModuleType:
         """The module of loops of the device that the numbers lie on."""
         return kernels.device_loops(self.params.device.type)
@@ -169,14 +185,17 @@ class ComputedField:
     @cached_property
     def loops(self) -> kernels.cpu.Loops:
         """The loops for fields of these sizes, on the device that the numbers lie on."""
-        sizes = tuple(sorted(self.bodies.sizes(self).items()))
-        return self.device_loops.loops_for(self.bodies, sizes, self.space)
+        sizes = self.bodies.sizes(self)
+        if self.tints is not None:
+            sizes |= {TINTED: 1}
+        return self.device_loops.loops_for(self.bodies, tuple(sorted(sizes.items())), self.space)
 
     @cached_property
     def arrays(self) -> NamedTuple:
         """What kernels read; `params` is shared, not copied."""
         loops = self.device_loops
-        return loops.on_device(self.kernel_arrays(loops.shared(self.params)))
+        arrays, tints = self.kernel_arrays(loops.shared(self.params)), self.tints
+        return loops.on_device(arrays if tints is None else with_tints(arrays, tints))
 
     @cached_property
     def grid(self) -> GridArrays:

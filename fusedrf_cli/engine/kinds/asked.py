@@ -97,7 +97,7 @@ def lattice_of(scene: ComposedField) -> Lattice | None:
     if len(scene.placed) > 1 or not np.array_equal(matrix[:3, :3], np.eye(3)):
         return None
     field = opened(placed.field)
-    if getattr(field, "resolution", None) is None:
+    if getattr(field, "resolution", None) is None or field.tints is not None:
         return None
     origin = matrix[:3, 3]
     everywhere = field.with_occupancy(OccupancyGrid.full(field.aabb))

@@ -15,6 +15,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.box import BoxField
+from fusedrf_cli.engine.fields.computed import WHITE
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.kinds import refitting, splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
@@ -177,6 +178,12 @@ class Kind:
         other = copy(self.on_one_grid(field))
         other.scale = field.scale * factor
         return other._afresh("arrays")
+
+    def tinted(self, field: StoredField, tint: tuple[float, float, float]) -> StoredField:
+        """A field whose colours are multiplied by r, g, b."""
+        other = copy(field)
+        other.tint = tuple(np.multiply(field.tint or WHITE, tint).tolist())
+        return other._afresh("arrays", "loops")
 
     def added(self, field: StoredField, objects: list[Placed], teach: Teach) -> Edited:
         """A field with objects placed in its frame put in, by the rule `max`. Raises ValueError where they

@@ -49,7 +49,12 @@ def blocks_of(
     whole = common_shape(shapes)
     shape = whole if ranks is None else smaller_shape(whole, ranks)
     blocks = [
-        Block(first[id(p.field)] + b.tensor, p.object_to_world @ b.object_to_field, block_name(p, b, own))
+        Block(
+            first[id(p.field)] + b.tensor,
+            p.object_to_world @ b.object_to_field,
+            block_name(p, b, own),
+            b.tint,
+        )
         for p in placed
         for b in own[id(p.field)]
     ]

@@ -62,9 +62,7 @@ def cut_out(field: VMField, selection: Selection) -> VMField | None:
 
 def cut_away(field: VMField, selection: Selection) -> VMField | None:
     """What of each block is not a selected object's, see splitting.py."""
-    return apart(
-        field, lambda own, block: splitting.cut_away(own, selection, to_field(field, own, block))
-    )
+    return apart(field, lambda own, block: splitting.cut_away(own, selection, to_field(field, own, block)))
 
 
 def cropped(field: VMField, holds: splitting.Holds) -> VMField | None:
@@ -90,8 +88,14 @@ def apart(field: VMField, part_of: Callable[[VMField, Block], VMField | None]) -
     for block in field.blocks:
         part = part_of(tensor_field(field, block.tensor), block)
         if part is not None:
-            found.append(Placed(block.name, part, block.object_to_field))
+            found.append(Placed(block.name, tinted(part, block.tint), block.object_to_field))
     return joined(found)
+
+
+def tinted(field: VMField, tint: tuple[float, float, float]) -> VMField:
+    """The field with the colours of all its blocks multiplied by r, g, b."""
+    blocks = tuple(replace(b, tint=tuple(np.multiply(b.tint, tint).tolist())) for b in field.blocks)
+    return VMField(field.shape, field.tensors, blocks, field.params, field.occupancy, field.owners)
 
 
 def joined(placed: list[Placed]) -> VMField | None:

@@ -23,7 +23,7 @@ from fusedrf_cli.engine.fields.box import (
     unit_texels,
     whole_numbers,
 )
-from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
+from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, unpack_bits
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
     SCENE_CELLS,
@@ -92,6 +92,8 @@ class Block:
     """(4, 4) float64 affine; columns act on points."""
     name: str
     """The node of the scene graph it stands for."""
+    tint: tuple[float, float, float] = WHITE
+    """That its colours are multiplied by."""
 
 
 @dataclass(frozen=True)
@@ -255,6 +257,12 @@ class VMField(ComputedField):
     # -- reading ---------------------------------------------------------------------------------------------
 
     @property
+    def tints(self) -> np.ndarray | None:
+        """See ComputedField: of the blocks."""
+        tints = np.array([block.tint for block in self.blocks])
+        return None if (tints == 1).all() else tints
+
+    @property
     def resolution(self) -> tuple[int, int, int] | None:
         """Texels per axis of the one tensor; None where there are several blocks."""
         return self.tensors[0].resolution if len(self.blocks) == 1 else None
@@ -394,6 +402,7 @@ class VMField(ComputedField):
             ],
             "blocks": [
                 {"tensor": b.tensor, "object_to_field": b.object_to_field.tolist(), "name": b.name}
+                | ({} if b.tint == WHITE else {"tint": list(b.tint)})
                 for b in self.blocks
             ],
         }
@@ -463,7 +472,10 @@ def stored_block(i: int, stored: dict, tensors: int) -> Block:
     sizes = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if sizes[-1] <= 1e-6 * sizes[0]:
         raise ValueError(f"block {i}: object_to_field is singular")
-    return Block(stored["tensor"], matrix, str(stored["name"]))
+    tint = tuple(float(share) for share in stored.get("tint", WHITE))
+    if len(tint) != 3 or not all(0 <= share <= 1 for share in tint):
+        raise ValueError(f"block {i}: tint should be three numbers from 0 to 1, found {stored['tint']}")
+    return Block(stored["tensor"], matrix, str(stored["name"]), tint)
 
 
 def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:

@@ -116,7 +116,8 @@ def block_colour(field, b: int, points: torch.Tensor, dirs: torch.Tensor) -> tor
     unit, _ = object_point(field, b, points)
     turned, _ = object_direction(field, b, dirs)
     kind = field.params.dtype
-    return vm_colour(field.sections(field.blocks[b].tensor), unit.to(kind), turned.to(kind))
+    rgb = vm_colour(field.sections(field.blocks[b].tensor), unit.to(kind), turned.to(kind))
+    return rgb * torch.tensor(field.blocks[b].tint, dtype=kind, device=points.device)
 
 
 def vm_products(sections: dict[str, torch.Tensor], what: str, unit: torch.Tensor) -> torch.Tensor:
