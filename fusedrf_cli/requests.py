@@ -91,7 +91,7 @@ class FuseRequest(Learning):
     memory: int | None
     allow_outside: bool
     resume: bool
-    sources: str | None = None
+    sources: str | None
     """A folder in which sources of a fused bundle are looked for."""
 
 

@@ -31,6 +31,7 @@ def convert(request: ConvertRequest, progress) -> dict:
             keep_sources=False,
             allow_outside=False,
             resume=False,
+            sources=None,
             **words,
         ),  # fmt: skip
         progress,

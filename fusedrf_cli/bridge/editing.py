@@ -33,7 +33,7 @@ from fusedrf_cli.bridge.scene import (
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
-from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
+from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge, RegionJudge
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement, transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
@@ -47,6 +47,9 @@ from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import AddRequest, EditRequest, Learning
 
 REGION_SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+LOCAL_VIEW = 100
+"""Pixels a side of the views of an edit that changes nothing outside of its region: what it put in is shown
+as it was made, and asking the scene as composed takes most of such an edit's time."""
 SAME_BITS = "outside of it all numbers are the same bits"
 NEARLY = "outside of it the field was held to what it showed, and is not the same to the bit"
 
@@ -149,7 +152,12 @@ def add(request: AddRequest, progress) -> dict:
             raise InvalidInput(f"{request.fused}: {error}") from error
         progress.phase("measuring", None)
         origin = placement(fused.origin) @ placement(truth.origin)
-        judge = Judge(truth, cameras_of(request, fused, new, placed, truth, origin), origin)
+        size = LOCAL_VIEW if edited.local else REGION_SETTINGS.view_size
+        cameras = cameras_of(request, fused, new, placed, truth, origin, size)
+        if edited.local:  # what the region hides is all that can differ
+            judge = RegionJudge(truth, cameras, origin, placed_box(edited.box, fused.origin))
+        else:
+            judge = Judge(truth, cameras, origin)
         as_read = stored(edited.field, precision)
         if truth.origin.shape == (3,):
             as_read = as_read.moved(truth.origin)
@@ -242,9 +250,10 @@ def cameras_of(
     placed: list[Placed],
     truth: ComposedField,
     origin: np.ndarray,
+    side: int,
 ) -> list[Camera]:
-    """The views that an addition is judged by: of the whole, whose frame lies at `origin` (4, 4), and of what
-    was added."""
+    """The views, `side` pixels a side, that an addition is judged by: of the whole, whose frame lies at
+    `origin` (4, 4), and of what was added."""
     kept = fused.scene.cameras
     own = rig_of(new)
     rig = own and own.placed(request.object_to_world)
@@ -253,11 +262,10 @@ def cameras_of(
         for p in placed
         if not p.unbounded
     ]
-    size = REGION_SETTINGS.view_size, REGION_SETTINGS.view_size
     box = placed_box(truth.occupancy.subject, origin)
     seed = JUDGED_SEED, 3, request.seed
     whole = None if kept is None else read_rig(kept)
-    return [look.camera for look in looks(whole, box, subjects, REGION_SETTINGS.views, size, seed)]
+    return [look.camera for look in looks(whole, box, subjects, REGION_SETTINGS.views, (side, side), seed)]
 
 
 def placed_at(placed: Placed, field: StoredField, request: AddRequest) -> Placed:

@@ -39,8 +39,8 @@ def charted(shop, tmp_path_factory):
             patch.setattr(blocks, name, ("float16",))
         patch.setattr(blocks, "LADDER_RANKS", (None,))
 
-        def noted(request, progress):
-            report = fuse(request, progress)
+        def noted(request, progress, load):
+            report = fuse(request, progress, load)
             made.append(Path(request.output).read_bytes())
             return report
 
@@ -110,7 +110,7 @@ def test_what_cannot_be_charted(run, folder, monkeypatch):
 def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
     before = sorted(folder.iterdir())
 
-    def interrupted(request, progress):
+    def interrupted(request, progress, load):
         Path(request.output).touch()
         Path(f"{request.output}.checkpoint").touch()
         _interrupt(signal.SIGINT, None)
@@ -188,7 +188,7 @@ def climbing(
     paths = iter(map(Path, "abcdefghijklmnop"))
     run = module.Charting(benchmark, paths, CHARTED, heard)
 
-    def fuse(request, progress):
+    def fuse(request, progress, load):
         kind = request.kind
         clock[0] += seconds[kind] / 2  # the first of a kind is done twice
         if kind in refused:

@@ -169,6 +169,7 @@ def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
         "ranks": None,
         "sh_degree": None,
         "resume": False,
+        "sources": None,
         "allow_outside": False,
     }
 

@@ -3,6 +3,8 @@
 Each part of the work runs on one core and writes only what is its own, so that a sum has one order.
 """
 
+import math
+
 import numpy as np
 from numba import njit, prange
 
@@ -84,6 +86,19 @@ def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
         pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d)
+
+
+@task
+def mark_cells(corners, offsets, marked):
+    """Set the cells of marked (X, Y, Z) bool in which corners (N, 3) plus offsets (K, 3) lie, both counted in
+    cells; for those outside the cell on a face that is next to them."""
+    nx, ny, nz = marked.shape
+    for n in range(corners.shape[0]):
+        for k in range(offsets.shape[0]):
+            i = int(math.floor(corners[n, 0] + offsets[k, 0]))
+            j = int(math.floor(corners[n, 1] + offsets[k, 1]))
+            m = int(math.floor(corners[n, 2] + offsets[k, 2]))
+            marked[min(max(i, 0), nx - 1), min(max(j, 0), ny - 1), min(max(m, 0), nz - 1)] = True
 
 
 @loop

@@ -9,7 +9,11 @@ PSNR_CAP = 100.0  # dB, what two equal pictures are given
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     """Peak signal-to-noise ratio in dB of two arrays in [0, 1]: -10 log10 of the mean squared difference, at
     most PSNR_CAP."""
-    mse = float(np.mean((np.asarray(a, np.float64) - b) ** 2))
+    return psnr_of_mse(float(np.mean((np.asarray(a, np.float64) - b) ** 2)))
+
+
+def psnr_of_mse(mse: float) -> float:
+    """PSNR in dB of a mean squared difference."""
     return PSNR_CAP if mse == 0 else min(PSNR_CAP, float(-10 * np.log10(mse)))
 
 

@@ -243,7 +243,10 @@ class VMField(ComputedField):
         shift = np.eye(4)
         shift[:3, 3] = -np.asarray(origin)
         blocks = tuple(replace(b, object_to_field=shift @ b.object_to_field) for b in self.blocks)
-        return VMField.assembled(self.shape, self.tensors, blocks, self.params)
+        if self.space is not bounded:
+            return VMField.assembled(self.shape, self.tensors, blocks, self.params)
+        grid = replace(self.occupancy, aabb=self.occupancy.aabb - np.tile(origin, 2))
+        return VMField(self.shape, self.tensors, blocks, self.params, grid, self.owners)
 
     def stored(self, as_stored: Callable[[np.ndarray, str], np.ndarray]) -> "VMField":
         """See ComputedField; which block is asked where stays as it is, and need not be found again."""
