@@ -30,7 +30,8 @@ from formats.quantised import (
 )
 
 KEY = "fusedrf"
-VERSION = 2  # of fields with coded arrays; others have version 1
+PLAIN, CODED, VERSION = 1, 2, 3  # of fields without coded arrays, with them, and that need what is in NEEDS
+NEEDS = ("hashed",)  # what a field's metadata may say that a reader must know, to show it as it is
 MAX_HEADER = 1 << 20
 MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30
@@ -126,9 +127,11 @@ def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
     """
     where = f"field of kind {record.kind!r}"
     stored, coded = _stored_arrays(record.arrays, precision, where)
-    content = {"kind": record.kind, "metadata": record.metadata, "version": 1}
+    content = {"kind": record.kind, "metadata": record.metadata, "version": PLAIN}
     if coded:
-        content |= {"version": VERSION, "coded": coded}
+        content |= {"version": CODED, "coded": coded}
+    if "needs" in record.metadata:
+        content["version"] = VERSION
     try:
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
     except (TypeError, ValueError, RecursionError) as error:
@@ -278,14 +281,20 @@ def _content(entry: object, where: str) -> tuple[str, dict, dict]:
     version, kind, metadata = content["version"], content.get("kind"), content.get("metadata")
     if version > VERSION:
         raise NewerVersion(f"{where}: field version {version}, this fusedrf reads {VERSION}; update fusedrf")
-    coded = content.get("coded", {})
-    expected = {"kind", "metadata", "version"} | ({"coded"} if version == VERSION else set())
-    if version < 1 or set(content) != expected or not isinstance(metadata, dict):
+    coded, is_coded_too = content.get("coded", {}), version == CODED or version > CODED and "coded" in content
+    expected = {"kind", "metadata", "version"} | ({"coded"} if is_coded_too else set())
+    if version < PLAIN or set(content) != expected or not isinstance(metadata, dict):
         raise BadSchema(
             f"{where}: expected {', '.join(sorted(expected))} in version {version}, found {sorted(content)}"
         )
-    if not isinstance(coded, dict) or (version == VERSION and not coded):
+    if not isinstance(coded, dict) or (is_coded_too and not coded):
         raise BadSchema(f"{where}: 'coded' should be an object that names the coded arrays")
+    needs = metadata.get("needs", [])
+    if ("needs" in metadata) != (version == VERSION) or not isinstance(needs, list):
+        raise BadSchema(f"{where}: fields of version {VERSION}, and no others, have a list 'needs'")
+    unknown = [need for need in needs if need not in NEEDS]
+    if unknown:
+        raise NewerVersion(f"{where}: needs {unknown[0]!r}, which this fusedrf does not know; update fusedrf")
     if not isinstance(kind, str) or not KIND.fullmatch(kind):
         raise BadSchema(f"{where}: kind {kind!r} is not a lower-case word")
     if "aabb" in metadata:

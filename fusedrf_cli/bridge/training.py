@@ -26,12 +26,13 @@ from fusedrf_cli.bridge.running import (
     resumable,
 )
 from fusedrf_cli.bridge.scene import refuse_options, stored, unusable_kind, write_field
-from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes
+from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures
+from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Way
+from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Section, Way
 from fusedrf_cli.engine.spaces.unbounded import SIDE
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
@@ -44,6 +45,12 @@ PATIENCE, FOR_MORE, MOST_MORE = 120, 0.23, 1.5
 most: on two cores ten minutes with 1.45 times as many reach 0.5 dB more, two minutes less."""
 PLACE_PRECISION = "int8"
 """Of a place, where none is asked for: half the bytes of float16 for 0.0001 dB."""
+HASHED = Hashed((2 * SIDE / 512, 2 * SIDE / 1024), 1 << 20)
+"""What is finer than the texels of a place."""
+HASHED_FROM, HASHED_STEPS, HASHED_TEXELS = 180.0, 4000, 1.5
+"""Seconds and steps of learning from which a place has that detail, and times the texels of a box that it has
+then: after ten minutes 1 dB more than with any number of texels without it, in the first two minutes none."""
+HASHED_SHARE = 0.5  # of a file, that it may take
 LARGEST_PLACE = 95_000_000
 """Bytes of a place, stored as its kind is by default, where no size is asked for: voxels of all of space, as
 fine as planes are, would take a hundred times those of the planes."""
@@ -236,12 +243,10 @@ def fit_settings(
         poses=request.refine_poses,
         device=place,
     )
+    room = request.max_size and max(1, request.max_size - besides)
     if extent.unbounded:
-        patience = max(1.0, (request.time_budget or 0) / PATIENCE)
-        longest = round(settings.longest * min(MOST_MORE, patience**FOR_MORE))
-        settings = replace(settings, longest=texels_of_place(extent.box, longest))
+        settings = of_place(settings, kind, extent.box, room)
     if request.max_size or not extent.unbounded:
-        room = request.max_size and max(1, request.max_size - besides)
         longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     else:  # however its numbers are stored
         longest = fitting_longest(kind, extent.box, settings, LARGEST_PLACE, kind.faithful)
@@ -250,12 +255,27 @@ def fit_settings(
     return replace(settings, longest=longest)
 
 
-def texels_of_place(box: np.ndarray, longest: int) -> int:
-    """Texels on the longest side of a part (6,) of unbounded space: planes over it have as many as over all
-    of space, where a field in a box has so many."""
+def of_place(settings: FitSettings, kind: Kind, box: np.ndarray, room: int | None) -> FitSettings:
+    """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
+    learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
+    longer they learn."""
+    seconds = np.inf if settings.time_budget is None else settings.time_budget
+    takes = section_bytes(Section("detail", HASHED.shape), settings.way.precision)
+    fits = room is None or takes <= HASHED_SHARE * room
+    if kind.hashes and fits and seconds >= HASHED_FROM and settings.steps >= HASHED_STEPS:
+        longest = texels_of_place(box, HASHED_TEXELS * settings.longest)
+        return replace(settings, longest=longest, way=replace(settings.way, hashed=HASHED))
+    patience = max(1.0, (settings.time_budget or 0) / PATIENCE)
+    more = UNBOUNDED_TEXELS * min(MOST_MORE, patience**FOR_MORE)
+    return replace(settings, longest=texels_of_place(box, more * settings.longest))
+
+
+def texels_of_place(box: np.ndarray, longest: float) -> int:
+    """Texels on the longest side of a part (6,) of unbounded space: planes over it have as many as those over
+    all of space that have so many a side."""
     a, b, c = box[3:] - box[:3]
     shrunk = np.sqrt((a * b + b * c + c * a) / (3 * (2 * SIDE) ** 2)) / (max(a, b, c) / (2 * SIDE))
-    return round(UNBOUNDED_TEXELS * longest / shrunk)
+    return round(longest / shrunk)
 
 
 def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:

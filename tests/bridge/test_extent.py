@@ -133,6 +133,29 @@ def test_planes_over_a_part_of_space_have_as_many_texels_as_over_all_of_it():
     assert abs(texels(part) / texels(WHOLE) - 1) < 0.02
 
 
+def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch):
+    """And fewer texels then; no object does, nor a kind that has none."""
+    for name, steps in (("draft", 1500), ("normal", 4000), ("best", 24000)):
+        monkeypatch.setitem(training.QUALITY, name, FitSettings(longest=224, steps=steps))
+    ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
+    capture = photos(ring)
+
+    def settings(kind: str = "vm", bounded: bool = False, **words) -> FitSettings:
+        asked = replace(request(), precision="int8", unbounded=not bounded, **words)
+        extent = extent_of(asked, capture, False)
+        return fit_settings(asked, registry.kind(kind), capture, extent, "cpu")
+
+    plain = settings(time_budget=60.0)
+    assert plain.way.hashed is None
+    for words in ({"time_budget": 600.0}, {}, {"quality": "best"}, {"max_size": 30_000_000}):
+        found = settings(**words)
+        assert found.way.hashed is training.HASHED
+        assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
+    assert settings(quality="draft").way.hashed is None
+    assert settings(max_size=12_000_000).way.hashed is None
+    assert settings("cp").way.hashed is None and settings(bounded=True).way.hashed is None
+
+
 @pytest.mark.parametrize("precision", ("float16", "float32"))
 def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, monkeypatch):
     """Where no size is asked for, however the numbers are stored; and within one that is."""
@@ -146,6 +169,6 @@ def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(prec
         limited = replace(asked, max_size=size)
         return fit_settings(limited, registry.kind(kind), capture, extent, "cpu").longest
 
-    assert longest("vm") == longest("cp") == texels_of_place(extent.box, 256)
+    assert longest("vm") == longest("cp") == texels_of_place(extent.box, 2 * 256)
     assert 100 < longest("dense") < longest("vm")
     assert longest("vm", 10_000_000) < longest("vm")

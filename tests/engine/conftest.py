@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.analytic.export import SHAPE as THIRTY_TWO  # float32's: few shapes, since each is compiled
@@ -41,15 +42,17 @@ def random_vm(
     matrix=None,
     scale: float = 3.0,
     shift: float = -1.0,
+    hashed: Hashed | None = None,
 ) -> VMField:
     """A one-block VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so
     many cells."""
     generator = torch.Generator().manual_seed(seed)
-    params = torch.randn(shape.size(resolution), generator=generator, dtype=torch.float64) * 0.5
     grid = OccupancyGrid.full(aabb, cells or 1)
     if cells is not None:
         grid = OccupancyGrid(grid.aabb, np.random.default_rng(seed).random(grid.occupied.shape) < 0.3)
-    tensor = VMTensor(resolution, grid.aabb, scale, shift, None if cells is None else grid.occupied)
+    occupied = None if cells is None else grid.occupied
+    tensor = VMTensor(resolution, grid.aabb, scale, shift, occupied, hashed=hashed)
+    params = torch.randn(tensor.size(shape), generator=generator, dtype=torch.float64) * 0.5
     block = Block(0, np.eye(4) if matrix is None else matrix, "one")
     return VMField(shape, (tensor,), (block,), params.to(dtype), grid)
 

@@ -130,7 +130,16 @@ HOSTILE = {
     "two metadata keys": (raw({"__metadata__": {"fusedrf": "{}", "x": ""}}), errors.BadHeader),
     "content no object": (raw(field(content=[1])), errors.BadSchema),
     "version boolean": (raw(field(content=CONTENT | {"version": True})), errors.BadSchema),
-    "version newer": (raw(field(content=CONTENT | {"version": 3})), errors.NewerVersion),
+    "version newer": (raw(field(content=CONTENT | {"version": 4})), errors.NewerVersion),
+    "version 3 in need of nothing": (raw(field(content=CONTENT | {"version": 3})), errors.BadSchema),
+    "needs in version 1": (
+        raw(field(content=CONTENT | {"metadata": {"needs": ["hashed"]}})),
+        errors.BadSchema,
+    ),
+    "needs no list": (
+        raw(field(content=CONTENT | {"version": 3, "metadata": {"needs": "hashed"}})),
+        errors.BadSchema,
+    ),
     "version old": (raw(field(content=CONTENT | {"version": 0})), errors.BadSchema),
     "kind": (raw(field(content=CONTENT | {"kind": "../x"})), errors.BadSchema),
     "key unknown": (raw(field(content=CONTENT | {"x": 1})), errors.BadSchema),

@@ -61,7 +61,7 @@ class Adam:
         self.field.settle()
 
     def sound(self) -> bool:
-        """Whether the gradients are finite, judged by those of the slower groups, some thousand numbers that
+        """Whether the gradients are finite, judged by those of the slowest groups, some thousand numbers that
         all samples share, or by all where a field has none; those of which a step looks at few lines only are
         left out.
 
@@ -70,7 +70,8 @@ class Adam:
         left to the guard's look at all numbers.
         """
         groups = [group for group in self.field.groups() if group.lines is None]
-        looked_at = [group for group in groups if group.rate < 1] or groups
+        slowest = min((group.rate for group in groups), default=1.0)
+        looked_at = [group for group in groups if group.rate == slowest]
         parts = [row[group.low : group.high] for group in looked_at for row in self.gradient]
         return all(bool(torch.dot(part, part).isfinite()) for part in parts)
 

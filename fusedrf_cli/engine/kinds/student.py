@@ -14,6 +14,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.rendering.cameras import Camera
 
@@ -37,6 +38,8 @@ class Way:
     """Density and colour components per mode at most; None: as the kind or the sources have them."""
     sh_degree: int | None = None
     """SH degree at most; None: as the kind or the sources have it."""
+    hashed: Hashed | None = None
+    """What is finer than the grid, of kinds that can have it."""
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,7 @@ def test_a_tensor_stays_while_one_copy_does():
 
 
 def at_most(numbers):
-    return lambda shape, tensors: sum(shape.size(t.resolution) for t in tensors) <= numbers
+    return lambda shape, tensors: sum(t.size(shape) for t in tensors) <= numbers
 
 
 def test_shrunk_fits_and_resembles():

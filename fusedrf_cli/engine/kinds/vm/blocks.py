@@ -22,6 +22,7 @@ from fusedrf_cli.engine.kinds.vm.trimming import smaller_shape, truncated
 MAX_BLOCKS = 255
 FINER = 1 / 8  # of the finest voxel: with a stretched block a common voxel may lie under it
 TOLERANCE = 1 + 1e-4  # to which a common voxel is found
+COARSER = 1.5
 
 
 def blocks_of(
@@ -62,12 +63,12 @@ def blocks_of(
         raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, this scene has {len(blocks)}")
     if fits is not None:
         tensors = fitting_tensors(tensors, blocks, lambda tried: fits(shape, tried))
-    params = torch.empty(sum(shape.size(t.resolution) for t in tensors), dtype=dtype)
+    params = torch.empty(sum(t.size(shape) for t in tensors), dtype=dtype)
     at = 0
     for key, streamed in fields.items():  # one after the other: not all of them need to be in memory
         field = reshaped(opened(streamed).to("cpu"), whole)
         for t in range(len(field.tensors)):
-            numbers = truncated(tensor_field(field, t, tensors[first[key] + t].resolution), shape).params
+            numbers = truncated(tensor_field(field, t, tensors[first[key] + t]), shape).params
             params[at : at + len(numbers)] = numbers
             at += len(numbers)
     return VMField.assembled(shape, *shared(shape, tensors, blocks, params))
@@ -78,8 +79,8 @@ def shared(
 ) -> tuple[tuple[VMTensor, ...], tuple[Block, ...], torch.Tensor]:
     """Tensors, blocks and numbers, of tensors that are equal to the bit the first alone: one more of an
     object that is there already costs a placement."""
-    ends = np.cumsum([shape.size(tensor.resolution) for tensor in tensors])
-    parts = [params[end - shape.size(t.resolution) : end] for end, t in zip(ends, tensors, strict=True)]
+    ends = np.cumsum([tensor.size(shape) for tensor in tensors])
+    parts = [params[end - t.size(shape) : end] for end, t in zip(ends, tensors, strict=True)]
     first, kept = [], []
     for i, tensor in enumerate(tensors):
         same = (j for j in kept if equal(tensor, tensors[j]) and torch.equal(parts[i], parts[j]))
@@ -94,7 +95,7 @@ def shared(
 def equal(one: VMTensor, other: VMTensor) -> bool:
     """Whether two tensors lie alike: all but their numbers."""
     grids = one.occupancy, other.occupancy
-    facts = [(t.resolution, t.scale, t.shift, t.space) for t in (one, other)]
+    facts = [(t.resolution, t.scale, t.shift, t.space, t.hashed) for t in (one, other)]
     return (
         facts[0] == facts[1]
         and np.array_equal(one.aabb, other.aabb)
@@ -120,7 +121,7 @@ def without(field: VMField, names: set[str]) -> VMField | None:
     if not kept:
         return None
     used = sorted({b.tensor for b in kept})
-    sizes = [field.shape.size(field.tensors[t].resolution) for t in used]
+    sizes = [field.tensors[t].size(field.shape) for t in used]
     params = torch.cat(
         [field.params[field.layout[t, 0] : field.layout[t, 0] + n] for t, n in zip(used, sizes, strict=True)]
     )
@@ -139,7 +140,7 @@ def reshaped(field: VMField, shape: VMShape) -> VMField:
     """The same field with more components and coefficients, the new ones zero."""
     if field.shape == shape:
         return field
-    params = torch.zeros(sum(shape.size(t.resolution) for t in field.tensors), dtype=field.params.dtype)
+    params = torch.zeros(sum(t.size(shape) for t in field.tensors), dtype=field.params.dtype)
     wide = VMField(shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
     for t in range(len(field.tensors)):
         target = wide.sections(t)
@@ -158,7 +159,8 @@ def fitting_tensors(
     tensors: list[VMTensor], blocks: list[Block], fits: Callable[[list[VMTensor]], bool]
 ) -> list[VMTensor]:
     """The tensors at their own resolution, or at that of the finest common voxel (in the blocks' frame) at
-    which they fit, where that is less.
+    which they fit, where that is less. What is left of a tensor whose voxels are more than COARSER times its
+    own is without its detail, which would be most of its numbers.
     """
     if fits(tensors):
         return tensors
@@ -172,7 +174,8 @@ def fitting_tensors(
         for tensor, scale in zip(tensors, stretch, strict=True):
             wanted = np.ceil((tensor.aabb[3:] - tensor.aabb[:3]) * scale / voxel).astype(int) + 1
             texels = tuple(int(n) for n in np.clip(wanted, 2, tensor.resolution))
-            found.append(replace(tensor, resolution=texels))
+            coarser = max(tensor.resolution) > COARSER * max(texels)
+            found.append(replace(tensor, resolution=texels, hashed=None if coarser else tensor.hashed))
         return found
 
     fine = FINER * min(tensors[b.tensor].voxel_size.min() * s[-1] for b, s in zip(blocks, sizes, strict=True))
@@ -183,12 +186,13 @@ def fitting_tensors(
     return at_voxel(coarse)
 
 
-def tensor_field(field: VMField, t: int, resolution: tuple[int, int, int] | None = None) -> VMField:
-    """One tensor of a field as a field of its own, in its object's frame, resampled where another resolution
-    is given."""
+def tensor_field(field: VMField, t: int, wanted: VMTensor | None = None) -> VMField:
+    """One tensor of a field as a field of its own, in its object's frame, resampled and without its detail
+    where the one that is wanted in its place is."""
     tensor: VMTensor = field.tensors[t]
+    kept = tensor if wanted is None or wanted.hashed else replace(tensor, hashed=None)  # the last section
     start = int(field.layout[t, 0])
-    params = field.params[start : start + field.shape.size(tensor.resolution)].clone()
-    alone = VMField(field.shape, (tensor,), (Block(0, np.eye(4), ""),), params, tensor.occupancy)
-    same = resolution is None or resolution == tensor.resolution
-    return alone if same else alone.resampled(tensor.aabb, resolution)
+    params = field.params[start : start + kept.size(field.shape)].clone()
+    alone = VMField(field.shape, (kept,), (Block(0, np.eye(4), ""),), params, tensor.occupancy)
+    same = wanted is None or wanted.resolution == tensor.resolution
+    return alone if same else alone.resampled(tensor.aabb, wanted.resolution)

@@ -7,18 +7,25 @@ Notation for the whole file.
                  12 colour basis
     modes        mode 0 = plane xy, line z; mode 1 = plane xz, line y; mode 2 = plane yz, line x (TensoRF, eq.
                  5)
-    place        the block that a point belongs to; it is also the frame
+    rows         of a tensor's hashed detail (engine/fields/hashed.py), section 13, level after level: added
+                 to the density and to the logits of the colour where planes and lines say that there may be
+                 matter
+    place        the block that a point belongs to, which is also the frame, and NEAR more where its tensor's
+                 detail was asked
 DENSITY_RANK, COLOUR_RANK and COEFFICIENTS are the field's sizes. A ray's `scratch` holds, one after the
 other, the directional basis (BASIS), its gradient (D_BASIS), the gradient of a sample's colour features
 (D_FEATURES), the spherical harmonics (SH), and room for one mode (TILE) and one number (ONE).
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import literally
 
+from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, RUN, WIDTH
 from fusedrf_cli.engine.kernels.parts import (
+    accumulate,
     add_scaled,
     bilinear,
     cell_of,
@@ -30,17 +37,18 @@ from fusedrf_cli.engine.kernels.parts import (
     store_8,
     texel,
 )  # fmt: skip
-from fusedrf_cli.engine.kernels.prefetch import prefetch_plane
+from fusedrf_cli.engine.kernels.prefetch import prefetch, prefetch_plane
 
 NO_BLOCK = 255  # in the ownership grids: nobody is asked here
 EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
+NEAR = 256  # in a place, beside the block
 
 
 class Arrays(NamedTuple):
     """Everything a kernel reads of a VM field, as arrays (T tensors, B blocks)."""
 
     params: object  # (P,) float, all sections of all tensors
-    layout: object  # (T, 13) int64, offsets into params
+    layout: object  # (T, 14) int64, offsets into params
     resolution: object  # (T, 3) int64, texels per axis
     to_unit: object  # (B, 3, 4) float, field frame -> unit cube of the block's tensor
     to_object: object  # (B, 3, 3) float, field directions -> object directions, unnormalised
@@ -52,6 +60,9 @@ class Arrays(NamedTuple):
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
     crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
     part: object  # (B, 6) float64, lower corner and 1 / sides of a tensor's box in its own unbounded space
+    rows: object  # (T, 2) int64, rows of a level of a tensor's hashed detail, and how many levels it has
+    lattice: object  # (T, levels, 4) float, sides of a tensor's box in spacings of a level, and 1 / spacing
+    corner: object  # (T, 3) float, lower corner of a tensor's box
 
 
 def sizes(field) -> dict[str, int]:
@@ -65,7 +76,7 @@ def sizes(field) -> dict[str, int]:
     return {
         "DENSITY_RANK": rank, "COLOUR_RANK": colour_rank, "COEFFICIENTS": field.shape.coefficients,
         **dict(zip(held, starts, strict=False)), "SCRATCH": starts[-1], "KEPT": 3 * colour_rank,
-        "CROSSING": int(any(field.crossings)),
+        "CROSSING": int(any(field.crossings)), "DETAIL": int(any(t.hashed for t in field.tensors)),
     }  # fmt: skip
 
 
@@ -245,6 +256,90 @@ def scatter_colour(field, grads, t, u, v, w, scratch):
     mode_scatter(rank, p, grads, off[8], off[11], ny, nz, nx, v, w, u, D_FEATURES + 2 * rank, 1, scratch)
 
 
+# -- a tensor's hashed detail --------------------------------------------------------------------------------
+
+
+def row_at(field, t, level, i, j, k):
+    """Offset in params of the row of a vertex. RUN vertices along z share a hash and lie side by side."""
+    rows = np.uint64(field.rows[t, 0])
+    h = (
+        (np.uint64(i) * np.uint64(2654435761))
+        ^ (np.uint64(j) * np.uint64(805459861))
+        ^ (np.uint64(k // RUN) * np.uint64(3674653429))
+    )
+    run = (h ^ (h >> np.uint64(15))) & (rows // np.uint64(RUN) - np.uint64(1))
+    row = np.uint64(level) * rows + run * np.uint64(RUN) + np.uint64(k % RUN)
+    return np.uint64(field.layout[t, 13]) + row * np.uint64(WIDTH)
+
+
+def vertex_below(field, t, level, u, v, w):
+    """The vertex (i, j, k) of a level below a unit point on all axes, and how far (a, b, c) in [0, 1) of a
+    spacing the point is from it."""
+    h = field.lattice[t, level]
+    x = u * h[0] + field.corner[t, 0] * h[3]
+    y = v * h[1] + field.corner[t, 1] * h[3]
+    z = w * h[2] + field.corner[t, 2] * h[3]
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
+    real = field.params.dtype.type
+    return (int(i), int(j), int(k)), (real(x - i), real(y - j), real(z - k))
+
+
+def detail_density(field, t, u, v, w):
+    """What the rows of tensor t add to the density at a unit point, before activation: trilinear between
+    vertices, summed over the levels."""
+    p = field.params
+    one, total = p.dtype.type(1), p.dtype.type(0)
+    for level in range(field.rows[t, 1]):
+        (i, j, k), (a, b, c) = vertex_below(field, t, level, u, v, w)
+        for di in range(2):
+            for dj in range(2):
+                weight = (a if di == 1 else one - a) * (b if dj == 1 else one - b)
+                low = row_at(field, t, level, i + di, j + dj, k)
+                high = row_at(field, t, level, i + di, j + dj, k + 1)
+                total += weight * (p[low] + c * (p[high] - p[low]))
+    return total
+
+
+def detail_colour(field, t, u, v, w):
+    """As `detail_density`, what they add to the logits of red, green and blue."""
+    p = field.params
+    one = p.dtype.type(1)
+    red, green, blue = p.dtype.type(0), p.dtype.type(0), p.dtype.type(0)
+    for level in range(field.rows[t, 1]):
+        (i, j, k), (a, b, c) = vertex_below(field, t, level, u, v, w)
+        for di in range(2):
+            for dj in range(2):
+                for dk in range(2):
+                    weight = (a if di == 1 else one - a) * (b if dj == 1 else one - b)
+                    weight *= c if dk == 1 else one - c
+                    row = row_at(field, t, level, i + di, j + dj, k + dk)
+                    red += weight * p[row + np.uint64(1)]
+                    green += weight * p[row + np.uint64(2)]
+                    blue += weight * p[row + np.uint64(3)]
+    return red, green, blue
+
+
+def scatter_detail(field, grad, t, u, v, w, d_feature, rgb, d_rgb):
+    """Adjoint of `detail_density` and, where d_rgb is not 0, of `detail_colour` behind its sigmoid."""
+    real = field.params.dtype.type
+    one = real(1)
+    d_red = real(d_rgb[0] * rgb[0] * (1 - rgb[0]))
+    d_green = real(d_rgb[1] * rgb[1] * (1 - rgb[1]))
+    d_blue = real(d_rgb[2] * rgb[2] * (1 - rgb[2]))
+    for level in range(field.rows[t, 1]):
+        (i, j, k), (a, b, c) = vertex_below(field, t, level, u, v, w)
+        for di in range(2):
+            for dj in range(2):
+                for dk in range(2):
+                    weight = (a if di == 1 else one - a) * (b if dj == 1 else one - b)
+                    weight *= c if dk == 1 else one - c
+                    row = row_at(field, t, level, i + di, j + dj, k + dk)
+                    accumulate(grad, row, weight * d_feature)
+                    accumulate(grad, row + np.uint64(1), weight * d_red)
+                    accumulate(grad, row + np.uint64(2), weight * d_green)
+                    accumulate(grad, row + np.uint64(3), weight * d_blue)
+
+
 # -- blocks -------------------------------------------------------------------------------------------------
 
 
@@ -261,16 +356,20 @@ def object_direction(field, b, d):
 
 
 def block_density(field, b, p, stretch):
-    """(σ in the field frame, pre-activation) of block b at a field point; (0, 0) outside its tensor."""
+    """(σ in the field frame, pre-activation, place) of block b at a field point; (0, 0, b) outside its
+    tensor."""
     u, v, w, inside = unit_point(field, b, p)
     if not inside:
-        return 0.0, 0.0
+        return 0.0, 0.0, b
     t = field.tensor[b]
     if field.first.shape[0] != 0 and not matter_at(field, t, u, v, w):
-        return 0.0, 0.0
-    f = density_feature(field, t, u, v, w)
+        return 0.0, 0.0, b
+    f, place = density_feature(field, t, u, v, w), b
+    if DETAIL != 0 and field.rows[t, 1] != 0 and f + field.activation[t, 1] > EMPTY_FROM:
+        f += detail_density(field, t, u, v, w)
+        place = b + NEAR
     slope = crossed(field, b, p, stretch) * field.activation[t, 0]
-    return float(slope * softplus(f + field.activation[t, 1])), float(f)
+    return float(slope * softplus(f + field.activation[t, 1])), float(f), place
 
 
 def crossed(field, b, p, stretch):
@@ -291,11 +390,11 @@ def matter_at(field, t, u, v, w):
 
 
 def density(field, grid, k, p, d, scratch):
-    """(σ, pre-activation, 1, block) of the densest block at a point; ties go to the lower block (DESIGN)."""
+    """(σ, pre-activation, 1, place) of the densest block at a point; ties go to the lower block (DESIGN)."""
     if field.first.shape[0] == 0:
         stretch = object_direction(field, 0, d)[3]
-        sigma, f = block_density(field, 0, p, stretch)
-        return sigma, f, 1, 0
+        sigma, f, place = block_density(field, 0, p, stretch)
+        return sigma, f, 1, place
     nx, ny, nz = field.first.shape
     i = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
     j = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
@@ -303,13 +402,13 @@ def density(field, grid, k, p, d, scratch):
     b = int(field.first[i, j, m])
     if b == NO_BLOCK:
         return 0.0, 0.0, 1, 0
-    sigma, f = block_density(field, b, p, object_direction(field, b, d)[3])
+    sigma, f, place = block_density(field, b, p, object_direction(field, b, d)[3])
     other = int(field.second[i, j, m])
     if other != NO_BLOCK:
-        sigma2, f2 = block_density(field, other, p, object_direction(field, other, d)[3])
+        sigma2, f2, place2 = block_density(field, other, p, object_direction(field, other, d)[3])
         if sigma2 > sigma:
-            return sigma2, f2, 1, other
-    return sigma, f, 1, b
+            return sigma2, f2, 1, place2
+    return sigma, f, 1, place
 
 
 def unstretched(field, grid, frame, p, scratch):
@@ -319,11 +418,11 @@ def unstretched(field, grid, frame, p, scratch):
 
 def frame_of(place):
     """The block."""
-    return place
+    return place % NEAR
 
 
 def keep(place):
-    """The block."""
+    """The place itself."""
     return place
 
 
@@ -370,30 +469,36 @@ def dot_row(scratch, row, features, base):
 
 
 def colour(field, place, p, d, scratch, memory, at):
-    """rgb_c = sigmoid(<basis_c, features>); the features are kept."""
-    u, v, w, _ = unit_point(field, place, p)
-    colour_features(field, field.tensor[place], u, v, w, memory, at)
-    return (
-        float(sigmoid(dot_row(scratch, 0, memory, at))),
-        float(sigmoid(dot_row(scratch, 1, memory, at))),
-        float(sigmoid(dot_row(scratch, 2, memory, at))),
-    )
+    """rgb_c = sigmoid(<basis_c, features> + detail_c); the features are kept."""
+    u, v, w, _ = unit_point(field, frame_of(place), p)
+    t = field.tensor[frame_of(place)]
+    colour_features(field, t, u, v, w, memory, at)
+    r, g = dot_row(scratch, 0, memory, at), dot_row(scratch, 1, memory, at)
+    b = dot_row(scratch, 2, memory, at)
+    if DETAIL != 0 and place >= NEAR:
+        red, green, blue = detail_colour(field, t, u, v, w)
+        r, g, b = r + red, g + green, b + blue
+    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
 def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """Adjoint of `density` and, where shaded, of `colour`; the basis gathers its gradient until `end`."""
     if shaded:
-        u, v, w, _ = unit_point(field, place, p)
+        u, v, w, _ = unit_point(field, frame_of(place), p)
         d_logits(rgb, d_rgb, scratch, memory, at)
-        scatter_colour(field, grad, field.tensor[place], u, v, w, scratch)
+        scatter_colour(field, grad, field.tensor[frame_of(place)], u, v, w, scratch)
     density_backward(field, place, p, d, pre, d_sigma, scratch, grad)
+    if DETAIL != 0 and place >= NEAR:
+        u, v, w, _ = unit_point(field, frame_of(place), p)
+        scatter_detail(field, grad, field.tensor[frame_of(place)], u, v, w, scratch[ONE], rgb, d_rgb)
 
 
 def density_backward(field, place, p, d, pre, d_sigma, scratch, grad):
-    """Adjoint of `density`."""
-    u, v, w, _ = unit_point(field, place, p)
-    t = field.tensor[place]
-    slope = crossed(field, place, p, object_direction(field, place, d)[3]) * field.activation[t, 0]
+    """Adjoint of `density` but for the detail; leaves in scratch[ONE] what is sent to the feature."""
+    b = frame_of(place)
+    u, v, w, _ = unit_point(field, b, p)
+    t = field.tensor[b]
+    slope = crossed(field, b, p, object_direction(field, b, d)[3]) * field.activation[t, 0]
     scratch[ONE] = d_sigma * slope * sigmoid(pre + field.activation[t, 1])
     if scratch[ONE] != 0:
         scatter_density(field, grad, t, u, v, w, scratch)
@@ -421,9 +526,11 @@ def d_logits(rgb, d_rgb, scratch, memory, at):
 
 
 def ahead_density(field, array, held, p):
-    """The density planes. A random point misses the cache a dozen times; asked for early, the misses
-    overlap."""
+    """The density planes, and the rows of the detail if that was asked last. A random point misses the cache
+    a dozen times; asked for early, the misses overlap."""
     ahead_planes(DENSITY_RANK, 0, field, array, held, p)
+    if DETAIL != 0 and held >= NEAR:
+        ahead_detail(field, array, held, p)
 
 
 def ahead_colour(field, array, held, p):
@@ -431,10 +538,21 @@ def ahead_colour(field, array, held, p):
     ahead_planes(COLOUR_RANK, 6, field, array, held, p)
 
 
+def ahead_detail(field, array, held, p):
+    """Ask for the rows on the four edges along z of the lattice's cells around a field point."""
+    u, v, w, _ = unit_point(field, frame_of(held), p)
+    t = field.tensor[frame_of(held)]
+    for level in range(field.rows[t, 1]):
+        (i, j, k), _ = vertex_below(field, t, level, u, v, w)
+        for di in range(2):
+            for dj in range(2):
+                prefetch(array, row_at(field, t, level, i + di, j + dj, k))
+
+
 def ahead_planes(rank, first, field, array, block, p):
     """Ask for what of the three planes from section `first` on a query of a block at a field point reads."""
-    u, v, w, _ = unit_point(field, block, p)
-    t = field.tensor[block]
+    u, v, w, _ = unit_point(field, frame_of(block), p)
+    t = field.tensor[frame_of(block)]
     nx, ny, nz = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
     off = field.layout[t]
     prefetch_plane(rank, array, off[first], nx, ny, u, v)

@@ -40,6 +40,11 @@ def shape_of(way: Way) -> VMShape:
     return VMShape(*ranks, SHAPE.sh_degree if way.sh_degree is None else way.sh_degree)
 
 
+def tensor_of(way: Way, resolution: tuple[int, int, int]) -> VMTensor:
+    """A tensor in a way, somewhere."""
+    return VMTensor(resolution, np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]), 1.0, hashed=way.hashed)
+
+
 class VMKind(Kind):
     """TensoRF's vector-matrix decomposition."""
 
@@ -48,18 +53,20 @@ class VMKind(Kind):
     field = VMField
     takes = frozenset({"ranks", "sh_degree"})
     takes_over = True
+    hashes = True
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
-        """Planes, lines and the colour basis of one tensor."""
-        return [Section(*named) for named in shape_of(way).sections(resolution)]
+        """Planes, lines, the colour basis and the detail of one tensor."""
+        return [Section(*named) for named in tensor_of(way, resolution).sections(shape_of(way))]
 
     def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
         """Floats of one tensor, each section on a cache line."""
-        return shape_of(way).size(resolution)
+        return tensor_of(way, resolution).size(shape_of(way))
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> VMField:
         """One tensor."""
-        return VMField.create(plan.box, plan.resolution, shape_of(plan.way), generator, name)
+        shape = shape_of(plan.way)
+        return VMField.create(plan.box, plan.resolution, shape, generator, name, plan.way.hashed)
 
     def suits(self, scene: ComposedField) -> Suits:
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
@@ -86,13 +93,14 @@ class VMKind(Kind):
         return widened(moved, plan, scene, generator)
 
     def describe(self, field: VMField) -> dict:
-        """Texels per axis of its tensor, or of each of its tensors, ranks and SH degree."""
+        """Texels per axis of its tensor, or of each of its tensors, ranks, SH degree, and rows of detail."""
         texels = [list(t.resolution) for t in field.tensors]
+        rows = sum(t.hashed.shape[0] for t in field.tensors if t.hashed)
         return {
             "resolution": texels if len(field.blocks) > 1 else texels[0],
             "ranks": [field.shape.density_rank, field.shape.colour_rank],
             "sh_degree": field.shape.sh_degree,
-        }
+        } | ({"detail_rows": rows} if rows else {})
 
     def counts(self, field: VMField) -> dict[str, int]:
         """Its blocks."""
@@ -152,7 +160,7 @@ def place_of(background: Placed, plan: Plan, scene: ComposedField) -> VMField | 
     box, shape = field.tensors[0].aabb, common_shape([field.shape, shape_of(plan.way)])
     beyond = np.maximum(box[:3] - cells.centres(), cells.centres() - box[3:]).max()
     as_placed = np.allclose(background.object_to_world, np.eye(4), atol=1e-9)
-    if not as_placed or beyond > cells.cell.max() or shape.size(field.resolution) > plan.numbers:
+    if not as_placed or beyond > cells.cell.max() or field.tensors[0].size(shape) > plan.numbers:
         return None
     if plan.way.ranks is not None and shape != shape_of(plan.way):
         return None
@@ -162,8 +170,8 @@ def place_of(background: Placed, plan: Plan, scene: ComposedField) -> VMField | 
 
 
 def upright(background: Placed) -> VMField | None:
-    """A placed field of one tensor in the frame it is placed in, or None where its axes are others: a
-    decomposition follows them, so it must only be moved and scaled alike along all of them."""
+    """A placed field of one tensor in the frame it is placed in, without its detail, or None where its axes
+    are others: a decomposition follows them, so it must only be moved and scaled alike along all of them."""
     linear = background.object_to_world[:3, :3]
     scale = linear[0, 0]
     field = background.field
@@ -174,9 +182,8 @@ def upright(background: Placed) -> VMField | None:
     source = field.tensors[0]
     box = source.aabb * scale + np.tile(background.object_to_world[:3, 3], 2)
     tensor = VMTensor(source.resolution, box, source.scale / scale, source.shift)
-    return VMField(
-        field.shape, (tensor,), (Block(0, np.eye(4), "fused"),), field.params, OccupancyGrid.full(box)
-    )
+    params = field.params[: tensor.size(field.shape)]  # the detail is the last section
+    return VMField(field.shape, (tensor,), (Block(0, np.eye(4), "fused"),), params, OccupancyGrid.full(box))
 
 
 def widened(field: VMField, plan: Plan, scene: ComposedField, generator: torch.Generator) -> VMField:
@@ -192,7 +199,7 @@ def add_noise(student: VMField, generator: torch.Generator) -> None:
     """Small noise on every factor: where plane and line are both 0 the gradient of their product is too, for
     ever."""
     for name, section in student.sections(0).items():
-        if name != "colour_basis":
+        if name not in ("colour_basis", "detail"):
             section += NOISE * torch.randn(section.shape, generator=generator)
 
 
@@ -201,7 +208,7 @@ def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Con
     sections, bits = [], 0
     for tensor in tensors:
         bits += tensor.occupancy.occupied.size + 8  # each is packed by itself
-        for name, section in shape.sections(tensor.resolution):
+        for name, section in tensor.sections(shape):
             used = read_texels(tensor, int(name[-1])) if "_plane_" in name else None
             sections.append(Section(name, section, used))
     return Contents(sections, bits, len(tensors), blocks)

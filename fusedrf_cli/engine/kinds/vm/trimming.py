@@ -65,12 +65,13 @@ def truncated(field: VMField, shape: VMShape) -> VMField:
         return field
     if field.params.device.type != "cpu":
         return truncated(field.to("cpu"), shape).to(field.params.device)
-    params = torch.zeros(sum(least.size(t.resolution) for t in field.tensors), dtype=field.params.dtype)
+    params = torch.zeros(sum(t.size(least) for t in field.tensors), dtype=field.params.dtype)
     small = VMField(least, field.tensors, field.blocks, params, field.occupancy, field.owners)
     for t in range(len(field.tensors)):
         old = {name: view.double().numpy() for name, view in field.sections(t).items()}
         old["colour_basis"] = old["colour_basis"][:, : least.coefficients]
-        for name, values in truncated_tensor(old, least).items():
+        kept = {name: old[name] for name in old.keys() & {"detail"}}
+        for name, values in (truncated_tensor(old, least) | kept).items():
             small.sections(t)[name].copy_(torch.from_numpy(values))
     return small
 

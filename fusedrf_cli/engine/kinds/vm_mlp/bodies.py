@@ -48,7 +48,7 @@ def sizes(field) -> dict[str, int]:
         "FEATURES": features, "WIDTH": width,
         "INPUTS": inputs, **dict(zip(held, starts, strict=False)), "SCRATCH": starts[-1],
         "INPUT": kept[0], "FIRST": kept[1], "SECOND": kept[2], "LAST": kept[3], "KEPT": kept[4],
-        "LEARN_FROM": 1 / 64, "SHADING_COST": 8, "CROSSING": int(any(field.factors.crossings)),
+        "LEARN_FROM": 1 / 64, "SHADING_COST": 8, "CROSSING": int(any(field.factors.crossings)), "DETAIL": 0,
     }  # fmt: skip
 
 

@@ -35,6 +35,8 @@ class VMMLPField(ComputedField):
         """weights are the network's by name: `<layer>.weight` (out, in) and `<layer>.bias` (out,)."""
         if len(factors.blocks) != 1:
             raise ValueError(f"a vm-mlp field has one block, found {len(factors.blocks)}")
+        if factors.tensors[0].hashed:
+            raise ValueError("a vm-mlp field has no hashed detail")
         self.width, self.factors = len(weights["0.bias"]), factors
         packed = factors.params.new_zeros(self.network_size)
         self._place(torch.cat([factors.params, packed]))

@@ -1,0 +1,170 @@
+"""The hashed detail of a vm tensor: its rows by the rule of SPEC.md, what keeps it and what leaves it out,
+and that it holds what is finer than the texels."""
+
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from formats.errors import FormatError
+from formats.records import FieldRecord, decode_field, encode_field
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, reshaped, tensor_field, without
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.reference import hashed_row
+from fusedrf_cli.engine.kinds.vm.trimming import truncated
+from tests.analytic.rays import affine
+
+from ..conftest import BOX, THIRTY_TWO, points_in, random_vm, unit
+from .cases import coarse_ownership, random_detail  # noqa: F401  (a fixture)
+
+
+def asked(field, count=300):
+    points = points_in(field.aabb, count)
+    dirs = unit(np.random.default_rng(0).normal(size=(count, 3)))
+    return field.query(torch.from_numpy(points), torch.from_numpy(dirs))
+
+
+def same(one, other):
+    for a, b in zip(asked(one), asked(other), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12)
+
+
+def by_the_rule(rows: int, i: int, j: int, k: int) -> int:
+    """SPEC.md, section 2.4, in integers without an end."""
+    q = (2654435761 * i ^ 805459861 * j ^ 3674653429 * (k // 4)) % 2**64
+    return 4 * ((q ^ (q >> 15)) % (rows // 4)) + k % 4
+
+
+@pytest.mark.parametrize("rows", [4, 64, 1 << 20, 1 << 24])
+def test_rows_are_those_of_the_rule(rows):
+    vertices = np.random.default_rng(0).integers(-3000, 3000, (500, 3))
+    found = hashed_row(Hashed((1.0,), rows), torch.from_numpy(vertices))
+    assert found.tolist() == [by_the_rule(rows, *(int(n) for n in vertex)) for vertex in vertices]
+
+
+def test_an_answer_by_the_rule_alone():
+    """One level, a tensor that says the same everywhere: σ and colour from eight rows, in a slow loop."""
+    field = random_vm(hashed=Hashed((0.25,), 16), scale=2.0, shift=1.0)
+    sections = field.sections(0)
+    for name, view in sections.items():
+        if name != "detail":
+            view.zero_()
+    rows, (x, y, z) = sections["detail"].numpy(), (0.3, -0.55, 0.1)
+    total = np.zeros(4)
+    for corner in product((0, 1), repeat=3):
+        place = np.array([x, y, z]) / 0.25
+        below = np.floor(place).astype(int)
+        share = np.abs(1 - np.array(corner) - (place - below))
+        total += share.prod() * rows[by_the_rule(16, *(int(n) for n in below + corner))]
+    sigma, rgb = field.query(torch.tensor([[x, y, z]]).double(), torch.tensor([[0.0, 0.0, 1.0]]).double())
+    assert sigma.item() == pytest.approx(2.0 * np.log1p(np.exp(total[0] + 1.0)), rel=1e-6)
+    np.testing.assert_allclose(rgb[0], 1 / (1 + np.exp(-total[1:])), rtol=1e-6)
+
+
+@pytest.mark.parametrize("kwargs", [{"spacings": ()}, {"spacings": (0.0,)}, {"rows": 48}, {"rows": 2}])
+def test_what_the_kernels_cannot_serve_is_refused(kwargs):
+    with pytest.raises(ValueError, match="spacings|rows"):
+        Hashed(**({"spacings": (0.1,), "rows": 64} | kwargs))
+
+
+def test_it_stays_where_texels_change():
+    """Texels at which planes and lines are exact again: the old ones are among the new."""
+    field = random_detail(resolution=(5, 8, 7))
+    same(field, field.resampled(field.tensors[0].aabb, (9, 15, 13)).with_occupancy(field.occupancy))
+    wider = VMShape(16, 24, 3)
+    same(field, reshaped(field, wider))
+    same(field, truncated(reshaped(field, wider), field.shape))
+
+
+def test_blocks_keep_it_and_share_it():
+    rough, plain = random_detail(), random_vm(cells=4, seed=3)
+    nodes = [("a", rough, 0.0), ("b", plain, 3.0), ("c", rough, 6.0)]
+    field = blocks_of([Placed(name, f, affine(1.0, (x, 0, 0))) for name, f, x in nodes])
+    assert [t.hashed for t in field.tensors] == [rough.tensors[0].hashed, None]
+    same(tensor_field(field, 0), rough)
+    same(tensor_field(field, 1), plain)
+    left = without(field, {"b", "c"})
+    same(tensor_field(left, 0), rough)
+
+
+def test_far_fewer_texels_leave_it_out():
+    """Under a limit that its rows alone pass; what is left answers as the tensor without them."""
+    hashed = Hashed((0.05,), 1 << 12)
+    field = random_vm(resolution=(20, 20, 20), hashed=hashed)
+    limit = 4 * hashed.rows
+    placed = [Placed("a", field, np.eye(4))]
+    small = blocks_of(placed, lambda shape, tensors: sum(t.size(shape) for t in tensors) < limit)
+    assert small.tensors[0].hashed is None and len(small.params) < limit
+    bare = tensor_field(field, 0, small.tensors[0])
+    same(small, bare.with_occupancy(small.occupancy))
+
+
+def test_it_comes_back_from_a_file_that_older_readers_refuse():
+    field = random_detail().with_params(random_detail().params.float())
+    data = encode_field(FieldRecord("vm", *field.state()), "float32")
+    back = decode_field(data, "somewhere")
+    found = VMField.from_state(back.arrays, back.metadata)
+    assert found.tensors[0].hashed == field.tensors[0].hashed
+    same(field, found)
+    assert b'\\"version\\":3' in data
+    plain = encode_field(FieldRecord("vm", *random_vm().state()), "float32")
+    assert b'\\"version\\":1' in plain
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"rows": 1 << 25}, "rows"),
+        ({"rows": 63}, "power of two"),
+        ({"rows": 32}, "should have shape"),
+        ({"spacings": [0.1]}, "should have shape"),
+        ({"spacings": [0.1] * 9}, "levels"),
+        ({"spacings": [-1.0, 0.1]}, "above 0"),
+    ],
+)
+def test_hostile_metadata_is_refused(change, said):
+    arrays, metadata = random_detail().state()
+    metadata = json.loads(json.dumps(metadata))
+    metadata["tensors"][0]["hashed"] |= change
+    with pytest.raises(ValueError, match=said):
+        VMField.from_state(arrays, metadata)
+
+
+def test_numbers_that_multiply_past_all_bounds_are_refused():
+    arrays, metadata = random_detail().state()
+    arrays["tensor_0.detail"] = np.full_like(arrays["tensor_0.detail"], 3e38)
+    with pytest.raises(ValueError, match="multiply to"):
+        VMField.from_state(arrays, metadata)
+
+
+def test_a_need_that_is_not_known_is_refused():
+    record = FieldRecord("vm", {}, {"needs": ["magic"]})
+    with pytest.raises(FormatError, match="magic.*update fusedrf"):
+        decode_field(encode_field(record), "somewhere")
+
+
+def test_it_learns_what_is_finer_than_texels(monkeypatch):
+    """A checkerboard of a quarter of a texel: planes and lines can only say its mean, a detail the rest."""
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.DETAIL_FROM", 2)
+    points = torch.from_numpy(points_in(BOX, 4000))
+    wanted = ((points / 0.2).floor().sum(1) % 2)[:, None].expand(-1, 3).float()
+    dirs = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(len(points), 3)
+    left = {}
+    for hashed in (None, Hashed((0.2 / 3,), 1 << 16)):
+        field = VMField.create(BOX, (3, 3, 3), THIRTY_TWO, torch.Generator().manual_seed(0), "", hashed)
+        for name, view in field.sections(0).items():
+            if name.startswith("density"):
+                view.fill_(1.0)  # matter, where a detail is asked for
+        optimiser = Adam.of(field)
+        for _ in range(60):
+            error = field.query(points, dirs)[1] - wanted
+            field.query_backward(points, dirs, torch.zeros(len(points)), error, optimiser.grads)
+            optimiser.step(0.17)
+        left[hashed] = error.square().mean().item()
+    plain, detailed = left.values()
+    assert plain > 0.2 and detailed < 0.05
