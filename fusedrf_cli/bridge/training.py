@@ -47,9 +47,10 @@ PLACE_PRECISION = "int8"
 """Of a place, where none is asked for: half the bytes of float16 for 0.0001 dB."""
 HASHED = Hashed((2 * SIDE / 512, 2 * SIDE / 1024), 1 << 20)
 """What is finer than the texels of a place."""
-HASHED_FROM, HASHED_STEPS, HASHED_TEXELS = 180.0, 4000, 1.5
+HASHED_FROM, HASHED_STEPS, HASHED_TEXELS = 360.0, 4000, 1.5
 """Seconds and steps of learning from which a place has that detail, and times the texels of a box that it has
-then: after ten minutes 1 dB more than with any number of texels without it, in the first two minutes none."""
+then. After ten minutes a park shows up to 1 dB more than with any number of texels without it; in the first
+five minutes a step with it gains less than the two that could be made without it in its time."""
 HASHED_SHARE = 0.5  # of a file, that it may take
 LARGEST_PLACE = 95_000_000
 """Bytes of a place, stored as its kind is by default, where no size is asked for: voxels of all of space, as
