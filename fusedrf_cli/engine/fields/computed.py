@@ -11,12 +11,15 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.fields.insides import insides_of, with_insides
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.loops import (
     RAYS_PER_TASK,
     Answers,
     Cells,
+    Insides,
+    Looked,
     Points,
     Rays,
     Sent,
@@ -25,6 +28,9 @@ from fusedrf_cli.engine.kernels.loops import (
 )
 from fusedrf_cli.engine.kernels.specialise import TINTED
 from fusedrf_cli.engine.kernels.tinting import with_tints
+from fusedrf_cli.engine.spaces import bounded
+
+CELLS_PER_TASK = 256
 
 
 class Batch(NamedTuple):
@@ -155,7 +161,7 @@ class ComputedField:
 
     def _afresh(self, *names: str) -> "ComputedField":
         """Itself without what was computed from things that have changed."""
-        for name in names:
+        for name in (*names, "pictured"):
             self.__dict__.pop(name, None)
         return self
 
@@ -202,6 +208,23 @@ class ComputedField:
         """The occupancy's arrays."""
         return self.device_loops.on_device(self.occupancy.arrays)
 
+    def for_pictures(self) -> "ComputedField":
+        """The field under a grid that knows the insides of its cells (engine/fields/insides.py), whose
+        pictures are the same in fewer samples. Looking into the cells takes about as long as a picture, and
+        is done again when the numbers have changed."""
+        if self.__dict__.get("pictured", (None, None))[0] != self.params._version:
+            self.__dict__["pictured"] = self.params._version, self.looked_into()
+        return self.__dict__["pictured"][1]
+
+    def looked_into(self) -> "ComputedField":
+        """See `for_pictures`. A place, which is full of haze, is taken as it is."""
+        insides = insides_of(self) if self.space is bounded else None
+        if insides is None:
+            return self
+        other = copy(self)._afresh()
+        other.__dict__["grid"] = self.device_loops.on_device(with_insides(self.occupancy, insides))
+        return other
+
     @property
     def real(self) -> np.dtype:
         """The type of the field's numbers."""
@@ -247,6 +270,16 @@ class ComputedField:
         out = np.zeros(len(cells), self.real)
         self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(cells), out)
         return out
+
+    def look_into(self, cells: np.ndarray, offsets: np.ndarray, least: np.ndarray) -> Insides:
+        """For each of `least` (L,), σ per length of the space's coordinates, and of `cells` (N, 3) of the
+        field's grid: the bits (L, N) of the parts in which σ is more at one of the offsets (64 K, 3) in a
+        cell, K in each part, and the mean (L, N) of what is less."""
+        asked = Looked(np.ascontiguousarray(cells, np.int64), exact(offsets), exact(least))
+        shape = len(least), len(cells)
+        found = Insides(np.zeros(shape, np.uint64), np.zeros(shape, self.real))
+        self.loops.each("look_into_cell", self.arrays, self.grid, asked, len(cells), found, CELLS_PER_TASK)
+        return found
 
     def weights_in_cells(
         self, rays_o: np.ndarray, rays_d: np.ndarray, jitter: np.ndarray, near: float, step: float

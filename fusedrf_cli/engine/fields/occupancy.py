@@ -16,7 +16,8 @@ from fusedrf_cli.engine.spaces import bounded, unbounded
 DEFAULT_CELLS = 128
 SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
 THINNEST = 12  # texels across a flat box
-MAX_STRIDE = 255
+MAX_STRIDE = 1 << 15
+PARTS = 8  # of a step: what strides are whole numbers of
 ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
 NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
@@ -37,7 +38,7 @@ class OccupancyGrid:
     space: ModuleType = bounded
     """That its cells, and the numbers of the field that owns it, lie in (engine/spaces)."""
     stride: np.ndarray | None = None
-    """(X, Y, Z) uint8: samples in a cell may lie so many times `unit` apart; None: a step everywhere."""
+    """(X, Y, Z) uint16: samples in a cell may lie so many PARTS of `unit` apart; None: a step everywhere."""
     unit: float = 0.0
     """The distance of samples where they lie closest; 0: it follows from the field's voxel."""
     looked_at: np.ndarray | None = None
@@ -72,8 +73,10 @@ class OccupancyGrid:
     @cached_property
     def arrays(self) -> GridArrays:
         """The arrays kernels read."""
-        stride = np.zeros((0, 0, 0), np.uint8) if self.stride is None else self.stride
-        return GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell, stride, self.unit)
+        found = GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
+        if self.stride is None:
+            return found
+        return found._replace(stride=self.stride, unit=self.unit / PARTS, parts=PARTS)
 
     def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
         """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where
@@ -141,14 +144,15 @@ class OccupancyGrid:
         return found
 
     def strides_at(self, points: np.ndarray) -> np.ndarray:
-        """(N,) strides at points (N, 3) of the space's coordinates, the smallest near them."""
+        """(N,) how many times `unit` samples may lie apart at points (N, 3) of the space's coordinates, the
+        least near them."""
         if self.stride is None:
             return np.ones(len(points))
         from scipy.ndimage import minimum_filter
 
         least = minimum_filter(np.where(self.occupied, self.stride, MAX_STRIDE), 3)
         index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
-        return least[tuple(np.clip(index, 0, np.array(least.shape) - 1).T)]
+        return least[tuple(np.clip(index, 0, np.array(least.shape) - 1).T)] / PARTS
 
     def centres(self) -> np.ndarray:
         """(M, 3) centres of the occupied cells."""
@@ -224,11 +228,11 @@ class Pace:
         if not known.any():
             return grid
         spacing = self.stepping_over_nothing()
-        most, least = spacing[known].max(), spacing[known].min()
-        unit = float(max(least, most / MAX_STRIDE))
-        strides = np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
-        stride = np.clip(strides, 1, MAX_STRIDE).astype(np.uint8)
-        return replace(grid, stride=None if stride.max() == 1 else stride, unit=unit)
+        least = spacing[known].min()
+        unit = float(least)
+        strides = PARTS * np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
+        stride = np.clip(strides, PARTS, MAX_STRIDE).astype(np.uint16)
+        return replace(grid, stride=None if stride.max() == PARTS else stride, unit=unit)
 
 
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:

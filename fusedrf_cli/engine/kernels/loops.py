@@ -37,8 +37,10 @@ from fusedrf_cli.engine.kernels.parts import accumulate, along, cell_of, compare
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
 LEARN_FROM = COLOUR_FROM  # the same in training
-LENT_FROM = COLOUR_FROM  # the same in pictures, behind a ray's first colour
+LENT_FROM = 2e-3  # the same in pictures, behind a ray's first colour
+REST_FROM = 0.0  # transmittance from which, in pictures that may stop early, all that is left shows a sample
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
+DIAGONAL = (3**-0.5,) * 3
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 SAMPLES_AHEAD = 2
 POINTS_PER_TASK = 2048
@@ -112,6 +114,21 @@ class Cells(NamedTuple):
     cells: object  # (N, 3) int64
     offsets: object  # (K, 3) in [0, 1], where in a cell
     frame: object  # int, one of the field's frames
+
+
+class Looked(NamedTuple):
+    """What `look_into_cell` looks at."""
+
+    cells: object  # (N, 3) int64, of the field's grid
+    offsets: object  # (64 K, 3) in [0, 1], K in each part of a cell, parts in the order of `parts.inner_exit`
+    least: object  # (L,) σ per length of the space's coordinates that count as matter
+
+
+class Insides(NamedTuple):
+    """What `look_into_cell` fills, for each σ that may count as matter."""
+
+    bits: object  # (L, N) uint64, the parts of a cell that have as much somewhere
+    rest: object  # (L, N) the mean σ in a cell of all that is less
 
 
 class Kept(NamedTuple):
@@ -201,6 +218,17 @@ def between(k, many):
     return 2 * k + many - 1
 
 
+def lattice_step(grid, step):
+    """The spacing of the lattice on which samples a step apart sit: parts of a step where cells have strides,
+    so that these need not be whole steps."""
+    return step / grid.parts
+
+
+def shifted(grid, jitter):
+    """Where a ray's lattice begins, in its steps, for samples `jitter` of a step into each step."""
+    return jitter * grid.parts - 0.5 * (grid.parts - 1)
+
+
 def optical_length(course, p, u, many, steps, step):
     """How much of a ray, by the unit that σ at p is of, a sample at u stands for: `many` steps around it, and
     as many again behind it for each of `steps` beyond the first."""
@@ -272,13 +300,15 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
     A sample sits in the middle of the steps it stands for. `waiting` is the weight of samples too light to be
     shaded: the next one that is lends them its colour, at the end of the ray the last one.
     """
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
     r, g, b = 0.0, 0.0, 0.0
     trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
-    current = -1
-    for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
+    current, begun = -1, entered(o, d, rays.reach[i, 0])
+    for _ in range(PIECES):
+        if trans <= rays.early_stop:
+            break
+        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, rays.reach[i, 1])
         u0 = u0 + 0.5 * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
@@ -288,6 +318,8 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
             )
             if steps > 0:
                 weight = trans * opacity
+                if rays.early_stop > 0.0 and trans - weight <= REST_FROM:
+                    weight = trans
                 trans -= weight
                 depth += weight * distance(course, u)
                 waiting += weight
@@ -310,14 +342,16 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
 
 def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     """Ray i of a batch: forward as in `render_ray`, compare, and back along the ray into grad (P,)."""
-    o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
+    o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), lattice_step(grid, batch.step)
     red, green, blue = 0.0, 0.0, 0.0
     trans, waiting = 1.0, 0.0
     count, shaded, current = 0, 0, -1
-    last = kept.memory.shape[0] - KEPT
+    last, begun = kept.memory.shape[0] - KEPT, entered(o, d, batch.near)
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, batch.near, math.inf)
-        u0 = u0 + batch.jitter[i] * step
+        if trans <= batch.early_stop:
+            break
+        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, math.inf)
+        u0 = u0 + shifted(grid, batch.jitter[i]) * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > batch.early_stop and count < kept.k.shape[0]:
             u = u0 + 0.5 * between(k, many) * step
@@ -368,7 +402,7 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
     `behind` gathers the share of all that lies behind a sample.
     """
     count, shaded, current = taken
-    o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
+    o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), lattice_step(grid, batch.step)
     last = kept.memory.shape[0] - KEPT
     overwritten = shaded * KEPT > kept.memory.shape[0]
     behind = trans * d_trans
@@ -385,7 +419,7 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         if PIECES > 1 and kept.piece[q] != number:
             number = kept.piece[q]
             origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
-        u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
+        u = u0 + shifted(grid, batch.jitter[i]) * step + 0.5 * kept.k[q] * step
         p = along(origin, way, u)
         place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
         rgb, d_rgb = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -422,12 +456,12 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
 def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
     """Raises most[c] to the weight of each sample of ray i that lies in cell c of the grid, counted z first,
     where it is more. Samples lie `rays.jitter[i]` of a step into each step."""
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
     nx, ny, nz = grid.skip.shape
     trans = 1.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, math.inf)
-        u0 = u0 + rays.jitter[i] * step
+        u0 = u0 + shifted(grid, rays.jitter[i]) * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
             u = u0 + 0.5 * between(k, many) * step
@@ -449,12 +483,12 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
 def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
     """Adds to votes[2 c], or, where `rays.inside[i]`, to votes[2 c + 1] the weight of each sample of ray i in
     cell c of a box of cells, counted z first. Samples lie `rays.jitter[i]` of a step into each step."""
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
     nx, ny, nz = rays.counts[0], rays.counts[1], rays.counts[2]
     trans = 1.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, math.inf)
-        u0 = u0 + rays.jitter[i] * step
+        u0 = u0 + shifted(grid, rays.jitter[i]) * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
             u = u0 + 0.5 * between(k, many) * step
@@ -482,6 +516,21 @@ def peak_of_cell(field, grid, cells, i, scratch, memory, out):
         z = cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2]
         best = max(best, unstretched(field, grid, cells.frame, (x, y, z), scratch))
     out[i] = best
+
+
+def look_into_cell(field, grid, looked, i, scratch, memory, out):
+    """Asks at places in the parts of cell i, along a diagonal of the frame where that matters."""
+    count = looked.offsets.shape[0]
+    for q in range(count):
+        x = grid.lo[0] + (looked.cells[i, 0] + looked.offsets[q, 0]) * grid.cell[0]
+        y = grid.lo[1] + (looked.cells[i, 1] + looked.offsets[q, 1]) * grid.cell[1]
+        z = grid.lo[2] + (looked.cells[i, 2] + looked.offsets[q, 2]) * grid.cell[2]
+        sigma = density(field, grid, 0, (x, y, z), DIAGONAL, scratch)[0]
+        for level in range(looked.least.shape[0]):
+            if sigma > looked.least[level]:
+                out.bits[level, i] |= np.uint64(1) << np.uint64(64 * q // count)
+            else:
+                out.rest[level, i] += sigma / count
 
 
 # -- the CPU's loops over items ------------------------------------------------------------------------------
@@ -530,10 +579,10 @@ def sweep(field, grid, batch, count, most, grads, loss):
 def march_ray(grid, rays_o, rays_d, reach, jitter, step, i, start, ts, spans, counts):
     """The next samples of ray i within reach[i], from start[i] (piece and number of the sample) on: distances
     ts[i], what lengths of the ray they stand for, spans[i], as many as counts[i]."""
-    o, d = triple(rays_o, i), triple(rays_d, i)
+    o, d, step = triple(rays_o, i), triple(rays_d, i), lattice_step(grid, step)
     for number in range(start[i] % PIECES, PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, reach[i, 0], reach[i, 1])
-        u0 = u0 + jitter[i] * step
+        u0 = u0 + shifted(grid, jitter[i]) * step
         first = start[i] // PIECES if number == start[i] % PIECES else 0
         k, many = next_sample(grid, origin, way, u0, u1, step, first)
         while k >= 0 and counts[i] < ts.shape[1]:

@@ -20,14 +20,18 @@ FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must no
 
 class GridArrays(NamedTuple):
     """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
-    one. Samples in a cell may be `stride` times `unit` apart; without strides they are a step apart."""
+    one. Samples in a cell may be `stride` times `unit` apart, `parts` of which are a step; without strides
+    they are a step apart."""
 
     skip: object  # (X, Y, Z) uint8
     lo: object  # (3,) float, lower corner
     hi: object  # (3,) float, upper corner
     cell: object  # (3,) float, size of a cell
-    stride: object = np.zeros((0, 0, 0), np.uint8)  # (X, Y, Z) uint8, at least 1 in occupied cells
+    stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least `parts` in occupied cells
     unit: object = 0.0  # float
+    parts: object = 1  # int, of a step: the lattice that samples sit on is so much finer
+    inner: object = np.zeros((0, 0, 0), np.uint64)  # (X, Y, Z) uint64, see `inner_exit`; empty: not known
+    coarse: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, the stride in other parts; 0: skipped
 
 
 @body
@@ -75,9 +79,43 @@ def exit_distance(p, d, lo, cell, i, s):
 
 
 @body
+def in_matter(bits, x, y, z):
+    """Whether a point in a cell, in parts from its lower corner, lies in one of those that `bits` tell of."""
+    i, j, m = min(max(int(x), 0), 3), min(max(int(y), 0), 3), min(max(int(z), 0), 3)
+    bit = 32 * (i >> 1) + 16 * (j >> 1) + 8 * (m >> 1) + 4 * (i & 1) + 2 * (j & 1) + (m & 1)
+    return bits >> np.uint64(bit) & np.uint64(1) != np.uint64(0)
+
+
+@body
+def inner_exit(bits, p, d, lo, cell, i, j, m):
+    """Where a ray at p in cell (i, j, m) leaves what is empty of that cell's inside around p, or -1 where p
+    lies in matter. `bits` tell which of the 4 x 4 x 4 parts of a cell hold matter, those of an eighth of the
+    cell in a row: bit 32 a + 16 b + 8 c + 4 e + 2 f + g is part (2 a + e, 2 b + f, 2 c + g)."""
+    x = min(max(int((p[0] - lo[0]) / cell[0] * 4) - 4 * i, 0), 3)
+    y = min(max(int((p[1] - lo[1]) / cell[1] * 4) - 4 * j, 0), 3)
+    z = min(max(int((p[2] - lo[2]) / cell[2] * 4) - 4 * m, 0), 3)
+    eighth = bits >> np.uint64(32 * (x >> 1) + 16 * (y >> 1) + 8 * (z >> 1)) & np.uint64(255)
+    if eighth == np.uint64(0):
+        x, y, z, n = 2 * i + (x >> 1), 2 * j + (y >> 1), 2 * m + (z >> 1), 2
+    elif eighth >> np.uint64(4 * (x & 1) + 2 * (y & 1) + (z & 1)) & np.uint64(1) == np.uint64(0):
+        x, y, z, n = 4 * i + x, 4 * j + y, 4 * m + z, 4
+    else:
+        return -1.0
+    away = min(
+        exit_distance(p[0], d[0], lo[0], cell[0] / n, x, 1),
+        min(
+            exit_distance(p[1], d[1], lo[1], cell[1] / n, y, 1),
+            exit_distance(p[2], d[2], lo[2], cell[2] / n, z, 1),
+        ),
+    )
+    return max(away, 0.0)
+
+
+@body
 def next_sample(grid, origin, way, u0, u1, step, k):
-    """(first k' >= k at which u0 + k' step of a straight line lies in an occupied cell, for how many steps
-    from there on one sample may stand), or (-1, 1) when there is no such k' before u1.
+    """(first k' >= k at which u0 + k' step of a straight line lies in an occupied cell, and in matter where
+    the grid knows the insides of cells, for how many steps from there on one sample may stand), or (-1, 1)
+    when there is no such k' before u1.
 
     Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
     the same.
@@ -94,19 +132,27 @@ def next_sample(grid, origin, way, u0, u1, step, k):
         j = cell_of(y, lo[1], cell[1], ny)
         m = cell_of(z, lo[2], cell[2], nz)
         s = int(skip[np.uint64(i), np.uint64(j), np.uint64(m)])
-        if s == 0:
-            many = 1
-            if grid.stride.shape[0] != 0:
-                many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
-                if grid.unit != step:
-                    many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
-                while many > 1 and u + (many - 0.5) * step >= u1:
-                    many -= 1
-            return k, many
-        away = min(
-            exit_distance(x, dx, lo[0], cell[0], i, s),
-            min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
-        )
+        here, bare, bits, away = s == 0, False, np.uint64(0), 0.0
+        if s != 0:
+            away = min(
+                exit_distance(x, dx, lo[0], cell[0], i, s),
+                min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
+            )
+        elif grid.inner.shape[0] != 0:
+            bits = grid.inner[np.uint64(i), np.uint64(j), np.uint64(m)]
+            away = inner_exit(bits, (x, y, z), way, lo, cell, i, j, m)
+            bare = away >= 0.0
+            here = not bare or grid.coarse[np.uint64(i), np.uint64(j), np.uint64(m)] != 0
+        if here:
+            if grid.stride.shape[0] == 0:
+                return k, 1
+            many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
+            if bare:
+                many = int(grid.coarse[np.uint64(i), np.uint64(j), np.uint64(m)])
+            if grid.unit != step:
+                many = int(many * grid.unit / step + FACE_TOLERANCE)
+            end = min(u1, u + away) if bare and bits != np.uint64(0) else u1
+            return k, max(1, min(many, int(math.ceil((end - u) / step + 0.5)) - 1))
         k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
 
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from fusedrf_cli.engine.kernels.parts import LINE, adam_line, pinhole_ray, sum_of_rows
+from fusedrf_cli.engine.kernels.parts import LINE, adam_line, body, pinhole_ray, sum_of_rows
 
 FLAGS = dict(fastmath=True, error_model="numpy", cache=True)
 loop = njit(**FLAGS, parallel=True)
@@ -107,3 +107,90 @@ def sums_of_rows(values, base, width, start, source, weight, target, keep):
     gains, the weighted sum of the rows source[start[i]:start[i + 1]], none of which is a target."""
     for i in prange(target.shape[0]):
         sum_of_rows(values, base, width, start, source, weight, target, i, keep)
+
+
+# Of the bits of a cell's parts (`parts.inner_exit`) those in the lower half of an eighth, and of the cell.
+LOWER = tuple(
+    np.uint64(sum(1 << q for q in range(64) if not q & (low | high)))
+    for low, high in ((4, 0), (2, 0), (1, 0), (32, 0), (16, 0), (8, 0))
+)
+
+
+@task
+def grow_insides_task(bits, axis, x, grown):
+    """`grow_insides` for the cells (x, ...)."""
+    nx, ny, nz = bits.shape
+    one, zero = np.uint64(4 >> axis), np.uint64(0)  # how much later the bit of the next part is, in an eighth
+    eight = np.uint64(32 >> axis)
+    low, near = LOWER[axis], LOWER[3 + axis]
+    for y in range(ny):
+        for z in range(nz):
+            own = bits[x, y, z]
+            i, j, m = x + (axis == 0), y + (axis == 1), z + (axis == 2)
+            after = bits[i, j, m] if i < nx and j < ny and m < nz else zero
+            i, j, m = x - (axis == 0), y - (axis == 1), z - (axis == 2)
+            before = bits[i, j, m] if i >= 0 and j >= 0 and m >= 0 else zero
+            up = ((own & low) << one) | ((own & ~low & near) << (eight - one))
+            up |= (before & ~low & ~near) >> (eight + one)
+            down = ((own & ~low) >> one) | ((own & low & ~near) >> (eight - one))
+            down |= (after & low & near) << (eight + one)
+            grown[x, y, z] = own | up | down
+
+
+@loop
+def grow_insides(bits, axis, grown):
+    """Of bits (X, Y, Z) uint64, the parts of cells, those that are set, and those beside them along an axis,
+    into `grown`."""
+    for x in prange(bits.shape[0]):
+        grow_insides_task(bits, axis, x, grown)
+
+
+@task
+def mark_parts(bits, level, to_parts, steps, marked):
+    """Sets in marked (X, Y, Z) the bits of the parts in which matter of a grid (bits (A, B, C)) lies: of its
+    parts, of the eighths of cells that have any for level 1, of the cells for level 0. to_parts (3, 4) takes
+    its coordinates, in cells, to those of the marked grid, in parts; steps (K, 3) are the places in each that
+    are looked at."""
+    m = 1 << level
+    for x in range(bits.shape[0]):
+        for y in range(bits.shape[1]):
+            for z in range(bits.shape[2]):
+                for q in range(m * m * m if bits[x, y, z] != np.uint64(0) else 0):
+                    a, b, c = q // (m * m), q // m % m, q % m
+                    if holds_any(bits[x, y, z], level, a, b, c):
+                        for k in range(steps.shape[0]):
+                            u, v = x + (a + steps[k, 0]) / m, y + (b + steps[k, 1]) / m
+                            mark_part(to_parts, u, v, z + (c + steps[k, 2]) / m, marked)
+
+
+@body
+def holds_any(bits, level, a, b, c):
+    """Whether part, eighth or cell (a, b, c) of a cell, by the level, holds matter."""
+    if level == 2:
+        return bits >> bit_of(a, b, c) & np.uint64(1) != np.uint64(0)
+    if level == 1:
+        return bits >> bit_of(2 * a, 2 * b, 2 * c) & np.uint64(255) != np.uint64(0)
+    return True
+
+
+@body
+def mark_part(to_parts, u, v, w, marked):
+    """Sets the bit of the part in which a point lies."""
+    nx, ny, nz = marked.shape
+    i, j = part_at(to_parts, 0, u, v, w, nx), part_at(to_parts, 1, u, v, w, ny)
+    n = part_at(to_parts, 2, u, v, w, nz)
+    marked[i // 4, j // 4, n // 4] |= np.uint64(1) << bit_of(i % 4, j % 4, n % 4)
+
+
+@body
+def bit_of(a, b, c):
+    """The bit of part (a, b, c) of a cell (`parts.inner_exit`)."""
+    far = 32 * (a >> 1) + 16 * (b >> 1) + 8 * (c >> 1)
+    return np.uint64(far + 4 * (a & 1) + 2 * (b & 1) + (c & 1))
+
+
+@body
+def part_at(to_parts, axis, u, v, w, cells):
+    """Which of the parts of so many cells along an axis a point lies in, the nearest where it lies beside."""
+    at = to_parts[axis, 0] * u + to_parts[axis, 1] * v + to_parts[axis, 2] * w + to_parts[axis, 3]
+    return min(max(int(math.floor(at)), 0), 4 * cells - 1)

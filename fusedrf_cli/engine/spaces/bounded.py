@@ -29,12 +29,22 @@ def rate(q):
     return 1.0
 
 
-def piece(number, grid, o, d, near, far):
-    """(origin, direction, u0, u1, course) of a piece of the ray o + t d, t in [near, far): positions are
-    origin + u direction for u in [u0, u1), empty where u1 <= u0. `course` is what `distance` and `span`
-    need."""
+def entered(o, d, t):
+    """Where the first piece of the ray o + t d begins that is followed from t on."""
+    return t
+
+
+def stretch(begun, grid, o, d, far):
+    """(origin, direction, u0, u1, course) of the piece of a ray, in t < far, that begins there, and where the
+    next one begins: positions are origin + u direction for u in [u0, u1), empty where u1 <= u0. `course` is
+    what `distance` and `span` need."""
     t0, t1 = hit_box(o, d, grid.lo, grid.hi)
-    return o, d, max(t0, near), min(t1, far), 0.0
+    return (o, d, max(t0, begun), min(t1, far), 0.0), far
+
+
+def piece(number, grid, o, d, near, far):
+    """The piece of that number of a ray that is followed from `near` to `far`, see `stretch`."""
+    return stretch(entered(o, d, near), grid, o, d, far)[0]
 
 
 def distance(course, u):

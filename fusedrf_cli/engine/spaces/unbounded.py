@@ -25,7 +25,7 @@ ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
 SIDE = 2.0  # coordinates lie between -SIDE and SIDE
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
-LEARN_FROM, LENT_FROM = 3e-3, 1e-2
+LEARN_FROM, LENT_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
 WHOLE = np.array([-SIDE] * 3 + [SIDE] * 3)
 SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
 
@@ -109,19 +109,20 @@ def leaving(region, o, d, t):
     return max(end, t), after
 
 
-def piece(number, grid, o, d, near, far):
+def entered(o, d, t):
+    """See bounded.py; the region at t comes with it, or NOWHERE behind the last piece."""
+    return t, region_at(o, d, t)
+
+
+def stretch(begun, grid, o, d, far):
     """See bounded.py; `course` is (t0, t1 - t0, n0, n1, 1 / L)."""
-    t0 = near
-    region = region_at(o, d, t0)
-    t1, after = leaving(region, o, d, t0)
-    for _ in range(number):
-        if after != NOWHERE:
-            t0, region = t1, after
-            t1, after = leaving(region, o, d, t0)
-        else:
-            region = NOWHERE
-    if t0 >= far:
+    t0, region = begun
+    t1, after = t0, NOWHERE
+    if region != NOWHERE and t0 < far:
+        t1, after = leaving(region, o, d, t0)
+    else:
         region = NOWHERE
+    following = t1, after
     t1 = min(t1, far)
     p0 = (o[0] + t0 * d[0], o[1] + t0 * d[1], o[2] + t0 * d[2])
     p1 = (o[0] + t1 * d[0], o[1] + t1 * d[1], o[2] + t1 * d[2])
@@ -132,10 +133,19 @@ def piece(number, grid, o, d, near, far):
     x, y, z = q1[0] - q0[0], q1[1] - q0[1], q1[2] - q0[2]
     length = math.sqrt(x * x + y * y + z * z)
     if region == NOWHERE or length <= 0.0 or not n0 < FAR:
-        return q0, d, 1.0, 0.0, (t0, 0.0, 1.0, 1.0, 1.0)
+        return (q0, d, 1.0, 0.0, (t0, 0.0, 1.0, 1.0, 1.0)), following
     way = x / length, y / length, z / length
     u0, u1 = hit_box(q0, way, grid.lo, grid.hi)
-    return q0, way, u0, min(u1, length), (t0, t1 - t0, n0, n1, 1.0 / length)
+    return (q0, way, u0, min(u1, length), (t0, t1 - t0, n0, n1, 1.0 / length)), following
+
+
+def piece(number, grid, o, d, near, far):
+    """See bounded.py."""
+    begun = entered(o, d, near)
+    for _ in range(number):
+        if begun[1] != NOWHERE:
+            begun = leaving(begun[1], o, d, begun[0])
+    return stretch(begun, grid, o, d, far)[0]
 
 
 def in_region(region, p, n):

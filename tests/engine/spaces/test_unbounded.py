@@ -12,7 +12,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.visibility import shown_cells
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import PARTS, OccupancyGrid
 from fusedrf_cli.engine.kernels.specialise import specialised
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
@@ -380,7 +380,7 @@ def test_only_what_is_near_an_object_is_sampled_as_finely_as_it(monkeypatch):
     scene = ComposedField([Placed("place", place, np.eye(4)), small])
     joined, grid = blocks_of(scene.placed), scene.occupancy
     assert np.array_equal(joined.occupancy.stride, grid.stride) and joined.occupancy.unit == grid.unit
-    assert grid.stride.max() > 5 and (grid.stride[grid.occupied] == 1).mean() < 0.1
+    assert grid.stride.max() > 5 * PARTS and (grid.stride[grid.occupied] == PARTS).mean() < 0.1
     rng = np.random.default_rng(0)
     d = rng.normal(size=(8, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -415,7 +415,7 @@ def test_no_sample_of_a_coarse_place_steps_over_a_fine_object(scale):
     rng = np.random.default_rng(0)
     d = unit(rng.normal(size=(300, 3)))
     o = matrix[:3, 3] + 0.4 * scale * rng.normal(size=(300, 3)) - 1.2 * d
-    assert scene.occupancy.stride.max() > 1
+    assert scene.occupancy.stride.max() > PARTS
     every = ComposedField(scene.placed)
     every.__dict__["occupancy"] = replace(scene.occupancy, stride=None)
     wanted = render_rays(every, o, d)

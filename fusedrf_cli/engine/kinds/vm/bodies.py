@@ -29,6 +29,7 @@ from fusedrf_cli.engine.kernels.parts import (
     add_scaled,
     bilinear,
     cell_of,
+    in_matter,
     linear,
     scatter,
     sh_basis,
@@ -58,6 +59,8 @@ class Arrays(NamedTuple):
     second: object  # (X, Y, Z) uint8, the other block that has matter in the cell, or NO_BLOCK
     occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
+    inside: object  # flat uint64, the parts of cells of tensors that hold matter (`parts.inner_exit`)
+    inside_at: object  # (T,) int64, offset into inside, or -1: all of a tensor's occupied cells
     crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
     part: object  # (B, 6) float64, lower corner and 1 / sides of a tensor's box in its own unbounded space
     rows: object  # (T, 2) int64, rows of a level of a tensor's hashed detail, and how many levels it has
@@ -386,7 +389,11 @@ def matter_at(field, t, u, v, w):
     learnt."""
     nx, ny, nz = field.occupied_at[t, 1], field.occupied_at[t, 2], field.occupied_at[t, 3]
     i, j, m = min(int(u * nx), nx - 1), min(int(v * ny), ny - 1), min(int(w * nz), nz - 1)
-    return field.occupied[np.uint64(field.occupied_at[t, 0] + (i * ny + j) * nz + m)] != 0
+    cell = (i * ny + j) * nz + m
+    if field.inside_at[t] >= 0:
+        bits = field.inside[np.uint64(field.inside_at[t] + cell)]
+        return in_matter(bits, 4 * (u * nx - i), 4 * (v * ny - j), 4 * (w * nz - m))
+    return field.occupied[np.uint64(field.occupied_at[t, 0] + cell)] != 0
 
 
 def density(field, grid, k, p, d, scratch):

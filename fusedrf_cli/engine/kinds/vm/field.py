@@ -354,10 +354,20 @@ class VMField(ComputedField):
             second,
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
+            np.zeros(0, np.uint64),
+            np.full(len(self.tensors), -1, np.int64),
             np.asarray(self.crossings, np.uint8),
             np.stack([np.concatenate([box[:3], 1 / (box[3:] - box[:3])]) for box in boxes]),
             *detail_arrays(self.tensors, self.real),
         )
+
+    def looked_into(self) -> "VMField":
+        """See ComputedField; of several blocks each in its own cells."""
+        if self.owners is None:
+            return super().looked_into()
+        from fusedrf_cli.engine.kinds.vm.insides import looked_into
+
+        return looked_into(self)
 
     @cached_property
     def crossings(self) -> list[int]:

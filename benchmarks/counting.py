@@ -1,0 +1,89 @@
+"""Frames of `vm` fields with parts left out, to tell what the parts take: loops like `render_ray` of
+kernels/loops.py, for benchmarks/filled.py.
+
+A module like a kind's bodies.py, with the kind's own functions and these items of work beside them.
+"""
+
+from typing import NamedTuple
+
+from fusedrf_cli.engine.kernels.loops import between, lattice_step, met, triple
+from fusedrf_cli.engine.kernels.parts import along, next_sample
+from fusedrf_cli.engine.kinds.vm.bodies import Arrays, sizes
+
+__all__ = ["Arrays", "sizes"]
+
+
+class Counts(NamedTuple):
+    """What `count_ray` fills."""
+
+    samples: object  # (N,) int64, at which a density is asked for
+    dense: object  # (N,) int64, of which some are not 0
+    colours: object  # (N,) int64
+
+
+class Walked(NamedTuple):
+    """What `walk_ray` and `weigh_only_ray` follow."""
+
+    rays: object  # loops.Rays
+    samples: object  # (N,) int64, after how many samples each ends
+
+
+def count_ray(field, grid, rays, i, scratch, memory, out):
+    """The samples that `render_ray` takes of ray i."""
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
+    trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
+    out.samples[i], out.dense[i], out.colours[i] = 0, 0, 0
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
+        u0 = u0 + 0.5 * step
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and trans > rays.early_stop:
+            u = u0 + 0.5 * between(k, many) * step
+            _, opacity, _, _, _ = met(field, grid, (origin, way, course), k, many, u, step, d, scratch)
+            weight = trans * opacity
+            if trans - weight <= REST_FROM:
+                weight = trans
+            trans -= weight
+            waiting += weight
+            out.samples[i] += 1
+            out.dense[i] += 1 if opacity > 0.0 else 0
+            if waiting > enough:
+                out.colours[i] += 1
+                waiting, enough = 0.0, LENT_FROM
+            k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
+
+
+def walk_ray(field, grid, walked, i, scratch, memory, out):
+    """Marches to as many samples of ray i as it is said to have, and asks nothing; out[i] is where the last
+    one lies."""
+    rays = walked.rays
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
+    left, last = walked.samples[i], 0.0
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
+        u0 = u0 + 0.5 * step
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and left > 0:
+            p = along(origin, way, u0 + 0.5 * between(k, many) * step)
+            last += p[0] + p[1] + p[2]
+            left -= 1
+            k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
+    out[i] = last
+
+
+def weigh_only_ray(field, grid, walked, i, scratch, memory, out):
+    """As `walk_ray`, but asks for the density of each sample; out[i] is the transmittance."""
+    rays = walked.rays
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
+    left, trans = walked.samples[i], 1.0
+    for number in range(PIECES):
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
+        u0 = u0 + 0.5 * step
+        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
+        while k >= 0 and left > 0:
+            u = u0 + 0.5 * between(k, many) * step
+            _, opacity, _, _, _ = met(field, grid, (origin, way, course), k, many, u, step, d, scratch)
+            trans -= trans * opacity
+            left -= 1
+            k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
+    out[i] = trans
