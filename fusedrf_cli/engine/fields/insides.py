@@ -9,6 +9,7 @@ import numpy as np
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
+from fusedrf_cli.engine.kernels.parts import MIXED
 from fusedrf_cli.engine.kernels.plain import grow_insides
 
 SURFACE = 2e-2  # optical depth across a part from which there may be matter beside it
@@ -74,8 +75,12 @@ def grown(grid: OccupancyGrid, cells: np.ndarray, bits: np.ndarray) -> np.ndarra
 
 def with_insides(grid: OccupancyGrid, insides: np.ndarray, coarse: np.ndarray | None = None) -> GridArrays:
     """A grid's arrays that know the insides (X, Y, Z) of its cells. Parts without matter are skipped, or,
-    where `coarse` (X, Y, Z) says so, sampled with another stride: there lies what was not looked into."""
-    coarse = np.zeros(grid.occupied.shape, np.uint16) if coarse is None else coarse
-    return grid.arrays._replace(
-        skip=grid.marked((insides != 0) | (coarse != 0)).skip, inner=insides, coarse=coarse
-    )
+    where `coarse` (X, Y, Z) says so, sampled with another stride, of a cell at most: there lies what was not
+    looked into. Beside matter such samples end where parts do, so that none stands for it."""
+    matter, coarse = insides != 0, np.zeros(grid.occupied.shape, np.uint16) if coarse is None else coarse
+    known = grid.arrays._replace(skip=grid.marked(matter | (coarse != 0)).skip, inner=insides, coarse=coarse)
+    if grid.stride is None:
+        return known
+    stride = np.where(matter, grid.stride, coarse)
+    stride[grid.marked(matter).dilated().occupied] += np.uint16(MIXED)
+    return known._replace(stride=stride)

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.kernels import GridArrays
+from fusedrf_cli.engine.kernels.parts import MIXED
 from fusedrf_cli.engine.kernels.plain import mark_cells
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 DEFAULT_CELLS = 128
 SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
 THINNEST = 12  # texels across a flat box
-MAX_STRIDE = 1 << 15
+MAX_STRIDE = MIXED - 1
 PARTS = 8  # of a step: what strides are whole numbers of
 ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own

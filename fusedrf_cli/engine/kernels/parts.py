@@ -15,19 +15,21 @@ from numba import literally, njit
 body = njit(fastmath=True, error_model="numpy", cache=True, forceinline=True, _nrt=False)
 
 LINE = 16  # floats in a cache line
+MIXED = 1 << 15  # added to a stride
 FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must not be jumped over by rounding
 
 
 class GridArrays(NamedTuple):
     """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
     one. Samples in a cell may be `stride` times `unit` apart, `parts` of which are a step; without strides
-    they are a step apart."""
+    they are a step apart. Where the insides of cells are known, parts of a cell without matter are skipped or
+    have a stride of their own; with strides, that is so of cells that say MIXED."""
 
     skip: object  # (X, Y, Z) uint8
     lo: object  # (3,) float, lower corner
     hi: object  # (3,) float, upper corner
     cell: object  # (3,) float, size of a cell
-    stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least `parts` in occupied cells
+    stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least 1 in occupied cells, + MIXED
     unit: object = 0.0  # float
     parts: object = 1  # int, of a step: the lattice that samples sit on is so much finer
     inner: object = np.zeros((0, 0, 0), np.uint64)  # (X, Y, Z) uint64, see `inner_exit`; empty: not known
@@ -132,26 +134,28 @@ def next_sample(grid, origin, way, u0, u1, step, k):
         j = cell_of(y, lo[1], cell[1], ny)
         m = cell_of(z, lo[2], cell[2], nz)
         s = int(skip[np.uint64(i), np.uint64(j), np.uint64(m)])
-        here, bare, bits, away = s == 0, False, np.uint64(0), 0.0
+        many, mixed, end, away = 1, grid.inner.shape[0] != 0, u1, 0.0
         if s != 0:
+            many = 0
             away = min(
                 exit_distance(x, dx, lo[0], cell[0], i, s),
                 min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
             )
-        elif grid.inner.shape[0] != 0:
+        elif grid.stride.shape[0] != 0:
+            many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
+            mixed = many >= MIXED
+            many = many & (MIXED - 1)
+        if s == 0 and mixed:
             bits = grid.inner[np.uint64(i), np.uint64(j), np.uint64(m)]
             away = inner_exit(bits, (x, y, z), way, lo, cell, i, j, m)
-            bare = away >= 0.0
-            here = not bare or grid.coarse[np.uint64(i), np.uint64(j), np.uint64(m)] != 0
-        if here:
+            if away >= 0.0:
+                many = int(grid.coarse[np.uint64(i), np.uint64(j), np.uint64(m)])
+                end = min(u1, u + away)
+        if many > 0:
             if grid.stride.shape[0] == 0:
                 return k, 1
-            many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
-            if bare:
-                many = int(grid.coarse[np.uint64(i), np.uint64(j), np.uint64(m)])
             if grid.unit != step:
                 many = int(many * grid.unit / step + FACE_TOLERANCE)
-            end = min(u1, u + away) if bare and bits != np.uint64(0) else u1
             return k, max(1, min(many, int(math.ceil((end - u) / step + 0.5)) - 1))
         k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
 

@@ -55,8 +55,8 @@ class Arrays(NamedTuple):
     to_object: object  # (B, 3, 3) float, field directions -> object directions, unnormalised
     tensor: object  # (B,) int64, the tensor of a block
     activation: object  # (T, 2) float, scale (1/length of the object frame) and shift of the softplus
-    first: object  # (X, Y, Z) uint8, owning block of a cell; shape (0, 0, 0) when there is one block
-    second: object  # (X, Y, Z) uint8, the other block that has matter in the cell, or NO_BLOCK
+    owners: object  # (X, Y, Z) uint16, owning block of a cell + 256 times the other block that has matter in
+    # it, or NO_BLOCK; shape (0, 0, 0) when there is one block
     occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
     inside: object  # flat uint64, the parts of cells of tensors that hold matter (`parts.inner_exit`)
@@ -365,7 +365,7 @@ def block_density(field, b, p, stretch):
     if not inside:
         return 0.0, 0.0, b
     t = field.tensor[b]
-    if field.first.shape[0] != 0 and not matter_at(field, t, u, v, w):
+    if field.owners.shape[0] != 0 and not matter_at(field, t, u, v, w):
         return 0.0, 0.0, b
     f, place = density_feature(field, t, u, v, w), b
     if DETAIL != 0 and field.rows[t, 1] != 0 and f + field.activation[t, 1] > EMPTY_FROM:
@@ -398,19 +398,19 @@ def matter_at(field, t, u, v, w):
 
 def density(field, grid, k, p, d, scratch):
     """(σ, pre-activation, 1, place) of the densest block at a point; ties go to the lower block (DESIGN)."""
-    if field.first.shape[0] == 0:
+    if field.owners.shape[0] == 0:
         stretch = object_direction(field, 0, d)[3]
         sigma, f, place = block_density(field, 0, p, stretch)
         return sigma, f, 1, place
-    nx, ny, nz = field.first.shape
+    nx, ny, nz = field.owners.shape
     i = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
     j = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
     m = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
-    b = int(field.first[i, j, m])
+    owners = int(field.owners[np.uint64(i), np.uint64(j), np.uint64(m)])
+    b, other = owners % 256, owners // 256
     if b == NO_BLOCK:
         return 0.0, 0.0, 1, 0
     sigma, f, place = block_density(field, b, p, object_direction(field, b, d)[3])
-    other = int(field.second[i, j, m])
     if other != NO_BLOCK:
         sigma2, f2, place2 = block_density(field, other, p, object_direction(field, other, d)[3])
         if sigma2 > sigma:

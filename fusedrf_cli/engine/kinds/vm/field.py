@@ -342,6 +342,7 @@ class VMField(ComputedField):
             )
         boxes = [self.tensors[block.tensor].aabb for block in self.blocks]
         first, second = self.owners if self.owners is not None else NO_OWNERS
+        owners = first + np.uint16(256) * second
         return bodies.Arrays(
             params,
             self.layout,
@@ -350,8 +351,7 @@ class VMField(ComputedField):
             np.ascontiguousarray(to_object, np.float64),
             np.asarray([b.tensor for b in self.blocks], np.int64),
             np.asarray([[t.scale, t.shift] for t in self.tensors], self.real),
-            first,
-            second,
+            owners,
             np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
             occupied_layout(self.tensors),
             np.zeros(0, np.uint64),

@@ -7,6 +7,7 @@ import numpy as np
 
 from fusedrf_cli.engine.fields.insides import SIDE, insides_of, with_insides
 from fusedrf_cli.engine.fields.occupancy import (
+    MAX_STRIDE,
     PARTS,
     OccupancyGrid,
     Pace,
@@ -74,7 +75,8 @@ def placed_insides(field: VMField, insides: list[np.ndarray | None]):
 
 
 def strides_of(field: VMField, blocks: list[Block]) -> np.ndarray:
-    """(X, Y, Z) uint16 of the field's grid: the strides that some blocks need, 0 where they are not."""
+    """(X, Y, Z) uint16 of the field's grid: the strides that some blocks need, of a cell at most, 0 where
+    they are not."""
     grid = field.occupancy
     longest = max(grid.occupied.shape)
     placed = [(field.tensors[block.tensor].occupancy, block.object_to_field) for block in blocks]
@@ -85,8 +87,8 @@ def strides_of(field: VMField, blocks: list[Block]) -> np.ndarray:
     reached = np.isfinite(pace.spacing) & grid.occupied
     if grid.stride is None:
         return reached.astype(np.uint16)
-    strides = PARTS * np.where(reached, pace.spacing, 0) / grid.unit + 1e-4
-    return np.where(reached, np.maximum(strides, 1), 0).astype(np.uint16)
+    strides = PARTS * np.where(reached, np.minimum(pace.spacing, grid.cell.min()), 0) / grid.unit + 1e-4
+    return np.where(reached, np.clip(strides, 1, MAX_STRIDE), 0).astype(np.uint16)
 
 
 def place(bits: np.ndarray, box: np.ndarray, object_to_field: np.ndarray, grid, found: np.ndarray) -> None:
