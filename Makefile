@@ -39,8 +39,9 @@ fuzz: $(VENV)  ## 10,000 hostile packs and 200 kills of every command; PACKS=, K
 lint: $(VENV)  ## ruff
 	$(PYTHON) -m ruff check .
 
-bench: $(VENV)  ## the measurements that the claims rest on
+bench: $(VENV)  ## the measurements that the claims rest on; DATA= a folder with bear/, chair/ and fuze/: full frames too
 	$(PYTHON) -m benchmarks
+	$(if $(DATA),$(PYTHON) -m benchmarks.filled $(DATA))
 
 ablation: $(VENV)  ## what each part of distilling is worth; SCENE= for one of your own, SHARE= for fewer steps
 	mkdir -p build

@@ -144,13 +144,13 @@ def seconds(work: list, repeats: int) -> list[float]:
 
 def parts(frame: Frame, repeats: int) -> dict[str, float]:
     """Samples per hit ray, and the shares of a frame's time by leaving parts out."""
-    camera, field = frame.camera, copy(frame.field)
+    camera, field = frame.camera, copy(frame.field.for_pictures())
     rays_o, rays_d = camera.rays(order=tile_order(camera.width, camera.height))
     rays_o, rays_d, _ = seen_from(frame.origin, rays_o, rays_d)
     reach = reach_of(len(rays_o), 0.0, np.inf)
     rays = Rays(*map(np.ascontiguousarray, (rays_o, rays_d)), reach, sampling_step(field), EARLY_STOP)
     field.bodies = counting
-    field._afresh("loops", "arrays")
+    field._afresh("loops")
     counts = counting.Counts(*np.zeros((3, len(rays_o)), np.int64))
     field.loops.each("count_ray", field.arrays, field.grid, rays, len(rays_o), counts, RAYS_PER_TASK)
     walked, out = counting.Walked(rays, counts.samples), np.zeros((len(rays_o), 5))

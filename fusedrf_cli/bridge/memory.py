@@ -32,6 +32,7 @@ RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself,
 PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
 PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
+PER_LOOKED_CELL = 20  # of a field's grid: the bits of its parts while they grow, and distances
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
@@ -120,7 +121,8 @@ def picture(width: int, height: int, composed: bool) -> dict[str, float]:
     """Rendering one picture by bands; `composed`: by the general renderer."""
     band = min(width * max(1, ROWS_AT_ONCE_PIXELS // width), width * height)
     waves = min(band, RAYS_AT_ONCE) * SAMPLES_PER_WAVE * PER_SAMPLE if composed else 0
-    return {"a band of the picture": band * PER_PIXEL + waves}
+    insides = 0 if composed else PER_LOOKED_CELL * DEFAULT_CELLS**3
+    return {"a band of the picture": band * PER_PIXEL + waves, "the insides of cells": insides}
 
 
 def measured(width: int, height: int) -> dict[str, float]:

@@ -13,6 +13,7 @@ import torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
+from fusedrf_cli.engine.fields.insides import places
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
@@ -115,6 +116,26 @@ def test_render(name, dtype):
     for wanted, found in twice(field, picture):
         check(found, wanted, dtype)
         assert wanted[:, 3].max() > 0.1
+
+
+@on_a_device
+def test_looking_into_cells():
+    field, least = vm(torch.float64), np.array([1.0, 0.1])
+    cells = np.argwhere(field.occupancy.occupied)[:3]
+    for wanted, found in twice(field, lambda f: f.look_into(cells, places(1), least)):
+        check(found, wanted)
+        assert wanted.any()
+    rays_o, rays_d = rays_at(field.aabb, 4)
+
+    def picture(field):
+        out = np.zeros((4, 5))
+        looked = field.for_pictures()
+        assert looked.grid.inner.any()
+        looked.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
+        return (out,)
+
+    for wanted, found in twice(field, picture):
+        check(found, wanted)
 
 
 def trained(rays_o, rays_d, step):

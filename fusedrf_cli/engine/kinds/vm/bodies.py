@@ -358,9 +358,9 @@ def object_direction(field, b, d):
     return x / length, y / length, z / length, length
 
 
-def block_density(field, b, p, stretch):
+def block_density(field, b, p, d, stretched):
     """(σ in the field frame, pre-activation, place) of block b at a field point; (0, 0, b) outside its
-    tensor."""
+    tensor. Not `stretched`: as if its placement did not stretch it along d."""
     u, v, w, inside = unit_point(field, b, p)
     if not inside:
         return 0.0, 0.0, b
@@ -371,6 +371,7 @@ def block_density(field, b, p, stretch):
     if DETAIL != 0 and field.rows[t, 1] != 0 and f + field.activation[t, 1] > EMPTY_FROM:
         f += detail_density(field, t, u, v, w)
         place = b + NEAR
+    stretch = object_direction(field, b, d)[3] if stretched else 1.0
     slope = crossed(field, b, p, stretch) * field.activation[t, 0]
     return float(slope * softplus(f + field.activation[t, 1])), float(f), place
 
@@ -399,8 +400,7 @@ def matter_at(field, t, u, v, w):
 def density(field, grid, k, p, d, scratch):
     """(σ, pre-activation, 1, place) of the densest block at a point; ties go to the lower block (DESIGN)."""
     if field.owners.shape[0] == 0:
-        stretch = object_direction(field, 0, d)[3]
-        sigma, f, place = block_density(field, 0, p, stretch)
+        sigma, f, place = block_density(field, 0, p, d, True)
         return sigma, f, 1, place
     nx, ny, nz = field.owners.shape
     i = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
@@ -410,9 +410,9 @@ def density(field, grid, k, p, d, scratch):
     b, other = owners % 256, owners // 256
     if b == NO_BLOCK:
         return 0.0, 0.0, 1, 0
-    sigma, f, place = block_density(field, b, p, object_direction(field, b, d)[3])
+    sigma, f, place = block_density(field, b, p, d, True)
     if other != NO_BLOCK:
-        sigma2, f2, place2 = block_density(field, other, p, object_direction(field, other, d)[3])
+        sigma2, f2, place2 = block_density(field, other, p, d, True)
         if sigma2 > sigma:
             return sigma2, f2, 1, place2
     return sigma, f, 1, place
@@ -420,7 +420,7 @@ def density(field, grid, k, p, d, scratch):
 
 def unstretched(field, grid, frame, p, scratch):
     """σ of a block at a field point, in units of its object's frame."""
-    return block_density(field, frame, p, 1.0)[0]
+    return block_density(field, frame, p, (0.0, 0.0, 1.0), False)[0]
 
 
 def frame_of(place):
