@@ -13,6 +13,7 @@ from fusedrf_cli.engine.kernels.parts import MIXED
 from fusedrf_cli.engine.kernels.plain import grow_insides
 
 SURFACE = 2e-2  # optical depth across a part from which there may be matter beside it
+OPAQUE = 1.0  # from which all of an eighth of a cell counts as matter
 FAINT = 1e-3 * 0.4 ** np.arange(6)  # from which a part holds matter: the first by which little is lost
 LOST = 7e-4  # optical depth that is lost along lines of cells, root mean square
 SIDE = 4  # parts of a cell along an axis
@@ -28,7 +29,7 @@ def insides_of(field) -> np.ndarray | None:
     per = int(np.ceil(part / field.voxel_size))  # farther apart than a voxel matter would be missed
     if len(cells) * (SIDE * per) ** 3 > MOST_PLACES:
         return None
-    bits, rest = field.look_into(cells, places(per), np.array([SURFACE, *FAINT]) / part)
+    bits, rest = field.look_into(cells, places(per), np.array([SURFACE, *FAINT]) / part, OPAQUE / part)
     for own, lost in zip(bits[1:], SIDE * part * rest[1:], strict=True):
         if lost_along_lines(grid, cells, lost) <= LOST:
             return grown(grid, cells, bits[0]) | in_cells(grid, cells, own)

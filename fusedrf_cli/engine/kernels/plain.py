@@ -146,16 +146,19 @@ def grow_insides(bits, axis, grown):
 
 
 @task
-def mark_parts(bits, level, to_parts, steps, marked):
+def mark_parts(bits, level, to_parts, steps, whole, marked):
     """Sets in marked (X, Y, Z) the bits of the parts in which matter of a grid (bits (A, B, C)) lies: of its
     parts, of the eighths of cells that have any for level 1, of the cells for level 0. to_parts (3, 4) takes
     its coordinates, in cells, to those of the marked grid, in parts; steps (K, 3) are the places in each that
-    are looked at."""
+    are looked at, `whole` (M, 3) those in a cell that is full of matter."""
     m = 1 << level
     for x in range(bits.shape[0]):
         for y in range(bits.shape[1]):
             for z in range(bits.shape[2]):
-                for q in range(m * m * m if bits[x, y, z] != np.uint64(0) else 0):
+                full = bits[x, y, z] == ~np.uint64(0)
+                for k in range(whole.shape[0] if full else 0):
+                    mark_part(to_parts, x + whole[k, 0], y + whole[k, 1], z + whole[k, 2], marked)
+                for q in range(0 if full or bits[x, y, z] == np.uint64(0) else m * m * m):
                     a, b, c = q // (m * m), q // m % m, q % m
                     if holds_any(bits[x, y, z], level, a, b, c):
                         for k in range(steps.shape[0]):

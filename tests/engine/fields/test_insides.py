@@ -70,10 +70,12 @@ def test_marked_parts_are_those_that_placed_ones_reach(level):
     """Corners of the parts, eighths or cells that hold matter, one by one."""
     rng = np.random.default_rng(level)
     bits, found = random_bits(rng, (3, 4, 5), 0.05), np.zeros((6, 5, 4), np.uint64)
+    bits[1, 2, 3] = ~np.uint64(0)
     to_parts = np.concatenate([rng.normal(size=(3, 3)), rng.uniform(8, 12, (3, 1))], 1)
     corners = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), -1).reshape(-1, 3)
-    mark_parts(bits, level, to_parts, corners, found)
     n = 2**level
+    whole = np.argwhere(np.ones((n + 1,) * 3)) / n  # the same places
+    mark_parts(bits, level, to_parts, corners, whole, found)
     shape = (3, n, SIDE // n, 4, n, SIDE // n, 5, n, SIDE // n)
     held = parts_of(bits).reshape(shape).any((2, 5, 8)).reshape(3 * n, 4 * n, 5 * n)
     at = (np.argwhere(held)[:, None] + corners).reshape(-1, 3) / n

@@ -98,8 +98,13 @@ def place(bits: np.ndarray, box: np.ndarray, object_to_field: np.ndarray, grid, 
     wide = abs(object_to_field[:3, :3] * cell) / part[:, None]  # of a cell along each of its axes, in parts
     widest = wide.sum(1).max()
     level = next((n for n in range(LEVELS) if widest / 2**n <= 1), LEVELS)
-    counts = np.maximum(np.ceil(wide.max(0) / 2**level), 1).astype(int) + 1
-    steps = np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
+    steps, whole = steps_through(wide.max(0) / 2**level), steps_through(wide.max(0))
     linear = object_to_field[:3, :3] * cell / part[:, None]
     shift = (object_to_field[:3, :3] @ box[:3] + object_to_field[:3, 3] - grid.aabb[:3]) / part
-    mark_parts(bits, level, np.concatenate([linear, shift[:, None]], 1), steps, found)
+    mark_parts(bits, level, np.concatenate([linear, shift[:, None]], 1), steps, whole, found)
+
+
+def steps_through(sides: np.ndarray) -> np.ndarray:
+    """(N, 3) places in a box of sides (3,), of which it is 1 along each axis, no farther apart than 1."""
+    counts = np.maximum(np.ceil(sides), 1).astype(int) + 1
+    return np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
