@@ -22,9 +22,13 @@ class Counts(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What `walk_ray` and `weigh_only_ray` follow."""
+    """What `walk_ray` and `weigh_only_ray` follow: loops.Rays, and where they end."""
 
-    rays: object  # loops.Rays
+    rays_o: object
+    rays_d: object
+    reach: object
+    step: object
+    early_stop: object
     samples: object  # (N,) int64, after how many samples each ends
 
 
@@ -53,12 +57,11 @@ def count_ray(field, grid, rays, i, scratch, memory, out):
             k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
 
 
-def walk_ray(field, grid, walked, i, scratch, memory, out):
+def walk_ray(field, grid, rays, i, scratch, memory, out):
     """Marches to as many samples of ray i as it is said to have, and asks nothing; out[i] is where the last
     one lies."""
-    rays = walked.rays
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
-    left, last = walked.samples[i], 0.0
+    left, last = rays.samples[i], 0.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
         u0 = u0 + 0.5 * step
@@ -71,11 +74,10 @@ def walk_ray(field, grid, walked, i, scratch, memory, out):
     out[i] = last
 
 
-def weigh_only_ray(field, grid, walked, i, scratch, memory, out):
+def weigh_only_ray(field, grid, rays, i, scratch, memory, out):
     """As `walk_ray`, but asks for the density of each sample; out[i] is the transmittance."""
-    rays = walked.rays
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
-    left, trans = walked.samples[i], 1.0
+    left, trans = rays.samples[i], 1.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
         u0 = u0 + 0.5 * step

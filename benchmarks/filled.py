@@ -153,7 +153,7 @@ def parts(frame: Frame, repeats: int) -> dict[str, float]:
     field._afresh("loops")
     counts = counting.Counts(*np.zeros((3, len(rays_o)), np.int64))
     field.loops.each("count_ray", field.arrays, field.grid, rays, len(rays_o), counts, RAYS_PER_TASK)
-    walked, out = counting.Walked(rays, counts.samples), np.zeros((len(rays_o), 5))
+    walked, out = counting.Walked(*rays, counts.samples), np.zeros((len(rays_o), 5))
 
     def run(item: str, asked, to) -> None:
         field.loops.each(item, field.arrays, field.grid, asked, len(rays_o), to, RAYS_PER_TASK)

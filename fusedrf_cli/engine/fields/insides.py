@@ -2,7 +2,7 @@
 
 A cell is some voxels wide, and cells are grown by one around matter, so that most of what lies in occupied
 ones is empty, or haze too thin to be seen. Parts are found by asking in them, those of surfaces are grown by
-one, and they are kept as the bits of a number for each cell (`parts.inner_exit`).
+one, and they are kept as the bits of a number for each cell (`parts.bit_of`).
 """
 
 import numpy as np

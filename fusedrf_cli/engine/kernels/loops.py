@@ -120,7 +120,7 @@ class Looked(NamedTuple):
     """What `look_into_cell` looks at."""
 
     cells: object  # (N, 3) int64, of the field's grid
-    offsets: object  # (64 K, 3) in [0, 1], K in each part of a cell, parts in the order of `parts.inner_exit`
+    offsets: object  # (64 K, 3) in [0, 1], K in each part of a cell, parts in the order of `parts.bit_of`
     least: object  # (L,) σ per length of the space's coordinates that count as matter
     opaque: object  # float, σ from which all around is matter
 

@@ -32,7 +32,7 @@ class GridArrays(NamedTuple):
     stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least 1 in occupied cells, + MIXED
     unit: object = 0.0  # float
     parts: object = 1  # int, of a step: the lattice that samples sit on is so much finer
-    inner: object = np.zeros((0, 0, 0), np.uint64)  # (X, Y, Z) uint64, see `inner_exit`; empty: not known
+    inner: object = np.zeros((0, 0, 0), np.uint64)  # (X, Y, Z) uint64, see `bit_of`; empty: not known
     coarse: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, the stride in other parts; 0: skipped
 
 
@@ -81,18 +81,23 @@ def exit_distance(p, d, lo, cell, i, s):
 
 
 @body
+def bit_of(i, j, m):
+    """The bit of part (i, j, m) of the 4 x 4 x 4 of a cell: those of an eighth of the cell lie in a row."""
+    eighth = 32 * (i >> 1) + 16 * (j >> 1) + 8 * (m >> 1)
+    return np.uint64(eighth + 4 * (i & 1) + 2 * (j & 1) + (m & 1))
+
+
+@body
 def in_matter(bits, x, y, z):
     """Whether a point in a cell, in parts from its lower corner, lies in one of those that `bits` tell of."""
     i, j, m = min(max(int(x), 0), 3), min(max(int(y), 0), 3), min(max(int(z), 0), 3)
-    bit = 32 * (i >> 1) + 16 * (j >> 1) + 8 * (m >> 1) + 4 * (i & 1) + 2 * (j & 1) + (m & 1)
-    return bits >> np.uint64(bit) & np.uint64(1) != np.uint64(0)
+    return bits >> bit_of(i, j, m) & np.uint64(1) != np.uint64(0)
 
 
 @body
 def inner_exit(bits, p, d, lo, cell, i, j, m):
-    """Where a ray at p in cell (i, j, m) leaves what is empty of that cell's inside around p, or -1 where p
-    lies in matter. `bits` tell which of the 4 x 4 x 4 parts of a cell hold matter, those of an eighth of the
-    cell in a row: bit 32 a + 16 b + 8 c + 4 e + 2 f + g is part (2 a + e, 2 b + f, 2 c + g)."""
+    """How far away a ray at p in cell (i, j, m) leaves the empty part or eighth of that cell around p, or -1
+    where p lies in matter: in a part whose bit (`bit_of`) is set."""
     x = min(max(int((p[0] - lo[0]) / cell[0] * 4) - 4 * i, 0), 3)
     y = min(max(int((p[1] - lo[1]) / cell[1] * 4) - 4 * j, 0), 3)
     z = min(max(int((p[2] - lo[2]) / cell[2] * 4) - 4 * m, 0), 3)
@@ -120,8 +125,10 @@ def next_sample(grid, origin, way, u0, u1, step, k):
     when there is no such k' before u1.
 
     Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
-    the same.
+    the same: what stands for several steps begins at a whole multiple of them, if need be before k', or
+    where the sample before it ended.
     """
+    begun = k
     dx, dy, dz = way
     skip, lo, cell = grid.skip, grid.lo, grid.cell
     nx, ny, nz = skip.shape
@@ -155,8 +162,10 @@ def next_sample(grid, origin, way, u0, u1, step, k):
             if grid.stride.shape[0] == 0:
                 return k, 1
             if grid.unit != step:
-                many = int(many * grid.unit / step + FACE_TOLERANCE)
-            return k, max(1, min(many, int(math.ceil((end - u) / step + 0.5)) - 1))
+                many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
+            most = max(1, int(math.ceil((end - u) / step + 0.5)) - 1)
+            start = max(k - k % many, begun)
+            return start, min(k - k % many + many, k + most) - start
         k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
 
 

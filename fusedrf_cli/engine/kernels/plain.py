@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from fusedrf_cli.engine.kernels.parts import LINE, adam_line, body, pinhole_ray, sum_of_rows
+from fusedrf_cli.engine.kernels.parts import LINE, adam_line, bit_of, body, pinhole_ray, sum_of_rows
 
 FLAGS = dict(fastmath=True, error_model="numpy", cache=True)
 loop = njit(**FLAGS, parallel=True)
@@ -109,7 +109,7 @@ def sums_of_rows(values, base, width, start, source, weight, target, keep):
         sum_of_rows(values, base, width, start, source, weight, target, i, keep)
 
 
-# Of the bits of a cell's parts (`parts.inner_exit`) those in the lower half of an eighth, and of the cell.
+# Of the bits of a cell's parts (`parts.bit_of`) those in the lower half of an eighth, and of the cell.
 LOWER = tuple(
     np.uint64(sum(1 << q for q in range(64) if not q & (low | high)))
     for low, high in ((4, 0), (2, 0), (1, 0), (32, 0), (16, 0), (8, 0))
@@ -183,13 +183,6 @@ def mark_part(to_parts, u, v, w, marked):
     i, j = part_at(to_parts, 0, u, v, w, nx), part_at(to_parts, 1, u, v, w, ny)
     n = part_at(to_parts, 2, u, v, w, nz)
     marked[i // 4, j // 4, n // 4] |= np.uint64(1) << bit_of(i % 4, j % 4, n % 4)
-
-
-@body
-def bit_of(a, b, c):
-    """The bit of part (a, b, c) of a cell (`parts.inner_exit`)."""
-    far = 32 * (a >> 1) + 16 * (b >> 1) + 8 * (c >> 1)
-    return np.uint64(far + 4 * (a & 1) + 2 * (b & 1) + (c & 1))
 
 
 @body

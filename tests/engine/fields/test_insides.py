@@ -9,7 +9,7 @@ import torch
 from scipy.ndimage import binary_dilation
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.insides import SIDE, grown, insides_of, places, with_insides
+from fusedrf_cli.engine.fields.insides import FULL, SIDE, grown, insides_of, places, with_insides
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.plain import mark_parts
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
@@ -65,6 +65,24 @@ def test_march_visits_the_lattice_samples_in_matter(seed):
         assert np.array_equal(found, ts[parts[tuple(index.T)]])
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_strided_samples_in_matter_are_some_of_those_without_insides(seed):
+    rng = np.random.default_rng(seed)
+    shape, cell = (6, 5, 7), 0.25
+    aabb = np.concatenate([np.zeros(3), np.array(shape) * cell])
+    occupied, stride = rng.random(shape) < 0.6, rng.choice([8, 20], shape).astype(np.uint16)
+    grid = OccupancyGrid(aabb, occupied, stride=stride, unit=0.01)
+    bits = np.where(occupied, random_bits(rng, shape, 0.3), 0).astype(np.uint64)
+    rays_o, rays_d = rays_at(grid.aabb, 30, seed)
+    known = with_insides(grid, bits)._replace(skip=grid.skip)
+    some, every = (march(arrays, rays_o, rays_d, grid.unit) for arrays in (known, grid.arrays))
+    assert sum(map(len, some)) < 0.6 * sum(map(len, every))
+    same = [np.isin(found, wanted) for found, wanted in zip(some, every, strict=True)]
+    assert np.concatenate(same).mean() > 0.97  # but where strides change within an empty part
+    full = with_insides(grid, np.where(occupied, FULL, 0).astype(np.uint64))
+    assert all(map(np.array_equal, march(full, rays_o, rays_d, grid.unit), every))
+
+
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_marked_parts_are_those_that_placed_ones_reach(level):
     """Corners of the parts, eighths or cells that hold matter, one by one."""
@@ -107,7 +125,7 @@ def shown(field, camera) -> np.ndarray:
 
 def without_insides(field):
     """The same field, whose cells nobody looks into."""
-    other = copy(field)
+    other = copy(field)._afresh()
     other.looked_into = lambda: field
     return other
 

@@ -59,7 +59,7 @@ class Arrays(NamedTuple):
     # it, or NO_BLOCK; shape (0, 0, 0) when there is one block
     occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
     occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
-    inside: object  # flat uint64, the parts of cells of tensors that hold matter (`parts.inner_exit`)
+    inside: object  # flat uint64, the parts of cells of tensors that hold matter (`parts.bit_of`)
     inside_at: object  # (T,) int64, offset into inside, or -1: all of a tensor's occupied cells
     crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
     part: object  # (B, 6) float64, lower corner and 1 / sides of a tensor's box in its own unbounded space
