@@ -6,7 +6,7 @@ A module like a kind's bodies.py, with the kind's own functions and these items 
 
 from typing import NamedTuple
 
-from fusedrf_cli.engine.kernels.loops import between, lattice_step, met, triple
+from fusedrf_cli.engine.kernels.loops import between, met, triple
 from fusedrf_cli.engine.kernels.parts import along, next_sample
 from fusedrf_cli.engine.kinds.vm.bodies import Arrays, sizes
 
@@ -33,8 +33,8 @@ class Walked(NamedTuple):
 
 
 def count_ray(field, grid, rays, i, scratch, memory, out):
-    """The samples that `render_ray` takes of ray i."""
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
+    """The samples that `render_ray` takes of ray i, and those that it jumps over where there is nothing."""
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
     out.samples[i], out.dense[i], out.colours[i] = 0, 0, 0
     for number in range(PIECES):
@@ -60,7 +60,7 @@ def count_ray(field, grid, rays, i, scratch, memory, out):
 def walk_ray(field, grid, rays, i, scratch, memory, out):
     """Marches to as many samples of ray i as it is said to have, and asks nothing; out[i] is where the last
     one lies."""
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     left, last = rays.samples[i], 0.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
@@ -76,7 +76,7 @@ def walk_ray(field, grid, rays, i, scratch, memory, out):
 
 def weigh_only_ray(field, grid, rays, i, scratch, memory, out):
     """As `walk_ray`, but asks for the density of each sample; out[i] is the transmittance."""
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), lattice_step(grid, rays.step)
+    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     left, trans = rays.samples[i], 1.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])

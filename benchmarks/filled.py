@@ -16,6 +16,7 @@ import tempfile
 import time
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -57,9 +58,14 @@ class Frame:
     origin: np.ndarray
     camera: Camera
 
+    @cached_property
+    def looked(self) -> VMField:
+        """As pictures of a film are made of."""
+        return self.field.looked_into()
+
     def picture(self, denser: int = 1) -> np.ndarray:
-        """(H, W, 3) over white, by samples so many times as dense."""
-        field, step = self.field, sampling_step(self.field) / denser
+        """(H, W, 3) over white; by samples so many times as dense nothing is skipped inside cells."""
+        field, step = self.field if denser > 1 else self.looked, sampling_step(self.field) / denser
         if denser > 1 and field.occupancy.stride is not None:
             field = copy(field)._afresh("arrays", "grid")
             field.occupancy = replace(field.occupancy, unit=step)
@@ -144,7 +150,7 @@ def seconds(work: list, repeats: int) -> list[float]:
 
 def parts(frame: Frame, repeats: int) -> dict[str, float]:
     """Samples per hit ray, and the shares of a frame's time by leaving parts out."""
-    camera, field = frame.camera, copy(frame.field.for_pictures())
+    camera, field = frame.camera, copy(frame.looked)
     rays_o, rays_d = camera.rays(order=tile_order(camera.width, camera.height))
     rays_o, rays_d, _ = seen_from(frame.origin, rays_o, rays_d)
     reach = reach_of(len(rays_o), 0.0, np.inf)

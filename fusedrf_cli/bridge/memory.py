@@ -121,8 +121,12 @@ def picture(width: int, height: int, composed: bool) -> dict[str, float]:
     """Rendering one picture by bands; `composed`: by the general renderer."""
     band = min(width * max(1, ROWS_AT_ONCE_PIXELS // width), width * height)
     waves = min(band, RAYS_AT_ONCE) * SAMPLES_PER_WAVE * PER_SAMPLE if composed else 0
-    insides = 0 if composed else PER_LOOKED_CELL * DEFAULT_CELLS**3
-    return {"a band of the picture": band * PER_PIXEL + waves, "the insides of cells": insides}
+    return {"a band of the picture": band * PER_PIXEL + waves}
+
+
+def insides() -> dict[str, float]:
+    """Looking into the cells of a field (engine/fields/insides.py)."""
+    return {"the insides of cells": PER_LOOKED_CELL * DEFAULT_CELLS**3}
 
 
 def measured(width: int, height: int) -> dict[str, float]:

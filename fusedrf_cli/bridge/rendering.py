@@ -11,11 +11,12 @@ import numpy as np
 from formats.atomic import atomic_folder
 from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
-from fusedrf_cli.bridge.memory import Memory, ownership, picture, sources
+from fusedrf_cli.bridge.memory import Memory, insides, ownership, picture, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -55,6 +56,8 @@ def render(request: RenderRequest, progress) -> dict:
         budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
         if loaded.lone() is None and not request.naive:
             field = joined(loaded, field, needed, budget, place)
+        if hasattr(field, "for_pictures"):
+            field = field.for_pictures(rays_of(views))
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
         shooting = _Shooting(field, how, request.background, request.depth, progress)
@@ -79,7 +82,14 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     largest = max(views, key=lambda view: view.width * view.height)
     pixels = largest.width * largest.height
     needed = picture(largest.width, largest.height, composed=not hasattr(field, "render_rays"))
+    if rays_of(views) >= WORTH_LOOKING:
+        needed |= insides()
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
+
+
+def rays_of(views: list[Camera]) -> int:
+    """How many rays all the pictures take."""
+    return sum(view.width * view.height for view in views)
 
 
 def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:

@@ -58,7 +58,6 @@ class Adam:
                 self.field.device_loops.adam(*moved, own, group.low, group.high, *rest)
             else:
                 self.field.device_loops.adam_lines(*moved, own, group.lines, *rest)
-        self.field._afresh()
         self.field.settle()
 
     def sound(self) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.insides import insides_of, with_insides
+from fusedrf_cli.engine.fields.insides import WORTH_LOOKING, insides_of, with_insides
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.loops import (
@@ -161,7 +161,7 @@ class ComputedField:
 
     def _afresh(self, *names: str) -> "ComputedField":
         """Itself without what was computed from things that have changed."""
-        for name in (*names, "pictured"):
+        for name in names:
             self.__dict__.pop(name, None)
         return self
 
@@ -208,13 +208,11 @@ class ComputedField:
         """The occupancy's arrays."""
         return self.device_loops.on_device(self.occupancy.arrays)
 
-    def for_pictures(self) -> "ComputedField":
-        """The field under a grid that knows the insides of its cells (engine/fields/insides.py), whose
-        pictures are the same in fewer samples. Looking into the cells takes about as long as a picture, and
-        is done again when the numbers have changed."""
-        if self.__dict__.get("pictured", (None, None))[0] != self.params._version:
-            self.__dict__["pictured"] = self.params._version, self.looked_into()
-        return self.__dict__["pictured"][1]
+    def for_pictures(self, rays: int) -> "ComputedField":
+        """The field for pictures of so many rays in all: where they are worth it, under a grid that knows the
+        insides of its cells (engine/fields/insides.py), by which they take fewer samples and look the same.
+        It shows the numbers as they are now."""
+        return self.looked_into() if rays >= WORTH_LOOKING else self
 
     def looked_into(self) -> "ComputedField":
         """See `for_pictures`. A place, which is full of haze, is taken as it is."""

@@ -13,6 +13,7 @@ RUN = 4  # rows that lie side by side along z, so that neighbours share a cache 
 WIDTH = 4  # numbers of a row: density, then red, green and blue
 EMPTY_FROM = -6.0  # density before activation, shift included, under which none is asked for
 MAX_LEVELS, MAX_ROWS = 8, 1 << 24
+MAX_VERTEX = 1 << 20  # along an axis: past it, float32 would not tell where between two a point is
 
 
 @dataclass(frozen=True)

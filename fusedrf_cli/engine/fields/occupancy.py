@@ -18,7 +18,8 @@ DEFAULT_CELLS = 128
 SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
 THINNEST = 12  # texels across a flat box
 MAX_STRIDE = MIXED - 1
-PARTS = 8  # of a step: what strides are whole numbers of
+UNITS = 8  # at least, of the distance of samples where they lie closest: strides are whole numbers of units
+ALIKE = 1 + 1e-3  # times apart: distances of samples so close to each other are one
 ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
 NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
@@ -39,9 +40,9 @@ class OccupancyGrid:
     space: ModuleType = bounded
     """That its cells, and the numbers of the field that owns it, lie in (engine/spaces)."""
     stride: np.ndarray | None = None
-    """(X, Y, Z) uint16: samples in a cell may lie so many PARTS of `unit` apart; None: a step everywhere."""
+    """(X, Y, Z) uint16: samples in a cell may lie so many times `unit` apart; None: a step everywhere."""
     unit: float = 0.0
-    """The distance of samples where they lie closest; 0: it follows from the field's voxel."""
+    """Of the strides, or without them the distance of samples; 0: it follows from the field's voxel."""
     looked_at: np.ndarray | None = None
     """(6,) box of the frame that views look at; None: it follows from the cells."""
 
@@ -77,7 +78,7 @@ class OccupancyGrid:
         found = GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
         if self.stride is None:
             return found
-        return found._replace(stride=self.stride, unit=self.unit / PARTS, parts=PARTS)
+        return found._replace(stride=self.stride, unit=self.unit)
 
     def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
         """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where
@@ -153,7 +154,7 @@ class OccupancyGrid:
 
         least = minimum_filter(np.where(self.occupied, self.stride, MAX_STRIDE), 3)
         index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
-        return least[tuple(np.clip(index, 0, np.array(least.shape) - 1).T)] / PARTS
+        return least[tuple(np.clip(index, 0, np.array(least.shape) - 1).T)]
 
     def centres(self) -> np.ndarray:
         """(M, 3) centres of the occupied cells."""
@@ -229,11 +230,20 @@ class Pace:
         if not known.any():
             return grid
         spacing = self.stepping_over_nothing()
-        least = spacing[known].min()
-        unit = float(least)
-        strides = PARTS * np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
-        stride = np.clip(strides, PARTS, MAX_STRIDE).astype(np.uint16)
-        return replace(grid, stride=None if stride.max() == PARTS else stride, unit=unit)
+        most, least = float(spacing[known].max()), float(spacing[known].min())
+        unit = self.unit(most, least)
+        strides = np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
+        stride = np.clip(strides, 1, MAX_STRIDE).astype(np.uint16)
+        return replace(grid, stride=None if stride.max() == 1 else stride, unit=unit)
+
+    def unit(self, most: float, least: float) -> float:
+        """That of strides where samples lie from `least` to `most` apart. In a place it is a part of `most`,
+        by which all that lies behind what stands in it is sampled: so its samples come where they come
+        without that, and do not move with what else is there. In a box it is `least`, by which all of a scene
+        is sampled before it is fused."""
+        if self.whole.space is bounded or most <= ALIKE * least:
+            return max(least, most / MAX_STRIDE)
+        return most / min(np.ceil(UNITS * most / least), MAX_STRIDE)
 
 
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:

@@ -21,9 +21,9 @@ FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must no
 
 class GridArrays(NamedTuple):
     """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
-    one. Samples in a cell may be `stride` times `unit` apart, `parts` of which are a step; without strides
-    they are a step apart. Where the insides of cells are known, parts of a cell without matter are skipped or
-    have a stride of their own; with strides, that is so of cells that say MIXED."""
+    one. Samples in a cell may be `stride` times `unit` apart; without strides they are a step apart. Where
+    the insides of cells are known, parts of a cell without matter are skipped or have a stride of their own;
+    with strides, that is so of cells that say MIXED."""
 
     skip: object  # (X, Y, Z) uint8
     lo: object  # (3,) float, lower corner
@@ -31,7 +31,6 @@ class GridArrays(NamedTuple):
     cell: object  # (3,) float, size of a cell
     stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least 1 in occupied cells, + MIXED
     unit: object = 0.0  # float
-    parts: object = 1  # int, of a step: the lattice that samples sit on is so much finer
     inner: object = np.zeros((0, 0, 0), np.uint64)  # (X, Y, Z) uint64, see `bit_of`; empty: not known
     coarse: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, the stride in other parts; 0: skipped
 
@@ -164,8 +163,9 @@ def next_sample(grid, origin, way, u0, u1, step, k):
             if grid.unit != step:
                 many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
             most = max(1, int(math.ceil((end - u) / step + 0.5)) - 1)
-            start = max(k - k % many, begun)
-            return start, min(k - k % many + many, k + most) - start
+            first = many * int(k / many)  # k % many takes twice as long
+            start = max(first, begun)
+            return start, min(first + many, k + most) - start
         k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
 
 

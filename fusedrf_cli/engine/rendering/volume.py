@@ -215,8 +215,6 @@ def render_bands(
     """The view of `render_image` as bands of whole rows from the top, for pictures that memory does not hold;
     put together they are that picture to the bit."""
     rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
-    if getattr(field, "device_loops", None) is not None:
-        step, field = step or sampling_step(field), field.for_pictures()
     for top in range(0, camera.height, rows):
         order = tile_order(camera.width, min(rows, camera.height - top))
         rays_o, rays_d = camera.rays(slice(top, top + rows), order)

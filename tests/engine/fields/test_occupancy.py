@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fusedrf_cli.engine.fields.occupancy import (
-    PARTS,
     OccupancyGrid,
     Pace,
     cell_counts,
@@ -150,22 +149,21 @@ def test_cells_of_another_size_that_share_a_volume(longest):
     assert np.array_equal(overlapped(part, longest), again)
 
 
-def test_steps_need_not_be_whole_numbers_of_finer_ones():
-    """Cells of a finer field and of a coarser one: each is sampled at its own step, to an eighth of the finer
-    one's."""
-    grid = OccupancyGrid.full(BOX, 8)
+def test_steps_in_a_place_are_parts_of_its_own():
+    """Cells of a finer field and of the place: the place is sampled at its own step, what is finer at no more
+    than its own, and at least an eighth less."""
+    grid = OccupancyGrid.full(BOX, 8, unbounded)
     fine = np.zeros(grid.occupied.shape, bool)
     fine[:4] = True
-    for ratio in (1.0, 1.4, 3.3):
+    for ratio in (1.0, 1.4, 3.3, 100.0):
         pace = Pace(grid)
-        steps = 0.05, 0.05 * ratio
+        steps = 0.15 / ratio, 0.15
         assert len(list(pace.kept([fine, ~fine], [(grid, np.eye(4))] * 2, steps))) == 2
         found = pace.grid(fine | ~fine)
-        assert found.unit == pytest.approx(steps[0])
         if ratio == 1:
             assert found.stride is None
             continue
-        spacing = found.stride * found.unit / PARTS
-        assert spacing[fine] == pytest.approx(steps[0])
-        assert (spacing[~fine] <= steps[1] + 1e-9).all()
-        assert (spacing[~fine] > steps[1] - found.unit / PARTS).all()
+        spacing = found.stride * found.unit
+        assert spacing[~fine] == pytest.approx(steps[1])
+        assert (spacing[fine] <= steps[0] + 1e-6).all()
+        assert (spacing[fine] > steps[0] * 7 / 8).all()

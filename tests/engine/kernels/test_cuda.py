@@ -27,7 +27,7 @@ from tests.engine.kernels.simulated import (
     run_simulated,
 )
 from tests.engine.kernels.test_cpu import two_blocks
-from tests.engine.kinds.cases import BOXED, random_boxed
+from tests.engine.kinds.cases import BOXED, random_boxed, random_detail
 from tests.engine.kinds.sparse_cases import random_sparse
 
 if HERE:
@@ -48,12 +48,13 @@ def vm(dtype: torch.dtype) -> ComputedField:
 
 FIELDS = {
     "vm": vm,
+    "vm, detail": lambda dtype: random_detail(dtype=dtype),
     "vm of two blocks": lambda dtype: two_blocks(TURNED).with_params(two_blocks(TURNED).params.to(dtype)),
     "sparse": lambda dtype: random_sparse(dtype=dtype),
     "sparse without bands": lambda dtype: random_sparse(0, dtype=dtype),
     **{name: partial(random_boxed, name) for name in BOXED},
 }
-SINGLE = ["vm", "sparse", *BOXED]
+SINGLE = ["vm", "vm, detail", "sparse", *BOXED]
 CASES = [(name, torch.float64) for name in FIELDS] + [(name, torch.float32) for name in SINGLE]
 every_field = pytest.mark.parametrize(
     "name, dtype", CASES, ids=[f"{name}, {str(dtype).removeprefix('torch.')}" for name, dtype in CASES]
@@ -129,7 +130,7 @@ def test_looking_into_cells():
 
     def picture(field):
         out = np.zeros((4, 5))
-        looked = field.for_pictures()
+        looked = field.looked_into()
         assert looked.grid.inner.any()
         looked.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
         return (out,)

@@ -125,6 +125,8 @@ def test_it_comes_back_from_a_file_that_older_readers_refuse():
         ({"spacings": [0.1]}, "should have shape"),
         ({"spacings": [0.1] * 9}, "levels"),
         ({"spacings": [-1.0, 0.1]}, "above 0"),
+        ({"spacings": [1e-300, 0.1]}, "numbered up to"),
+        ({"spacings": [0.31, 9e-7]}, "numbered up to"),
     ],
 )
 def test_hostile_metadata_is_refused(change, said):

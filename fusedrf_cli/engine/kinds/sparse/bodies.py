@@ -185,7 +185,7 @@ def node_exit(field, level, p, way):
     )
 
 
-def advance(field, place, steps, k, p, way, u, u0, step):
+def advance(field, grid, place, many, steps, k, p, way, u, u0, step):
     """In a brick the next number that is a multiple of its steps, or the first beyond it; else the first
     beyond the empty node."""
     brick, level = place[0], place[1]

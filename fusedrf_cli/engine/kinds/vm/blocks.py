@@ -22,7 +22,7 @@ from fusedrf_cli.engine.kinds.vm.trimming import smaller_shape, truncated
 MAX_BLOCKS = 255
 FINER = 1 / 8  # of the finest voxel: with a stretched block a common voxel may lie under it
 TOLERANCE = 1 + 1e-4  # to which a common voxel is found
-COARSER = 1.5
+COARSER = 1.5  # times its own voxel: how coarse a tensor can get before it is left without its detail
 
 
 def blocks_of(

@@ -25,10 +25,13 @@ from numba import literally
 
 from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, RUN, WIDTH
 from fusedrf_cli.engine.kernels.parts import (
+    FACE_TOLERANCE,
+    MIXED,
     accumulate,
     add_scaled,
     bilinear,
     cell_of,
+    exit_distance,
     in_matter,
     linear,
     scatter,
@@ -57,15 +60,15 @@ class Arrays(NamedTuple):
     activation: object  # (T, 2) float, scale (1/length of the object frame) and shift of the softplus
     owners: object  # (X, Y, Z) uint16, owning block of a cell + 256 times the other block that has matter in
     # it, or NO_BLOCK; shape (0, 0, 0) when there is one block
-    occupied: object  # flat uint8, the tensors' own occupancy, asked only where there are several blocks
-    occupied_at: object  # (T, 4) int64, offset into occupied and cells per axis
+    apart: object  # flat uint8, how many cells those of a tensor's box are from matter, with several blocks
+    apart_at: object  # (T, 4) int64, offset into apart and cells per axis
     inside: object  # flat uint64, the parts of cells of tensors that hold matter (`parts.bit_of`)
     inside_at: object  # (T,) int64, offset into inside, or -1: all of a tensor's occupied cells
+    cell: object  # (B, 2) float64, a cell of the block's tensor: in the field's coordinates, in its own steps
     crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
     part: object  # (B, 6) float64, lower corner and 1 / sides of a tensor's box in its own unbounded space
     rows: object  # (T, 2) int64, rows of a level of a tensor's hashed detail, and how many levels it has
-    lattice: object  # (T, levels, 4) float, sides of a tensor's box in spacings of a level, and 1 / spacing
-    corner: object  # (T, 3) float, lower corner of a tensor's box
+    lattice: object  # (T, levels, 2, 3) float, sides and lower corner of a tensor's box in a level's spacings
 
 
 def sizes(field) -> dict[str, int]:
@@ -264,83 +267,74 @@ def scatter_colour(field, grads, t, u, v, w, scratch):
 
 def row_at(field, t, level, i, j, k):
     """Offset in params of the row of a vertex. RUN vertices along z share a hash and lie side by side."""
-    rows = np.uint64(field.rows[t, 0])
-    h = (
-        (np.uint64(i) * np.uint64(2654435761))
-        ^ (np.uint64(j) * np.uint64(805459861))
-        ^ (np.uint64(k // RUN) * np.uint64(3674653429))
-    )
-    run = (h ^ (h >> np.uint64(15))) & (rows // np.uint64(RUN) - np.uint64(1))
-    row = np.uint64(level) * rows + run * np.uint64(RUN) + np.uint64(k % RUN)
-    return np.uint64(field.layout[t, 13]) + row * np.uint64(WIDTH)
+    rows = int(field.rows[t, 0])
+    h = (i * 2654435761) ^ (j * 805459861) ^ (k // RUN * 3674653429)  # wraps around at 64 bits
+    run = (h ^ (h >> 15)) & (rows // RUN - 1)
+    return np.uint64(field.layout[t, 13] + (level * rows + run * RUN + k % RUN) * WIDTH)
 
 
 def vertex_below(field, t, level, u, v, w):
     """The vertex (i, j, k) of a level below a unit point on all axes, and how far (a, b, c) in [0, 1) of a
     spacing the point is from it."""
-    h = field.lattice[t, level]
-    x = u * h[0] + field.corner[t, 0] * h[3]
-    y = v * h[1] + field.corner[t, 1] * h[3]
-    z = w * h[2] + field.corner[t, 2] * h[3]
+    sides, low = field.lattice[t, level, 0], field.lattice[t, level, 1]
+    x, y, z = u * sides[0] + low[0], v * sides[1] + low[1], w * sides[2] + low[2]
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     real = field.params.dtype.type
     return (int(i), int(j), int(k)), (real(x - i), real(y - j), real(z - k))
+
+
+def corner(field, t, level, n, below, share):
+    """The row of the n-th of the eight vertices around a point, and its part in what is interpolated there;
+    below and share as `vertex_below` returns them."""
+    one = field.params.dtype.type(1)
+    di, dj, dk = n >> 2, (n >> 1) & 1, n & 1
+    part = share[0] if di == 1 else one - share[0]
+    part *= share[1] if dj == 1 else one - share[1]
+    part *= share[2] if dk == 1 else one - share[2]
+    return row_at(field, t, level, below[0] + di, below[1] + dj, below[2] + dk), part
 
 
 def detail_density(field, t, u, v, w):
     """What the rows of tensor t add to the density at a unit point, before activation: trilinear between
     vertices, summed over the levels."""
     p = field.params
-    one, total = p.dtype.type(1), p.dtype.type(0)
+    total = p.dtype.type(0)
     for level in range(field.rows[t, 1]):
-        (i, j, k), (a, b, c) = vertex_below(field, t, level, u, v, w)
-        for di in range(2):
-            for dj in range(2):
-                weight = (a if di == 1 else one - a) * (b if dj == 1 else one - b)
-                low = row_at(field, t, level, i + di, j + dj, k)
-                high = row_at(field, t, level, i + di, j + dj, k + 1)
-                total += weight * (p[low] + c * (p[high] - p[low]))
+        below, share = vertex_below(field, t, level, u, v, w)
+        for n in range(8):
+            row, part = corner(field, t, level, n, below, share)
+            total += part * p[row]
     return total
 
 
 def detail_colour(field, t, u, v, w):
     """As `detail_density`, what they add to the logits of red, green and blue."""
     p = field.params
-    one = p.dtype.type(1)
     red, green, blue = p.dtype.type(0), p.dtype.type(0), p.dtype.type(0)
     for level in range(field.rows[t, 1]):
-        (i, j, k), (a, b, c) = vertex_below(field, t, level, u, v, w)
-        for di in range(2):
-            for dj in range(2):
-                for dk in range(2):
-                    weight = (a if di == 1 else one - a) * (b if dj == 1 else one - b)
-                    weight *= c if dk == 1 else one - c
-                    row = row_at(field, t, level, i + di, j + dj, k + dk)
-                    red += weight * p[row + np.uint64(1)]
-                    green += weight * p[row + np.uint64(2)]
-                    blue += weight * p[row + np.uint64(3)]
+        below, share = vertex_below(field, t, level, u, v, w)
+        for n in range(8):
+            row, part = corner(field, t, level, n, below, share)
+            red += part * p[row + np.uint64(1)]
+            green += part * p[row + np.uint64(2)]
+            blue += part * p[row + np.uint64(3)]
     return red, green, blue
 
 
 def scatter_detail(field, grad, t, u, v, w, d_feature, rgb, d_rgb):
     """Adjoint of `detail_density` and, where d_rgb is not 0, of `detail_colour` behind its sigmoid."""
     real = field.params.dtype.type
-    one = real(1)
     d_red = real(d_rgb[0] * rgb[0] * (1 - rgb[0]))
     d_green = real(d_rgb[1] * rgb[1] * (1 - rgb[1]))
     d_blue = real(d_rgb[2] * rgb[2] * (1 - rgb[2]))
     for level in range(field.rows[t, 1]):
-        (i, j, k), (a, b, c) = vertex_below(field, t, level, u, v, w)
-        for di in range(2):
-            for dj in range(2):
-                for dk in range(2):
-                    weight = (a if di == 1 else one - a) * (b if dj == 1 else one - b)
-                    weight *= c if dk == 1 else one - c
-                    row = row_at(field, t, level, i + di, j + dj, k + dk)
-                    accumulate(grad, row, weight * d_feature)
-                    accumulate(grad, row + np.uint64(1), weight * d_red)
-                    accumulate(grad, row + np.uint64(2), weight * d_green)
-                    accumulate(grad, row + np.uint64(3), weight * d_blue)
+        below, share = vertex_below(field, t, level, u, v, w)
+        for n in range(8):
+            row, part = corner(field, t, level, n, below, share)
+            accumulate(grad, row, part * d_feature)
+            accumulate(grad, row + np.uint64(1), part * d_red)
+            accumulate(grad, row + np.uint64(2), part * d_green)
+            accumulate(grad, row + np.uint64(3), part * d_blue)
 
 
 # -- blocks -------------------------------------------------------------------------------------------------
@@ -366,7 +360,7 @@ def block_density(field, b, p, d, stretched):
         return 0.0, 0.0, b
     t = field.tensor[b]
     if field.owners.shape[0] != 0 and not matter_at(field, t, u, v, w):
-        return 0.0, 0.0, b
+        return 0.0, 0.0, b  # what a tensor says there was never learnt
     f, place = density_feature(field, t, u, v, w), b
     if DETAIL != 0 and field.rows[t, 1] != 0 and f + field.activation[t, 1] > EMPTY_FROM:
         f += detail_density(field, t, u, v, w)
@@ -386,36 +380,90 @@ def crossed(field, b, p, stretch):
 
 
 def matter_at(field, t, u, v, w):
-    """Whether a unit point lies in an occupied cell of tensor t; what a tensor says elsewhere was never
-    learnt."""
-    nx, ny, nz = field.occupied_at[t, 1], field.occupied_at[t, 2], field.occupied_at[t, 3]
+    """Whether a unit point lies in what is known to hold matter of tensor t; what a tensor says elsewhere was
+    never learnt."""
+    if field.inside_at[t] < 0:
+        return cells_apart(field, t, u, v, w) == 0
+    nx, ny, nz = field.apart_at[t, 1], field.apart_at[t, 2], field.apart_at[t, 3]
     i, j, m = min(int(u * nx), nx - 1), min(int(v * ny), ny - 1), min(int(w * nz), nz - 1)
-    cell = (i * ny + j) * nz + m
-    if field.inside_at[t] >= 0:
-        bits = field.inside[np.uint64(field.inside_at[t] + cell)]
-        return in_matter(bits, 4 * (u * nx - i), 4 * (v * ny - j), 4 * (w * nz - m))
-    return field.occupied[np.uint64(field.occupied_at[t, 0] + cell)] != 0
+    bits = field.inside[np.uint64(field.inside_at[t] + (i * ny + j) * nz + m)]
+    return in_matter(bits, 4 * (u * nx - i), 4 * (v * ny - j), 4 * (w * nz - m))
+
+
+def cells_apart(field, t, u, v, w):
+    """How many cells of tensor t's box that of a unit point is from the nearest with matter."""
+    nx, ny, nz = field.apart_at[t, 1], field.apart_at[t, 2], field.apart_at[t, 3]
+    i, j, m = min(int(u * nx), nx - 1), min(int(v * ny), ny - 1), min(int(w * nz), nz - 1)
+    return int(field.apart[np.uint64(field.apart_at[t, 0] + (i * ny + j) * nz + m)])
 
 
 def density(field, grid, k, p, d, scratch):
-    """(σ, pre-activation, 1, place) of the densest block at a point; ties go to the lower block (DESIGN)."""
+    """(σ, pre-activation, 1, place) of the densest block at a point; ties go to the lower block (DESIGN).
+    With several blocks 0 instead of 1 where none has matter."""
     if field.owners.shape[0] == 0:
         sigma, f, place = block_density(field, 0, p, d, True)
         return sigma, f, 1, place
-    nx, ny, nz = field.owners.shape
-    i = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
-    j = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
-    m = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
-    owners = int(field.owners[np.uint64(i), np.uint64(j), np.uint64(m)])
-    b, other = owners % 256, owners // 256
+    i, j, m = ownership_cell(field, grid, p)
+    b, other = owners_of(field, i, j, m)
     if b == NO_BLOCK:
-        return 0.0, 0.0, 1, 0
+        return 0.0, 0.0, 0, 0
     sigma, f, place = block_density(field, b, p, d, True)
     if other != NO_BLOCK:
         sigma2, f2, place2 = block_density(field, other, p, d, True)
         if sigma2 > sigma:
             return sigma2, f2, 1, place2
-    return sigma, f, 1, place
+    return sigma, f, (1 if sigma > 0.0 else 0), place
+
+
+def owners_of(field, i, j, m):
+    """The two blocks that are asked in a cell, or NO_BLOCK."""
+    owners = int(field.owners[np.uint64(i), np.uint64(j), np.uint64(m)])
+    return owners % 256, owners // 256
+
+
+def ownership_cell(field, grid, p):
+    """Indices of the cell of a point."""
+    nx, ny, nz = field.owners.shape
+    i = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
+    j = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
+    return i, j, cell_of(p[2], grid.lo[2], grid.cell[2], nz)
+
+
+def advance(field, grid, place, many, steps, k, p, way, u, u0, step):
+    """Where there is nothing, the first sample in this cell of the ownership grid that may have matter: which
+    samples there are does not change by it."""
+    if steps > 0 or field.owners.shape[0] == 0:
+        return k + max(many * steps, 1)
+    i, j, m = ownership_cell(field, grid, p)
+    stride = 1
+    if grid.stride.shape[0] != 0:
+        stride = max(1, int((int(grid.stride[i, j, m]) & (MIXED - 1)) * grid.unit / step + FACE_TOLERANCE))
+    away = min(
+        exit_distance(p[0], way[0], grid.lo[0], grid.cell[0], i, 1),
+        min(
+            exit_distance(p[1], way[1], grid.lo[1], grid.cell[1], j, 1),
+            exit_distance(p[2], way[2], grid.lo[2], grid.cell[2], m, 1),
+        ),
+    )
+    b, other = owners_of(field, i, j, m)
+    if b != NO_BLOCK:
+        away = min(away, nothing_for(field, b, p, stride * step))
+    if other != NO_BLOCK:
+        away = min(away, nothing_for(field, other, p, stride * step))
+    beyond = int((u + away - u0) / step) // stride * stride
+    return max(k + many, beyond)
+
+
+def nothing_for(field, b, p, stride):
+    """How far from a point of the field block b has no matter in any direction, at least; stride: between
+    samples there, which is no more than the block needs."""
+    u, v, w, _ = unit_point(field, b, p)
+    u, v, w = min(max(u, 0), 1), min(max(v, 0), 1), min(max(w, 0), 1)  # matter in the box is no nearer to p
+    whole = max(cells_apart(field, field.tensor[b], u, v, w) - 1, 0)
+    cell = field.cell[b, 1] * stride
+    if CROSSING == 0 or field.crossing[b] == 0:
+        cell = field.cell[b, 0]
+    return whole * cell
 
 
 def unstretched(field, grid, frame, p, scratch):

@@ -24,7 +24,7 @@ from fusedrf_cli.engine.fields.box import (
     whole_numbers,
 )
 from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, unpack_bits
-from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, Hashed
+from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
     SCENE_CELLS,
@@ -85,6 +85,11 @@ class VMTensor:
             if self.occupied is None
             else OccupancyGrid(self.aabb, self.occupied, self.space)
         )
+
+    @cached_property
+    def apart(self) -> np.ndarray:
+        """(X, Y, Z) uint8, how many cells a cell of its occupancy grid is from the nearest with matter."""
+        return self.occupancy.skip
 
     @property
     def voxel_size(self) -> np.ndarray:
@@ -352,10 +357,10 @@ class VMField(ComputedField):
             np.asarray([b.tensor for b in self.blocks], np.int64),
             np.asarray([[t.scale, t.shift] for t in self.tensors], self.real),
             owners,
-            np.concatenate([t.occupancy.occupied.ravel() for t in self.tensors]).view(np.uint8),
-            occupied_layout(self.tensors),
+            *apart_arrays(self.tensors if self.owners is not None else ()),
             np.zeros(0, np.uint64),
             np.full(len(self.tensors), -1, np.int64),
+            self.cell_sizes(),
             np.asarray(self.crossings, np.uint8),
             np.stack([np.concatenate([box[:3], 1 / (box[3:] - box[:3])]) for box in boxes]),
             *detail_arrays(self.tensors, self.real),
@@ -381,6 +386,15 @@ class VMField(ComputedField):
             else:
                 found.append(1 if own is bounded else 2)
         return found
+
+    def cell_sizes(self) -> np.ndarray:
+        """`cell` of bodies.py: the smallest side of a cell of each block's tensor, as placed and in steps."""
+        found = []
+        for block in self.blocks:
+            tensor = self.tensors[block.tensor]
+            side = float(tensor.occupancy.cell.min())
+            found.append([side * squeezed(block.object_to_field), side / tensor.step])
+        return np.asarray(found)
 
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
@@ -458,12 +472,6 @@ class VMField(ComputedField):
 def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VMShape) -> VMTensor:
     """The i-th tensor as metadata tell it. Raises ValueError naming what does not fit."""
     resolution = whole_numbers(stored["resolution"], 2, f"tensor {i}: resolution")
-    hashed = hashed_of(i, stored["hashed"]) if "hashed" in stored else None
-    for name, expected in shape.sections(resolution) + ([("detail", hashed.shape)] if hashed else []):
-        found = arrays.get(f"tensor_{i}.{name}")
-        if found is None or found.shape != expected:
-            have = "nothing" if found is None else list(found.shape)
-            raise ValueError(f"array 'tensor_{i}.{name}' should have shape {list(expected)}, found {have}")
     aabb = np.asarray(stored["aabb"], np.float64)
     if aabb.shape != (6,) or not np.isfinite(aabb).all() or (aabb[:3] >= aabb[3:]).any():
         raise ValueError(f"tensor {i}: aabb should be three minima below three maxima, found {aabb.tolist()}")
@@ -473,7 +481,14 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
     cells = whole_numbers(stored["occupancy"], 1, f"tensor {i}: occupancy")
     occupied = unpack_bits(arrays, f"tensor_{i}.occupancy", list(cells))
     space = space_named(stored.get("space", "bounded"))
-    return VMTensor(resolution, aabb, scale, shift, occupied, space, hashed)
+    hashed = hashed_of(i, stored["hashed"], aabb) if "hashed" in stored else None
+    tensor = VMTensor(resolution, aabb, scale, shift, occupied, space, hashed)
+    for name, expected in tensor.sections(shape):
+        found = arrays.get(f"tensor_{i}.{name}")
+        if found is None or found.shape != expected:
+            have = "nothing" if found is None else list(found.shape)
+            raise ValueError(f"array 'tensor_{i}.{name}' should have shape {list(expected)}, found {have}")
+    return tensor
 
 
 def stored_hashed(hashed: Hashed) -> dict:
@@ -481,8 +496,9 @@ def stored_hashed(hashed: Hashed) -> dict:
     return {"spacings": list(hashed.spacings), "rows": hashed.rows}
 
 
-def hashed_of(i: int, stored: dict) -> Hashed:
-    """Inverse of `stored_hashed`, of the i-th tensor. Raises ValueError naming what does not fit."""
+def hashed_of(i: int, stored: dict, aabb: np.ndarray) -> Hashed:
+    """Inverse of `stored_hashed`, of the i-th tensor, whose box is aabb (6,). Raises ValueError naming what
+    does not fit."""
     spacings, rows = stored["spacings"], stored["rows"]
     if type(rows) is not int or not 0 < rows <= MAX_ROWS or not 1 <= len(spacings) <= MAX_LEVELS:
         raise ValueError(
@@ -490,9 +506,15 @@ def hashed_of(i: int, stored: dict) -> Hashed:
             f"{len(spacings)} of {rows}"
         )
     try:
-        return Hashed(tuple(float(h) for h in spacings), rows)
+        hashed = Hashed(tuple(float(h) for h in spacings), rows)
     except ValueError as error:
         raise ValueError(f"tensor {i}: {error}") from None
+    if not np.abs(aabb).max() <= MAX_VERTEX * min(hashed.spacings):
+        raise ValueError(
+            f"tensor {i}: the vertices of a hashed detail should be numbered up to {MAX_VERTEX}, but its box "
+            f"reaches to {np.abs(aabb).max():g} and its 'spacings' are {list(hashed.spacings)}"
+        )
+    return hashed
 
 
 def check_answers(i: int, tensor: VMTensor, sections: dict[str, torch.Tensor]) -> None:
@@ -532,23 +554,24 @@ def stored_block(i: int, stored: dict, tensors: int) -> Block:
     return Block(stored["tensor"], matrix, str(stored["name"]), tint)
 
 
-def occupied_layout(tensors: tuple[VMTensor, ...]) -> np.ndarray:
-    """(T, 4) int64: offset of a tensor's cells in the concatenated occupancies, and cells per axis."""
-    shapes = [t.occupancy.occupied.shape for t in tensors]
+def apart_arrays(tensors: tuple[VMTensor, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """`apart` and `apart_at` of bodies.py."""
+    shapes = [t.apart.shape for t in tensors]
     offsets = np.cumsum([0, *[int(np.prod(s)) for s in shapes]])[:-1]
-    return np.asarray([[o, *s] for o, s in zip(offsets, shapes, strict=True)], np.int64)
+    at = np.asarray([[o, *s] for o, s in zip(offsets, shapes, strict=True)], np.int64).reshape(-1, 4)
+    return np.concatenate([np.zeros(0, np.uint8), *[t.apart.ravel() for t in tensors]]), at
 
 
-def detail_arrays(tensors: tuple[VMTensor, ...], real: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`rows`, `lattice` and `corner` of bodies.py."""
+def detail_arrays(tensors: tuple[VMTensor, ...], real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+    """`rows` and `lattice` of bodies.py."""
     levels = max(len(t.hashed.spacings) if t.hashed else 0 for t in tensors)
-    rows, lattice = np.zeros((len(tensors), 2), np.int64), np.zeros((len(tensors), levels, 4), real)
+    rows, lattice = np.zeros((len(tensors), 2), np.int64), np.zeros((len(tensors), levels, 2, 3), real)
     for i, tensor in enumerate(tensors):
         if tensor.hashed:
             rows[i] = tensor.hashed.rows, len(tensor.hashed.spacings)
             for level, spacing in enumerate(tensor.hashed.spacings):
-                lattice[i, level] = [*(tensor.aabb[3:] - tensor.aabb[:3]) / spacing, 1 / spacing]
-    return rows, lattice, np.stack([tensor.aabb[:3] for tensor in tensors]).astype(real)
+                lattice[i, level] = np.stack([tensor.aabb[3:] - tensor.aabb[:3], tensor.aabb[:3]]) / spacing
+    return rows, lattice
 
 
 def claimed_cells(marks: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

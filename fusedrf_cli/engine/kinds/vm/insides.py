@@ -8,7 +8,6 @@ import numpy as np
 from fusedrf_cli.engine.fields.insides import SIDE, insides_of, with_insides
 from fusedrf_cli.engine.fields.occupancy import (
     MAX_STRIDE,
-    PARTS,
     OccupancyGrid,
     Pace,
     reached_cells,
@@ -87,7 +86,7 @@ def strides_of(field: VMField, blocks: list[Block]) -> np.ndarray:
     reached = np.isfinite(pace.spacing) & grid.occupied
     if grid.stride is None:
         return reached.astype(np.uint16)
-    strides = PARTS * np.where(reached, np.minimum(pace.spacing, grid.cell.min()), 0) / grid.unit + 1e-4
+    strides = np.where(reached, np.minimum(pace.spacing, grid.cell.min()), 0) / grid.unit + 1e-4
     return np.where(reached, np.clip(strides, 1, MAX_STRIDE), 0).astype(np.uint16)
 
 
