@@ -1,5 +1,6 @@
 """`extract`: an object out of a field, told by masks, points or shapes, and what is left without it."""
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,7 +10,7 @@ import numpy as np
 
 from formats.atomic import atomic_folder, check_writable
 from formats.captures import read_cameras
-from formats.errors import BadMask, FormatError
+from formats.errors import BadMask, FormatError, OutputExists
 from formats.hulls import Hull
 from formats.images import read_mask, write_png
 from formats.photos import pictures
@@ -44,6 +45,8 @@ AROUND = 2
 """Cells around an object that was found in a first look."""
 RADIUS = 3
 """Pixels of LONGEST around a point that say what it does, beside masks."""
+PREVIEW = re.compile(r".*_(object|marked|rest)\.png")
+"""Names of previews."""
 MARKED = np.array([1.0, 0.2, 0.1])
 BEFORE, ALIKE = 1.05, 0.1
 """A pixel of the whole shows something before the object where its distance is less by so much, and its
@@ -87,7 +90,7 @@ def extract(request: ExtractRequest, progress) -> dict:
         if (request.refit or request.fill) and not request.invert:
             raise UsageProblem("--refit and --fill mend what is left of the field; give --invert too")
         if request.preview:
-            check_writable(request.preview, request.overwrite, folders=True)
+            check_preview(request)
         progress.phase("reading", None)
         memory = Memory(request.memory)
         fused = read_fused(request.field, memory, turned=True)
@@ -141,6 +144,19 @@ def extract(request: ExtractRequest, progress) -> dict:
         "total_seconds": time.monotonic() - started,
         "memory": memory.report(),
     }
+
+
+def check_preview(request: ExtractRequest) -> None:
+    """Before any work: the folder of previews may be written, and what would be replaced are previews.
+    `--overwrite` is asked for the sake of the bundle, and must not take other files with it."""
+    check_writable(request.preview, request.overwrite, folders=True)
+    folder = Path(request.preview)
+    files = folder.iterdir() if folder.is_dir() else ()
+    others = [file for file in files if not PREVIEW.fullmatch(file.name)]
+    if others:
+        raise OutputExists(
+            f"{folder}: holds {others[0].name}, which is no preview; choose a folder that is new or empty"
+        )
 
 
 # -- what tells of it ----------------------------------------------------------------------------------------
@@ -199,6 +215,10 @@ def within(request: ExtractRequest, fused: Fused) -> Callable[[np.ndarray], np.n
 def masked(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress) -> list[Look]:
     """The masks of a folder, each with the view that is named as it."""
     files = pictures(Path(request.masks))
+    if not files:
+        raise InvalidInput(
+            f"{request.masks}: no folder of pictures; give one of masks, each named as the view that it masks"
+        )
     pairs = [(path, rig.get(path.stem) or rig.get(Path(path.stem).stem)) for path in files]
     known = [(path, view) for path, view in pairs if view is not None]
     if not known:
