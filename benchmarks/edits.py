@@ -58,8 +58,8 @@ ABOUT = (
     "is added, between two and into their boxes: *outside* is the largest change of density, in parts of the "
     "largest, at points outside of the region that this touched, and the PSNR to before of the pixels whose "
     "rays miss it. *Deleted again*: the PSNR to before once it is deleted, with all sources known; and with "
-    f"none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} pixels of the scene before (`--refit`). *Fused in, "
-    "deleted*: of an object that was fused with the others, the PSNR to the scene composed without it, "
+    f"none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} pixels of the scene before (`--refit`). "
+    "*Fused in, deleted*: of an object that was fused with the others, the PSNR to the scene composed without it, "
     f"sources known and photos alone. *Shuffled*: {SHUFFLED} additions to the same in another order. *Edit*: "
     "seconds to add an object whose box has that share of the scene's, and over those of the fuse of all."
 )
