@@ -52,16 +52,17 @@ PHOTOS, PHOTO_SIDE = 40, 300
 EDITS, CYCLE = 2000, 20
 """Of the long run, and how many of them add an object, move it about, name it anew, and delete it."""
 ABOUT = (
-    f"Written by `python -m benchmarks.edits DATA`: chairs and bottles of {MOST} on a lattice, turned and "
-    f"scaled. All PSNR is of {VIEWS} pictures of the whole. *One by one* is the PSNR to the composed scene "
-    "of a field that all were added to, *at once* that of one fuse. To what was fused at once another object "
-    "is added, between two and into their boxes: *outside* is the largest change of density, in parts of the "
-    "largest, at points outside of the region that this touched, and the PSNR to before of the pixels whose "
-    "rays miss it. *Deleted again*: the PSNR to before once it is deleted, with all sources known; and with "
-    f"none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} pixels of the scene before (`--refit`). "
-    "*Fused in, deleted*: of an object that was fused with the others, the PSNR to the scene composed without it, "
-    f"sources known and photos alone. *Shuffled*: {SHUFFLED} additions to the same in another order. *Edit*: "
-    "seconds to add an object whose box has that share of the scene's, and over those of the fuse of all."
+    f"Written by `python -m benchmarks.edits DATA`: chairs and bottles of {MOST} on a lattice, turned "
+    f"and scaled. All PSNR is of {VIEWS} pictures of the whole. *One by one* is the PSNR to the composed "
+    "scene of a field that all were added to, *at once* that of one fuse. To what was fused at once "
+    "another object is added, between two and into their boxes: *outside* is the largest change of "
+    "density, in parts of the largest, at points outside of the region that this touched, and the PSNR "
+    "to before of the pixels whose rays miss it. *Deleted again*: the PSNR to before once it is "
+    f"deleted, with all sources known; and with none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} "
+    "pixels of the scene before (`--refit`). *Fused in, deleted*: of an object that was fused with the "
+    "others, the PSNR to the scene composed without it, sources known and photos alone. *Shuffled*: "
+    f"{SHUFFLED} additions to the same in another order. *Edit*: seconds to add an object whose box has "
+    "that share of the scene's, and over those of the fuse of all."
 )
 LONG = (
     f"\n## {EDITS:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an object is "
