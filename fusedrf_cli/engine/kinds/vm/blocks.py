@@ -122,6 +122,11 @@ def part_name(name: str) -> str:
     return f"{name}/{name}" if name in UNNAMED else name
 
 
+def node_name(part: str) -> str:
+    """Inverse of `part_name`."""
+    return next((name for name in UNNAMED if part == part_name(name)), part)
+
+
 def without(field: VMField, names: set[str]) -> VMField | None:
     """The field without the blocks of those names and the tensors that only they used; None when nothing is
     left.

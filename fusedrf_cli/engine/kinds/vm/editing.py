@@ -19,6 +19,7 @@ from fusedrf_cli.engine.kinds.vm.blocks import (
     RESTORED,
     UNNAMED,
     blocks_of,
+    node_name,
     part_name,
     tensor_field,
 )
@@ -39,15 +40,14 @@ def parts(field: VMField) -> list[Part]:
 
 def arranged(field: VMField, becoming: Becoming) -> VMField:
     """The field with the blocks that stand for an object named and placed as `becoming` says."""
-    blocks = [
-        replace(block, name=block.name if name == block.name else part_name(name), object_to_field=matrix)
-        for block in field.blocks
-        for name, matrix in (
-            [(block.name, block.object_to_field)]
-            if block.name in UNNAMED
-            else becoming(block.name, block.object_to_field)
-        )
-    ]
+
+    def after(block: Block) -> list[Block]:
+        if block.name in UNNAMED:
+            return [block]
+        found = becoming(node_name(block.name), block.object_to_field)
+        return [replace(block, name=part_name(name), object_to_field=at) for name, at in found]
+
+    blocks = [one for block in field.blocks for one in after(block)]
     if len(blocks) > MAX_BLOCKS:
         raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, and this would be {len(blocks)}")
     for block in blocks:
