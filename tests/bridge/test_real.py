@@ -79,8 +79,9 @@ def test_the_page_of_edits(folder, tmp_path, monkeypatch):
         shutil.copy(folder / f"{solid}.rfpack", folder / f"{name}.rfpack")
     out = tmp_path / "real"
     out.mkdir()
-    small = {"SIDE": 40, "VIEWS": 2, "SHUFFLED": 3, "PHOTOS": 6, "PHOTO_SIDE": 32, "EDITS": 20, "REPEATS": 1}
-    for name, value in (small | {"POINTS": 2000, "OBJECTS": {"blocks": 5, "sparse": 5}}).items():
+    kinds = {"blocks": 5, "sparse": 5}
+    small = {"SIDE": 40, "VIEWS": 2, "SHUFFLED": 3, "PHOTOS": 6, "PHOTO_SIDE": 32, "EDITS": 20, "REFIT": "2"}
+    for name, value in (small | {"POINTS": 2000, "REPEATS": 1, "OBJECTS": kinds}).items():
         monkeypatch.setattr(edits, name, value)
     monkeypatch.setattr(sys, "argv", ["edits", str(folder), "--out", str(out), "--keep", str(folder)])
     edits.main()
