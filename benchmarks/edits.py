@@ -60,9 +60,9 @@ ABOUT = (
     "to before of the pixels whose rays miss it. *Deleted again*: the PSNR to before once it is "
     f"deleted, with all sources known; and with none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} "
     "pixels of the scene before (`--refit`, a minute). *Fused in, deleted*: of an object that was fused "
-    "with the others, the PSNR to one fuse of the others as blocks, sources known and photos alone. *Shuffled*: "
-    f"{SHUFFLED} additions to the same in another order. *Edit*: seconds to add an object whose box has "
-    "that share of the scene's, and over those of the fuse of all."
+    "with the others, the PSNR to one fuse of the others as blocks, sources known and photos alone. "
+    f"*Shuffled*: {SHUFFLED} additions to the same in another order. *Edit*: seconds to add an object "
+    "whose box has that share of the scene's, and over those of the fuse of all."
 )
 LONG = (
     f"\n## {EDITS:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an object is "
