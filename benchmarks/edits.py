@@ -13,7 +13,6 @@ import random
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ import torch
 
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, tell
+from benchmarks.paper.work import Kept, fusedrf, tell
 from formats.bundle import read_headers
 from formats.captures import write_capture
 from formats.views import View
@@ -69,26 +68,6 @@ LONG = (
     f"added, moved {CYCLE - 3} times, named anew and deleted, over and over. Median seconds per edit of the "
     "first and the last hundred; bytes that history takes in the bundle, and bundles that are kept.\n\n"
 )
-
-
-class Kept:
-    """What was measured so far, in a file, so that a run can go on."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-
-    def note(self, name: str, value) -> None:
-        """Remember a value."""
-        self.found[name] = value
-        self.path.write_text(json.dumps(self.found), encoding="utf-8")
-        tell(f"{name}: {value}")
-
-    def once(self, name: str, measure: Callable[[], object]):
-        """What `measure` gives, which is asked once."""
-        if name not in self.found:
-            self.note(name, measure())
-        return self.found[name]
 
 
 def nodes(count: int) -> list[tuple[str, str, list[str]]]:

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, tell
+from benchmarks.paper.work import Kept, fusedrf, tell
 from formats.captures import read_cameras, read_capture
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
@@ -88,7 +88,17 @@ def together(folder: Path, field: str, views) -> float:
     return psnr(np.array(shots[0]), np.array(shots[1]))
 
 
-def row(folder: Path, what: str, field: str, words: list[str], views, true) -> dict:
+def row(folder: Path, what: str, field: str, words: list[str], views, true, reference: str = "") -> dict:
+    """Cut an object out, and measure it, its rim against a bundle of it alone; once."""
+
+    def measure() -> dict:
+        found = measured(folder, what, field, words, views, true)
+        return found | {"rim": f"{rim(folder, reference, views, true):.1f}" if reference else ""}
+
+    return Kept(folder / "rows.json").once(what, measure)
+
+
+def measured(folder: Path, what: str, field: str, words: list[str], views, true) -> dict:
     """Cut an object out, and measure it."""
     tell(what)
     started = time.monotonic()
@@ -96,7 +106,7 @@ def row(folder: Path, what: str, field: str, words: list[str], views, true) -> d
     seconds = time.monotonic() - started
     fusedrf(folder, "extract", field, *words, "--invert", "-o", "rest.rfpack")
     scores = agreement(silhouettes(folder / "object.rfpack", views), true)
-    found = {
+    return {
         "what": what,
         "IoU": f"{scores.mean():.3f}",
         "worst": f"{scores.min():.3f}",
@@ -104,10 +114,7 @@ def row(folder: Path, what: str, field: str, words: list[str], views, true) -> d
         "seconds": f"{seconds:.1f}",
         "MB": f"{said['bytes'] / 1e6:.2f}",
         "sure": said.get("sure", ""),
-        "rim": "",
     }
-    tell(str(found))
-    return found
 
 
 def tankard(folder: Path, data: Path, seconds: float) -> list[dict]:
@@ -239,13 +246,13 @@ def red_table(folder: Path, data: Path, seconds: float) -> list[dict]:
     rest = [i for i in range(VIEWS) if i not in given]
     words = ["--masks", "red_masks", "--cameras", "cameras.json"]
     views, true = [cameras[i] for i in rest], [seen[i][0] for i in rest]
-    found = row(folder, "chair of a red table, vm, 3 masks", "red.rfpack", words, views, true)
-    return [found | {"rim": f"{rim(folder, views, true):.1f}"}]
+    what = "chair of a red table, vm, 3 masks"
+    return [row(folder, what, "red.rfpack", words, views, true, "chair.rfpack")]
 
 
-def rim(folder: Path, views, true) -> float:
-    """The mean difference of colours, of 255, of object.rfpack and chair.rfpack near the chair's outline."""
-    pair = [renderable(load_scene(str(folder / name))) for name in ("object.rfpack", "chair.rfpack")]
+def rim(folder: Path, reference: str, views, true) -> float:
+    """The mean difference of colours, of 255, of object.rfpack and another bundle near the true outline."""
+    pair = [renderable(load_scene(str(folder / name))) for name in ("object.rfpack", reference)]
     found = []
     for view, inside in zip(views, true, strict=True):
         one, other = (render_image(field, view, origin=origin).over((1, 1, 1)) for field, origin in pair)
