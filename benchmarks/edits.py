@@ -31,8 +31,10 @@ from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 
-OBJECTS = {"blocks": 32, "sparse": 32, "vm": 32}
-"""How many are added one by one."""
+OBJECTS = {"blocks": 32, "sparse": 8, "vm": 32}
+"""How many are added one by one; bricks take longer."""
+FUSING = {"vm": ("--time-budget", "40"), "sparse": ("--max-size", "8MB")}
+"""Further words of a fuse."""
 MOST = "1MB"
 """For a source: bricks as fine as larger ones take minutes to fill."""
 SHUFFLED = 6
@@ -43,11 +45,11 @@ FRAME = np.array([-0.6, -0.6, -0.6, 9.7, 4.5, 0.6])
 EXTRA = "extra", "fuze.rfpack", ["-t", "4.55,0.1,0", "-r", "0,0,20", "-s", "4"]
 """One more object, between two others and reaching into their boxes."""
 SMALL = "small", "chair.rfpack", ["-t", "4.55,2.0,0.2", "-s", "0.53"]
-"""One whose box is about a hundredth of the scene's."""
+"""One whose box is about a hundredth of the scene's of 32; of that of 8 it is the one before."""
 INNER = 3
 """Of the objects that were fused, one that is deleted."""
 REPEATS = 3
-PHOTOS, PHOTO_SIDE, REFIT = 40, 300, "60"
+PHOTOS, PHOTO_SIDE, REFIT = 40, 300, "30"
 EDITS, CYCLE = 2000, 20
 """Of the long run, and how many of them add an object, move it about, name it anew, and delete it."""
 ABOUT = (
@@ -58,10 +60,10 @@ ABOUT = (
     "density, in parts of the largest, at points outside of the region that this touched, and the PSNR "
     "to before of the pixels whose rays miss it. *Deleted again*: the PSNR to before once it is "
     f"deleted, with all sources known; and with none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} "
-    "pixels of the scene before (`--refit`, a minute). *Fused in, deleted*: of an object that was fused "
-    "with the others, the PSNR to one fuse of the others as blocks, sources known and photos alone. "
-    f"*Shuffled*: {SHUFFLED} additions to the same in another order. *Edit*: seconds to add an object "
-    "whose box has that share of the scene's, and over those of the fuse of all."
+    "pixels of the scene before (`--refit`, half a minute). *Fused in, deleted*: of an object that was "
+    "fused with the others, the PSNR to one fuse of the others as blocks, sources known and photos "
+    f"alone. *Shuffled*: {SHUFFLED} additions to the same in another order. *Edit*: seconds to add an "
+    "object whose box has that share of the scene's, and over those of the fuse of all."
 )
 LONG = (
     f"\n## {EDITS:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an object is "
@@ -92,7 +94,7 @@ def fused(folder: Path, kind: str, objects, output: str) -> float:
     """One fuse of all of them; its seconds."""
     compose(folder, objects, "some.json")
     started = time.monotonic()
-    fusedrf(folder, "fuse", "some.json", "--kind", kind, "-o", output)
+    fusedrf(folder, "fuse", "some.json", "--kind", kind, *FUSING.get(kind, ()), "-o", output)
     return time.monotonic() - started
 
 
@@ -105,11 +107,11 @@ def put(folder: Path, bundle: str, one, output: str) -> tuple[float, dict]:
 
 
 def added(folder: Path, kind: str, objects, output: str, kept: Kept) -> list[list]:
-    """A fuse of the first and an addition of each other, and after every eighth of them their number and the
+    """A fuse of the first and an addition of each other, and after every quarter of them their number and the
     PSNR to the scene of them."""
     along = kept.found.get(output, [])
     done = along[-1][0] if along else 0
-    every = max(1, len(objects) // 8)
+    every = max(1, len(objects) // 4)
     for last in range(done + every, len(objects) + 1, every):
         for i in range(last - every, last):
             if i == 0:
@@ -195,9 +197,9 @@ def shuffled(folder: Path, kind: str, objects) -> float:
     return likeness(folder, "few.rfpack", "other.rfpack")
 
 
-def small_edit(folder: Path, bundle: str) -> tuple[float, float]:
-    """Median seconds of adding a small object, and the share that it touches of the scene's box."""
-    tried = [put(folder, bundle, SMALL, "more.rfpack") for _ in range(REPEATS)]
+def timed(folder: Path, bundle: str, one) -> tuple[float, float]:
+    """Median seconds of adding an object, and the share that it touches of the scene's box."""
+    tried = [put(folder, bundle, one, "more.rfpack") for _ in range(REPEATS)]
     return float(np.median([seconds for seconds, _ in tried])), tried[0][1]["touched"]["share_of_box"]
 
 
@@ -209,7 +211,7 @@ def row(folder: Path, kind: str) -> tuple[dict, list[list]]:
     once, many, more = (f"{kind}_{name}.rfpack" for name in ("once", "many", "more"))
     compose(folder, objects, "all.json")
     whole = kept.once("seconds", lambda: fused(folder, kind, objects, once))
-    seconds, share = kept.once("edit", lambda: small_edit(folder, once))
+    seconds, share = kept.once("edit", lambda: timed(folder, once, SMALL if len(objects) > 8 else EXTRA))
     at_once = kept.once("at once", lambda: likeness(folder, once, "all.json"))
     box = kept.once("box", lambda: put(folder, once, EXTRA, more)[1]["touched"]["aabb"])
     change, missed = kept.once("outside", lambda: outside(folder, once, more, np.array(box)))
