@@ -32,7 +32,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
-from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, depths, shown_by, well_shown
+from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, shown_by, well_shown
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest
 
@@ -120,7 +120,8 @@ def extract(request: ExtractRequest, progress) -> dict:
                 )
             progress.phase("cutting", None)
             try:
-                parts = cut(fused, selection, shown, well, cameras if request.invert else [])
+                both = bool(request.invert or request.preview)
+                parts = cut(fused, selection, shown, well, cameras if request.invert else [], both)
             except ValueError as error:
                 raise InvalidInput(f"{request.field}: {error}") from error
             figures = {"sure": round(selection.sure, 3), "seen": seen_share(fused, rig, parts[0])}
@@ -294,7 +295,7 @@ def surface_at(field: StoredField, look: Look, what: str) -> np.ndarray:
     """(3,) the point of the frame that the middle of a pointed look shows; InvalidInput where there is
     nothing."""
     rays_o, rays_d = look.camera.rays()
-    away = depths(field, look.camera).ravel()[look.counted.ravel()]
+    away = look.depths(field).ravel()[look.counted.ravel()]
     if not np.isfinite(away).any():
         raise InvalidInput(f"{what}: there is nothing to be seen; point at what shows")
     chosen = look.counted.ravel()
@@ -390,12 +391,19 @@ def watching(fused: Fused) -> list[Camera]:
 
 
 def cut(
-    fused: Fused, selection: Selection, shown: np.ndarray, least: float, cameras: list[Camera]
+    fused: Fused,
+    selection: Selection,
+    shown: np.ndarray,
+    least: float,
+    cameras: list[Camera],
+    both: bool,
 ) -> tuple[StoredField | None, StoredField | None]:
     """The object, and what is left, without what shows where the object was to cameras that did not see it
     before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it lies
-    more of it."""
+    more of it. Without `both` the object alone is cut out."""
     found = fused.kind.cut_out(fused.field, selection)
+    if not both:
+        return found, None
     gone = selection.with_islands() if cameras else selection  # of photos: what hangs in the air is an error
     left = fused.kind.cut_away(fused.field, gone)
     for _ in range(LAYERS if cameras else 0):
