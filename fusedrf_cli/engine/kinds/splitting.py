@@ -104,7 +104,17 @@ def cut_out(field, box: np.ndarray, selection: Selection, to_field: ToField = as
     """The object as a field over the texels around it of a field that has `resampled` over a box (6,); None
     where there is nothing of it."""
     narrowest = float(selection.lattice.grid.cell.min())
-    return within(field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)))
+    looked_in = field.occupancy.aabb
+    if to_field is as_it_is:
+        looked_in = common_box(looked_in, selection.object.tight_aabb(1))
+    return within(
+        field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)), looked_in
+    )
+
+
+def common_box(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(6,) what two boxes (6,) have in common."""
+    return np.concatenate([np.maximum(one[:3], other[:3]), np.minimum(one[3:], other[3:])])
 
 
 def cropped(field, box: np.ndarray, holds: Holds):
@@ -117,13 +127,13 @@ def cropped(field, box: np.ndarray, holds: Holds):
             kept[kept] = holds(placed(middles[kept] + corner * size, field.space))
         return kept
 
-    return within(field, box, field.voxel_size, wholly)
+    return within(field, box, field.voxel_size, wholly, field.occupancy.aabb)
 
 
-def within(field, box: np.ndarray, narrowest: float, inside):
+def within(field, box: np.ndarray, narrowest: float, inside, looked_in: np.ndarray):
     """The part of a field, whose numbers lie over a box (6,), that `with_object` keeps, on the texels around
-    it."""
-    rough = with_object(field.occupancy, field.occupancy.aabb, narrowest, inside)
+    it. There is none of it outside of the box `looked_in` (6,)."""
+    rough = with_object(field.occupancy, looked_in, narrowest, inside)
     if rough is None:
         return None
     around, resolution = on_texels(rough.tight_aabb(1), box, field.resolution)

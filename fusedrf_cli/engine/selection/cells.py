@@ -60,6 +60,13 @@ class Lattice:
         return self.grid.cell.max() / np.sqrt(rates)
 
     @cached_property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) corners of the box around the occupied cells in the field's frame."""
+        wide = self.widths.max(initial=0)
+        low, high = self.points.min(0, initial=np.inf), self.points.max(0, initial=-np.inf)
+        return np.stack([low - wide, high + wide])
+
+    @cached_property
     def dense(self) -> np.ndarray:
         """(M,) bool: those with matter that shows."""
         at = torch.from_numpy(self.points)

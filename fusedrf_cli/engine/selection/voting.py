@@ -73,10 +73,8 @@ def shown_by(field, lattice: Lattice, cameras: Sequence[Camera]) -> np.ndarray:
 
 def reaching(lattice: Lattice, rays_o: np.ndarray, rays_d: np.ndarray) -> np.ndarray:
     """(N,) bool: which rays (N, 3) meet the box around the cells of a lattice."""
-    low, high = lattice.points.min(0, initial=np.inf), lattice.points.max(0, initial=-np.inf)
-    wide = lattice.widths.max(initial=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([(low - wide - rays_o) / rays_d, (high + wide - rays_o) / rays_d])
+        ends = np.stack([(corner - rays_o) / rays_d for corner in lattice.bounds])
     return np.nanmax(ends.min(0), 1).clip(0) <= np.nanmin(ends.max(0), 1)
 
 
