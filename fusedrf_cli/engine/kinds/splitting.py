@@ -107,9 +107,7 @@ def cut_out(field, box: np.ndarray, selection: Selection, to_field: ToField = as
     looked_in = field.occupancy.aabb
     if to_field is as_it_is:
         looked_in = common_box(looked_in, selection.object.tight_aabb(1))
-    return within(
-        field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)), looked_in
-    )
+    return within(field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)), looked_in)
 
 
 def common_box(one: np.ndarray, other: np.ndarray) -> np.ndarray:
