@@ -308,12 +308,14 @@ def surface_at(field: StoredField, look: Look, what: str) -> np.ndarray:
 
 
 def selected(field: StoredField, told: Told) -> Selection:
-    """The object in two looks: at all of the field in coarse cells, and at the box that it lies in."""
+    """The object in two looks: at all of the field in coarse cells, and at the box that it lies in. Where it
+    touches other matter colours correct what masks say."""
     found = choice(Lattice.over(field, field.occupancy.aabb, COARSE), told)
     if not found.shows:
         return found
     held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
-    return choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+    return fine.without_foreign() if told.masks else fine
 
 
 def choice(lattice: Lattice, told: Told) -> Selection:
