@@ -44,7 +44,7 @@ class Kept:
         """Remember a value."""
         self.found[name] = value
         self.path.write_text(json.dumps(self.found), encoding="utf-8")
-        tell(f"{name}: {value}")
+        tell(f"{name}: {value}"[:200])
 
     def once(self, name: str, measure: Callable[[], object]):
         """What `measure` gives, which is asked once."""

@@ -86,7 +86,7 @@ def test_the_page_of_edits(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["edits", str(folder), "--out", str(out), "--keep", str(folder)])
     edits.main()
     found = json.loads((out / "edits.json").read_text())
-    assert found["long"]["edits"] == 20 and found["long"]["bundles kept"] == 19
+    assert found["long"]["edits"] == 20 and found["long"]["bundles kept"] == 20
     for kind in ("blocks", "sparse"):
         row, along = found[kind]
         assert [count for count, _ in along] == [1, 2, 3, 4] and row["outside"].startswith("0;")
