@@ -33,7 +33,7 @@ from fusedrf_cli.engine.rendering.volume import render_image
 
 OBJECTS = {"blocks": 32, "sparse": 8, "vm": 32}
 """How many are added one by one; bricks take longer."""
-FUSING = {"vm": ("--time-budget", "40"), "sparse": ("--max-size", "8MB")}
+FUSING = {"vm": ("--time-budget", "20"), "sparse": ("--max-size", "8MB")}
 """Further words of a fuse."""
 MOST = "1MB"
 """For a source: bricks as fine as larger ones take minutes to fill."""
@@ -106,6 +106,14 @@ def put(folder: Path, bundle: str, one, output: str) -> tuple[float, dict]:
     return time.monotonic() - started, said
 
 
+def begun(folder: Path, kind: str, one, output: str) -> None:
+    """A fuse of one object."""
+    first = folder / f"{kind}_first.rfpack"
+    if not first.exists():
+        fused(folder, kind, [one], first.name)
+    shutil.copy(first, folder / output)
+
+
 def added(folder: Path, kind: str, objects, output: str, kept: Kept) -> list[list]:
     """A fuse of the first and an addition of each other, and after every quarter of them their number and the
     PSNR to the scene of them."""
@@ -115,7 +123,7 @@ def added(folder: Path, kind: str, objects, output: str, kept: Kept) -> list[lis
     for last in range(done + every, len(objects) + 1, every):
         for i in range(last - every, last):
             if i == 0:
-                fused(folder, kind, objects[:1], output)
+                begun(folder, kind, objects[0], output)
             else:
                 put(folder, output, objects[i], output)
         compose(folder, objects[:last], "some.json")
@@ -175,15 +183,15 @@ def photographed(folder: Path, scene: str, output: Path) -> None:
 def deleted(folder: Path, bundle: str, name: str, before: str) -> tuple[float, float]:
     """PSNR in dB to a bundle or scene of what is left when an object is deleted: where the other sources are
     found, and where none is, but there are photos of that scene."""
-    fusedrf(folder, "delete", bundle, name, "-o", "less.rfpack")
+    learning = ("--time-budget", REFIT)
+    fusedrf(folder, "delete", bundle, name, *learning, "-o", "less.rfpack")
     known = likeness(folder, "less.rfpack", before)
     apart = folder / "apart"
     shutil.rmtree(apart, ignore_errors=True)
     apart.mkdir()
     shutil.copy(folder / bundle, apart / "bundle.rfpack")
     photographed(folder, before, apart / "photos")
-    words = ("--refit", "photos", "--time-budget", REFIT, "-o", "../less.rfpack")
-    fusedrf(apart, "delete", "bundle.rfpack", name, *words)
+    fusedrf(apart, "delete", "bundle.rfpack", name, "--refit", "photos", *learning, "-o", "../less.rfpack")
     return known, likeness(folder, "less.rfpack", before)
 
 
@@ -191,7 +199,7 @@ def shuffled(folder: Path, kind: str, objects) -> float:
     """PSNR in dB of additions to the same in another order."""
     orders = objects, [objects[0], *random.Random(2).sample(objects[1:], len(objects) - 1)]
     for order, output in zip(orders, ("few.rfpack", "other.rfpack"), strict=True):
-        fused(folder, kind, order[:1], output)
+        begun(folder, kind, order[0], output)
         for one in order[1:]:
             put(folder, output, one, output)
     return likeness(folder, "few.rfpack", "other.rfpack")
