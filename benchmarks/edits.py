@@ -24,6 +24,7 @@ from benchmarks.paper.work import Kept, fusedrf, tell
 from formats.bundle import read_headers
 from formats.captures import write_capture
 from formats.views import View
+from fusedrf_cli.bridge.history import graph_nodes
 from fusedrf_cli.bridge.rendering import renderable, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.distillation.judging import meets
@@ -33,7 +34,7 @@ from fusedrf_cli.engine.rendering.volume import render_image
 
 OBJECTS = {"blocks": 32, "sparse": 8, "vm": 32}
 """How many are added one by one; bricks take longer."""
-FUSING = {"vm": ("--time-budget", "20"), "sparse": ("--max-size", "8MB")}
+FUSING = {"vm": ("--time-budget", "20"), "sparse": ("--max-size", "4MB")}
 """Further words of a fuse."""
 MOST = "1MB"
 """For a source: bricks as fine as larger ones take minutes to fill."""
@@ -106,6 +107,11 @@ def put(folder: Path, bundle: str, one, output: str) -> tuple[float, dict]:
     return time.monotonic() - started, said
 
 
+def held(bundle: Path) -> set[str]:
+    """Names of the objects in a bundle."""
+    return {node["name"] for node in graph_nodes(read_headers(bundle)[0])}
+
+
 def begun(folder: Path, kind: str, one, output: str) -> None:
     """A fuse of one object."""
     first = folder / f"{kind}_first.rfpack"
@@ -120,14 +126,15 @@ def added(folder: Path, kind: str, objects, output: str, kept: Kept) -> list[lis
     along = kept.found.get(output, [])
     done = along[-1][0] if along else 0
     every = max(1, len(objects) // 4)
-    for last in range(done + every, len(objects) + 1, every):
-        for i in range(last - every, last):
+    ends = [*range(every, len(objects), every), len(objects)]
+    for last in (end for end in ends if end > done):
+        for i in range(done, last):
             if i == 0:
                 begun(folder, kind, objects[0], output)
-            else:
+            elif objects[i][0] not in held(folder / output):
                 put(folder, output, objects[i], output)
         compose(folder, objects[:last], "some.json")
-        along = [*along, [last, psnr(pictures(folder, output), pictures(folder, "some.json"))]]
+        done, along = last, [*along, [last, psnr(pictures(folder, output), pictures(folder, "some.json"))]]
         kept.note(output, along)
     return along
 
@@ -224,9 +231,10 @@ def row(folder: Path, kind: str) -> tuple[dict, list[list]]:
     box = kept.once("box", lambda: put(folder, once, EXTRA, more)[1]["touched"]["aabb"])
     change, missed = kept.once("outside", lambda: outside(folder, once, more, np.array(box)))
     again = kept.once("deleted again", lambda: deleted(folder, more, EXTRA[0], once))
-    if not (folder / "without.rfpack").exists():  # as blocks it is the composed scene, and is rendered sooner
-        fused(folder, "blocks", objects[:INNER] + objects[INNER + 1 :], "without.rfpack")
-    inner = kept.once("fused in", lambda: deleted(folder, once, objects[INNER][0], "without.rfpack"))
+    without = f"without_{len(objects)}.rfpack"
+    if not (folder / without).exists():  # as blocks it is the composed scene, and is rendered sooner
+        fused(folder, "blocks", objects[:INNER] + objects[INNER + 1 :], without)
+    inner = kept.once("fused in", lambda: deleted(folder, once, objects[INNER][0], without))
     order = kept.once("shuffled", lambda: shuffled(folder, kind, objects[:SHUFFLED]))
     along = added(folder, kind, objects, many, kept)
     return {
