@@ -125,7 +125,7 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
         return _read_llff(path / llff.NAME, downscale)
     if (folders := polycam.keyframes(path)) is not None:
         return _read_polycam(path, *folders, downscale)
-    found = "pictures but" if has_pictures(path) else "neither pictures nor"
+    found = "pictures but" if has_pictures(path) else "no pictures and"
     raise NoPoses(
         f"{path}: found {found} no camera poses (transforms.json, transforms_train.json, COLMAP's sparse/0, "
         "LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"

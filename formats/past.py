@@ -80,6 +80,8 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
         raise BadSchema(f"{bundle}: not a bundle; only edits of a fused .rfpack can be undone")
     scene, _ = read_headers(bundle)
     checksum = before(scene)
+    if all(entry.get("event") == "fused" and not entry.get("edits") for entry in scene.history):
+        raise BadSchema(f"{bundle}: it was not edited since it was made; there is nothing to undo")
     if checksum is None:
         raise BadSchema(
             f"{bundle}: what it was before its last edit was not kept; edit with --keep-history to undo it"

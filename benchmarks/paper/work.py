@@ -6,7 +6,7 @@ import io
 import json
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +31,26 @@ class Work:
     """Tables and plots."""
     data: Path | None
     """Captures: chair/ and fuze/fuze.obj; None: scenes that are made here alone."""
+
+
+class Kept:
+    """What was measured so far, in a file, so that a run can go on."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+    def note(self, name: str, value) -> None:
+        """Remember a value."""
+        self.found[name] = value
+        self.path.write_text(json.dumps(self.found), encoding="utf-8")
+        tell(f"{name}: {value}"[:200])
+
+    def once(self, name: str, measure: Callable[[], object]):
+        """What `measure` gives, which is asked once."""
+        if name not in self.found:
+            self.note(name, measure())
+        return self.found[name]
 
 
 def fusedrf(folder: Path, *words: str) -> dict:

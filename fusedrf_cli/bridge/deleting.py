@@ -78,6 +78,8 @@ def without_objects(
             "what the deleted objects hid stays empty; --refit PHOTOS learns it from photos, --fill goes on "
             "smoothly with what is seen around it"
         )
+    if request.refit and "photos" not in told:
+        progress.warn("--refit is not needed: what the deleted objects hid is known")
     restored = rest is not None or not inside
     for node in inside:
         progress.phase(f"deleting {node['name']}", 1.0)
@@ -119,7 +121,7 @@ def check_names(request: DeleteRequest, fused: Fused) -> None:
     for name in request.names:
         if name not in fused.names:
             raise InvalidInput(
-                f"{request.fused}: there is no '{name}' to delete; it holds "
+                f"{request.fused}: there is no '{name}'; it holds "
                 f"{', '.join(sorted(fused.names)) or 'nothing that has a name'}"
             )
     if set(request.names) == fused.names:

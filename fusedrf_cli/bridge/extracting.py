@@ -1,5 +1,6 @@
 """`extract`: an object out of a field, told by masks, points or shapes, and what is left without it."""
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,7 +10,7 @@ import numpy as np
 
 from formats.atomic import atomic_folder, check_writable
 from formats.captures import read_cameras
-from formats.errors import BadMask, FormatError
+from formats.errors import BadMask, FormatError, OutputExists
 from formats.hulls import Hull
 from formats.images import read_mask, write_png
 from formats.photos import pictures
@@ -31,7 +32,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
-from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, depths, shown_by, well_shown
+from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, shown_by, well_shown
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest
 
@@ -44,6 +45,8 @@ AROUND = 2
 """Cells around an object that was found in a first look."""
 RADIUS = 3
 """Pixels of LONGEST around a point that say what it does, beside masks."""
+PREVIEW = re.compile(r".*_(object|marked|rest)\.png")
+"""Names of previews."""
 MARKED = np.array([1.0, 0.2, 0.1])
 BEFORE, ALIKE = 1.05, 0.1
 """A pixel of the whole shows something before the object where its distance is less by so much, and its
@@ -87,7 +90,7 @@ def extract(request: ExtractRequest, progress) -> dict:
         if (request.refit or request.fill) and not request.invert:
             raise UsageProblem("--refit and --fill mend what is left of the field; give --invert too")
         if request.preview:
-            check_writable(request.preview, request.overwrite, folders=True)
+            check_preview(request)
         progress.phase("reading", None)
         memory = Memory(request.memory)
         fused = read_fused(request.field, memory, turned=True)
@@ -117,7 +120,8 @@ def extract(request: ExtractRequest, progress) -> dict:
                 )
             progress.phase("cutting", None)
             try:
-                parts = cut(fused, selection, shown, well, cameras if request.invert else [])
+                both = bool(request.invert or request.preview)
+                parts = cut(fused, selection, shown, well, cameras if request.invert else [], both)
             except ValueError as error:
                 raise InvalidInput(f"{request.field}: {error}") from error
             figures = {"sure": round(selection.sure, 3), "seen": seen_share(fused, rig, parts[0])}
@@ -141,6 +145,19 @@ def extract(request: ExtractRequest, progress) -> dict:
         "total_seconds": time.monotonic() - started,
         "memory": memory.report(),
     }
+
+
+def check_preview(request: ExtractRequest) -> None:
+    """Before any work: the folder of previews may be written, and what would be replaced are previews.
+    `--overwrite` is asked for the sake of the bundle, and must not take other files with it."""
+    check_writable(request.preview, request.overwrite, folders=True)
+    folder = Path(request.preview)
+    files = folder.iterdir() if folder.is_dir() else ()
+    others = [file for file in files if not PREVIEW.fullmatch(file.name)]
+    if others:
+        raise OutputExists(
+            f"{folder}: holds {others[0].name}, which is no preview; choose a folder that is new or empty"
+        )
 
 
 # -- what tells of it ----------------------------------------------------------------------------------------
@@ -199,6 +216,10 @@ def within(request: ExtractRequest, fused: Fused) -> Callable[[np.ndarray], np.n
 def masked(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress) -> list[Look]:
     """The masks of a folder, each with the view that is named as it."""
     files = pictures(Path(request.masks))
+    if not files:
+        raise InvalidInput(
+            f"{request.masks}: no folder of pictures; give one of masks, each named as the view that it masks"
+        )
     pairs = [(path, rig.get(path.stem) or rig.get(Path(path.stem).stem)) for path in files]
     known = [(path, view) for path, view in pairs if view is not None]
     if not known:
@@ -274,7 +295,7 @@ def surface_at(field: StoredField, look: Look, what: str) -> np.ndarray:
     """(3,) the point of the frame that the middle of a pointed look shows; InvalidInput where there is
     nothing."""
     rays_o, rays_d = look.camera.rays()
-    away = depths(field, look.camera).ravel()[look.counted.ravel()]
+    away = look.depths(field).ravel()[look.counted.ravel()]
     if not np.isfinite(away).any():
         raise InvalidInput(f"{what}: there is nothing to be seen; point at what shows")
     chosen = look.counted.ravel()
@@ -287,12 +308,14 @@ def surface_at(field: StoredField, look: Look, what: str) -> np.ndarray:
 
 
 def selected(field: StoredField, told: Told) -> Selection:
-    """The object in two looks: at all of the field in coarse cells, and at the box that it lies in."""
+    """The object in two looks: at all of the field in coarse cells, and at the box that it lies in. Where it
+    touches other matter colours correct what masks say."""
     found = choice(Lattice.over(field, field.occupancy.aabb, COARSE), told)
     if not found.shows:
         return found
     held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
-    return choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+    return fine.without_foreign() if told.masks else fine
 
 
 def choice(lattice: Lattice, told: Told) -> Selection:
@@ -370,12 +393,19 @@ def watching(fused: Fused) -> list[Camera]:
 
 
 def cut(
-    fused: Fused, selection: Selection, shown: np.ndarray, least: float, cameras: list[Camera]
+    fused: Fused,
+    selection: Selection,
+    shown: np.ndarray,
+    least: float,
+    cameras: list[Camera],
+    both: bool,
 ) -> tuple[StoredField | None, StoredField | None]:
     """The object, and what is left, without what shows where the object was to cameras that did not see it
     before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it lies
-    more of it."""
+    more of it. Without `both` the object alone is cut out."""
     found = fused.kind.cut_out(fused.field, selection)
+    if not both:
+        return found, None
     gone = selection.with_islands() if cameras else selection  # of photos: what hangs in the air is an error
     left = fused.kind.cut_away(fused.field, gone)
     for _ in range(LAYERS if cameras else 0):

@@ -108,7 +108,10 @@ def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredFie
         at = splitting.placed(points, learnt.space)
         return ((at >= box[:3]) & (at <= box[3:])).all(1)
 
-    return splitting.within(learnt, learnt.tensors[0].aabb, learnt.voxel_size, inside)
+    looked_in = learnt.occupancy.aabb
+    if same:
+        looked_in = splitting.common_box(looked_in, box)
+    return splitting.within(learnt, learnt.tensors[0].aabb, learnt.voxel_size, inside, looked_in)
 
 
 # -- learning from photos ------------------------------------------------------------------------------------

@@ -7,6 +7,8 @@ import pytest
 
 from formats.bundle import read_bundle, read_field, read_headers
 from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.bridge.conftest import done
 
@@ -86,7 +88,7 @@ def test_a_renamed_object_goes_by_its_new_name(report, run, picture, folder):
     report("rename", "blocks.rfpack", "red", "box", "-o", "named.rfpack")
     assert np.array_equal(picture("named.rfpack"), picture("blocks.rfpack"))
     gone = run("delete", "named.rfpack", "red", "-o", "less.rfpack")
-    assert gone.exit_code == 3 and "there is no 'red' to delete; it holds box, floor" in gone.stderr
+    assert gone.exit_code == 3 and "there is no 'red'; it holds box, floor" in gone.stderr
     report("delete", "named.rfpack", "box", "-o", "less.rfpack")
     history = read_bundle(folder / "less.rfpack").scene.history
     assert [entry["event"] for entry in history] == ["fused", "renamed", "deleted"]
@@ -132,7 +134,43 @@ def test_edits_are_undone_as_they_were_made(report, run, folder):
         report("undo", "fused.rfpack", "-o", "fused.rfpack", "-w")
         assert (folder / "fused.rfpack").read_bytes() == before
     result = run("undo", "fused.rfpack", "-o", "fused.rfpack", "-w")
+    assert result.exit_code == 3 and "nothing to undo" in result.stderr
+    report("move", "fused.rfpack", "red", "-t", "0.1,0,0", "-o", "fused.rfpack", "-w")
+    result = run("undo", "fused.rfpack", "-o", "fused.rfpack", "-w")
     assert result.exit_code == 3 and "--keep-history" in result.stderr
+
+
+@pytest.mark.parametrize("name", ["fused", "restored"])
+def test_an_object_may_have_any_name(report, picture, folder, name):
+    """Those too by which a field calls tensors of its own."""
+    report("rename", "blocks.rfpack", "red", name, "-o", "named.rfpack")
+    report("duplicate", "blocks.rfpack", "red", name, *UP, "-o", "two.rfpack")
+    report("move", "named.rfpack", name, *UP, "-o", "moved.rfpack")
+    report("delete", "two.rfpack", "red", "-o", "one.rfpack")
+    assert np.array_equal(picture("one.rfpack"), picture("moved.rfpack"))
+    report("rename", "named.rfpack", name, "red", "-o", "back.rfpack")
+    assert parts_of(folder / "back.rfpack") == parts_of(folder / "blocks.rfpack")
+    report("delete", "blocks.rfpack", "red", "-o", "floor.rfpack", "-w")
+    report("delete", "two.rfpack", "red", name, "-o", "none.rfpack")
+    assert np.array_equal(picture("none.rfpack"), picture("floor.rfpack"))
+
+
+@pytest.mark.parametrize("name", ["fused", "restored"])
+def test_a_fused_object_may_have_any_name(report, picture, folder, name):
+    shutil.copy(folder / "red.rfpack", folder / f"{name}.rfpack")
+    words = ("floor.rfpack", "-t", "0,0,-0.7", f"{name}.rfpack", "-t", "-0.5,0,0")
+    report("compose", *words, "-o", "scene.json", "-w")
+    report("fuse", "scene.json", "-o", "both.rfpack")
+    assert parts_of(folder / "both.rfpack") == ["floor", f"{name}/{name}"]
+    report("delete", "both.rfpack", name, "-o", "less.rfpack")
+    report("delete", "blocks.rfpack", "red", "-o", "floor.rfpack", "-w")
+    assert np.array_equal(picture("less.rfpack"), picture("floor.rfpack"))
+
+
+def parts_of(path) -> list[str]:
+    """Names of what a bundle holds apart."""
+    field, _ = load_scene(str(path)).lone()
+    return [part.name for part in registry.kind(field.kind).parts(field)]
 
 
 def test_what_replaces_an_object_stands_as_it_did(report, run, folder, picture):

@@ -131,7 +131,7 @@ def test_an_object_added_to_a_distilled_field_can_go_again(report, picture):
     [
         (("add", "blocks.rfpack", "blue.rfpack", "--name", "red"), "a 'red' already"),
         (("add", "scene.json", "blue.rfpack", "--name", "new"), "not a bundle"),
-        (("delete", "blocks.rfpack", "ghost"), "no 'ghost' to delete; it holds floor, red"),
+        (("delete", "blocks.rfpack", "ghost"), "no 'ghost'; it holds floor, red"),
         (("delete", "blocks.rfpack", "red", "floor"), "would leave nothing"),
         (("delete", "vm.rfpack", "red", "floor", "blue"), "would leave nothing"),
         (("delete", "scene.json", "red"), "not a bundle"),

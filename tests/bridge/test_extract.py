@@ -174,6 +174,7 @@ BAD = {
     ),
     "masks of another shape": (("--masks", "wide", "--cameras", "cameras.json"), 3, "paint masks on"),
     "black masks": (("--masks", "black", "--cameras", "cameras.json"), 3, "black all over"),
+    "no masks": (("--masks", "cameras.json", "--cameras", "cameras.json"), 3, "no folder of pictures"),
     "nothing to mend": (("--box", AROUND, "--fill"), 2, "give --invert too"),
     "a name and more": (("--name", "red", "--box", AROUND), 2, "--name takes a whole part"),
 }
@@ -192,6 +193,16 @@ def test_bad_words_get_one_sentence(run, folder, what):
     assert result.stderr.count("\n") <= 2 and not (folder / "object.rfpack").exists()
     assert not (folder / "look").exists()
 
+
+
+def test_previews_replace_no_other_pictures(report, run, folder):
+    words = ("extract", "blocks.rfpack", "--name", "red", "-o", "object.rfpack", "-w", "--preview")
+    kept = sorted((folder / "masks").iterdir())
+    result = run(*words, "masks")
+    assert result.exit_code == 1 and "which is no preview" in result.stderr
+    assert sorted((folder / "masks").iterdir()) == kept and not (folder / "object.rfpack").exists()
+    for _ in range(2):
+        report(*words, "look")
 
 
 COLUMN = ("--box", "-0.9,-0.4,-0.95,-0.1,0.4,0.4")  # the red box, and the floor below it

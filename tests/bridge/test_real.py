@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import real, spoiled
+from benchmarks import edits, real, spoiled
 from formats.captures import hold_out, read_capture
 from formats.images import read_image, read_image_header, write_png
 from fusedrf_cli.bridge.pictures import over_white
@@ -70,3 +70,28 @@ def test_the_table_of_spoiled_captures(data, monkeypatch, capsys):
         assert 0 < abs(one.camera_to_world - other.camera_to_world).max() < 2
     for one, other in zip(whole.test, moved.test, strict=True):
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
+
+
+@pytest.mark.slow
+def test_the_page_of_edits(folder, tmp_path, monkeypatch):
+    """Of two solids in place of the captures; what was measured once is not measured again."""
+    for name, solid in (("chair", "red"), ("fuze", "blue")):
+        shutil.copy(folder / f"{solid}.rfpack", folder / f"{name}.rfpack")
+    out = tmp_path / "real"
+    out.mkdir()
+    kinds = {"blocks": 4, "sparse": 4}
+    small = {"SIDE": 40, "VIEWS": 2, "SHUFFLED": 3, "PHOTOS": 6, "PHOTO_SIDE": 32, "EDITS": 20, "REFIT": "2"}
+    for name, value in (small | {"POINTS": 2000, "REPEATS": 1, "OBJECTS": kinds}).items():
+        monkeypatch.setattr(edits, name, value)
+    monkeypatch.setattr(sys, "argv", ["edits", str(folder), "--out", str(out), "--keep", str(folder)])
+    edits.main()
+    found = json.loads((out / "edits.json").read_text())
+    assert found["long"]["edits"] == 20 and found["long"]["bundles kept"] == 20
+    for kind in ("blocks", "sparse"):
+        row, along = found[kind]
+        assert [count for count, _ in along] == [1, 2, 3, 4] and row["outside"].startswith("0;")
+        assert row["shuffled"] == "identical" or kind == "sparse"
+    monkeypatch.setattr(edits, "fused", None)
+    edits.write_page(out, {"sparse": edits.row(folder, "sparse")})
+    assert json.loads((out / "edits.json").read_text()) == found
+    assert "![PSNR along additions](edits.svg)" in (out / "edits.md").read_text()

@@ -39,6 +39,9 @@ def test_edits_are_undone_one_after_the_other_to_the_byte(tmp_path):
         said = undo(path, path)
         assert path.read_bytes() == was[left]
         assert (said["more"], said["undone"]) == (left, "moved")
+    with pytest.raises(BadSchema, match="not edited since it was made"):
+        undo(path, path)
+    write(path, 1, {"event": "fused"}, {"event": "added"})
     with pytest.raises(BadSchema, match="was not kept; edit with --keep-history"):
         undo(path, path)
 

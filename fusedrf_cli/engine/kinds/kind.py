@@ -44,6 +44,8 @@ class Kind:
     """Whether a student may start as the scene's background (`taken_over`)."""
     precisions: tuple[str, ...] = ("int4", "int8")
     """That are tried where a quality is asked for, the cheapest first."""
+    rounds_anew = False
+    """Whether numbers stored in few bits share their scales with other ones once an edit has added some."""
     faithful = "float16"
     """The precision where only a size is given."""
 

@@ -15,7 +15,8 @@ FINEST = 320
 """Cells along an axis of the grid of a field from which an object is gone, at most, or as many as it had."""
 CUT = 256
 """Cells along the longest side of an object's grid, at most."""
-
+OWN, OTHER = 1, 2
+"""Of what is in a cell of a selection."""
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(-1, 3)
 Holds = Callable[[np.ndarray], np.ndarray]
 """Which points (N, 3) of a frame are kept, (N,) bool."""
@@ -46,26 +47,44 @@ def without_object(
     so that nothing of that is lost."""
     finer = refined(grid, voxel)
     index = np.argwhere(finer.occupied)
-    kept = finer.occupied.copy()
+    kept, matter = finer.occupied.copy(), Matter(selection)
     for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
-        kept[tuple(part[emptied(finer, part, selection, to_field)].T)] = False
+        kept[tuple(part[emptied(finer, part, matter, to_field)].T)] = False
     return grid.marked(kept)
 
 
-def emptied(grid: OccupancyGrid, index: np.ndarray, selection: Selection, to_field: ToField) -> np.ndarray:
+class Matter:
+    """What the cells of a selection hold, by points."""
+
+    def __init__(self, selection: Selection):
+        grid = selection.lattice.grid
+        self.low, self.cell, self.box = grid.aabb[:3], grid.cell, selection.object.tight_aabb(1)
+        # a cell more on each side, where there is nothing
+        held = np.where(selection.object.occupied, OWN, selection.other.occupied * OTHER)
+        whole = np.pad(held.astype(np.uint8), 1)
+        self.flat, self.last = whole.ravel(), np.array(whole.shape) - 1
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """(N,) uint8: OWN where points (N, 3) lie in the object, OTHER in other matter, 0 in neither."""
+        index = np.clip(np.floor((points - self.low) / self.cell) + 1, 0, self.last).astype(np.int64)
+        rows, columns = self.last[1] + 1, self.last[2] + 1
+        return self.flat[(index[:, 0] * rows + index[:, 1]) * columns + index[:, 2]]
+
+
+def emptied(grid: OccupancyGrid, index: np.ndarray, matter: Matter, to_field: ToField) -> np.ndarray:
     """(N,) bool: which cells (N, 3) of a grid hold cells of the object and no other matter."""
     middles = grid.aabb[:3] + (index + 0.5) * grid.cell
     at, corners = to_field(middles), to_field(middles + grid.cell / 2)
     reach = 2 * np.abs(corners - at).max(initial=0)  # cells of the selection may be narrower, or wider
-    box = selection.object.tight_aabb(1)
-    near = ((at > box[:3] - reach) & (at < box[3:] + reach)).all(1)
-    own, other = selection.object.contains(at[near]), np.zeros(int(near.sum()), bool)
+    left = np.flatnonzero(((at > matter.box[:3] - reach) & (at < matter.box[3:] + reach)).all(1))
+    held = matter.at(at[left]) & OWN
     for probe in PROBES:
-        at = to_field(middles[near] + (probe - 0.5) * grid.cell)
-        own |= selection.object.contains(at)
-        other |= selection.other.contains(at)
-    near[near] = own & ~other
-    return near
+        held |= matter.at(to_field(middles[left] + (probe - 0.5) * grid.cell))
+        alone = held & OTHER == 0
+        left, held = left[alone], held[alone]
+    found = np.zeros(len(index), bool)
+    found[left] = held == OWN
+    return found
 
 
 def with_object(
@@ -85,7 +104,15 @@ def cut_out(field, box: np.ndarray, selection: Selection, to_field: ToField = as
     """The object as a field over the texels around it of a field that has `resampled` over a box (6,); None
     where there is nothing of it."""
     narrowest = float(selection.lattice.grid.cell.min())
-    return within(field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)))
+    looked_in = field.occupancy.aabb
+    if to_field is as_it_is:
+        looked_in = common_box(looked_in, selection.object.tight_aabb(1))
+    return within(field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)), looked_in)
+
+
+def common_box(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(6,) what two boxes (6,) have in common."""
+    return np.concatenate([np.maximum(one[:3], other[:3]), np.minimum(one[3:], other[3:])])
 
 
 def cropped(field, box: np.ndarray, holds: Holds):
@@ -98,13 +125,13 @@ def cropped(field, box: np.ndarray, holds: Holds):
             kept[kept] = holds(placed(middles[kept] + corner * size, field.space))
         return kept
 
-    return within(field, box, field.voxel_size, wholly)
+    return within(field, box, field.voxel_size, wholly, field.occupancy.aabb)
 
 
-def within(field, box: np.ndarray, narrowest: float, inside):
+def within(field, box: np.ndarray, narrowest: float, inside, looked_in: np.ndarray):
     """The part of a field, whose numbers lie over a box (6,), that `with_object` keeps, on the texels around
-    it."""
-    rough = with_object(field.occupancy, field.occupancy.aabb, narrowest, inside)
+    it. There is none of it outside of the box `looked_in` (6,)."""
+    rough = with_object(field.occupancy, looked_in, narrowest, inside)
     if rough is None:
         return None
     around, resolution = on_texels(rough.tight_aabb(1), box, field.resolution)

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.ndimage import label
+from scipy.ndimage import label, uniform_filter
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
 
@@ -18,6 +18,11 @@ ASIDE = 0.05
 ISLAND = 0.05
 """Of the object's cells: a piece of other matter with fewer, inside of its box and touching nothing outside,
 cannot stand without it."""
+MIXED, WINDOW = 2, 4
+"""Cells from other matter up to which a cell may hold some of it, and up to which colours are compared."""
+FOREIGN, CONTRAST = 2.0, 0.15
+"""How many times farther from the object's colours nearby than from those of other matter a cell's colour is
+that is not its, and how far these must lie apart, of 1 in each channel."""
 ASKED_AT_ONCE = 1 << 20
 
 
@@ -60,6 +65,13 @@ class Lattice:
         return self.grid.cell.max() / np.sqrt(rates)
 
     @cached_property
+    def bounds(self) -> np.ndarray:
+        """(2, 3) corners of the box around the occupied cells in the field's frame."""
+        wide = self.widths.max(initial=0)
+        low, high = self.points.min(0, initial=np.inf), self.points.max(0, initial=-np.inf)
+        return np.stack([low - wide, high + wide])
+
+    @cached_property
     def dense(self) -> np.ndarray:
         """(M,) bool: those with matter that shows."""
         at = torch.from_numpy(self.points)
@@ -82,6 +94,25 @@ class Lattice:
         """(K,) bool, of allowed cells (M,) with K of them: those next to matter in cells that are not."""
         other = self.grid.marked(self.spread(~allowed & self.dense)).dilated().occupied
         return other[self.grid.occupied][allowed]
+
+    def around(self, cells: np.ndarray, reach: int) -> np.ndarray:
+        """(M,) bool: which cells lie within so many cells of some of them, (M,) bool."""
+        grown = self.grid.marked(self.spread(cells)).dilated(reach).occupied
+        return grown[self.grid.occupied]
+
+    def means(self, values: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """(M, D) the mean of values (M, D) of some cells, (M,) bool, up to WINDOW cells away; nan where there
+        are none."""
+        side, held = 2 * WINDOW + 1, cells.astype(np.float32)
+        columns = [held, *(values * held[:, None]).T.astype(np.float32)]
+        low, high = self.index.min(0), self.index.max(0) + 1
+        whole = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        count, *sums = (
+            uniform_filter(self.spread(column)[whole], side, mode="constant")[tuple((self.index - low).T)]
+            for column in columns
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(count > 0.5 / side**3, np.stack(sums) / count, np.nan).T
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """(X, Y, Z) of what is known of the occupied cells, (M,); 0 elsewhere."""
@@ -130,6 +161,24 @@ class Selection:
         for side in (found[[0, -1]], found[:, [0, -1]], found[:, :, [0, -1]]):
             lost[side.ravel()] = False
         return self.joined(lost[found][self.lattice.grid.occupied])
+
+    def without_foreign(self) -> "Selection":
+        """The object without cells beside other matter that have its colour and not the object's: of what the
+        object touches, a little comes along."""
+        around = self.lattice.around
+        own, other = self.chosen & self.lattice.dense, ~self.chosen & self.lattice.dense
+        near_own, near_other = around(own, MIXED), around(other, MIXED)
+        band = (own & around(other, WINDOW)) | (other & around(own, WINDOW))
+        if not band.any():
+            return self
+        inner = self.lattice.kept(band)
+        colours = inner.colours()
+        means = [inner.means(colours, sure[band]) for sure in (own & ~near_other, other & ~near_own)]
+        away = [((colours - mean) ** 2).sum(1) for mean in means]
+        differ = ((means[0] - means[1]) ** 2).sum(1) > 3 * CONTRAST**2
+        foreign = np.zeros(len(own), bool)
+        foreign[band] = differ & (away[0] > FOREIGN**2 * away[1])
+        return self.without(foreign & own & near_other)
 
     def without(self, cells: np.ndarray) -> "Selection":
         """The object without some cells, (M,) bool, and without small pieces that then lie apart."""

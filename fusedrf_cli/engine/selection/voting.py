@@ -2,7 +2,7 @@
 2024: with the weights of volume rendering the best labels are a majority of such votes, in closed form)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
@@ -33,6 +33,14 @@ class Look:
     """(H, W) bool: which pixels show the object."""
     counted: np.ndarray | None = None
     """(H, W) bool: which pixels say so; None: all, and the object is nowhere outside of them."""
+    surfaces: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
+    """`depths` of fields, by their identity: both looks at a field ask for them."""
+
+    def depths(self, of) -> np.ndarray:
+        """(H, W) see `depths`."""
+        if id(of) not in self.surfaces:
+            self.surfaces[id(of)] = depths(of, self.camera)
+        return self.surfaces[id(of)]
 
 
 def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
@@ -52,19 +60,22 @@ def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
 def shown_by(field, lattice: Lattice, cameras: Sequence[Camera]) -> np.ndarray:
     """(M,) how much cameras in the frame see of each cell in a field, which may be the lattice's own without
     something: the largest sum of weights (NeRF, eq. 3) in the cell or one beside it."""
-    found = np.zeros(len(lattice.index))
-    low, high = lattice.points.min(0, initial=np.inf), lattice.points.max(0, initial=-np.inf)
-    wide, step = lattice.widths.max(initial=0), sampling_step(lattice.field)
+    found, step = np.zeros(len(lattice.index)), sampling_step(lattice.field)
     for camera in cameras:
         rays_o, rays_d = camera.rays()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.stack([(low - wide - rays_o) / rays_d, (high + wide - rays_o) / rays_d])
-        meets = np.nanmax(ends.min(0), 1).clip(0) <= np.nanmin(ends.max(0), 1)
-        rays_o, rays_d = rays_o[meets], rays_d[meets]
+        met = reaching(lattice, rays_o, rays_d)
+        rays_o, rays_d = rays_o[met], rays_d[met]
         half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), np.uint8)
         sums = field.votes(rays_o, rays_d, half, every, step, lattice.grid)
         found += sums[1][lattice.grid.occupied]
     return maximum_filter(lattice.spread(found), 3)[lattice.grid.occupied]
+
+
+def reaching(lattice: Lattice, rays_o: np.ndarray, rays_d: np.ndarray) -> np.ndarray:
+    """(N,) bool: which rays (N, 3) meet the box around the cells of a lattice."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([(corner - rays_o) / rays_d for corner in lattice.bounds])
+    return np.nanmax(ends.min(0), 1).clip(0) <= np.nanmin(ends.max(0), 1)
 
 
 def well_shown(selection: Selection, shown: np.ndarray) -> float:
@@ -83,16 +94,16 @@ def agreement(votes: np.ndarray, against: np.ndarray) -> float:
 def tallied(lattice: Lattice, looks: Sequence[Look]) -> np.ndarray:
     """(2, M) what the pixels outside and inside of the masks show of each cell: sums of weights (NeRF,
     eq. 3)."""
-    generator, field, found = np.random.default_rng(SEED), lattice.field, 0.0
+    generator, found = np.random.default_rng(SEED), 0.0
     for look in looks:
         rays_o, rays_d = look.camera.rays()
-        jitter, inside, weight = generator.random(len(rays_o)), look.inside.ravel(), 1.0
+        jitter, weight = generator.random(len(rays_o)), 1.0
+        asked = reaching(lattice, rays_o, rays_d)
         if look.counted is not None:
-            rays_o, rays_d, jitter, inside = (
-                each[look.counted.ravel()] for each in (rays_o, rays_d, jitter, inside)
-            )
+            asked &= look.counted.ravel()
             weight = POINTED
-        sums = field.votes(rays_o, rays_d, jitter, inside, sampling_step(field), lattice.grid)
+        rays = rays_o[asked], rays_d[asked], jitter[asked], look.inside.ravel()[asked]
+        sums = lattice.field.votes(*rays, sampling_step(lattice.field), lattice.grid)
         found = found + weight * sums[:, lattice.grid.occupied]
     return found
 
@@ -120,7 +131,7 @@ def hull(lattice: Lattice, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarra
         inside = look.inside[row, column]
         room[np.flatnonzero(shown)[inside]] = True
         outside = np.flatnonzero(shown)[~inside]
-        surface = depths(lattice.field, look.camera)[row[~inside], column[~inside]]
+        surface = look.depths(lattice.field)[row[~inside], column[~inside]]
         distance = np.linalg.norm(lattice.points[outside] - look.camera.camera_to_world[:3, 3], axis=1)
         shut[outside[distance < surface + BEHIND * lattice.widths[outside]]] = True
     return room & ~shut, shut

@@ -51,9 +51,10 @@ class SparseKind(Kind):
     """Bricks of voxels."""
 
     name = "sparse"
-    good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local to the bit."
+    good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local."
     field = SparseField
     takes = frozenset({"sh_degree"})
+    rounds_anew = True
     precisions = ("int8", "float16")
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
 

@@ -20,6 +20,9 @@ from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.trimming import smaller_shape, truncated
 
 MAX_BLOCKS = 255
+LEARNT, RESTORED = "fused", "restored"
+"""Names of blocks that stand for no object: what was distilled, and what fills what a cut uncovered."""
+UNNAMED = ("", LEARNT, RESTORED)
 FINER = 1 / 8  # of the finest voxel: with a stretched block a common voxel may lie under it
 TOLERANCE = 1 + 1e-4  # to which a common voxel is found
 COARSER = 1.5  # times its own voxel: how coarse a tensor can get before it is left without its detail
@@ -110,7 +113,18 @@ def block_name(placed: Placed, block: Block, own: dict[int, tuple[Block, ...]]) 
     """
     if not placed.name:
         return block.name
-    return placed.name if len(own[id(placed.field)]) == 1 else f"{placed.name}/{block.name}"
+    several = len(own[id(placed.field)]) > 1
+    return f"{placed.name}/{block.name}" if several else part_name(placed.name)
+
+
+def part_name(name: str) -> str:
+    """A block's name for a node's: its own, but for those that say that a block stands for no object."""
+    return f"{name}/{name}" if name in UNNAMED else name
+
+
+def node_name(part: str) -> str:
+    """Inverse of `part_name`."""
+    return next((name for name in UNNAMED if part == part_name(name)), part)
 
 
 def without(field: VMField, names: set[str]) -> VMField | None:

@@ -14,12 +14,18 @@ from fusedrf_cli.engine.fields.occupancy import placement, seen_box, transformed
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach, enclosing, goes_by
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.blocks import MAX_BLOCKS, blocks_of, tensor_field
+from fusedrf_cli.engine.kinds.vm.blocks import (
+    MAX_BLOCKS,
+    RESTORED,
+    UNNAMED,
+    blocks_of,
+    node_name,
+    part_name,
+    tensor_field,
+)
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMTensor
 from fusedrf_cli.engine.selection.cells import Selection
 
-RESTORED = "restored"  # name of the blocks that fill what a cut uncovered
-UNNAMED = ("", "fused", RESTORED)  # blocks that stand for no object
 NUMBERS = 2_000_000  # of a tensor that a region or an object is learnt into
 
 
@@ -34,15 +40,14 @@ def parts(field: VMField) -> list[Part]:
 
 def arranged(field: VMField, becoming: Becoming) -> VMField:
     """The field with the blocks that stand for an object named and placed as `becoming` says."""
-    blocks = [
-        replace(block, name=name, object_to_field=matrix)
-        for block in field.blocks
-        for name, matrix in (
-            [(block.name, block.object_to_field)]
-            if block.name in UNNAMED
-            else becoming(block.name, block.object_to_field)
-        )
-    ]
+
+    def after(block: Block) -> list[Block]:
+        if block.name in UNNAMED:
+            return [block]
+        found = becoming(node_name(block.name), block.object_to_field)
+        return [replace(block, name=part_name(name), object_to_field=at) for name, at in found]
+
+    blocks = [one for block in field.blocks for one in after(block)]
     if len(blocks) > MAX_BLOCKS:
         raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, and this would be {len(blocks)}")
     for block in blocks:
@@ -88,24 +93,30 @@ def apart(field: VMField, part_of: Callable[[VMField, Block], VMField | None]) -
     for block in field.blocks:
         part = part_of(tensor_field(field, block.tensor), block)
         if part is not None:
-            found.append(Placed(block.name, tinted(part, block.tint), block.object_to_field))
+            alone = replace(part.blocks[0], name=block.name)
+            part = tinted(replaced(part, (alone,)), block.tint)
+            found.append(Placed("", part, block.object_to_field))
     return joined(found)
+
+
+def replaced(field: VMField, blocks: tuple[Block, ...]) -> VMField:
+    """The field with other blocks that lie as its own do."""
+    return VMField(field.shape, field.tensors, blocks, field.params, field.occupancy, field.owners)
 
 
 def tinted(field: VMField, tint: tuple[float, float, float]) -> VMField:
     """The field with the colours of all its blocks multiplied by r, g, b."""
-    blocks = tuple(replace(b, tint=tuple(np.multiply(b.tint, tint).tolist())) for b in field.blocks)
-    return VMField(field.shape, field.tensors, blocks, field.params, field.occupancy, field.owners)
+    return replaced(
+        field, tuple(replace(b, tint=tuple(np.multiply(b.tint, tint).tolist())) for b in field.blocks)
+    )
 
 
 def joined(placed: list[Placed]) -> VMField | None:
     """Placed fields of one tensor each as one field; None of none."""
     if not placed:
         return None
-    alone = placed[0].field if len(placed) == 1 else None
-    if alone is not None and np.array_equal(placed[0].object_to_world, np.eye(4)):
-        blocks = (replace(alone.blocks[0], name=placed[0].name),)
-        return VMField(alone.shape, alone.tensors, blocks, alone.params, alone.occupancy)
+    if len(placed) == 1 and np.array_equal(placed[0].object_to_world, np.eye(4)):
+        return placed[0].field
     return blocks_of(placed)
 
 
@@ -143,7 +154,7 @@ def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, t
     student = kind.empty(local, Way(), NUMBERS, torch.Generator().manual_seed(teach.seed), RESTORED)
     student, figures = teach(local, student, [local.occupancy.subject], True)
     back = placement(teacher.origin)
-    whole = blocks_of([Placed("", emptied, np.eye(4)), Placed(RESTORED, student, back)])
+    whole = blocks_of([Placed("", emptied, np.eye(4)), Placed("", student, back)])
     how = "the cells of its box emptied, and what the other sources show there learnt into a block"
     return Edited(whole, region, how, figures=figures)
 

@@ -71,7 +71,7 @@ class PlaceStudent(Student):
 
     def whole(self, field: StoredField) -> VMField:
         """The tensor in its place."""
-        return without_unread(blocks_of([Placed("fused", field, placement(self.scene.origin)), self.place]))
+        return without_unread(blocks_of([Placed("", field, placement(self.scene.origin)), self.place]))
 
     def why(self, field: StoredField) -> str:
         """See Student."""

@@ -24,7 +24,7 @@ from fusedrf_cli.engine.kinds.student import (
     finest_within,
 )
 from fusedrf_cli.engine.kinds.vm import editing
-from fusedrf_cli.engine.kinds.vm.blocks import common_shape, reshaped, without
+from fusedrf_cli.engine.kinds.vm.blocks import LEARNT, common_shape, reshaped, without
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.places import place_student
 from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
@@ -183,7 +183,7 @@ def upright(background: Placed) -> VMField | None:
     box = source.aabb * scale + np.tile(background.object_to_world[:3, 3], 2)
     tensor = VMTensor(source.resolution, box, source.scale / scale, source.shift)
     params = field.params[: tensor.size(field.shape)]  # the detail is the last section
-    return VMField(field.shape, (tensor,), (Block(0, np.eye(4), "fused"),), params, OccupancyGrid.full(box))
+    return VMField(field.shape, (tensor,), (Block(0, np.eye(4), LEARNT),), params, OccupancyGrid.full(box))
 
 
 def widened(field: VMField, plan: Plan, scene: ComposedField, generator: torch.Generator) -> VMField:
