@@ -10,14 +10,13 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kernels.parts import MIXED
 from fusedrf_cli.engine.kernels.plain import mark_cells
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 DEFAULT_CELLS = 128
 SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
 THINNEST = 12  # texels across a flat box
-MAX_STRIDE = MIXED - 1
+MAX_STRIDE = 255
 UNITS = 8  # at least, of the distance of samples where they lie closest: strides are whole numbers of units
 ALIKE = 1 + 1e-3  # times apart: distances of samples so close to each other are one
 ROUNDED = 1e-9  # cells: faces that lie so close are the same
