@@ -261,39 +261,33 @@ def scatter_colour(field, grads, t, u, v, w, scratch):
 # -- a tensor's hashed detail --------------------------------------------------------------------------------
 
 
-def hashed_cell(field, t, level, u, v, w):
-    """The cell of a level's lattice around a unit point: what below and above it along each axis gives to the
-    hashes of its vertices, (x0, x1, y0, y1, z0, z1); where along z its vertices lie in their runs, below and
-    above; and how far (a, b, c) in [0, 1) of a spacing the point is from the vertex below on all axes."""
+def row_at(field, t, level, i, j, k):
+    """Offset in params of the row of a vertex. RUN vertices along z share a hash and lie side by side."""
+    rows = int(field.rows[t, 0])
+    h = (i * 2654435761) ^ (j * 805459861) ^ (k // RUN * 3674653429)  # wraps around at 64 bits
+    run = (h ^ (h >> 15)) & (rows // RUN - 1)
+    return np.uint64(field.layout[t, 13] + (level * rows + run * RUN + k % RUN) * WIDTH)
+
+
+def vertex_below(field, t, level, u, v, w):
+    """The vertex (i, j, k) of a level below a unit point on all axes, and how far (a, b, c) in [0, 1) of a
+    spacing the point is from it."""
     sides, low = field.lattice[t, level, 0], field.lattice[t, level, 1]
     x, y, z = u * sides[0] + low[0], v * sides[1] + low[1], w * sides[2] + low[2]
-    i, j, k = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
-    # Products wrap around at 64 bits. RUN is 4: vertices along z share a hash and lie side by side.
-    first, second, third = i * 2654435761, j * 805459861, (k >> 2) * 3674653429
-    above = ((k + 1) >> 2) * 3674653429
-    hashes = first, first + 2654435761, second, second + 805459861, third, above
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
     real = field.params.dtype.type
-    return hashes, (k & 3, (k + 1) & 3), (real(x - i), real(y - j), real(z - k))
+    return (int(i), int(j), int(k)), (real(x - i), real(y - j), real(z - k))
 
 
-def edge(field, t, level, n, hashes, within, share):
-    """The n-th of the four edges along z of a cell, which is given as `hashed_cell` returns it: offsets in
-    params of the rows of its lower and its upper vertex, and its part in what is interpolated across."""
+def corner(field, t, level, n, below, share):
+    """The row of the n-th of the eight vertices around a point, and its part in what is interpolated there;
+    below and share as `vertex_below` returns them."""
     one = field.params.dtype.type(1)
-    x, part = (hashes[1], share[0]) if n > 1 else (hashes[0], one - share[0])
-    y, other = (hashes[3], share[1]) if n & 1 else (hashes[2], one - share[1])
-    return (
-        row_of(field, t, level, x ^ y ^ hashes[4], within[0]),
-        row_of(field, t, level, x ^ y ^ hashes[5], within[1]),
-        part * other,
-    )
-
-
-def row_of(field, t, level, h, within):
-    """Offset in params of a row of a level, by its hash and its place in its run."""
-    rows = int(field.rows[t, 0])
-    run = (h ^ (h >> 15)) & (rows // RUN - 1)
-    return np.uint64(field.layout[t, 13] + (level * rows + run * RUN + within) * WIDTH)
+    di, dj, dk = n >> 2, (n >> 1) & 1, n & 1
+    part = share[0] if di == 1 else one - share[0]
+    part *= share[1] if dj == 1 else one - share[1]
+    part *= share[2] if dk == 1 else one - share[2]
+    return row_at(field, t, level, below[0] + di, below[1] + dj, below[2] + dk), part
 
 
 def detail_density(field, t, u, v, w):
@@ -302,10 +296,10 @@ def detail_density(field, t, u, v, w):
     p = field.params
     total = p.dtype.type(0)
     for level in range(field.rows[t, 1]):
-        hashes, within, share = hashed_cell(field, t, level, u, v, w)
-        for n in range(4):
-            lower, upper, part = edge(field, t, level, n, hashes, within, share)
-            total += part * (p[lower] + share[2] * (p[upper] - p[lower]))
+        below, share = vertex_below(field, t, level, u, v, w)
+        for n in range(8):
+            row, part = corner(field, t, level, n, below, share)
+            total += part * p[row]
     return total
 
 
@@ -314,14 +308,12 @@ def detail_colour(field, t, u, v, w):
     p = field.params
     red, green, blue = p.dtype.type(0), p.dtype.type(0), p.dtype.type(0)
     for level in range(field.rows[t, 1]):
-        hashes, within, share = hashed_cell(field, t, level, u, v, w)
-        for n in range(4):
-            lower, upper, part = edge(field, t, level, n, hashes, within, share)
-            up = part * share[2]
-            down = part - up
-            red += down * p[lower + np.uint64(1)] + up * p[upper + np.uint64(1)]
-            green += down * p[lower + np.uint64(2)] + up * p[upper + np.uint64(2)]
-            blue += down * p[lower + np.uint64(3)] + up * p[upper + np.uint64(3)]
+        below, share = vertex_below(field, t, level, u, v, w)
+        for n in range(8):
+            row, part = corner(field, t, level, n, below, share)
+            red += part * p[row + np.uint64(1)]
+            green += part * p[row + np.uint64(2)]
+            blue += part * p[row + np.uint64(3)]
     return red, green, blue
 
 
@@ -332,20 +324,13 @@ def scatter_detail(field, grad, t, u, v, w, d_feature, rgb, d_rgb):
     d_green = real(d_rgb[1] * rgb[1] * (1 - rgb[1]))
     d_blue = real(d_rgb[2] * rgb[2] * (1 - rgb[2]))
     for level in range(field.rows[t, 1]):
-        hashes, within, share = hashed_cell(field, t, level, u, v, w)
-        for n in range(4):
-            lower, upper, part = edge(field, t, level, n, hashes, within, share)
-            up = part * share[2]
-            add_row(grad, lower, part - up, d_feature, d_red, d_green, d_blue)
-            add_row(grad, upper, up, d_feature, d_red, d_green, d_blue)
-
-
-def add_row(grad, row, part, density, red, green, blue):
-    """Add a part of four gradients to those of a row."""
-    accumulate(grad, row, part * density)
-    accumulate(grad, row + np.uint64(1), part * red)
-    accumulate(grad, row + np.uint64(2), part * green)
-    accumulate(grad, row + np.uint64(3), part * blue)
+        below, share = vertex_below(field, t, level, u, v, w)
+        for n in range(8):
+            row, part = corner(field, t, level, n, below, share)
+            accumulate(grad, row, part * d_feature)
+            accumulate(grad, row + np.uint64(1), part * d_red)
+            accumulate(grad, row + np.uint64(2), part * d_green)
+            accumulate(grad, row + np.uint64(3), part * d_blue)
 
 
 # -- blocks -------------------------------------------------------------------------------------------------
@@ -597,9 +582,10 @@ def ahead_detail(field, array, held, p):
     u, v, w, _ = unit_point(field, frame_of(held), p)
     t = field.tensor[frame_of(held)]
     for level in range(field.rows[t, 1]):
-        hashes, within, share = hashed_cell(field, t, level, u, v, w)
-        for n in range(4):
-            prefetch(array, edge(field, t, level, n, hashes, within, share)[0])
+        (i, j, k), _ = vertex_below(field, t, level, u, v, w)
+        for di in range(2):
+            for dj in range(2):
+                prefetch(array, row_at(field, t, level, i + di, j + dj, k))
 
 
 def ahead_planes(rank, first, field, array, block, p):
