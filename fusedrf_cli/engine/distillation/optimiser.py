@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.computed import ComputedField
 
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15  # TensoRF's; a gradient here can be tiny, so eps must not damp it
@@ -20,9 +21,10 @@ class Adam:
 
     def __post_init__(self):
         params = self.field.params
-        # torch's memory starts on a cache line, so that a run of numbers touches no more lines than it must
-        self.gradient = params.new_zeros(self.parts, len(params))
-        self.moments = torch.zeros_like(params), torch.zeros_like(params)
+        # Rows start on a cache line, so that a run of numbers touches no more lines than it must.
+        count, kind = len(params), (params.dtype, params.device)
+        self.gradient = pages.zeros(self.parts * count, *kind).view(self.parts, count)
+        self.moments = pages.zeros(count, *kind), pages.zeros(count, *kind)
         shared = self.field.device_loops.shared
         self.grads, self.moment1, self.moment2 = shared(self.gradient), *map(shared, self.moments)
         self.steps = 0

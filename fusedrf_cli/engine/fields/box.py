@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
@@ -65,7 +66,7 @@ class BoxField(ComputedField):
         zeros; occupancy None: full."""
         self.shape, self.box, self.resolution = shape, np.asarray(box, np.float64), tuple(resolution)
         self.scale, self.shift = float(scale), float(shift)
-        self.params = torch.zeros(self.size) if params is None else params
+        self.params = pages.zeros(self.size) if params is None else params
         self.occupancy = OccupancyGrid.full(self.box) if occupancy is None else occupancy
 
     # -- for kinds to define -----------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.computed import ComputedField, exact
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.parts import LINE
@@ -74,7 +75,7 @@ class SparseField(ComputedField):
         """params (P,) float; None: zeros. The bricks lie in the coordinates of the space."""
         self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
         self.coarse = Lattice(fine.tree, COARSE) if shape.sh_degree else None
-        self.params = torch.zeros(self.size) if params is None else params
+        self.params = pages.zeros(self.size) if params is None else params
 
     def moved(self, origin: np.ndarray) -> "SparseField":
         """The same field in a frame whose origin is at `origin` (3,) of its own."""

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.editing import goes_by
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
@@ -66,7 +67,7 @@ def blocks_of(
         raise ValueError(f"a field holds at most {MAX_BLOCKS} blocks, this scene has {len(blocks)}")
     if fits is not None:
         tensors = fitting_tensors(tensors, blocks, lambda tried: fits(shape, tried))
-    params = torch.empty(sum(t.size(shape) for t in tensors), dtype=dtype)
+    params = pages.zeros(sum(t.size(shape) for t in tensors), dtype)
     at = 0
     for key, streamed in fields.items():  # one after the other: not all of them need to be in memory
         field = reshaped(opened(streamed).to("cpu"), whole)
@@ -154,7 +155,7 @@ def reshaped(field: VMField, shape: VMShape) -> VMField:
     """The same field with more components and coefficients, the new ones zero."""
     if field.shape == shape:
         return field
-    params = torch.zeros(sum(t.size(shape) for t in field.tensors), dtype=field.params.dtype)
+    params = pages.zeros(sum(t.size(shape) for t in field.tensors), field.params.dtype)
     wide = VMField(shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
     for t in range(len(field.tensors)):
         target = wide.sections(t)

@@ -15,6 +15,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.box import (
     DENSITY_SCALE_PER_EXTENT,
     DENSITY_SHIFT,
@@ -243,7 +244,7 @@ class VMField(ComputedField):
         (tensor,), (block,) = self.tensors, self.blocks
         aabb = np.asarray(aabb, np.float64)
         resized = replace(tensor, resolution=resolution, aabb=aabb)
-        params = torch.zeros(resized.size(self.shape), dtype=self.params.dtype)
+        params = pages.zeros(resized.size(self.shape), self.params.dtype)
         new = VMField(self.shape, (resized,), (block,), params, self.occupancy, None)
         at = [unit_texels(aabb, tensor.aabb, axis, resolution[axis]) for axis in range(3)]
         old, target = self.sections(0), new.sections(0)
@@ -269,7 +270,7 @@ class VMField(ComputedField):
 
     def stored(self, as_stored: Callable[[np.ndarray, str], np.ndarray]) -> "VMField":
         """See ComputedField; which block is asked where stays as it is, and need not be found again."""
-        back = self.with_params(torch.zeros_like(self.params))
+        back = self.with_params(pages.zeros(len(self.params), self.params.dtype, self.params.device))
         for t in range(len(self.tensors)):
             target = back.sections(t)
             for name, view in self.sections(t).items():
@@ -460,7 +461,7 @@ class VMField(ComputedField):
         blocks = tuple(stored_block(i, b, len(tensors)) for i, b in enumerate(metadata["blocks"]))
         if not 1 <= len(blocks) <= NO_BLOCK:
             raise ValueError(f"there should be 1 to {NO_BLOCK} blocks, found {len(blocks)}")
-        params = torch.zeros(sum(t.size(shape) for t in tensors))
+        params = pages.zeros(sum(t.size(shape) for t in tensors))
         unplaced = cls(shape, tensors, blocks, params, tensors[0].occupancy, NO_OWNERS)
         for t in range(len(tensors)):
             for name, view in unplaced.sections(t).items():

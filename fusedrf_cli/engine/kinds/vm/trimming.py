@@ -5,6 +5,7 @@ energy.
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.kinds.vm.field import MODES, VMField, VMShape, VMTensor
 
 REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
@@ -65,7 +66,7 @@ def truncated(field: VMField, shape: VMShape) -> VMField:
         return field
     if field.params.device.type != "cpu":
         return truncated(field.to("cpu"), shape).to(field.params.device)
-    params = torch.zeros(sum(t.size(least) for t in field.tensors), dtype=field.params.dtype)
+    params = pages.zeros(sum(t.size(least) for t in field.tensors), field.params.dtype)
     small = VMField(least, field.tensors, field.blocks, params, field.occupancy, field.owners)
     for t in range(len(field.tensors)):
         old = {name: view.double().numpy() for name, view in field.sections(t).items()}

@@ -1,0 +1,22 @@
+"""Arrays in large pages of memory: a field's numbers are read in random order, and with pages of 4 kB most
+reads would have to look for their page first."""
+
+import mmap
+
+import torch
+
+LARGE = 1 << 22  # bytes from which an array gets them
+ADVICE = getattr(mmap, "MADV_HUGEPAGE", None)  # of Linux
+
+
+def zeros(count: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> torch.Tensor:
+    """(count,) zeros; large arrays of the CPU lie in large pages where the system has them."""
+    size = count * dtype.itemsize
+    if ADVICE is None or size < LARGE or torch.device(device).type != "cpu":
+        return torch.zeros(count, dtype=dtype, device=device)
+    memory = mmap.mmap(-1, size)
+    try:
+        memory.madvise(ADVICE)
+    except OSError:  # a system that was built without them
+        return torch.zeros(count, dtype=dtype)
+    return torch.frombuffer(memory, dtype=dtype, count=count)

@@ -1,0 +1,48 @@
+"""Arrays in large pages are arrays like any other."""
+
+import mmap
+
+import pytest
+import torch
+
+from fusedrf_cli.engine.fields import pages
+
+MANY = pages.LARGE // 4
+
+
+@pytest.mark.parametrize("count", [0, 7, MANY - 1, MANY, MANY + 5])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_they_are_zeros_that_can_be_written(count, dtype):
+    numbers = pages.zeros(count, dtype)
+    assert numbers.shape == (count,) and numbers.dtype == dtype and numbers.device.type == "cpu"
+    assert not numbers.any()
+    numbers += 1
+    view = numbers[count // 2 :].numpy()
+    del numbers  # what is left keeps the memory
+    assert (view == 1).all()
+
+
+def test_large_ones_are_asked_for_in_large_pages(monkeypatch):
+    asked = []
+
+    class Memory(mmap.mmap):
+        def madvise(self, *advice):
+            asked.append((len(self), *advice))
+
+    monkeypatch.setattr(pages.mmap, "mmap", Memory)
+    monkeypatch.setattr(pages, "ADVICE", 14)
+    pages.zeros(MANY - 1)
+    pages.zeros(MANY)
+    assert asked == [(pages.LARGE, 14)]
+
+
+def test_a_system_without_them_gives_small_ones(monkeypatch):
+    class Memory(mmap.mmap):
+        def madvise(self, *advice):
+            raise OSError(22, "Invalid argument")
+
+    monkeypatch.setattr(pages.mmap, "mmap", Memory)
+    monkeypatch.setattr(pages, "ADVICE", 14)
+    assert not pages.zeros(MANY).any()
+    monkeypatch.setattr(pages, "ADVICE", None)
+    assert not pages.zeros(MANY).any()
