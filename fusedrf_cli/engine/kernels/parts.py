@@ -124,10 +124,8 @@ def next_sample(grid, origin, way, u0, u1, step, k):
     when there is no such k' before u1.
 
     Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
-    the same: what stands for several steps ends at a whole multiple of them. Where insides of cells are
-    skipped it begins at one too, if need be before k', or where the sample before it ended.
+    the same: what stands for several steps ends at a whole multiple of them, or before.
     """
-    begun = k
     dx, dy, dz = way
     skip, lo, cell = grid.skip, grid.lo, grid.cell
     nx, ny, nz = skip.shape
@@ -163,9 +161,8 @@ def next_sample(grid, origin, way, u0, u1, step, k):
             if grid.unit != step:
                 many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
             most = max(1, int(math.ceil((end - u) / step + 0.5)) - 1)
-            first = many * int(k / many)  # k % many takes twice as long
-            start = max(first, begun) if grid.inner.shape[0] != 0 else k
-            return start, min(first + many, k + most) - start
+            # the same samples wherever a ray comes to cells of a stride; k % many takes twice as long
+            return k, min(many - (k - many * int(k / many)), most)
         k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
 
 

@@ -234,7 +234,7 @@ class VMField(ComputedField):
         occupancy = pace.grid(count > 0)
         unsettled = cls(shape, tensors, blocks, params, occupancy, owners=(first, second))
         settle_crowded(unsettled, np.argwhere(count > 2), first, second)
-        return unsettled
+        return unsettled._afresh("arrays")
 
     def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
         """A one-block field on another box and resolution: planes and lines are interpolated, outside the old
