@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.insides import WORTH_LOOKING, insides_of, with_insides
+from fusedrf_cli.engine.fields.insides import insides_of, with_insides, worth_looking
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.loops import (
@@ -212,7 +212,7 @@ class ComputedField:
         """The field for pictures of so many rays in all: where they are worth it, under a grid that knows the
         insides of its cells (engine/fields/insides.py), by which they take fewer samples and look the same.
         It shows the numbers as they are now."""
-        return self.looked_into() if rays >= WORTH_LOOKING else self
+        return self.looked_into() if worth_looking(self, rays) else self
 
     def looked_into(self) -> "ComputedField":
         """See `for_pictures`. A place, which is full of haze, is taken as it is."""
