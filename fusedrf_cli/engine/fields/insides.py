@@ -20,8 +20,8 @@ LOST = 7e-4  # optical depth that is lost along lines of cells, root mean square
 SIDE = 4  # parts of a cell along an axis
 MOST_PLACES = 60_000_000  # that are asked at: a second or two
 FULL = np.uint64(2**64 - 1)
-# Rays from which looking into cells is worth it. Of four objects it takes 1.2 s, and of 640,000 rays saves 0.42 s;
-# of seven objects in a place it takes 0.9 s, and of 160,000 rays saves 2.2 s.
+# Rays from which looking into cells is worth it. Of four objects it takes 1.2 s, and of 640,000 rays saves
+# 0.42 s; of seven objects in a place it takes 0.9 s, and of 160,000 rays saves 2.2 s.
 WORTH_LOOKING, WORTH_IN_PLACE = 3_000_000, 200_000
 
 
