@@ -22,7 +22,7 @@ class Counts(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """What `walk_ray` and `weigh_only_ray` follow: loops.Rays, and where they end."""
+    """What `walk_ray` follows: loops.Rays, where they end, and what is asked on the way."""
 
     rays_o: object
     rays_d: object
@@ -30,6 +30,7 @@ class Walked(NamedTuple):
     step: object
     early_stop: object
     samples: object  # (N,) int64, after how many samples each ends
+    asked: object  # bool: whether for densities
 
 
 def count_ray(field, grid, rays, i, scratch, memory, out):
@@ -58,34 +59,22 @@ def count_ray(field, grid, rays, i, scratch, memory, out):
 
 
 def walk_ray(field, grid, rays, i, scratch, memory, out):
-    """Marches to as many samples of ray i as it is said to have, and asks nothing; out[i] is where the last
-    one lies."""
+    """Marches to as many samples of ray i as it is said to have, and asks for their densities or for nothing;
+    out[i] is made of what was found, so that no part of it is left out when this is compiled."""
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
-    left, last = rays.samples[i], 0.0
-    for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
-        u0 = u0 + 0.5 * step
-        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
-        while k >= 0 and left > 0:
-            p = along(origin, way, u0 + 0.5 * between(k, many) * step)
-            last += p[0] + p[1] + p[2]
-            left -= 1
-            k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
-    out[i] = last
-
-
-def weigh_only_ray(field, grid, rays, i, scratch, memory, out):
-    """As `walk_ray`, but asks for the density of each sample; out[i] is the transmittance."""
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
-    left, trans = rays.samples[i], 1.0
+    left, trans, places = rays.samples[i], 1.0, 0.0
     for number in range(PIECES):
         origin, way, u0, u1, course = piece(number, grid, o, d, rays.reach[i, 0], rays.reach[i, 1])
         u0 = u0 + 0.5 * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and left > 0:
             u = u0 + 0.5 * between(k, many) * step
-            _, opacity, _, _, _ = met(field, grid, (origin, way, course), k, many, u, step, d, scratch)
-            trans -= trans * opacity
+            if rays.asked:
+                _, opacity, _, _, _ = met(field, grid, (origin, way, course), k, many, u, step, d, scratch)
+                trans -= trans * opacity
+            else:
+                x, y, z = along(origin, way, u)
+                places += x + y + z
             left -= 1
             k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
-    out[i] = trans
+    out[i] = trans + places

@@ -33,14 +33,14 @@ class Look:
     """(H, W) bool: which pixels show the object."""
     counted: np.ndarray | None = None
     """(H, W) bool: which pixels say so; None: all, and the object is nowhere outside of them."""
-    surfaces: dict[int, np.ndarray] = field(default_factory=dict, repr=False)
-    """`depths` of fields, by their identity: both looks at a field ask for them."""
+    surfaces: list[tuple[object, np.ndarray]] = field(default_factory=list, repr=False)
+    """Fields and their `depths`, which both looks at one ask for."""
 
     def depths(self, of) -> np.ndarray:
         """(H, W) see `depths`."""
-        if id(of) not in self.surfaces:
-            self.surfaces[id(of)] = depths(of, self.camera)
-        return self.surfaces[id(of)]
+        if not any(known is of for known, _ in self.surfaces):
+            self.surfaces.append((of, depths(of, self.camera)))
+        return next(found for known, found in self.surfaces if known is of)
 
 
 def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:

@@ -10,6 +10,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.insides import (
     FULL,
     SIDE,
+    WORTH_IN_PLACE,
     WORTH_LOOKING,
     grown,
     insides_of,
@@ -22,6 +23,7 @@ from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import BOX, THIRTY_TWO, points_in, rays_at
 from tests.engine.kernels.test_cpu import march, stepping
 
@@ -157,6 +159,16 @@ def test_cells_are_looked_into_where_many_rays_are_shown():
     field = ball(8)
     assert field.for_pictures(WORTH_LOOKING - 1) is field
     assert field.for_pictures(WORTH_LOOKING).grid.inner.any()
+
+
+def test_what_stands_in_a_place_is_looked_into_for_a_still():
+    place = VMField.create(unbounded.WHOLE, (12,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
+    place = place.with_occupancy(OccupancyGrid.full(unbounded.WHOLE, 16, unbounded))
+    small = np.diag([0.2, 0.2, 0.2, 1.0])
+    scene = blocks_of([Placed("place", place, np.eye(4)), Placed("thing", ball(), small)])
+    assert scene.for_pictures(WORTH_IN_PLACE - 1) is scene
+    assert scene.for_pictures(WORTH_IN_PLACE).grid.inner.any()
+    assert place.for_pictures(WORTH_LOOKING) is place
 
 
 def test_places_lie_in_their_parts():
