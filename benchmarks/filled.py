@@ -31,6 +31,7 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
 from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Rays
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
@@ -61,8 +62,13 @@ class Frame:
 
     @cached_property
     def looked(self) -> VMField:
-        """As pictures of a film are made of."""
-        return self.field.looked_into()
+        """As `render` makes pictures of it: one that stands in a place is looked into."""
+        return self.field.for_pictures(WORTH_LOOKING)
+
+    @property
+    def looking(self) -> float:
+        """Seconds that it takes to look into it."""
+        return seconds([partial(self.field.for_pictures, WORTH_LOOKING)], 1)[0]
 
     def picture(self, looked: bool = True, denser: int = 1) -> np.ndarray:
         """(H, W, 3) over white, of a field that is looked into or not, by samples so many times as dense."""
@@ -194,7 +200,7 @@ def rows(frames: list[Frame], repeats: int) -> list[dict]:
         fine, film, still = frame.picture(False, DENSER), *(frame.picture(way) for way in ways)
         found.append(
             {"frame": frame.what, "s": f"{own:.2f}", "over N = 1": f"{own / took[0]:.2f}"}
-            | {"without, s": f"{plain:.2f}", "looking, s": f"{seconds([frame.field.looked_into], 1)[0]:.2f}"}
+            | {"without, s": f"{plain:.2f}", "looking, s": f"{frame.looking:.2f}"}
             | parts(frame, repeats)
             | {"dB to without": f"{psnr(film, still):.1f}", "to denser": f"{psnr(film, fine):.1f}"}
             | {"without, to denser": f"{psnr(still, fine):.1f}"}

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.insides import insides_of, with_insides, worth_looking
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.loops import (
@@ -28,7 +27,6 @@ from fusedrf_cli.engine.kernels.loops import (
 )
 from fusedrf_cli.engine.kernels.specialise import TINTED
 from fusedrf_cli.engine.kernels.tinting import with_tints
-from fusedrf_cli.engine.spaces import bounded
 
 CELLS_PER_TASK = 256
 
@@ -209,19 +207,9 @@ class ComputedField:
         return self.device_loops.on_device(self.occupancy.arrays)
 
     def for_pictures(self, rays: int) -> "ComputedField":
-        """The field for pictures of so many rays in all: where they are worth it, under a grid that knows the
-        insides of its cells (engine/fields/insides.py), by which they take fewer samples and look the same.
-        It shows the numbers as they are now."""
-        return self.looked_into() if worth_looking(self, rays) else self
-
-    def looked_into(self) -> "ComputedField":
-        """See `for_pictures`. A place, which is full of haze, is taken as it is."""
-        insides = insides_of(self) if self.space is bounded else None
-        if insides is None:
-            return self
-        other = copy(self)._afresh()
-        other.__dict__["grid"] = self.device_loops.on_device(with_insides(self.occupancy, insides))
-        return other
+        """The field for pictures of so many rays in all, perhaps under a grid that skips more and shows the
+        numbers as they are now."""
+        return self
 
     @property
     def real(self) -> np.dtype:

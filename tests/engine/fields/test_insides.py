@@ -10,7 +10,6 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.insides import (
     FULL,
     SIDE,
-    WORTH_IN_PLACE,
     WORTH_LOOKING,
     grown,
     insides_of,
@@ -21,6 +20,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.plain import mark_parts
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm.insides import looked_into
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.spaces import unbounded
@@ -136,17 +136,14 @@ def decibels(one: np.ndarray, other: np.ndarray) -> float:
 
 def test_pictures_stay_and_take_fewer_samples():
     field = ball()
-    bits, camera = insides_of(field), framing_camera(BOX, 0.9, 0.45, 60, 60)
-    plain = shown(field, camera)
-    assert decibels(shown(field.looked_into(), camera), plain) > 65 and plain.min() < 0.9
-    assert 0.02 < parts_of(bits).mean() < 0.25  # a ball of radius 0.6 in a box of 2: 0.11
+    assert 0.02 < parts_of(insides_of(field)).mean() < 0.25  # a ball of radius 0.6 in a box of 2: 0.11
     scale = np.diag([0.4, 0.3, 0.5, 1.0])
     placed = [Placed(str(i), field, shift(x) @ scale) for i, x in enumerate([-0.5, 0.3, 0.6])]
     scene = blocks_of(placed)
     camera = framing_camera(scene.occupancy.tight_aabb(), 0.9, 0.45, 60, 60)
     plain = shown(scene, camera)
-    assert decibels(shown(scene.looked_into(), camera), plain) > 60 and plain.min() < 0.9
-    assert parts_of(scene.looked_into().grid.inner).mean() < 0.5 * scene.occupancy.occupied.mean()
+    assert decibels(shown(looked_into(scene), camera), plain) > 60 and plain.min() < 0.9
+    assert parts_of(looked_into(scene).grid.inner).mean() < 0.5 * scene.occupancy.occupied.mean()
 
 
 def shift(x: float) -> np.ndarray:
@@ -155,20 +152,16 @@ def shift(x: float) -> np.ndarray:
     return matrix
 
 
-def test_cells_are_looked_into_where_many_rays_are_shown():
-    field = ball(8)
-    assert field.for_pictures(WORTH_LOOKING - 1) is field
-    assert field.for_pictures(WORTH_LOOKING).grid.inner.any()
-
-
-def test_what_stands_in_a_place_is_looked_into_for_a_still():
+def test_what_stands_in_a_place_is_looked_into_where_many_rays_are_shown():
     place = VMField.create(unbounded.WHOLE, (12,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
     place = place.with_occupancy(OccupancyGrid.full(unbounded.WHOLE, 16, unbounded))
     small = np.diag([0.2, 0.2, 0.2, 1.0])
     scene = blocks_of([Placed("place", place, np.eye(4)), Placed("thing", ball(), small)])
-    assert scene.for_pictures(WORTH_IN_PLACE - 1) is scene
-    assert scene.for_pictures(WORTH_IN_PLACE).grid.inner.any()
-    assert place.for_pictures(WORTH_LOOKING) is place
+    assert scene.for_pictures(WORTH_LOOKING - 1) is scene
+    assert scene.for_pictures(WORTH_LOOKING).grid.inner.any()
+    in_a_box = blocks_of([Placed("one", ball(), small), Placed("other", ball(), shift(1.0))])
+    for field in (place, ball(), in_a_box):
+        assert field.for_pictures(WORTH_LOOKING) is field
 
 
 def test_places_lie_in_their_parts():
@@ -184,6 +177,8 @@ def test_of_fog_nothing_is_left_out():
     sections = field.sections(0)
     sections["density_plane_0"][..., 0] = 0
     sections["density_line_0"][:, 1] = 10 + np.log(5e-2 / (2 * field.tensors[0].scale))
-    bits, camera = insides_of(field), framing_camera(BOX, 0.9, 0.45, 20, 20)
+    bits = insides_of(field)
     assert bits is None or parts_of(bits).all()
-    assert np.array_equal(shown(field.looked_into(), camera), shown(field, camera))
+    camera = framing_camera(BOX, 0.9, 0.45, 20, 20)
+    scene = blocks_of([Placed("one", field, shift(-1.0)), Placed("other", field, shift(1.0))])
+    assert np.array_equal(shown(looked_into(scene), camera), shown(scene, camera))

@@ -15,6 +15,7 @@ from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.fields.insides import places
 from fusedrf_cli.engine.kernels import cpu
+from fusedrf_cli.engine.kinds.vm.insides import looked_into
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.engine.conftest import BOX, points_in, random_vm, rays_at, unit
@@ -126,16 +127,17 @@ def test_looking_into_cells():
     for wanted, found in twice(field, lambda f: f.look_into(cells, places(1), least)):
         check(found, wanted)
         assert wanted.any()
-    rays_o, rays_d = rays_at(field.aabb, 4)
+    blocks = two_blocks(TURNED)
+    rays_o, rays_d = rays_at(blocks.aabb, 4)
 
     def picture(field):
         out = np.zeros((4, 5))
-        looked = field.looked_into()
+        looked = looked_into(field)
         assert looked.grid.inner.any()
         looked.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
         return (out,)
 
-    for wanted, found in twice(field, picture):
+    for wanted, found in twice(blocks, picture):
         check(found, wanted)
 
 

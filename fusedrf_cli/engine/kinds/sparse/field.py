@@ -124,10 +124,6 @@ class SparseField(ComputedField):
         back.settle()
         return back
 
-    def looked_into(self) -> "SparseField":
-        """See ComputedField: bricks say of each of their voxels whether it is empty."""
-        return self
-
     # -- reading ---------------------------------------------------------------------------------------------
 
     @property

@@ -26,6 +26,7 @@ from fusedrf_cli.engine.fields.box import (
 )
 from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, unpack_bits
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed
+from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
     SCENE_CELLS,
@@ -367,10 +368,10 @@ class VMField(ComputedField):
             *detail_arrays(self.tensors, self.real),
         )
 
-    def looked_into(self) -> "VMField":
-        """See ComputedField; of several blocks each in its own cells."""
-        if self.owners is None:
-            return super().looked_into()
+    def for_pictures(self, rays: int) -> "VMField":
+        """See ComputedField: what stands in a place is looked into where pictures are worth it."""
+        if self.owners is None or self.space is bounded or rays < WORTH_LOOKING:
+            return self
         from fusedrf_cli.engine.kinds.vm.insides import looked_into
 
         return looked_into(self)
