@@ -21,8 +21,8 @@ MOST_PLACES = 60_000_000  # that are asked at: a second or two
 FULL = np.uint64(2**64 - 1)
 WORTH_LOOKING = 1_500_000
 """Rays from which looking into the cells of what stands in a place is worth it: of three objects it takes
-1.8 s, and of 426,000 rays saves 0.5 s; of small ones close by it saves more. Of four objects in a box it takes
-1.2 s, saves 0.4 s of 640,000 rays, and costs 3 dB to denser samples: nothing is looked into there."""
+1.8 s, and of 426,000 rays saves 0.5 s; of small ones close by it saves more. Of four objects in a box it
+takes 1.2 s, saves 0.4 s of 640,000 rays, and costs 3 dB to denser samples: nothing is looked into there."""
 
 
 def insides_of(field) -> np.ndarray | None:
