@@ -58,7 +58,8 @@ ABOUT = (
     f"and scaled. All PSNR is of {VIEWS} pictures of the whole. *One by one* is the PSNR to the composed "
     "scene of a field that all were added to, *at once* that of one fuse. To what was fused at once "
     "another object is added, between two and into their boxes: *outside* is the largest change of "
-    "density, in parts of the largest, at points outside of the region that this touched, and the PSNR "
+    "density, in parts of the largest, at points outside of the region that this touched (of `sparse`, "
+    "with the top cells whose numbers share scales with new ones), and the PSNR "
     "to before of the pixels whose rays miss it. *Deleted again*: the PSNR to before once it is "
     f"deleted, with all sources known; and with none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} "
     "pixels of the scene before (`--refit`, half a minute). *Fused in, deleted*: of an object that was "
@@ -105,6 +106,11 @@ def put(folder: Path, bundle: str, one, output: str) -> tuple[float, dict]:
     started = time.monotonic()
     said = fusedrf(folder, "add", bundle, source, "--name", name, *place, "-o", output)
     return time.monotonic() - started, said
+
+
+def changed_box(said: dict) -> list[float]:
+    """(6,) outside of which an edit changed nothing, as it reported."""
+    return said["touched"].get("rounded_in", said["touched"]["aabb"])
 
 
 def held(bundle: Path) -> set[str]:
@@ -228,7 +234,7 @@ def row(folder: Path, kind: str) -> tuple[dict, list[list]]:
     whole = kept.once("seconds", lambda: fused(folder, kind, objects, once))
     seconds, share = kept.once("edit", lambda: timed(folder, once, SMALL if len(objects) > 8 else EXTRA))
     at_once = kept.once("at once", lambda: likeness(folder, once, "all.json"))
-    box = kept.once("box", lambda: put(folder, once, EXTRA, more)[1]["touched"]["aabb"])
+    box = kept.once("box", lambda: changed_box(put(folder, once, EXTRA, more)[1]))
     change, missed = kept.once("outside", lambda: outside(folder, once, more, np.array(box)))
     again = kept.once("deleted again", lambda: deleted(folder, more, EXTRA[0], once))
     without = f"without_{len(objects)}.rfpack"

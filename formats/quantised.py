@@ -1,7 +1,8 @@
 """Arrays in 8 or 4 bits: a code for every number, and a scale for every block of neighbours.
 
 An array of three dimensions (na, nb, R) is cut into blocks of 8 x 8 x 1, one of two (V, C) into blocks of
-64 x 1, from index 0, smaller at the far edges. With L = 127 in 8 bits and 7 in 4, a number is
+64 x 1, from index 0, smaller at the far edges; where the rows of the latter lie in runs, they are cut anew at
+each, so that what one run holds leaves the others as they are. With L = 127 in 8 bits and 7 in 4, a number is
 
     value = scale * code / L        scale a float16 >= 0 of its block, code an integer from -L to L
 
@@ -31,9 +32,25 @@ def is_coded(shape: tuple[int, ...]) -> bool:
     return len(shape) in LEAST and math.prod(shape) >= LEAST[len(shape)]
 
 
-def scales_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Blocks per axis of an array of two or three dimensions."""
-    return tuple(-(-n // b) for n, b in zip(shape, BLOCKS[len(shape)], strict=True))
+def scales_shape(shape: tuple[int, ...], runs: np.ndarray | None = None) -> tuple[int, ...]:
+    """Blocks per axis of an array of two or three dimensions; runs (R,) are the rows in each run of one of
+    two."""
+    counts = [-(-n // b) for n, b in zip(shape, BLOCKS[len(shape)], strict=True)]
+    if runs is not None:
+        counts[0] = int((-(-np.asarray(runs, np.int64) // BLOCKS[2][0])).sum())
+    return tuple(counts)
+
+
+def block_sides(shape: tuple[int, ...], runs: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+    """The lengths of the blocks along each axis, (scales_shape[axis],) int64."""
+    sides = []
+    for axis, (n, b) in enumerate(zip(shape, BLOCKS[len(shape)], strict=True)):
+        lengths = np.asarray([n] if axis or runs is None else runs, np.int64)
+        counts = -(-lengths // b)
+        full = np.full(int(counts.sum()), b, np.int64)
+        full[np.cumsum(counts)[lengths > 0] - 1] += (lengths - counts * b)[lengths > 0]
+        sides.append(full)
+    return tuple(sides)
 
 
 def code_bytes(numbers: int, bits: int) -> int:
@@ -41,32 +58,39 @@ def code_bytes(numbers: int, bits: int) -> int:
     return -(-numbers * bits // 8)
 
 
-def quantised(array: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray]:
+def quantised(
+    array: np.ndarray, bits: int, runs: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Scales, float16 of `scales_shape`, and codes, flat uint8, of a float array of two or three dimensions.
 
     An error is at most scale / (2 L), or 2^-24 where that is more, in 8 bits; in 4 the largest numbers of a
     block may be cut off where the others gain by it. Magnitudes have to be at most 65504.
     """
     levels = LEVELS[bits]
-    scales, codes = np.empty(scales_shape(array.shape), np.float16), []
-    for rows, blocks in _slabs(array.shape):
+    scales, codes = np.empty(scales_shape(array.shape, runs), np.float16), []
+    for rows, blocks, sides in _slabs(array.shape, runs):
         values = np.asarray(array[rows], np.float32)
-        scales[blocks] = _best_scales(values, bits)
-        spread = _spread(scales[blocks], values.shape)
+        scales[blocks] = _best_scales(values, sides, bits)
+        spread = _spread(scales[blocks], sides)
         codes.append((_codes(values, spread, levels) + np.float32(levels + 1)).astype(np.uint8)[spread > 0])
     found = np.concatenate(codes) if codes else np.zeros(0, np.uint8)
     return scales, found if bits == 8 else _paired(found)
 
 
 def dequantised(
-    scales: np.ndarray, codes: np.ndarray, bits: int, shape: tuple[int, ...], where: str
+    scales: np.ndarray,
+    codes: np.ndarray,
+    bits: int,
+    shape: tuple[int, ...],
+    where: str,
+    runs: np.ndarray | None = None,
 ) -> np.ndarray:
-    """float32 numbers of `shape` from what `quantised` gave; `scales` have the shape that `shape` asks for.
+    """float32 numbers of `shape` from what `quantised` gave; `scales` have the `scales_shape` of it.
 
     `where` leads error sentences. Before the numbers are allocated, raises NotFinite (scales) and BadArray
     (negative scales, invalid codes, too many or too few of them).
     """
-    levels, kept_numbers = LEVELS[bits], check_scales(scales, shape, where)
+    levels, kept_numbers = LEVELS[bits], check_scales(scales, shape, where, runs)
     if codes.size != code_bytes(kept_numbers, bits):
         raise BadArray(
             f"{where}: {codes.size:,} bytes of codes, but its scales need "
@@ -80,10 +104,10 @@ def dequantised(
     if kept_numbers and not codes.min():
         raise BadArray(f"{where}: has a code 0, expected 1 to {2 * levels + 1}; make the file again")
     array, at = np.zeros(shape, np.float32), 0
-    for rows, blocks in _slabs(shape):
+    for rows, blocks, sides in _slabs(shape, runs):
         if not scales[blocks].any():
             continue  # pages of zeros are never touched
-        spread = _spread(scales[blocks], array[rows].shape)
+        spread = _spread(scales[blocks], sides)
         kept = spread > 0
         count = np.count_nonzero(kept)
         signed = np.zeros(kept.shape, np.float32)
@@ -93,55 +117,61 @@ def dequantised(
     return array
 
 
-def check_scales(scales: np.ndarray, shape: tuple[int, ...], where: str) -> int:
+def check_scales(
+    scales: np.ndarray, shape: tuple[int, ...], where: str, runs: np.ndarray | None = None
+) -> int:
     """How many numbers of an array of `shape` have codes. Raises NotFinite and BadArray for invalid
     scales."""
     if not np.isfinite(scales).all():
         raise NotFinite(f"{where}: has scales that are NaN or infinite; make the file again")
     if np.signbit(scales).any():
         raise BadArray(f"{where}: has negative scales; make the file again")
-    return _numbers_kept(scales > 0, shape)
+    return _numbers_kept(scales > 0, shape, runs)
 
 
 def exact_code_bytes(array: np.ndarray, bits: int) -> int:
-    """Bytes that the codes of an array take, without making them."""
+    """Bytes that the codes of an array without runs take, without making them."""
     kept = np.empty(scales_shape(array.shape), bool)
-    for rows, blocks in _slabs(array.shape):
-        kept[blocks] = _floored(_by_block(np.maximum, np.abs(array[rows]))) > 0
+    for rows, blocks, sides in _slabs(array.shape):
+        kept[blocks] = _floored(_by_block(np.maximum, np.abs(array[rows]), sides)) > 0
     return code_bytes(_numbers_kept(kept, array.shape), bits)
 
 
-def _numbers_kept(kept: np.ndarray, shape: tuple[int, ...]) -> int:
+def _numbers_kept(kept: np.ndarray, shape: tuple[int, ...], runs: np.ndarray | None = None) -> int:
     """How many numbers lie in the blocks that are kept."""
     counts = kept.astype(np.int64)
-    for axis, (n, b) in enumerate(zip(shape, BLOCKS[len(shape)], strict=True)):
-        lengths = np.minimum(b, n - b * np.arange(kept.shape[axis]))
+    for axis, lengths in enumerate(block_sides(shape, runs)):
         counts *= lengths.reshape([-1 if a == axis else 1 for a in range(len(shape))])
     return int(counts.sum())
 
 
-def _slabs(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice]]:
-    """Slices of an array's first axis, and of its scales', that cut no block."""
-    block = BLOCKS[len(shape)][0]
-    step = max(1, NUMBERS_AT_ONCE // (block * max(1, math.prod(shape[1:]))))
-    for first in range(0, -(-shape[0] // block), step):
-        yield slice(block * first, block * (first + step)), slice(first, first + step)
+def _slabs(
+    shape: tuple[int, ...], runs: np.ndarray | None = None
+) -> Iterator[tuple[slice, slice, tuple[np.ndarray, ...]]]:
+    """Slices of an array's first axis, and of its scales', that cut no block, and the blocks' lengths in them
+    along each axis."""
+    rows, *others = block_sides(shape, runs)
+    step = max(1, NUMBERS_AT_ONCE // (BLOCKS[len(shape)][0] * max(1, math.prod(shape[1:]))))
+    at = 0
+    for first in range(0, len(rows), step):
+        sides = rows[first : first + step]
+        yield slice(at, at := at + int(sides.sum())), slice(first, first + step), (sides, *others)
 
 
-def _spread(scales: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """float32 of `shape`: the scale of every number's block."""
+def _spread(scales: np.ndarray, sides: tuple[np.ndarray, ...]) -> np.ndarray:
+    """float32: the scale of every number's block."""
     spread = scales.astype(np.float32)
-    for axis, (n, b) in enumerate(zip(shape, BLOCKS[len(shape)], strict=True)):
-        if b > 1:
-            spread = np.repeat(spread, b, axis)[(slice(None),) * axis + (slice(n),)]
+    for axis, lengths in enumerate(sides):
+        if (lengths != 1).any():
+            spread = np.repeat(spread, lengths, axis)
     return spread
 
 
-def _by_block(reduce: np.ufunc, values: np.ndarray) -> np.ndarray:
+def _by_block(reduce: np.ufunc, values: np.ndarray, sides: tuple[np.ndarray, ...]) -> np.ndarray:
     """The largest of every block, or its sum."""
-    for axis, b in enumerate(BLOCKS[values.ndim]):
-        if b > 1:
-            values = reduce.reduceat(values, np.arange(0, values.shape[axis], b), axis)
+    for axis, lengths in enumerate(sides):
+        if (lengths != 1).any():
+            values = reduce.reduceat(values, np.cumsum(lengths) - lengths, axis)
     return values
 
 
@@ -152,16 +182,16 @@ def _floored(peaks: np.ndarray) -> np.ndarray:
     return np.where(near > peaks, np.nextafter(near, np.float16(0)), near)
 
 
-def _best_scales(values: np.ndarray, bits: int) -> np.ndarray:
+def _best_scales(values: np.ndarray, sides: tuple[np.ndarray, ...], bits: int) -> np.ndarray:
     """float16 scales of the blocks of a slab, of the least squared error among those tried."""
-    levels, peaks = LEVELS[bits], _by_block(np.maximum, np.abs(values))
+    levels, peaks = LEVELS[bits], _by_block(np.maximum, np.abs(values), sides)
     tried, errors = [_floored(np.float32(factor) * peaks) for factor in FACTORS[bits]], []
     if len(tried) == 1:
         return tried[0]
     for scales in tried:
-        spread = _spread(scales, values.shape)
+        spread = _spread(scales, sides)
         off = values - spread * _codes(values, spread, levels) / np.float32(levels)
-        errors.append(_by_block(np.add, np.square(off, dtype=np.float64)))
+        errors.append(_by_block(np.add, np.square(off, dtype=np.float64), sides))
     first = np.argmin(errors, 0)  # of equal ones the largest scale, so that what was coded stays
     return np.take_along_axis(np.stack(tried), first[None], 0)[0]
 

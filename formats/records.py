@@ -31,7 +31,7 @@ from formats.quantised import (
 
 KEY = "fusedrf"
 PLAIN, CODED, VERSION = 1, 2, 3  # of fields without coded arrays, with them, and that need what is in NEEDS
-NEEDS = ("hashed",)  # what a field's metadata may say that a reader must know, to show it as it is
+NEEDS = ("hashed", "runs")  # what a field's metadata may say that a reader must know, to show it as it is
 MAX_HEADER = 1 << 20
 MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30
@@ -73,6 +73,8 @@ class CodedSpec:
 
     bits: int
     shape: tuple[int, ...]
+    runs: bool
+    """Whether its rows lie in runs, of the lengths in NAME.runs."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +124,10 @@ def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
     """Safetensors bytes of `record`; equal records give equal bytes.
 
     Floats are cast to `precision`, "float16" or "float32"; in "int8" and "int4" large arrays of two or three
-    dimensions are coded (formats/quantised.py), others cast to float16. Bool becomes uint8, other integers
-    int32. Raises NotFinite (NaN, infinity, overflow in the cast), BadArray, BadSchema, LimitExceeded.
+    dimensions are coded (formats/quantised.py), others cast to float16. Where there is an array NAME.runs of
+    whole numbers, it holds the lengths of runs of NAME's rows, and each is coded in blocks of its own. Bool
+    becomes uint8, other integers int32. Raises NotFinite (NaN, infinity, overflow in the cast), BadArray,
+    BadSchema, LimitExceeded.
     """
     where = f"field of kind {record.kind!r}"
     stored, coded = _stored_arrays(record.arrays, precision, where)
@@ -157,11 +161,15 @@ def exact_bytes(array: np.ndarray, precision: str) -> int:
     return most - code_bytes(array.size, BITS[precision]) + exact_code_bytes(array, BITS[precision])
 
 
-def as_stored(array: np.ndarray, precision: str, name: str = "") -> np.ndarray:
-    """The float32 numbers that a float array comes back as from a field. Raises NotFinite."""
+def as_stored(
+    array: np.ndarray, precision: str, name: str = "", runs: np.ndarray | None = None
+) -> np.ndarray:
+    """The float32 numbers that a float array comes back as from a field; runs (R,) are the lengths of those
+    of its rows, if it has any. Raises NotFinite."""
     cast = _cast(name, array, precision, "the field")
     if precision in BITS and is_coded(array.shape):
-        return dequantised(*quantised(array, BITS[precision]), BITS[precision], array.shape, name)
+        bits = BITS[precision]
+        return dequantised(*quantised(array, bits, runs), bits, array.shape, name, runs)
     return cast.astype(np.float32)
 
 
@@ -180,7 +188,11 @@ def decode_field(data: bytes | memoryview, where: str) -> FieldRecord:
         arrays[name] = array
     for name, spec in header.coded.items():
         scales, codes = (_mapped(data, header.specs[part]) for part in coded_parts(name))
-        arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, f"{where}: array {name!r}")
+        runs = arrays[runs_of(name)] if spec.runs else None
+        place = f"{where}: array {name!r}"
+        if runs is not None:
+            _check_runs(runs, spec.shape[0], scales.shape[0], place)
+        arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, place, runs)
     return FieldRecord(header.kind, arrays, header.metadata)
 
 
@@ -215,6 +227,11 @@ def coded_parts(name: str) -> tuple[str, str]:
     return f"{name}.scales", f"{name}.codes"
 
 
+def runs_of(name: str) -> str:
+    """The name of the array that holds the lengths of an array's runs of rows."""
+    return f"{name}.runs"
+
+
 def _plain(value: object) -> object:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
@@ -235,8 +252,10 @@ def _stored_arrays(
         shape = np.shape(array)
         if precision in BITS and np.asarray(array).dtype.kind == "f" and is_coded(shape):
             _cast(name, array, precision, where)  # a scale is a float16 too
-            parts = dict(zip(coded_parts(name), quantised(array, BITS[precision]), strict=True))
+            runs = arrays.get(runs_of(name))
+            parts = dict(zip(coded_parts(name), quantised(array, BITS[precision], runs), strict=True))
             coded[name] = {"bits": BITS[precision], "shape": list(shape)}
+            coded[name] |= {} if runs is None else {"runs": True}
         else:
             parts = {name: _stored(name, array, precision, where)}
         if twice := parts.keys() & stored.keys():
@@ -332,14 +351,14 @@ def _spec(name: str, entry: object, base: int, where: str) -> ArraySpec:
 def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: str) -> CodedSpec:
     if not NAME.fullmatch(name) or name in specs:
         raise BadArray(f"{where}: coded array {name[:80]!r} has a wrong or taken name; make the file again")
-    if not isinstance(entry, dict) or set(entry) != {"bits", "shape"}:
-        raise BadSchema(f"{where}: coded array {name!r} should state bits and shape only")
-    bits, shape = entry["bits"], entry["shape"]
+    if not isinstance(entry, dict) or set(entry) - {"runs"} != {"bits", "shape"}:
+        raise BadSchema(f"{where}: coded array {name!r} should state bits, shape and runs only")
+    bits, shape, in_runs = entry["bits"], entry["shape"], entry.get("runs", False)
     if type(bits) is not int or bits not in LEVELS:
         raise BadSchema(f"{where}: array {name!r} is coded in {bits!r} bits, expected 4 or 8")
     if not _counts(shape) or len(shape) not in BLOCKS or not all(1 <= n <= MAX_DIMENSION for n in shape):
         raise BadArray(f"{where}: coded array {name!r} has shape {shape!r}, expected two or three sizes")
-    numbers, least = math.prod(shape), scales_shape(shape)
+    numbers = math.prod(shape)
     if 4 * numbers > MAX_ARRAY_BYTES:
         raise LimitExceeded(
             f"{where}: array {name!r} decodes to {4 * numbers:,} bytes, but at most "
@@ -348,6 +367,9 @@ def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: st
     scales, codes = (specs.get(part) for part in coded_parts(name))
     if scales is None or codes is None:
         raise BadArray(f"{where}: coded array {name!r} lacks its scales or its codes; make the file again")
+    least = scales_shape(shape)
+    if in_runs:
+        least = _in_runs(name, shape, in_runs, scales, specs.get(runs_of(name)), where)
     if scales.dtype != DTYPES["F16"] or scales.shape != least:
         found = f"{scales.dtype} {list(scales.shape)}"
         raise BadArray(f"{where}: array {name!r} has scales {found}, expected float16 {list(least)}")
@@ -356,7 +378,34 @@ def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: st
         raise BadArray(
             f"{where}: array {name!r} has codes {found}, expected at most {code_bytes(numbers, bits):,} bytes"
         )
-    return CodedSpec(bits, tuple(shape))
+    return CodedSpec(bits, tuple(shape), bool(in_runs))
+
+
+def _in_runs(
+    name: str, shape: list[int], said: object, scales: ArraySpec, runs: ArraySpec | None, where: str
+) -> tuple[int, ...]:
+    """The scales' shape of an array whose rows lie in runs: at least one block in each, as far as a header
+    can tell."""
+    if said is not True or len(shape) != 2:
+        raise BadSchema(f"{where}: 'runs' of array {name!r} should be true, and the array of two sizes")
+    if runs is None or runs.dtype != DTYPES["I32"] or len(runs.shape) != 1:
+        raise BadArray(f"{where}: array {name!r} lacks {runs_of(name)!r}, int32 in one dimension")
+    (count,), blocks = runs.shape, scales.shape[0] if scales.shape else 0
+    least, *columns = scales_shape(tuple(shape))
+    if not max(least, count) <= blocks <= least + count:
+        raise BadArray(
+            f"{where}: array {name!r} has {blocks:,} scales in a column, expected {max(least, count):,} to "
+            f"{least + count:,} for its {count:,} runs"
+        )
+    return blocks, *columns
+
+
+def _check_runs(runs: np.ndarray, rows: int, blocks: int, where: str) -> None:
+    """Raise BadArray where the lengths of runs are not those of so many rows and blocks."""
+    if runs.min(initial=1) < 1 or runs.sum(dtype=np.int64) != rows:
+        raise BadArray(f"{where}: its runs should be of 1 row and more, {rows:,} in all; make the file again")
+    if scales_shape((rows, 1), runs)[0] != blocks:
+        raise BadArray(f"{where}: its runs do not have {blocks:,} blocks in all; make the file again")
 
 
 def _counts(values: object) -> bool:

@@ -51,7 +51,7 @@ LOCAL_VIEW = 100
 """Pixels a side of the views of an edit that changes nothing outside of its region: what it put in is shown
 as it was made, and asking the scene as composed takes most of such an edit's time."""
 SAME_BITS = "outside of it all numbers are the same bits"
-ROUNDED = "outside of it all numbers are the same bits, until they are rounded to few bits beside new ones"
+ROUNDED = "outside of it all numbers are the same bits, but for those near it, which are rounded anew"
 NEARLY = "outside of it the field was held to what it showed, and is not the same to the bit"
 
 
@@ -299,6 +299,9 @@ def edit_report(
     """The report of an edit."""
     extent = edited.box[3:] - edited.box[:3]
     whole = edited.field.occupancy.aabb[3:] - edited.field.occupancy.aabb[:3]
+    rounded, near = None, SAME_BITS if edited.local else NEARLY
+    if edited.local and not (request.precision or fused.precision).startswith("float"):
+        rounded = fused.kind.rounded(edited.field, edited.box)
     return {
         "output": request.output,
         "bytes": size,
@@ -306,18 +309,12 @@ def edit_report(
         "touched": {
             "names": names,
             "aabb": placed_box(edited.box, fused.origin).tolist(),
+            **({} if rounded is None else {"rounded_in": placed_box(rounded, fused.origin).tolist()}),
             **fused.kind.counts(edited.field),
             "share_of_box": float(min(1.0, np.prod(extent / whole))),
-            "how": f"{edited.how}; {how_near(request, fused, edited)}",
+            "how": f"{edited.how}; {near if rounded is None else ROUNDED}",
         },
         **figures,
         "total_seconds": time.monotonic() - started,
     }
 
-
-def how_near(request: EditRequest, fused: Fused, edited: Edited) -> str:
-    """One clause: how near what lies outside of an edit's region is to what it was, in the file."""
-    if not edited.local:
-        return NEARLY
-    anew = fused.kind.rounds_anew and not (request.precision or fused.precision).startswith("float")
-    return ROUNDED if anew else SAME_BITS

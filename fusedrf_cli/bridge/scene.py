@@ -297,7 +297,7 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
 
 def stored(field: StoredField, precision: str) -> StoredField:
     """The field as it will come back from a bundle of that precision."""
-    return field.stored(lambda array, name: as_stored(array, precision, name))
+    return field.stored(lambda array, name, runs: as_stored(array, precision, name, runs))
 
 
 def write_field(

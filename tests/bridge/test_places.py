@@ -120,6 +120,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
     assert taken(part, ComposedField([part, replace(small, object_to_world=np.eye(4))])) is None
 
 
+@pytest.mark.slow
 def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report):
     """The place stays as it is; what is deleted leaves it so, and all others stay."""
     path = str(folder / "room.rfpack")
@@ -143,6 +144,7 @@ def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, repor
     assert psnr(picture("none.rfpack"), picture("room.rfpack")) > 35
 
 
+@pytest.mark.slow
 def test_a_place_takes_the_dearest_precision_that_leaves_room():
     """And is held beside the objects' tensor in no more bytes than were planned; where it leaves none, one
     tensor over all of space stands for the scene."""
@@ -174,6 +176,7 @@ def test_a_place_takes_the_dearest_precision_that_leaves_room():
     assert type(kind.student(summed, StudentRequest(sizes, 10**7))) is Student
 
 
+@pytest.mark.slow
 def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report):
     """What stands around stays as it was, and the object comes in, where there are texels for it."""
     path = str(folder / "room.rfpack")
@@ -282,7 +285,7 @@ def test_what_masks_exclude_does_not_count(report, folder):
     assert all(v["psnr"] > 35 and v["ssim"] > 0.95 for v in found)
 
 
-@pytest.mark.parametrize("x", [-0.5, 4.0])
+@pytest.mark.parametrize("x", [-0.5, pytest.param(4.0, marks=pytest.mark.slow)])
 def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     """As `sparse`, an object in the core and one far outside of it are there, and edits leave the rest."""
     nodes = [

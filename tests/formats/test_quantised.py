@@ -142,6 +142,79 @@ def test_four_bits_take_the_scale_of_the_least_squared_error():
     assert found < 1.1 * min(error(scale) for scale in np.linspace(1.5, 3.5, 400))
 
 
+# --- runs of rows -------------------------------------------------------------------------------------------
+
+
+@st.composite
+def arrays_in_runs(draw) -> tuple[np.ndarray, np.ndarray]:
+    """Rows in runs, short and long, each as large as its own numbers."""
+    runs = np.array(draw(st.lists(st.sampled_from([1, 2, 63, 64, 65, 128, 200]), min_size=1, max_size=6)))
+    sizes = draw(hnp.arrays(np.float32, len(runs), elements=st.sampled_from([0.0, 1e-7, 0.1, 300.0])))
+    values = np.random.default_rng(draw(st.integers(0, 99))).uniform(-1, 1, (runs.sum(), 3))
+    return (values * np.repeat(sizes, runs)[:, None]).astype(np.float32), runs.astype(np.int32)
+
+
+@settings(max_examples=60, deadline=None)
+@given(arrays_in_runs(), st.sampled_from([8, 4]))
+def test_runs_are_coded_as_if_each_were_an_array_of_its_own(case, bits):
+    """So what changes in one leaves the others as they are."""
+    array, runs = case
+    scales, codes = quantised.quantised(array, bits, runs)
+    assert scales.shape == scales_shape(array.shape, runs)
+    parts = np.split(array, np.cumsum(runs)[:-1])
+    alone = [quantised.quantised(part, bits) for part in parts]
+    np.testing.assert_array_equal(scales, np.concatenate([one[0] for one in alone]))
+    back = [dequantised(*one, bits, part.shape, "here") for one, part in zip(alone, parts, strict=True)]
+    found = dequantised(scales, codes, bits, array.shape, "here", runs)
+    np.testing.assert_array_equal(found, np.concatenate(back))
+    if bits == 8:
+        np.testing.assert_array_equal(codes, np.concatenate([one[1] for one in alone]))
+
+
+def in_runs(runs, rows: int = 70000) -> bytes:
+    """A field of one coded array of numbers, whose rows lie in runs."""
+    array = np.random.default_rng(0).normal(size=(rows, 1)).astype(np.float32)
+    arrays = {"a": array, "a.runs": np.asarray(runs, np.int32)}
+    return encode_field(FieldRecord("sparse", arrays, {"needs": ["runs"]}), "int8")
+
+
+def test_a_field_in_runs_comes_back_and_is_encoded_to_the_same_bytes():
+    data = in_runs([100, 1, 69899])
+    header, record = decode_header(data, "here"), decode_field(data, "here")
+    assert header.coded["a"].runs and header.specs["a.scales"].shape == (2 + 1 + 1093, 1)
+    assert encode_field(record, "int8") == data
+    array, runs = record.arrays["a"], record.arrays["a.runs"]
+    np.testing.assert_array_equal(as_stored(array, "int8", "a", runs), array)
+
+
+def altered(data: bytes, old: bytes, new: bytes) -> bytes:
+    """Bytes with others of the same length in one place."""
+    assert data.count(old) == 1 and len(old) == len(new)
+    return data.replace(old, new)
+
+
+def little(*numbers: int) -> bytes:
+    return np.array(numbers, "<i4").tobytes()
+
+
+BAD_RUNS = {
+    "a run of nothing": (little(100, 1, 69899), little(101, 0, 69899), "of 1 row and more, 70,000 in all"),
+    "a negative run": (little(100, 1, 69899), little(102, -1, 69899), "of 1 row and more, 70,000 in all"),
+    "too few rows": (little(100, 1, 69899), little(100, 1, 69898), "of 1 row and more, 70,000 in all"),
+    "other blocks": (little(100, 1, 69899), little(64, 36, 69900), "do not have 1,096 blocks"),
+    "no runs": (b'"a.runs":', b'"b.runs":', "lacks 'a.runs', int32 in one dimension"),
+    "said otherwise": (b'\\"runs\\":true', b'\\"runs\\":1234', "should be true"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_RUNS)
+def test_runs_that_fit_no_array_are_refused(name):
+    """P12."""
+    old, new, sentence = BAD_RUNS[name]
+    with pytest.raises(errors.FormatError, match=f"^here: .*{sentence}"):
+        decode_field(altered(in_runs([100, 1, 69899]), old, new), "here")
+
+
 # --- bytes --------------------------------------------------------------------------------------------------
 
 

@@ -19,7 +19,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.bridge.conftest import TinySettings, done
 from tests.bridge.test_edit import AT, blues, covered
 
-QUICK = {"blocks", "cp", "dense", "vm"}  # the others' loops take half a minute each to compile
+QUICK = {"blocks", "vm"}  # the others' loops take half a minute each to compile
 KINDS = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in registry.names()]
 SIZE = 900_000
 PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5")

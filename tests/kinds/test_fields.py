@@ -20,7 +20,11 @@ FIELDS = {name: make for name, make in KINDS.items() if "placed" not in name}
 FIELDS["vm-mlp"] = lambda: random_vm_mlp(cells=4)
 
 
-@pytest.fixture(params=FIELDS)
+RARE = {"cp", "dense-mlp"}  # each takes a quarter of a minute to compile
+TRIED = [pytest.param(name, marks=pytest.mark.slow) if name in RARE else name for name in FIELDS]
+
+
+@pytest.fixture(params=TRIED)
 def field(request):
     return FIELDS[request.param]()
 
@@ -105,7 +109,7 @@ def test_as_stored_is_as_it_comes_back(field):
     points, dirs = asked(field)
     for precision in ("float32", "float16", "int8", "int4"):
         told = single.stored(
-            lambda array, name, p=precision: as_stored(array, p, name) if array.dtype.kind == "f" else array
+            lambda array, name, runs, p=precision: as_stored(array, p, name, runs)
         )
         data = encode_field(FieldRecord(field.kind, *single.state()), precision)
         read = make_field(decode_field(data, "bundle"), "bundle")

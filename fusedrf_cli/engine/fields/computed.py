@@ -29,6 +29,14 @@ from fusedrf_cli.engine.kernels.specialise import TINTED
 from fusedrf_cli.engine.kernels.tinting import with_tints
 
 CELLS_PER_TASK = 256
+StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
+"""The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
+the runs of its rows, or None."""
+
+
+def runs_of(name: str) -> str:
+    """The name of the array (R,) that holds the lengths of an array's runs of rows."""
+    return f"{name}.runs"
 
 
 class Batch(NamedTuple):
@@ -147,12 +155,12 @@ class ComputedField:
             return self
         return self.with_params(self.params.to(device))
 
-    def stored(self, as_stored: Callable[[np.ndarray, str], np.ndarray]) -> "ComputedField":
-        """The field as it comes back from a bundle that keeps as_stored(array, name) of each array of
-        numbers."""
+    def stored(self, as_stored: StoredAs) -> "ComputedField":
+        """The field as it comes back from a bundle that keeps as_stored(array, name, runs) of each array of
+        numbers; runs (R,) are those of its rows, or None."""
         arrays, metadata = self.state()
         kept = {
-            name: as_stored(array, name) if array.dtype.kind == "f" else array
+            name: as_stored(array, name, arrays.get(runs_of(name))) if array.dtype.kind == "f" else array
             for name, array in arrays.items()
         }
         return type(self).from_state(kept, metadata).to(self.params.device)

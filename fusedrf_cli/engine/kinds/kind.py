@@ -44,8 +44,6 @@ class Kind:
     """Whether a student may start as the scene's background (`taken_over`)."""
     precisions: tuple[str, ...] = ("int4", "int8")
     """That are tried where a quality is asked for, the cheapest first."""
-    rounds_anew = False
-    """Whether numbers stored in few bits share their scales with other ones once an edit has added some."""
     faithful = "float16"
     """The precision where only a size is given."""
 
@@ -188,6 +186,11 @@ class Kind:
         other = copy(field)
         other.tint = tuple(np.multiply(field.tint or WHITE, tint).tolist())
         return other._afresh("arrays", "loops")
+
+    def rounded(self, field: StoredField, box: np.ndarray) -> np.ndarray | None:
+        """(6,) in the field's frame, as the box (6,) of an edit: outside of it, numbers that are stored in
+        few bits keep their codes. None: outside of the edit's box they do."""
+        return None
 
     def added(self, field: StoredField, objects: list[Placed], teach: Teach) -> Edited:
         """A field with objects placed in its frame put in, by the rule `max`. Raises ValueError where they

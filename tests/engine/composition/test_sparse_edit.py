@@ -1,17 +1,23 @@
 """Edits of sparse fields are exactly local: numbers outside the touched box are the same bits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from formats.records import as_stored
 from fusedrf_cli.engine.composition.region import MaxOf
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.sparse.editing import added, emptied
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import Lattice
+from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, runs_box
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import resampled
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.spaces import unbounded
 from tests.analytic.fields import Tint
 from tests.engine.composition.test_resample import ball, placed
 
@@ -65,6 +71,42 @@ def test_what_is_added_shows_and_touches_nothing_else(red, scale, at):
     assert not changed and sum(key in after for key in kept) > 0.99 * len(kept)
     truth = Truth(placed(ball(voxel=0.06)), blue)
     assert likeness(more, truth, blue.aabb) > 24 and likeness(red, truth, blue.aabb) < 20
+
+
+def test_in_eight_bits_too_an_edit_touches_only_what_is_near(red):
+    """Numbers share scales with others of their eight top cells alone. An object is put in at one end, one
+    beyond the other end, so that the box grows by an odd number of top cells, and the first taken out."""
+
+    def coded(field: SparseField) -> SparseField:
+        return field.stored(lambda array, name, runs: as_stored(array, "int8", name, runs))
+
+    first = coded(resampled(ball(voxel=0.02), SparseShape(red.shape.sh_degree), 10**6))
+    low, top = first.aabb[0], first.tree.top[0]
+    small, far = (placed(ball(voxel=0.03, tint=BLUE), 0.1, (x, 0.1, 0)) for x in (0.9, low - 5.9 * top))
+    fields = [first, coded(added(first, small))]
+    fields.append(coded(added(fields[-1], far)))
+    assert (fields[-1].tree.counts[0] - first.tree.counts[0]) % 2 == 1
+    fields.append(coded(emptied(fields[-1], small.aabb, [])))
+    for old, new, box in zip(fields, fields[1:], (small.aabb, far.aabb, small.aabb), strict=False):
+        before, after = numbers_by_place(old), numbers_by_place(new)
+        low, high = runs_box(new, box).reshape(2, 3)
+        places = np.array([key[1:] for key in before])
+        away = ((places < low) | (places > high)).any(1)
+        kept = [key for key, far_off in zip(before, away, strict=True) if far_off]
+        assert len(kept) > 0.3 * len(before) and all(after[key] == before[key] for key in kept)
+
+
+def test_the_box_of_runs_holds_what_space_makes_of_it(red, rng):
+    """In a place too, where boxes far out become thin ones: every point in the box lies in the found one."""
+    tree = replace(red.tree, lo=np.full(3, -2.0), top=np.full(3, 4 / 40), counts=(40, 40, 40))
+    field = SparseField(red.shape, Lattice(tree, SIDE), 1.0, space=unbounded)
+    for low, high in (([0.2, -0.3, 0.1], [0.5, 0.3, 0.4]), ([-4, 0.5, 1.5], [-1, 3, 9])):
+        found = runs_box(field, np.array([*low, *high], float))
+        points = torch.from_numpy(rng.uniform(low, high, (500, 3)))
+        cells = torch.floor((unbounded.contracted(points) + 2) * 10)
+        for corner in (0, 1):  # of the top cell around each point
+            corners = unbounded.placed((cells + corner) / 10 - 2).numpy()
+            assert ((corners >= found[:3] - 1e-9) & (corners <= found[3:] + 1e-9)).all()
 
 
 def test_added_and_deleted_it_is_as_before(red):

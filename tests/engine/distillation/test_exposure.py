@@ -123,6 +123,7 @@ def run(cameras, photos, exposure: bool) -> FitRun:
     return fitting
 
 
+@pytest.mark.slow
 def test_what_is_learnt_from_drifting_photos_is_neutral(drifting):
     """Gains are found that are nearer to the true ones than none, and of what unseen views lose by the drift
     most is regained."""

@@ -38,6 +38,7 @@ TURNED = np.array([[0.0, -0.9, 0.0, 0.2], [0.7, 0.0, 0.0, -0.1], [0.0, 0.0, 1.1,
 
 
 @beside_the_simulator
+@pytest.mark.slow
 def test_the_simulator_agrees():
     run_simulated(__file__)
 

@@ -1,5 +1,7 @@
 """Trees of bricks and the lattices over them: packing, indices against slow loops, vertices that hang."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     Lattice,
     children,
     key_places,
+    morton,
     node_keys,
 )
 from tests.engine.kinds.sparse_cases import random_tree
@@ -20,6 +23,39 @@ def test_keys_keep_places_and_their_order(rng):
     np.testing.assert_array_equal(key_places(node_keys(places)), places)
     order = np.lexsort((places[:, 2], places[:, 1], places[:, 0]))
     np.testing.assert_array_equal(np.argsort(node_keys(places)), order)
+
+
+def test_a_morton_code_is_the_bits_of_three_numbers_in_turn(rng):
+    places = rng.integers(0, 1 << 21, (50, 3))
+    for place, code in zip(places, morton(places), strict=True):
+        digits = zip(*(f"{n:021b}" for n in place), strict=True)
+        assert f"{code:063b}" == "".join("".join(three) for three in digits)
+
+
+@pytest.mark.parametrize("n", [4, 2])
+def test_rows_are_stored_in_runs_of_eight_top_cells(n):
+    """Every row once, those of a run in the same two top cells per axis, and no two runs in the same."""
+    lattice = Lattice(replace(random_tree(2), phase=(1, 0, 1)), n)
+    order, runs = lattice.stored_order
+    np.testing.assert_array_equal(np.sort(order), np.arange(lattice.free))
+    cells = lattice.vertices[order] // (SIDE << lattice.tree.depth)
+    pairs = (cells + [1, 0, 1]) // 2
+    each = [np.unique(part, axis=0) for part in np.split(pairs, np.cumsum(runs)[:-1])]
+    assert all(len(found) == 1 for found in each)
+    assert len(np.unique(np.concatenate(each), axis=0)) == len(runs) == len(np.unique(pairs, axis=0))
+
+
+def test_runs_stay_what_they_are_when_the_box_grows():
+    """By one top cell, which moves every other one to the other place of its pair, and by two."""
+    tree = random_tree(2)
+    lattice = Lattice(tree, SIDE)
+    order, runs = lattice.stored_order
+    held = {frozenset(keys) for keys in np.split(order, np.cumsum(runs)[:-1])}
+    for cells in ([1, 0, 2], [2, 1, 1], [3, 3, 0]):
+        low = tree.lo - (np.array(cells) - 0.5) * tree.top
+        wider = Lattice(tree.extended(np.concatenate([low, tree.aabb[3:]])), SIDE)
+        order, runs = wider.stored_order
+        assert {frozenset(keys) for keys in np.split(order, np.cumsum(runs)[:-1])} == held
 
 
 @pytest.mark.parametrize("depth", [0, 1, 3])

@@ -150,6 +150,7 @@ def test_a_need_that_is_not_known_is_refused():
         decode_field(encode_field(record), "somewhere")
 
 
+@pytest.mark.slow
 def test_it_learns_what_is_finer_than_texels(monkeypatch):
     """A checkerboard of a quarter of a texel: planes and lines can only say its mean, a detail the rest."""
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.DETAIL_FROM", 2)

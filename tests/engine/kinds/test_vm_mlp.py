@@ -257,6 +257,7 @@ def test_a_tiny_fit_learns_a_ball():
     assert shown > max(24, blank + 6)
 
 
+@pytest.mark.slow
 def test_a_fit_taken_up_from_a_checkpoint_goes_on_as_before():
     cameras, images = pictures_of_a_ball(3, 24)
     settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=24, steps=40, samples=1 << 11)

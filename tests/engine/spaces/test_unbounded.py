@@ -371,6 +371,7 @@ def test_a_field_over_a_part_of_space_is_empty_elsewhere_and_can_be_placed():
     assert colour.numpy() == pytest.approx(shown.numpy(), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_only_what_is_near_an_object_is_sampled_as_finely_as_it(monkeypatch):
     """Blocks and their composition sample alike, show about what a finer step everywhere does, and a training
     step through samples that stand for many steps has the gradient of its loss."""

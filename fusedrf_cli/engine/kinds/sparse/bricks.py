@@ -23,6 +23,13 @@ MAX_ENTRIES = 1 << 26  # of all top cells' tables: 256 MB
 MAX_BRICKS = 1 << 22
 
 EMPTY, BRICK, SPLIT = 0, 1, 2
+MORTON_SPREAD = (  # shifts and masks that put two zeros behind each of 21 bits
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
 
 
 @dataclass(frozen=True)
@@ -41,14 +48,24 @@ class BrickTree:
     """(N, 3) int64, lower corner of each brick in bricks of its level."""
     mask: np.ndarray
     """(N, 4, 4, 4) bool, the voxels that are active."""
+    phase: tuple[int, int, int] = (0, 0, 0)
+    """0 or 1 per axis: whether the first top cells are the second ones of the pairs that are stored
+    together. It keeps these pairs what they are when the box grows."""
 
     @classmethod
-    def of(cls, lo, top, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
+    def of(
+        cls, lo, top, counts, level: np.ndarray, at: np.ndarray, mask: np.ndarray, phase=(0, 0, 0)
+    ) -> "BrickTree":
         """The tree of bricks in any order, none inside another; top (3,), or one number for a cube."""
         key = walk_order(level, at, counts)
         order = np.lexsort((key, level))
-        counts = tuple(int(n) for n in counts)
-        return cls(np.asarray(lo, np.float64), sides(top), counts, level[order], at[order], mask[order])
+        counts, phase = (tuple(int(n) for n in three) for three in (counts, phase))
+        lo, top = np.asarray(lo, np.float64), sides(top)
+        return cls(lo, top, counts, level[order], at[order], mask[order], phase)
+
+    def of_same_box(self, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
+        """Other bricks in this tree's top cells."""
+        return BrickTree.of(self.lo, self.top, self.counts, level, at, mask, self.phase)
 
     @property
     def depth(self) -> int:
@@ -174,7 +191,8 @@ class BrickTree:
         counts = before + np.asarray(self.counts) + behind
         check_counts(counts)
         at = self.at + (before << self.level[:, None].astype(np.int64))
-        return BrickTree.of(self.lo - before * self.top, self.top, counts, self.level, at, self.mask)
+        phase = (self.phase - before) % 2
+        return BrickTree.of(self.lo - before * self.top, self.top, counts, self.level, at, self.mask, phase)
 
     def occupancy(self, longest: int) -> OccupancyGrid:
         """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of
@@ -248,6 +266,18 @@ class Lattice:
         order = np.argsort(self.keys)
         row = order[np.minimum(np.searchsorted(self.keys, keys, sorter=order), len(order) - 1)]
         return row, self.keys[row] == keys
+
+    @cached_property
+    def stored_order(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which free row (F,) each stored one is, and how many of these (R,) int32 lie in each run: the rows
+        of 2 x 2 x 2 top cells, as a Morton curve meets them. What changes in one moves no row of another."""
+        units = SIDE << MAX_LEVEL  # of the finest level that there may be, along a top cell
+        places = self.vertices[: self.free] << (MAX_LEVEL - self.tree.depth)
+        code = morton(places + np.asarray(self.tree.phase) * units)
+        order = np.argsort(code)
+        eight_cells = (code[order] >> 3 * units.bit_length()).astype(np.int64)
+        starts = np.flatnonzero(np.diff(eight_cells, prepend=-1))
+        return order, np.diff(np.append(starts, self.free)).astype(np.int32)
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -388,6 +418,17 @@ def key_places(keys: np.ndarray) -> np.ndarray:
     """Inverse of `node_keys`."""
     low = (1 << 21) - 1
     return np.stack([keys >> 42, keys >> 21 & low, keys & low], 1)
+
+
+def morton(places: np.ndarray) -> np.ndarray:
+    """(M,) uint64: the bits of three whole numbers (M, 3) from 0 to 2^21 - 1, interleaved, x the highest."""
+    found = np.zeros(len(places), np.uint64)
+    for axis in range(3):
+        bits = places[:, axis].astype(np.uint64)
+        for shift, kept in MORTON_SPREAD:
+            bits = (bits | bits << np.uint64(shift)) & np.uint64(kept)
+        found |= bits << np.uint64(2 - axis)
+    return found
 
 
 def walk_order(level: np.ndarray, at: np.ndarray, counts) -> np.ndarray:

@@ -69,6 +69,25 @@ def with_fringe(field: SparseField, box: np.ndarray) -> np.ndarray:
     return box + np.repeat([-1, 1], 3) * field.fine.finest_voxel[inside].max(initial=0)
 
 
+def runs_box(field: SparseField, box: np.ndarray) -> np.ndarray:
+    """(6,) in the field's frame: the runs of rows that are stored together (`Lattice.stored_order`) of which
+    an edit in a box (6,) can change any. Bricks that reach into the box are as wide as a top cell at most."""
+    tree, space = field.tree, field.space
+    cells = (through(space.contracted, box).reshape(2, 3) - tree.lo) / tree.top
+    low, high = np.floor(cells[0]) - 1, np.ceil(cells[1]) + 1
+    low, high = low - (low + tree.phase) % 2, high + (high + tree.phase) % 2
+    return through(space.placed, np.concatenate([tree.lo + low * tree.top, tree.lo + high * tree.top]))
+
+
+def through(mapping: Callable[[torch.Tensor], torch.Tensor], box: np.ndarray) -> np.ndarray:
+    """(6,) the box of what a space makes of a box. Each coordinate grows with itself, and for the rest
+    depends on the largest alone, so it has its extremes where the others have theirs, or are nearest to 0."""
+    low, high = box[:3], box[3:]
+    ends = np.stack([low, high, np.clip(0, low, high)])
+    found = mapping(torch.from_numpy(np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)))
+    return np.concatenate([found.min(0).values.numpy(), found.max(0).values.numpy()])
+
+
 def meets(low: np.ndarray, high: np.ndarray, box: np.ndarray) -> np.ndarray:
     """(N,) whether boxes of corners low and high (N, 3) and a box (6,) have a point in common."""
     return (low <= box[3:]).all(-1) & (box[:3] <= high).all(-1)
@@ -179,7 +198,7 @@ def with_bricks(old: CarriedRows, wanted: list[np.ndarray], box: np.ndarray) -> 
     mask = old.covers(halves.reshape(-1, 3)).reshape(len(at), SIDE, SIDE, SIDE)
     mask |= meets(low, low + side, box)[:, None, None, None]
     held = mask.any((1, 2, 3))
-    return BrickTree.of(tree.lo, tree.top, tree.counts, level[held], at[held], mask[held])
+    return tree.of_same_box(level[held], at[held], mask[held])
 
 
 def chosen(
@@ -205,7 +224,7 @@ def local_fill(field: SparseField, shows, fresh: np.ndarray, facing: np.ndarray)
     own = (fresh[rows] & (rows >= 0)).any(1)
     if not own.any():
         own[:1] = True
-    part = BrickTree.of(tree.lo, tree.top, tree.counts, tree.level[own], tree.at[own], tree.mask[own])
+    part = tree.of_same_box(tree.level[own], tree.at[own], tree.mask[own])
     local = SparseField(field.shape, Lattice(part, SIDE), field.scale, space=field.space)
     at = field.fine.find(local.fine.keys)[0]
     fill(local, shows, density(shows, local.fine.places), facing[at])

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.computed import ComputedField, exact
+from fusedrf_cli.engine.fields.computed import ComputedField, StoredAs, exact, runs_of
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.sparse import bodies, reference, training
@@ -113,14 +113,12 @@ class SparseField(ComputedField):
         lattice = training.whole_lattice(np.asarray(aabb, np.float64), resolution)
         return training.carried(self, training.within(lattice, self.occupancy) or lattice)
 
-    def stored(self, as_stored: Callable[[np.ndarray, str], np.ndarray]) -> "SparseField":
+    def stored(self, as_stored: StoredAs) -> "SparseField":
         """See ComputedField; where the bricks are stays as it is, and need not be found again."""
         back = self.with_params(self.params.clone())
-        held = [("rows", back.rows, back.fine)]
-        held += [("bands", back.bands, back.coarse)] if back.coarse else []
-        for name, view, lattice in held:
-            free = view[: lattice.free]
-            free.copy_(torch.from_numpy(as_stored(free.cpu().numpy(), name)))
+        for name, (view, lattice) in back._held().items():
+            order, runs = lattice.stored_order
+            view[order] = torch.from_numpy(as_stored(view[order].cpu().numpy(), name, runs)).to(view)
         back.settle()
         return back
 
@@ -253,19 +251,28 @@ class SparseField(ComputedField):
 
     # -- storing ---------------------------------------------------------------------------------------------
 
+    def _held(self) -> dict[str, tuple[torch.Tensor, Lattice]]:
+        """What is stored of each lattice: the view whose free rows these are."""
+        bands = {"bands": (self.bands, self.coarse)} if self.coarse else {}
+        return {"rows": (self.rows, self.fine)} | bands
+
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Arrays and metadata for a bundle: the free rows, brick by brick, and the tree; all indices
-        follow."""
+        """Arrays and metadata for a bundle: the tree, from which all indices follow, and the free rows run by
+        run (`Lattice.stored_order`), each in blocks of codes of its own, so that an edit elsewhere changes no
+        number of it."""
         nodes, masks = self.tree.packed()
-        arrays = {"rows": self.rows[: self.fine.free].detach().cpu().numpy(), "nodes": nodes, "masks": masks}
-        if self.coarse:
-            arrays["bands"] = self.bands[: self.coarse.free].detach().cpu().numpy()
+        arrays = {"nodes": nodes, "masks": masks}
+        for name, (view, lattice) in self._held().items():
+            order, runs = lattice.stored_order
+            arrays |= {name: view[order].detach().cpu().numpy(), runs_of(name): runs}
         metadata = {
             "aabb": self.aabb.tolist(),
             "counts": list(self.tree.counts),
             "top": self.tree.top.tolist(),
+            "phase": list(self.tree.phase),
             "scale": self.scale,
             "sh_degree": self.shape.sh_degree,
+            "needs": ["runs"],
             **({} if self.lies_in is bounded else {"space": name_of(self.lies_in)}),
         }
         return arrays, metadata
@@ -277,10 +284,8 @@ class SparseField(ComputedField):
         shape = SparseShape(whole(metadata["sh_degree"], "sh_degree", 0, 3))
         space = space_named(metadata.get("space", "bounded"))
         field = cls(shape, Lattice(tree, SIDE), positive(metadata["scale"], "scale"), space=space)
-        held = {"rows": (field.rows, field.fine)} | (
-            {"bands": (field.bands, field.coarse)} if field.coarse else {}
-        )
-        for name, (view, lattice) in held.items():
+        in_runs = "runs" in metadata.get("needs", [])
+        for name, (view, lattice) in field._held().items():
             found = arrays.get(name)
             expected = (lattice.free, view.shape[1])
             if found is None or found.shape != expected:
@@ -288,7 +293,10 @@ class SparseField(ComputedField):
                 raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
             if not float(np.abs(found).max(initial=0)) * max(field.scale, MAX_TERMS) <= MAX_ANSWER:
                 raise ValueError(f"array '{name}' holds numbers whose answers would be beyond {MAX_ANSWER:g}")
-            view[: lattice.free] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
+            order, runs = lattice.stored_order if in_runs else (slice(lattice.free), None)
+            if in_runs and not np.array_equal(arrays.get(runs_of(name)), runs):
+                raise ValueError(f"array '{runs_of(name)}' should hold the runs of its tree's vertices")
+            view[order] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
         field.settle()
         return field
 
@@ -315,6 +323,10 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     if len(arrays["masks"]) > 8 * MAX_BRICKS:
         raise ValueError(f"there should be at most {MAX_BRICKS} bricks, found {len(arrays['masks']) // 8}")
     tree = BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
+    phase = metadata.get("phase", [0, 0, 0])
+    if not isinstance(phase, list) or len(phase) != 3:
+        raise ValueError(f"phase should be three numbers, found {phase}")
+    tree = replace(tree, phase=tuple(whole(n, "phase", 0, 1) for n in phase))
     if not tree.mask.any():
         raise ValueError("array 'masks' should have an active voxel")
     tree.tables  # noqa: B018  (made now, so that what is too large is refused here)

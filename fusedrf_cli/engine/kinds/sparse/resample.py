@@ -33,6 +33,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 )
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.training import of_voxels
 from fusedrf_cli.engine.spaces import bounded
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
@@ -146,15 +147,9 @@ class EmptyField(ValueError):
 def thinned(lattice: Lattice, kept: np.ndarray, *values: np.ndarray) -> tuple[Lattice, list[np.ndarray]]:
     """The lattice of those active voxels of another that are kept (K,), and the values (V, ...) of its
     vertices. Raises EmptyField where there are none."""
-    if not kept.any():
+    smaller = of_voxels(lattice, kept)
+    if smaller is None:
         raise EmptyField("the scene shows nothing")
-    whole = lattice.tree
-    mask = np.zeros(lattice.active.shape, bool)
-    mask[lattice.active] = kept
-    own = mask.any(1)
-    mask = mask[own].reshape(-1, SIDE, SIDE, SIDE)
-    tree = BrickTree.of(whole.lo, whole.top, whole.counts, whole.level[own], whole.at[own], mask)
-    smaller = Lattice(tree, SIDE)
     at = lattice.find(smaller.keys)[0]
     return smaller, [v[at] for v in values]
 

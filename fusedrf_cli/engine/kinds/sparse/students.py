@@ -17,7 +17,7 @@ from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
-from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, with_fringe
+from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, runs_box, with_fringe
 from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
@@ -54,7 +54,6 @@ class SparseKind(Kind):
     good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local."
     field = SparseField
     takes = frozenset({"sh_degree"})
-    rounds_anew = True
     precisions = ("int8", "float16")
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
 
@@ -122,6 +121,10 @@ class SparseKind(Kind):
     def thinned(self, field: SparseField, factor: float) -> SparseField:
         """The same vertices, with another scale."""
         return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)
+
+    def rounded(self, field: SparseField, box: np.ndarray) -> np.ndarray:
+        """Numbers share scales with others of their run alone."""
+        return runs_box(field, box)
 
     def added(self, field: SparseField, objects: list[Placed], teach: Teach) -> Edited:
         """Bricks of the objects, filled by asking them."""

@@ -49,8 +49,7 @@ def of_voxels(lattice: Lattice, found: np.ndarray) -> Lattice | None:
     mask[lattice.active] = found
     own = mask.any(1)
     mask = mask[own].reshape(-1, SIDE, SIDE, SIDE)
-    tree = BrickTree.of(whole.lo, whole.top, whole.counts, whole.level[own], whole.at[own], mask)
-    return Lattice(tree, SIDE)
+    return Lattice(whole.of_same_box(whole.level[own], whole.at[own], mask), SIDE)
 
 
 def on_grid(lattice: Lattice, values: torch.Tensor, missing: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,7 @@ asked (two where they meet; the denser wins), so that a query costs the same how
 edit appends or drops a block and leaves the rest as it is.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -24,7 +24,7 @@ from fusedrf_cli.engine.fields.box import (
     unit_texels,
     whole_numbers,
 )
-from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, unpack_bits
+from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, StoredAs, unpack_bits
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed
 from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
 from fusedrf_cli.engine.fields.occupancy import (
@@ -269,13 +269,13 @@ class VMField(ComputedField):
         grid = replace(self.occupancy, aabb=self.occupancy.aabb - np.tile(origin, 2))
         return VMField(self.shape, self.tensors, blocks, self.params, grid, self.owners)
 
-    def stored(self, as_stored: Callable[[np.ndarray, str], np.ndarray]) -> "VMField":
+    def stored(self, as_stored: StoredAs) -> "VMField":
         """See ComputedField; which block is asked where stays as it is, and need not be found again."""
         back = self.with_params(pages.zeros(len(self.params), self.params.dtype, self.params.device))
         for t in range(len(self.tensors)):
             target = back.sections(t)
             for name, view in self.sections(t).items():
-                target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), name)))
+                target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), name, None)))
         return back
 
     # -- reading ---------------------------------------------------------------------------------------------
