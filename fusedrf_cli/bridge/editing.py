@@ -44,7 +44,7 @@ from fusedrf_cli.engine.kinds.student import DistillSettings
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput
-from fusedrf_cli.requests import AddRequest, EditRequest, Learning
+from fusedrf_cli.requests import AddRequest, ArrangeRequest, EditRequest, Learning
 
 REGION_SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
 LOCAL_VIEW = 100
@@ -288,7 +288,7 @@ def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
 
 
 def edit_report(
-    request: EditRequest,
+    request: EditRequest | ArrangeRequest,
     size: int,
     names: str,
     fused: Fused,
@@ -300,7 +300,8 @@ def edit_report(
     extent = edited.box[3:] - edited.box[:3]
     whole = edited.field.occupancy.aabb[3:] - edited.field.occupancy.aabb[:3]
     rounded, near = None, SAME_BITS if edited.local else NEARLY
-    if edited.local and not (request.precision or fused.precision).startswith("float"):
+    kept = isinstance(request, ArrangeRequest)  # whose numbers are written as they are
+    if edited.local and not kept and not (request.precision or fused.precision).startswith("float"):
         rounded = fused.kind.rounded(edited.field, edited.box)
     return {
         "output": request.output,
