@@ -4,7 +4,7 @@ DATA is a folder with bear/, chair/ and fuze/fuze.obj. Sources are learnt for ha
 which is the background, for a minute. Prints Markdown tables: of an 800 x 800 frame that four objects fill,
 and of frames of 400 x 400 in which small copies of a chair and a bottle stand on the bear's rock, seen from
 one of its photos' cameras and from close by. N counts the background too, and frames of all N take turns.
-*Without* is without the insides of cells (engine/fields/insides.py), *looking* what it takes to know them;
+*Without* is without the insides of cells (engine/fields/insides.py), *telling* what it takes to know them;
 *to denser* is the PSNR in dB to samples four times as dense. A hit ray is one that takes a sample.
 """
 
@@ -31,7 +31,7 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
+from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Rays
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
@@ -61,18 +61,18 @@ class Frame:
     camera: Camera
 
     @cached_property
-    def looked(self) -> VMField:
-        """As `render` makes pictures of it: one that stands in a place is looked into."""
-        return self.field.for_pictures(WORTH_LOOKING)
+    def known(self) -> VMField:
+        """As `render` makes pictures of it: under a grid that knows the insides of cells."""
+        return self.field.for_pictures(WORTH_TELLING)
 
     @property
-    def looking(self) -> float:
-        """Seconds that it takes to look into it."""
-        return seconds([partial(self.field.for_pictures, WORTH_LOOKING)], 1)[0]
+    def telling(self) -> float:
+        """Seconds that it takes to know them."""
+        return seconds([partial(self.field.for_pictures, WORTH_TELLING)], 1)[0]
 
-    def picture(self, looked: bool = True, denser: int = 1) -> np.ndarray:
-        """(H, W, 3) over white, of a field that is looked into or not, by samples so many times as dense."""
-        field, step = self.looked if looked else self.field, sampling_step(self.field) / denser
+    def picture(self, known: bool = True, denser: int = 1) -> np.ndarray:
+        """(H, W, 3) over white, whose cells are known inside or not, by samples so many times as dense."""
+        field, step = self.known if known else self.field, sampling_step(self.field) / denser
         if denser > 1 and field.occupancy.stride is not None:
             field = copy(field)._afresh("arrays", "grid")
             field.occupancy = replace(field.occupancy, unit=step)
@@ -157,7 +157,7 @@ def seconds(work: list, repeats: int) -> list[float]:
 
 def parts(frame: Frame, repeats: int) -> dict[str, float]:
     """Samples per hit ray, and the shares of a frame's time by leaving parts out."""
-    camera, field = frame.camera, copy(frame.looked)
+    camera, field = frame.camera, copy(frame.known)
     rays_o, rays_d = camera.rays(order=tile_order(camera.width, camera.height))
     rays_o, rays_d, _ = seen_from(frame.origin, rays_o, rays_d)
     reach = reach_of(len(rays_o), 0.0, np.inf)
@@ -197,13 +197,13 @@ def rows(frames: list[Frame], repeats: int) -> list[dict]:
     took = seconds([partial(frame.picture, way) for frame in frames for way in ways], repeats)
     found = []
     for frame, own, plain in zip(frames, took[::2], took[1::2], strict=True):
-        fine, film, still = frame.picture(False, DENSER), *(frame.picture(way) for way in ways)
+        fine, told, bare = frame.picture(False, DENSER), *(frame.picture(way) for way in ways)
         found.append(
             {"frame": frame.what, "s": f"{own:.2f}", "over N = 1": f"{own / took[0]:.2f}"}
-            | {"without, s": f"{plain:.2f}", "looking, s": f"{frame.looking:.2f}"}
+            | {"without, s": f"{plain:.2f}", "telling, s": f"{frame.telling:.2f}"}
             | parts(frame, repeats)
-            | {"dB to without": f"{psnr(film, still):.1f}", "to denser": f"{psnr(film, fine):.1f}"}
-            | {"without, to denser": f"{psnr(still, fine):.1f}"}
+            | {"dB to without": f"{psnr(told, bare):.1f}", "to denser": f"{psnr(told, fine):.1f}"}
+            | {"without, to denser": f"{psnr(bare, fine):.1f}"}
         )
     return found
 

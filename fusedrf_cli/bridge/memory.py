@@ -32,7 +32,7 @@ RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself,
 PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
 PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
-PER_LOOKED_CELL = 20  # of a field's grid: the bits of its parts while they grow, and distances
+PER_KNOWN_CELL = 30  # of a scene's grid: the bits of its parts, strides and distances
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
@@ -125,8 +125,8 @@ def picture(width: int, height: int, composed: bool) -> dict[str, float]:
 
 
 def insides() -> dict[str, float]:
-    """Looking into the cells of a field (engine/fields/insides.py)."""
-    return {"the insides of cells": PER_LOOKED_CELL * DEFAULT_CELLS**3}
+    """Telling those of a scene's grid (engine/fields/insides.py)."""
+    return {"the insides of cells": PER_KNOWN_CELL * SCENE_CELLS**3}
 
 
 def measured(width: int, height: int) -> dict[str, float]:

@@ -16,7 +16,7 @@ from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
+from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -82,7 +82,7 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     largest = max(views, key=lambda view: view.width * view.height)
     pixels = largest.width * largest.height
     needed = picture(largest.width, largest.height, composed=not hasattr(field, "render_rays"))
-    if rays_of(views) >= WORTH_LOOKING:
+    if rays_of(views) >= WORTH_TELLING:
         needed |= insides()
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
 

@@ -17,8 +17,6 @@ from fusedrf_cli.engine.kernels.loops import (
     RAYS_PER_TASK,
     Answers,
     Cells,
-    Insides,
-    Looked,
     Points,
     Rays,
     Sent,
@@ -264,19 +262,6 @@ class ComputedField:
         out = np.zeros(len(cells), self.real)
         self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(cells), out)
         return out
-
-    def look_into(
-        self, cells: np.ndarray, offsets: np.ndarray, least: np.ndarray, opaque: float = np.inf
-    ) -> Insides:
-        """For each of `least` (L,), σ per length of the space's coordinates, and of `cells` (N, 3) of the
-        field's grid: the bits (L, N) of the parts in which σ is more at one of the offsets (64 K, 3) in a
-        cell, K in each part, or more than `opaque` in the middle of their eighth of the cell, and the mean
-        (L, N) of what is less."""
-        asked = Looked(np.ascontiguousarray(cells, np.int64), exact(offsets), exact(least), float(opaque))
-        shape = len(least), len(cells)
-        found = Insides(np.zeros(shape, np.uint64), np.zeros(shape, self.real))
-        self.loops.each("look_into_cell", self.arrays, self.grid, asked, len(cells), found, CELLS_PER_TASK)
-        return found
 
     def weights_in_cells(
         self, rays_o: np.ndarray, rays_d: np.ndarray, jitter: np.ndarray, near: float, step: float

@@ -40,7 +40,6 @@ LEARN_FROM = COLOUR_FROM  # the same in training
 LENT_FROM = 2e-3  # the same in pictures, behind a ray's first colour
 REST_FROM = 0.0  # transmittance from which, in pictures that may stop early, all that is left shows a sample
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
-DIAGONAL = (3**-0.5,) * 3
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 SAMPLES_AHEAD = 2
 POINTS_PER_TASK = 2048
@@ -114,22 +113,6 @@ class Cells(NamedTuple):
     cells: object  # (N, 3) int64
     offsets: object  # (K, 3) in [0, 1], where in a cell
     frame: object  # int, one of the field's frames
-
-
-class Looked(NamedTuple):
-    """What `look_into_cell` looks at."""
-
-    cells: object  # (N, 3) int64, of the field's grid
-    offsets: object  # (64 K, 3) in [0, 1], K in each part of a cell, parts in the order of `parts.bit_of`
-    least: object  # (L,) σ per length of the space's coordinates that count as matter
-    opaque: object  # float, σ from which all around is matter
-
-
-class Insides(NamedTuple):
-    """What `look_into_cell` fills, for each σ that may count as matter."""
-
-    bits: object  # (L, N) uint64, the parts of a cell that have as much somewhere
-    rest: object  # (L, N) the mean σ in a cell of all that is less
 
 
 class Kept(NamedTuple):
@@ -510,34 +493,6 @@ def peak_of_cell(field, grid, cells, i, scratch, memory, out):
         z = cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2]
         best = max(best, unstretched(field, grid, cells.frame, (x, y, z), scratch))
     out[i] = best
-
-
-def look_into_cell(field, grid, looked, i, scratch, memory, out):
-    """Asks at the places in the parts of cell i, along a diagonal of the frame where that matters; of an
-    eighth of the cell that is opaque in its middle nowhere else."""
-    count, most = looked.offsets.shape[0], looked.least.shape[0]
-    for e in range(8):
-        first, last = e * count // 8, (e + 1) * count // 8 - 1
-        if asked_in_cell(field, grid, looked, i, first, last, scratch) > looked.opaque:
-            for level in range(most):
-                out.bits[level, i] |= np.uint64(255) << np.uint64(8 * e)
-        else:
-            for q in range(first, last + 1):
-                sigma = asked_in_cell(field, grid, looked, i, q, q, scratch)
-                for level in range(most):
-                    if sigma > looked.least[level]:
-                        out.bits[level, i] |= np.uint64(1) << np.uint64(64 * q // count)
-                    else:
-                        out.rest[level, i] += sigma / count
-
-
-def asked_in_cell(field, grid, looked, i, q, r, scratch):
-    """σ between two places in cell i."""
-    at = looked.offsets
-    x = grid.lo[0] + (looked.cells[i, 0] + 0.5 * (at[q, 0] + at[r, 0])) * grid.cell[0]
-    y = grid.lo[1] + (looked.cells[i, 1] + 0.5 * (at[q, 1] + at[r, 1])) * grid.cell[1]
-    z = grid.lo[2] + (looked.cells[i, 2] + 0.5 * (at[q, 2] + at[r, 2])) * grid.cell[2]
-    return density(field, grid, 0, (x, y, z), DIAGONAL, scratch)[0]
 
 
 # -- the CPU's loops over items ------------------------------------------------------------------------------

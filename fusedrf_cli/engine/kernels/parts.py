@@ -87,13 +87,6 @@ def bit_of(i, j, m):
 
 
 @body
-def in_matter(bits, x, y, z):
-    """Whether a point in a cell, in parts from its lower corner, lies in one of those that `bits` tell of."""
-    i, j, m = min(max(int(x), 0), 3), min(max(int(y), 0), 3), min(max(int(z), 0), 3)
-    return bits >> bit_of(i, j, m) & np.uint64(1) != np.uint64(0)
-
-
-@body
 def inner_exit(bits, p, d, lo, cell, i, j, m):
     """How far away a ray at p in cell (i, j, m) leaves the empty part or eighth of that cell around p, or -1
     where p lies in matter: in a part whose bit (`bit_of`) is set."""

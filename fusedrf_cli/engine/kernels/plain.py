@@ -109,84 +109,48 @@ def sums_of_rows(values, base, width, start, source, weight, target, keep):
         sum_of_rows(values, base, width, start, source, weight, target, i, keep)
 
 
-# Of the bits of a cell's parts (`parts.bit_of`) those in the lower half of an eighth, and of the cell.
-LOWER = tuple(
-    np.uint64(sum(1 << q for q in range(64) if not q & (low | high)))
-    for low, high in ((4, 0), (2, 0), (1, 0), (32, 0), (16, 0), (8, 0))
-)
-
-
-@task
-def grow_insides_task(bits, axis, x, grown):
-    """`grow_insides` for the cells (x, ...)."""
-    nx, ny, nz = bits.shape
-    one, zero = np.uint64(4 >> axis), np.uint64(0)  # how much later the bit of the next part is, in an eighth
-    eight = np.uint64(32 >> axis)
-    low, near = LOWER[axis], LOWER[3 + axis]
-    for y in range(ny):
-        for z in range(nz):
-            own = bits[x, y, z]
-            i, j, m = x + (axis == 0), y + (axis == 1), z + (axis == 2)
-            after = bits[i, j, m] if i < nx and j < ny and m < nz else zero
-            i, j, m = x - (axis == 0), y - (axis == 1), z - (axis == 2)
-            before = bits[i, j, m] if i >= 0 and j >= 0 and m >= 0 else zero
-            up = ((own & low) << one) | ((own & ~low & near) << (eight - one))
-            up |= (before & ~low & ~near) >> (eight + one)
-            down = ((own & ~low) >> one) | ((own & low & ~near) >> (eight - one))
-            down |= (after & low & near) << (eight + one)
-            grown[x, y, z] = own | up | down
-
-
-@loop
-def grow_insides(bits, axis, grown):
-    """Of bits (X, Y, Z) uint64, the parts of cells, those that are set, and those beside them along an axis,
-    into `grown`."""
-    for x in prange(bits.shape[0]):
-        grow_insides_task(bits, axis, x, grown)
-
-
-@task
-def mark_parts(bits, level, to_parts, steps, whole, marked):
-    """Sets in marked (X, Y, Z) the bits of the parts in which matter of a grid (bits (A, B, C)) lies: of its
-    parts, of the eighths of cells that have any for level 1, of the cells for level 0. to_parts (3, 4) takes
-    its coordinates, in cells, to those of the marked grid, in parts; steps (K, 3) are the places in each that
-    are looked at, `whole` (M, 3) those in a cell that is full of matter."""
-    m = 1 << level
-    for x in range(bits.shape[0]):
-        for y in range(bits.shape[1]):
-            for z in range(bits.shape[2]):
-                full = bits[x, y, z] == ~np.uint64(0)
-                for k in range(whole.shape[0] if full else 0):
-                    mark_part(to_parts, x + whole[k, 0], y + whole[k, 1], z + whole[k, 2], marked)
-                for q in range(0 if full or bits[x, y, z] == np.uint64(0) else m * m * m):
-                    a, b, c = q // (m * m), q // m % m, q % m
-                    if holds_any(bits[x, y, z], level, a, b, c):
-                        for k in range(steps.shape[0]):
-                            u, v = x + (a + steps[k, 0]) / m, y + (b + steps[k, 1]) / m
-                            mark_part(to_parts, u, v, z + (c + steps[k, 2]) / m, marked)
+# The bits (`parts.bit_of`) of the parts of a cell that are the first, second, third or fourth along an axis.
+ALONG = np.zeros((3, 4), np.uint64)
+for _i, _j, _m in np.ndindex(4, 4, 4):
+    for _axis, _at in enumerate((_i, _j, _m)):
+        ALONG[_axis, _at] |= np.uint64(1) << bit_of.py_func(_i, _j, _m)
 
 
 @body
-def holds_any(bits, level, a, b, c):
-    """Whether part, eighth or cell (a, b, c) of a cell, by the level, holds matter."""
-    if level == 2:
-        return bits >> bit_of(a, b, c) & np.uint64(1) != np.uint64(0)
-    if level == 1:
-        return bits >> bit_of(2 * a, 2 * b, 2 * c) & np.uint64(255) != np.uint64(0)
-    return True
+def bits_between(axis, low, high, cell):
+    """The bits of the parts of a cell, counted along an axis of all cells, from low to high."""
+    bits = np.uint64(0)
+    for part in range(max(low - 4 * cell, 0), min(high - 4 * cell, 3) + 1):
+        bits |= ALONG[axis, part]
+    return bits
 
 
-@body
-def mark_part(to_parts, u, v, w, marked):
-    """Sets the bit of the part in which a point lies."""
+@task
+def mark_parts(occupied, middles, reach, marked):
+    """Sets in marked (X, Y, Z) uint64 the bits (`parts.bit_of`) of the parts of cells that the boxes around
+    the occupied cells of another grid (A, B, C) reach. middles (3, 4) takes places counted in cells of that
+    one to places counted in parts of the marked one; reach (3,) is half the sides of such a box, in parts."""
     nx, ny, nz = marked.shape
-    i, j = part_at(to_parts, 0, u, v, w, nx), part_at(to_parts, 1, u, v, w, ny)
-    n = part_at(to_parts, 2, u, v, w, nz)
-    marked[i // 4, j // 4, n // 4] |= np.uint64(1) << bit_of(i % 4, j % 4, n % 4)
+    for x in range(occupied.shape[0]):
+        for y in range(occupied.shape[1]):
+            for z in range(occupied.shape[2]):
+                if occupied[x, y, z]:
+                    i0, i1 = parts_reached(middles, reach, 0, x, y, z, nx)
+                    j0, j1 = parts_reached(middles, reach, 1, x, y, z, ny)
+                    m0, m1 = parts_reached(middles, reach, 2, x, y, z, nz)
+                    for i in range(i0 // 4, i1 // 4 + 1):
+                        first = bits_between(0, i0, i1, i)
+                        for j in range(j0 // 4, j1 // 4 + 1):
+                            second = first & bits_between(1, j0, j1, j)
+                            for m in range(m0 // 4, m1 // 4 + 1):
+                                marked[i, j, m] |= second & bits_between(2, m0, m1, m)
 
 
 @body
-def part_at(to_parts, axis, u, v, w, cells):
-    """Which of the parts of so many cells along an axis a point lies in, the nearest where it lies beside."""
-    at = to_parts[axis, 0] * u + to_parts[axis, 1] * v + to_parts[axis, 2] * w + to_parts[axis, 3]
-    return min(max(int(math.floor(at)), 0), 4 * cells - 1)
+def parts_reached(middles, reach, axis, x, y, z, cells):
+    """The first and the last of the parts of so many cells along an axis that the box around a cell reaches,
+    the nearest where it lies beside them."""
+    at = middles[axis, 0] * (x + 0.5) + middles[axis, 1] * (y + 0.5) + middles[axis, 2] * (z + 0.5)
+    at += middles[axis, 3]
+    low, high = int(math.floor(at - reach[axis])), int(math.floor(at + reach[axis]))
+    return min(max(low, 0), 4 * cells - 1), min(max(high, 0), 4 * cells - 1)

@@ -1,33 +1,30 @@
 """The insides of cells: their bits against plain arrays of parts, and pictures with them against those
 without."""
 
+from copy import copy
+
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import binary_dilation
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.insides import (
-    FULL,
-    SIDE,
-    WORTH_LOOKING,
-    grown,
-    insides_of,
-    places,
-    with_insides,
-)
+from fusedrf_cli.engine.distillation.fit import occupancy_of
+from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.insides import SIDE, WORTH_TELLING, with_insides
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels.parts import bit_of
 from fusedrf_cli.engine.kernels.plain import mark_parts
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.kinds.vm.insides import looked_into
 from fusedrf_cli.engine.rendering.cameras import framing_camera
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import BOX, THIRTY_TWO, points_in, rays_at
 from tests.engine.kernels.test_cpu import march, stepping
 
-ORDER = (SIDE * places(1)).astype(int)  # (64, 3) of the part that each bit stands for
+ORDER = np.array(sorted(np.ndindex(4, 4, 4), key=lambda part: bit_of.py_func(*part)))
+"""(64, 3) the part that each bit stands for."""
+TURNED = np.array([[0.4, -0.3, 0, 0], [0.3, 0.4, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1.0]])
 
 
 def parts_of(bits: np.ndarray) -> np.ndarray:
@@ -41,17 +38,6 @@ def parts_of(bits: np.ndarray) -> np.ndarray:
 def random_bits(rng, shape, share: float) -> np.ndarray:
     parts = rng.random((*shape, 64)) < share
     return (parts * (np.uint64(1) << np.arange(64, dtype=np.uint64))).sum(-1, dtype=np.uint64)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_bits_grow_as_parts_do(seed):
-    """Along one axis after the other, so that diagonals are reached, where cells are occupied."""
-    rng = np.random.default_rng(seed)
-    shape = tuple(rng.integers(1, 6, 3))
-    bits, occupied = random_bits(rng, shape, 0.02), rng.random(shape) < 0.8
-    found = grown(OccupancyGrid(BOX, occupied), np.argwhere(bits >= 0), bits.ravel())
-    wide = np.repeat(np.repeat(np.repeat(occupied, SIDE, 0), SIDE, 1), SIDE, 2)
-    assert np.array_equal(parts_of(found), binary_dilation(parts_of(bits), np.ones((3, 3, 3))) & wide)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -83,35 +69,33 @@ def test_strided_samples_in_matter_end_where_those_in_full_cells_do(seed):
     bits = np.where(occupied, random_bits(rng, shape, 0.3), 0).astype(np.uint64)
     rays_o, rays_d = rays_at(grid.aabb, 30, seed)
     known = with_insides(grid, bits)._replace(skip=grid.skip)
-    full = with_insides(grid, np.where(occupied, FULL, 0).astype(np.uint64))
+    full = with_insides(grid, np.where(occupied, ~np.uint64(0), np.uint64(0)))
     some, every = (march(arrays, rays_o, rays_d, grid.unit) for arrays in (known, full))
     assert sum(map(len, some)) < 0.6 * sum(map(len, every))
     same = [np.isin(found, wanted) for found, wanted in zip(some, every, strict=True)]
     assert np.concatenate(same).mean() > 0.5  # but the first ones in matter, which end where those do
 
 
-@pytest.mark.parametrize("level", [0, 1, 2])
-def test_marked_parts_are_those_that_placed_ones_reach(level):
-    """Corners of the parts, eighths or cells that hold matter, one by one."""
-    rng = np.random.default_rng(level)
-    bits, found = random_bits(rng, (3, 4, 5), 0.05), np.zeros((6, 5, 4), np.uint64)
-    bits[1, 2, 3] = ~np.uint64(0)
-    to_parts = np.concatenate([rng.normal(size=(3, 3)), rng.uniform(8, 12, (3, 1))], 1)
-    corners = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0], indexing="ij"), -1).reshape(-1, 3)
-    n = 2**level
-    whole = np.argwhere(np.ones((n + 1,) * 3)) / n  # the same places
-    mark_parts(bits, level, to_parts, corners, whole, found)
-    shape = (3, n, SIDE // n, 4, n, SIDE // n, 5, n, SIDE // n)
-    held = parts_of(bits).reshape(shape).any((2, 5, 8)).reshape(3 * n, 4 * n, 5 * n)
-    at = (np.argwhere(held)[:, None] + corners).reshape(-1, 3) / n
-    index = np.floor(at @ to_parts[:, :3].T + to_parts[:, 3]).astype(int)
-    wanted = np.zeros(np.array(found.shape) * SIDE, bool)
-    wanted[tuple(np.clip(index, 0, np.array(wanted.shape) - 1).T)] = True
+@pytest.mark.parametrize("seed", range(5))
+def test_marked_parts_are_those_that_boxes_around_cells_reach(seed):
+    """In a slow loop; and whatever place there is in an occupied cell, its part is one of them."""
+    rng = np.random.default_rng(seed)
+    occupied, found = rng.random((3, 4, 5)) < 0.2, np.zeros((6, 5, 4), np.uint64)
+    middles = np.concatenate([rng.normal(size=(3, 3)), rng.uniform(8, 12, (3, 1))], 1)
+    reach = abs(middles[:, :3]).sum(1) / 2
+    mark_parts(occupied, middles, reach, found)
+    wanted, most = np.zeros(np.array(found.shape) * SIDE, bool), np.array(found.shape) * SIDE - 1
+    for cell in np.argwhere(occupied):
+        at = middles[:, :3] @ (cell + 0.5) + middles[:, 3]
+        low, high = (np.clip(np.floor(at + sign * reach).astype(int), 0, most) for sign in (-1, 1))
+        wanted[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))] = True
+        places = (cell + rng.random((100, 3))) @ middles[:, :3].T + middles[:, 3]
+        assert wanted[tuple(np.clip(np.floor(places).astype(int), 0, most).T)].all()
     assert np.array_equal(parts_of(found), wanted)
 
 
 def ball(cells: int = 24):
-    """A ball of matter in a box of 49 texels an axis, under a grid that is occupied all over."""
+    """A ball of matter in a box of 49 texels an axis, under a grid that is occupied around it."""
     field = VMField.create(BOX, (49,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
     sections = field.sections(0)
     for name in sections:
@@ -123,7 +107,7 @@ def ball(cells: int = 24):
     sections["density_line_0"][:, 0] = 1
     sections["density_plane_0"][..., 1] = 1
     sections["density_line_0"][:, 1] = -80 * at**2
-    return field.with_occupancy(OccupancyGrid.full(BOX, cells))
+    return field.with_occupancy(occupancy_of(field, BOX, cells))
 
 
 def shown(field, camera) -> np.ndarray:
@@ -134,16 +118,31 @@ def decibels(one: np.ndarray, other: np.ndarray) -> float:
     return -10 * np.log10(np.square(one - other).mean() + 1e-20)
 
 
+def of_two_boxes(cells: int):
+    """Two balls under grids that are occupied around them alone, the smaller one turned, far apart."""
+    field = ball(cells)
+    return blocks_of([Placed("one", field, shift(-6.0)), Placed("other", field, shift(6.0) @ TURNED)])
+
+
 def test_pictures_stay_and_take_fewer_samples():
-    field = ball()
-    assert 0.02 < parts_of(insides_of(field)).mean() < 0.25  # a ball of radius 0.6 in a box of 2: 0.11
-    scale = np.diag([0.4, 0.3, 0.5, 1.0])
-    placed = [Placed(str(i), field, shift(x) @ scale) for i, x in enumerate([-0.5, 0.3, 0.6])]
-    scene = blocks_of(placed)
+    """To the bit, where every sample stands for one step: what is left out is empty."""
+    scene = of_two_boxes(24)
+    known = scene.for_pictures(WORTH_TELLING)
+    assert parts_of(known.grid.inner).mean() < 0.7 * scene.occupancy.occupied.mean()
+    rays_o, rays_d = rays_at(scene.occupancy.tight_aabb(), 400, 1)
+    step = scene.occupancy.unit or sampling_step(scene)
+    plain = render_rays(without_strides(scene), rays_o, rays_d, step=step)
+    assert plain[:, 3].max() > 0.5
+    assert np.array_equal(render_rays(without_strides(known), rays_o, rays_d, step=step), plain)
     camera = framing_camera(scene.occupancy.tight_aabb(), 0.9, 0.45, 60, 60)
-    plain = shown(scene, camera)
-    assert decibels(shown(looked_into(scene), camera), plain) > 60 and plain.min() < 0.9
-    assert parts_of(looked_into(scene).grid.inner).mean() < 0.5 * scene.occupancy.occupied.mean()
+    assert decibels(shown(known, camera), shown(scene, camera)) > 65
+
+
+def without_strides(field: VMField) -> VMField:
+    """A field under its grid, each of whose samples stands for one step."""
+    other = copy(field)
+    other.__dict__["grid"] = stepping(field.grid, 0)
+    return other
 
 
 def shift(x: float) -> np.ndarray:
@@ -152,33 +151,16 @@ def shift(x: float) -> np.ndarray:
     return matrix
 
 
-def test_what_stands_in_a_place_is_looked_into_where_many_rays_are_shown():
+def test_what_stands_in_a_place_is_told_apart_from_it():
+    """Where pictures are large enough to be worth it, and there are several blocks."""
     place = VMField.create(unbounded.WHOLE, (12,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
     place = place.with_occupancy(OccupancyGrid.full(unbounded.WHOLE, 16, unbounded))
     small = np.diag([0.2, 0.2, 0.2, 1.0])
     scene = blocks_of([Placed("place", place, np.eye(4)), Placed("thing", ball(), small)])
-    assert scene.for_pictures(WORTH_LOOKING - 1) is scene
-    assert scene.for_pictures(WORTH_LOOKING).grid.inner.any()
-    in_a_box = blocks_of([Placed("one", ball(), small), Placed("other", ball(), shift(1.0))])
-    for field in (place, ball(), in_a_box):
-        assert field.for_pictures(WORTH_LOOKING) is field
-
-
-def test_places_lie_in_their_parts():
-    for per in (1, 2, 3):
-        found = places(per).reshape(64, per**3, 3)
-        assert np.array_equal(np.floor(SIDE * found), np.broadcast_to(ORDER[:, None], found.shape))
-        assert len(np.unique(np.round(found.reshape(-1, 3), 6), axis=0)) == 64 * per**3
-
-
-def test_of_fog_nothing_is_left_out():
-    """Fog of which no part holds much, but a line of cells does."""
-    field = ball()
-    sections = field.sections(0)
-    sections["density_plane_0"][..., 0] = 0
-    sections["density_line_0"][:, 1] = 10 + np.log(5e-2 / (2 * field.tensors[0].scale))
-    bits = insides_of(field)
-    assert bits is None or parts_of(bits).all()
-    camera = framing_camera(BOX, 0.9, 0.45, 20, 20)
-    scene = blocks_of([Placed("one", field, shift(-1.0)), Placed("other", field, shift(1.0))])
-    assert np.array_equal(shown(looked_into(scene), camera), shown(scene, camera))
+    assert scene.for_pictures(WORTH_TELLING - 1) is scene
+    known = scene.for_pictures(WORTH_TELLING)
+    assert known.grid.inner.any() and known.grid.coarse.any()
+    camera = framing_camera(np.array([-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]), 0.9, 0.45, 40, 40)
+    assert decibels(shown(known, camera), shown(scene, camera)) > 50
+    for field in (place, ball()):
+        assert field.for_pictures(WORTH_TELLING) is field

@@ -13,9 +13,8 @@ import torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
-from fusedrf_cli.engine.fields.insides import places
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.kinds.vm.insides import looked_into
+from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.engine.conftest import BOX, points_in, random_vm, rays_at, unit
@@ -122,20 +121,15 @@ def test_render(name, dtype):
 
 
 @on_a_device
-def test_looking_into_cells():
-    field, least = vm(torch.float64), np.array([1.0, 0.1])
-    cells = np.argwhere(field.occupancy.occupied)[:3]
-    for wanted, found in twice(field, lambda f: f.look_into(cells, places(1), least)):
-        check(found, wanted)
-        assert wanted.any()
+def test_pictures_under_a_grid_that_knows_the_insides_of_cells():
     blocks = two_blocks(TURNED)
     rays_o, rays_d = rays_at(blocks.aabb, 4)
 
     def picture(field):
         out = np.zeros((4, 5))
-        looked = looked_into(field)
-        assert looked.grid.inner.any()
-        looked.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
+        known = with_known_insides(field)
+        assert known.grid.inner.any()
+        known.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
         return (out,)
 
     for wanted, found in twice(blocks, picture):

@@ -32,7 +32,6 @@ from fusedrf_cli.engine.kernels.parts import (
     bilinear,
     cell_of,
     exit_distance,
-    in_matter,
     linear,
     scatter,
     sh_basis,
@@ -62,8 +61,6 @@ class Arrays(NamedTuple):
     # it, or NO_BLOCK; shape (0, 0, 0) when there is one block
     apart: object  # flat uint8, how many cells those of a tensor's box are from matter, with several blocks
     apart_at: object  # (T, 4) int64, offset into apart and cells per axis
-    inside: object  # flat uint64, the parts of cells of tensors that hold matter (`parts.bit_of`)
-    inside_at: object  # (T,) int64, offset into inside, or -1: all of a tensor's occupied cells
     cell: object  # (B, 2) float64, a cell of the block's tensor: in the field's coordinates, in its own steps
     crossing: object  # (B,) uint8, how points come to the block's tensor (VMField.crossings)
     part: object  # (B, 6) float64, lower corner and 1 / sides of a tensor's box in its own unbounded space
@@ -359,7 +356,7 @@ def block_density(field, b, p, d, stretched):
     if not inside:
         return 0.0, 0.0, b
     t = field.tensor[b]
-    if field.owners.shape[0] != 0 and not matter_at(field, t, u, v, w):
+    if field.owners.shape[0] != 0 and cells_apart(field, t, u, v, w) != 0:
         return 0.0, 0.0, b  # what a tensor says there was never learnt
     f, place = density_feature(field, t, u, v, w), b
     if DETAIL != 0 and field.rows[t, 1] != 0 and f + field.activation[t, 1] > EMPTY_FROM:
@@ -377,17 +374,6 @@ def crossed(field, b, p, stretch):
         own = 1.0 if field.crossing[b] == 1 else rate(point(affine(field.to_unit, b, frame_point(p))))
         return stretch * own / rate(p)
     return stretch
-
-
-def matter_at(field, t, u, v, w):
-    """Whether a unit point lies in what is known to hold matter of tensor t; what a tensor says elsewhere was
-    never learnt."""
-    if field.inside_at[t] < 0:
-        return cells_apart(field, t, u, v, w) == 0
-    nx, ny, nz = field.apart_at[t, 1], field.apart_at[t, 2], field.apart_at[t, 3]
-    i, j, m = min(int(u * nx), nx - 1), min(int(v * ny), ny - 1), min(int(w * nz), nz - 1)
-    bits = field.inside[np.uint64(field.inside_at[t] + (i * ny + j) * nz + m)]
-    return in_matter(bits, 4 * (u * nx - i), 4 * (v * ny - j), 4 * (w * nz - m))
 
 
 def cells_apart(field, t, u, v, w):

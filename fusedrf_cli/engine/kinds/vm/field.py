@@ -26,7 +26,7 @@ from fusedrf_cli.engine.fields.box import (
 )
 from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, StoredAs, unpack_bits
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed
-from fusedrf_cli.engine.fields.insides import WORTH_LOOKING
+from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
     SCENE_CELLS,
@@ -360,8 +360,6 @@ class VMField(ComputedField):
             np.asarray([[t.scale, t.shift] for t in self.tensors], self.real),
             owners,
             *apart_arrays(self.tensors if self.owners is not None else ()),
-            np.zeros(0, np.uint64),
-            np.full(len(self.tensors), -1, np.int64),
             self.cell_sizes(),
             np.asarray(self.crossings, np.uint8),
             np.stack([np.concatenate([box[:3], 1 / (box[3:] - box[:3])]) for box in boxes]),
@@ -369,12 +367,12 @@ class VMField(ComputedField):
         )
 
     def for_pictures(self, rays: int) -> "VMField":
-        """See ComputedField: what stands in a place is looked into where pictures are worth it."""
-        if self.owners is None or self.space is bounded or rays < WORTH_LOOKING:
+        """See ComputedField: of several blocks the insides of cells are told where pictures are worth it."""
+        if self.owners is None or rays < WORTH_TELLING:
             return self
-        from fusedrf_cli.engine.kinds.vm.insides import looked_into
+        from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 
-        return looked_into(self)
+        return with_known_insides(self)
 
     @cached_property
     def crossings(self) -> list[int]:

@@ -1,11 +1,11 @@
-"""The insides of cells (engine/fields/insides.py) of a field of several blocks: each tensor is looked into in
-its own grid, as fine as itself, and what was found there is placed."""
+"""The insides of cells (engine/fields/insides.py) of a field of several blocks: matter lies where an occupied
+cell of a tensor's own grid, which is as fine as the tensor, reaches after placing. Nothing is lost by it."""
 
 from copy import copy
 
 import numpy as np
 
-from fusedrf_cli.engine.fields.insides import SIDE, insides_of, with_insides
+from fusedrf_cli.engine.fields.insides import SIDE, with_insides
 from fusedrf_cli.engine.fields.occupancy import (
     MAX_STRIDE,
     OccupancyGrid,
@@ -14,63 +14,36 @@ from fusedrf_cli.engine.fields.occupancy import (
     transformed_aabb,
 )
 from fusedrf_cli.engine.kernels.plain import mark_parts
-from fusedrf_cli.engine.kinds.vm.field import Block, VMField
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMTensor
 from fusedrf_cli.engine.spaces import bounded
 
-LEVELS = 2  # halvings of a cell to its parts
+ROUNDING = 1e-6  # parts
 
 
-def looked_into(field: VMField) -> VMField:
-    """The field with tensors, and a grid, of which the insides of cells are known. Not looked into are those
-    tensors that lie in unbounded space, or are bent by the space that they were placed into."""
-    insides = [tensor_insides(field, t) for t in range(len(field.tensors))]
-    if all(bits is None for bits in insides):
+def with_known_insides(field: VMField) -> VMField:
+    """The field under a grid that knows the insides of cells. Blocks that lie in unbounded space, or are bent
+    by the space that they were placed into, fill the cells that they reach, at their own strides."""
+    straight = [is_straight(field, b) for b in range(len(field.blocks))]
+    whole = [block for block, own in zip(field.blocks, straight, strict=True) if not own]
+    if not any(straight):
         return field
-    starts = np.cumsum([0, *(0 if bits is None else bits.size for bits in insides)])[:-1]
-    at = np.where([bits is None for bits in insides], -1, starts)
-    held = np.concatenate([bits.ravel() for bits in insides if bits is not None])
-    other, loops = copy(field), field.device_loops
-    held, at = loops.on_device(held), loops.on_device(at.astype(np.int64))
-    other.__dict__["arrays"] = field.arrays._replace(inside=held, inside_at=at)
-    other.__dict__["grid"] = loops.on_device(placed_insides(field, insides))
+    grid, other = field.occupancy, copy(field)
+    found = np.zeros(grid.occupied.shape, np.uint64)
+    for block in (block for block, own in zip(field.blocks, straight, strict=True) if own):
+        mark(field.tensors[block.tensor], block.object_to_field, grid, found)
+    found[~grid.occupied] = 0
+    known = with_insides(grid, found, strides_of(field, whole) if whole else None)
+    other.__dict__["grid"] = field.device_loops.on_device(known)
     return other
 
 
-def tensor_insides(field: VMField, t: int) -> np.ndarray | None:
-    """Those of a tensor's own cells, where it is looked into."""
-    if field.tensors[t].space is not bounded or not all(
-        straight(field, b) for b, block in enumerate(field.blocks) if block.tensor == t
-    ):
-        return None
-    return insides_of(alone(field, t))
-
-
-def straight(field: VMField, b: int) -> bool:
+def is_straight(field: VMField, b: int) -> bool:
     """Whether a block lies in the coordinates of the field's space as its placement says: in unbounded space
     the core does."""
     block = field.blocks[b]
-    box = transformed_aabb(field.tensors[block.tensor].aabb, block.object_to_field)
-    return field.space is bounded or abs(box).max() <= 1
-
-
-def alone(field: VMField, t: int) -> VMField:
-    """A tensor of a field in its own frame, with the field's numbers."""
-    tensor, start = field.tensors[t], int(field.layout[t, 0])
-    numbers = field.params[start : start + tensor.size(field.shape)]
-    return VMField(field.shape, (tensor,), (Block(0, np.eye(4), ""),), numbers, tensor.occupancy)
-
-
-def placed_insides(field: VMField, insides: list[np.ndarray | None]):
-    """The field's grid, whose parts hold matter where that of a tensor reaches that was looked into; what was
-    not lies in whole cells, at its own strides."""
-    grid = field.occupancy
-    found = np.zeros(grid.occupied.shape, np.uint64)
-    whole = [block for block in field.blocks if insides[block.tensor] is None]
-    for block in field.blocks:
-        if insides[block.tensor] is not None:
-            place(insides[block.tensor], field.tensors[block.tensor].aabb, block.object_to_field, grid, found)
-    found[~grid.occupied] = 0
-    return with_insides(grid, found, strides_of(field, whole) if whole else None)
+    tensor = field.tensors[block.tensor]
+    box = transformed_aabb(tensor.aabb, block.object_to_field)
+    return tensor.space is bounded and (field.space is bounded or abs(box).max() <= 1)
 
 
 def strides_of(field: VMField, blocks: list[Block]) -> np.ndarray:
@@ -90,20 +63,12 @@ def strides_of(field: VMField, blocks: list[Block]) -> np.ndarray:
     return np.where(reached, np.clip(strides, 1, MAX_STRIDE), 0).astype(np.uint16)
 
 
-def place(bits: np.ndarray, box: np.ndarray, object_to_field: np.ndarray, grid, found: np.ndarray) -> None:
-    """Mark in `found` what the parts of a tensor's cells reach after placing; where they are finer than those
-    of the grid, its eighths or cells."""
-    cell, part = (box[3:] - box[:3]) / bits.shape, grid.cell / SIDE
-    wide = abs(object_to_field[:3, :3] * cell) / part[:, None]  # of a cell along each of its axes, in parts
-    widest = wide.sum(1).max()
-    level = next((n for n in range(LEVELS) if widest / 2**n <= 1), LEVELS)
-    steps, whole = steps_through(wide.max(0) / 2**level), steps_through(wide.max(0))
+def mark(tensor: VMTensor, object_to_field: np.ndarray, grid: OccupancyGrid, found: np.ndarray) -> None:
+    """Set in `found` (X, Y, Z) uint64 the parts of the grid's cells that the boxes around the occupied cells
+    of a tensor's own grid reach after placing."""
+    occupied, part = tensor.occupancy.occupied, grid.cell / SIDE
+    cell = (tensor.aabb[3:] - tensor.aabb[:3]) / occupied.shape
     linear = object_to_field[:3, :3] * cell / part[:, None]
-    shift = (object_to_field[:3, :3] @ box[:3] + object_to_field[:3, 3] - grid.aabb[:3]) / part
-    mark_parts(bits, level, np.concatenate([linear, shift[:, None]], 1), steps, whole, found)
-
-
-def steps_through(sides: np.ndarray) -> np.ndarray:
-    """(N, 3) places in a box of sides (3,), of which it is 1 along each axis, no farther apart than 1."""
-    counts = np.maximum(np.ceil(sides), 1).astype(int) + 1
-    return np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
+    shift = (object_to_field[:3, :3] @ tensor.aabb[:3] + object_to_field[:3, 3] - grid.aabb[:3]) / part
+    reach = abs(linear).sum(1) / 2 + ROUNDING
+    mark_parts(occupied, np.concatenate([linear, shift[:, None]], 1), reach, found)
