@@ -17,6 +17,8 @@ from types import ModuleType
 import numba
 from numba.core import event
 
+from fusedrf_cli.engine.kernels.threads import ONE_THREAD
+
 
 def kernel_cache() -> Path:
     """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
@@ -25,6 +27,7 @@ def kernel_cache() -> Path:
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     """
     bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined())).hexdigest()[:12]
+    bodies += "-one" if ONE_THREAD else ""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     wanted = Path(home) / "fusedrf" / "kernels" / bodies
     try:

@@ -9,9 +9,10 @@ import numpy as np
 from numba import njit, prange
 
 from fusedrf_cli.engine.kernels.parts import LINE, adam_line, bit_of, body, pinhole_ray, sum_of_rows
+from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
 FLAGS = dict(fastmath=True, error_model="numpy", cache=True)
-loop = njit(**FLAGS, parallel=True)
+loop = njit(**FLAGS, parallel=not ONE_THREAD)
 # A task is the serial work of one core. Without the reference counting of array arguments (_nrt) it is up to
 # eight times faster, so tasks allocate nothing: the loops around them hand in the scratch.
 task = njit(**FLAGS, _nrt=False)
