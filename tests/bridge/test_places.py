@@ -285,7 +285,8 @@ def test_what_masks_exclude_does_not_count(report, folder):
     assert all(v["psnr"] > 35 and v["ssim"] > 0.95 for v in found)
 
 
-@pytest.mark.parametrize("x", [-0.5, pytest.param(4.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("x", [-0.5, 4.0])
 def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     """As `sparse`, an object in the core and one far outside of it are there, and edits leave the rest."""
     nodes = [

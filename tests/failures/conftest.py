@@ -62,6 +62,8 @@ class Row:
         sign = "at most" if at_most else "at least"
         assert passed, f"{row}: {what}: {figure:.6g} {unit}, should be {sign} {bar:g} {unit}"
 
+RARE = {"cp", "dense-mlp", "vm-mlp"}  # kinds whose loops the quick tests do not wait for
+
 
 @pytest.fixture
 def row(request) -> Row:
@@ -88,7 +90,9 @@ def quick(monkeypatch) -> None:
 def pytest_generate_tests(metafunc):
     """A test that takes `kind` runs once for every registered field kind, also for those still to come."""
     if "kind" in metafunc.fixturenames:
-        metafunc.parametrize("kind", sorted(field_kinds()))
+        kinds = sorted(field_kinds())
+        slow = pytest.mark.slow
+        metafunc.parametrize("kind", [pytest.param(k, marks=slow if k in RARE else ()) for k in kinds])
 
 
 @pytest.hookimpl(wrapper=True)

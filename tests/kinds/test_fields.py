@@ -20,7 +20,7 @@ FIELDS = {name: make for name, make in KINDS.items() if "placed" not in name}
 FIELDS["vm-mlp"] = lambda: random_vm_mlp(cells=4)
 
 
-RARE = {"cp", "dense-mlp"}  # each takes a quarter of a minute to compile
+RARE = {"cp", "dense-mlp", "vm-mlp"}  # each takes a quarter of a minute to compile
 TRIED = [pytest.param(name, marks=pytest.mark.slow) if name in RARE else name for name in FIELDS]
 
 

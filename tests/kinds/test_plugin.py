@@ -57,6 +57,7 @@ def cubes(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_page_s_kind_is_listed_trained_and_rendered(cubes):
     ball = trimesh.creation.icosphere(subdivisions=2)
     ball.visual.vertex_colors = [200, 60, 40, 255]

@@ -19,7 +19,10 @@ from .test_references import asked, sent_back
 TINT = (0.9, 0.4, 0.0)
 
 
-@pytest.fixture(params=["vm-mlp", "sparse, levels and bands", "dense"])
+RARE = pytest.param("vm-mlp", marks=pytest.mark.slow)  # its loops take long to compile
+
+
+@pytest.fixture(params=[RARE, "sparse, levels and bands", "dense"])
 def pair(request) -> tuple[RadianceField, RadianceField]:
     """A field, and the same with a tint."""
     field = KINDS[request.param]()
