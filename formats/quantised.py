@@ -129,14 +129,6 @@ def check_scales(
     return _numbers_kept(scales > 0, shape, runs)
 
 
-def exact_code_bytes(array: np.ndarray, bits: int) -> int:
-    """Bytes that the codes of an array without runs take, without making them."""
-    kept = np.empty(scales_shape(array.shape), bool)
-    for rows, blocks, sides in _slabs(array.shape):
-        kept[blocks] = _floored(_by_block(np.maximum, np.abs(array[rows]), sides)) > 0
-    return code_bytes(_numbers_kept(kept, array.shape), bits)
-
-
 def _numbers_kept(kept: np.ndarray, shape: tuple[int, ...], runs: np.ndarray | None = None) -> int:
     """How many numbers lie in the blocks that are kept."""
     counts = kept.astype(np.int64)

@@ -23,7 +23,6 @@ from formats.quantised import (
     LEVELS,
     code_bytes,
     dequantised,
-    exact_code_bytes,
     is_coded,
     quantised,
     scales_shape,
@@ -151,14 +150,6 @@ def coded_bytes(shape: tuple[int, ...], precision: str) -> int:
     if precision not in BITS or not is_coded(shape):
         return numbers * np.dtype(PRECISIONS[precision]).itemsize
     return math.prod(scales_shape(shape)) * DTYPES["F16"].itemsize + code_bytes(numbers, BITS[precision])
-
-
-def exact_bytes(array: np.ndarray, precision: str) -> int:
-    """The bytes that a float array takes in a field: blocks that are all zero have no codes."""
-    most = coded_bytes(array.shape, precision)
-    if precision not in BITS or not is_coded(array.shape):
-        return most
-    return most - code_bytes(array.size, BITS[precision]) + exact_code_bytes(array, BITS[precision])
 
 
 def as_stored(

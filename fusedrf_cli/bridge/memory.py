@@ -124,9 +124,9 @@ def picture(width: int, height: int, composed: bool) -> dict[str, float]:
     return {"a band of the picture": band * PER_PIXEL + waves}
 
 
-def insides() -> dict[str, float]:
-    """Telling those of a scene's grid (engine/fields/insides.py)."""
-    return {"the insides of cells": PER_KNOWN_CELL * SCENE_CELLS**3}
+def insides(aabb: np.ndarray) -> dict[str, float]:
+    """Telling those of the cells (engine/fields/insides.py) of a scene's grid over its box (6,)."""
+    return {"the insides of cells": PER_KNOWN_CELL * float(np.prod(cell_counts(aabb, SCENE_CELLS)))}
 
 
 def measured(width: int, height: int) -> dict[str, float]:

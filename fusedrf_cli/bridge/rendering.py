@@ -82,8 +82,8 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     largest = max(views, key=lambda view: view.width * view.height)
     pixels = largest.width * largest.height
     needed = picture(largest.width, largest.height, composed=not hasattr(field, "render_rays"))
-    if rays_of(views) >= WORTH_TELLING:
-        needed |= insides()
+    if len(getattr(field, "blocks", ())) > 1 and rays_of(views) >= WORTH_TELLING:
+        needed |= insides(field.aabb)
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
 
 
@@ -111,6 +111,7 @@ def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: M
         sources(loaded.sizes, copies=JOINING)
         | {"the sources put together": sum(loaded.sizes)}
         | ownership(box)
+        | insides(box)
         | needed
     )
     if budget.room(most) < 0:

@@ -18,6 +18,7 @@ from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Student
 from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings
+from tests.engine.kinds.cases import SLOW_TO_COMPILE
 
 ROW = re.compile(r"test_([a-z]+\d+)_")
 
@@ -62,8 +63,6 @@ class Row:
         sign = "at most" if at_most else "at least"
         assert passed, f"{row}: {what}: {figure:.6g} {unit}, should be {sign} {bar:g} {unit}"
 
-RARE = {"cp", "dense-mlp", "vm-mlp"}  # kinds whose loops the quick tests do not wait for
-
 
 @pytest.fixture
 def row(request) -> Row:
@@ -92,7 +91,8 @@ def pytest_generate_tests(metafunc):
     if "kind" in metafunc.fixturenames:
         kinds = sorted(field_kinds())
         slow = pytest.mark.slow
-        metafunc.parametrize("kind", [pytest.param(k, marks=slow if k in RARE else ()) for k in kinds])
+        tried = [pytest.param(k, marks=slow if k in SLOW_TO_COMPILE else ()) for k in kinds]
+        metafunc.parametrize("kind", tried)
 
 
 @pytest.hookimpl(wrapper=True)

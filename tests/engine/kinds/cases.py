@@ -21,6 +21,9 @@ from tests.analytic.rays import affine, turn
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm
 from .sparse_cases import random_sparse
 
+SLOW_TO_COMPILE = {"cp", "dense-mlp", "vm-mlp"}
+"""Kinds whose loops the quick tests do not wait for, where they try every kind."""
+
 
 def random_blocks():
     """Three overlapping, turned and stretched tensors in one field."""
