@@ -44,14 +44,12 @@ def of_count(work: Work, count: int) -> list[dict]:
     naive_peak = peak_of(scene, FRAME)
     rows = []
     for (limit, path), ms in zip(bundles.items(), fused, strict=True):
-        psnr, ssim = held.quality(path)
         rows.append(
             {
                 "n": count,
                 "limit": limit,
                 "kind": reports[limit]["kind"],
-                "psnr": psnr,
-                "ssim": ssim,
+                **held.quality(path),
                 "bytes": within(path, LIMITS[limit]),
                 "source bytes": held.source_bytes,
                 "seconds": reports[limit]["total_seconds"],

@@ -45,7 +45,7 @@ def closeup(work: Work) -> dict[str, str]:
     held, whole, rows = course(scene, SIZE, box), course(scene, SIZE), []
     for kind in KINDS:
         found, _ = fused(held, scene, kind)
-        found["psnr of the whole"], _ = whole.quality(bundle_of(scene, kind))
+        found["psnr of the whole"] = whole.quality(bundle_of(scene, kind))["psnr"]
         rows.append({"kind": kind, "units tall": TINY} | found)
         write_csv(work.out / "closeup.csv", rows)
     return {"closeup": listed({r["kind"]: r["psnr"] for r in rows})}
@@ -62,8 +62,8 @@ def fused(held, scene: Path, kind: str, *words: str) -> tuple[dict, float]:
     path = bundle_of(scene, kind)
     line = ("--kind", kind, "--max-size", str(SIZES.get(kind, MOST_BYTES)), *words)
     report = fusedrf(scene.parent, "fuse", scene.name, "-o", path.name, *line)
-    psnr, ssim = held.quality(path)
-    return {"psnr": psnr, "ssim": ssim, "bytes": report["bytes"]}, report["total_seconds"]
+    found = {"covered share": held.covered_share, **held.quality(path), "bytes": report["bytes"]}
+    return found, report["total_seconds"]
 
 
 def listed(values: dict[str, float], digits: int = 1) -> str:

@@ -22,16 +22,16 @@ def smallest(work: Work) -> dict[str, str]:
     tell("smallest: the search")
     words = ("-o", "target.rfpack", "--target-psnr", f"{WANTED:g}")
     found = fusedrf(scene.parent, "fuse", scene.name, *words)
-    psnr, _ = course(scene, SIZE).quality(scene.with_name("target.rfpack"))
-    row = {"by": "search", "flags": " ".join(words[2:]), "psnr": psnr, "bytes": found["bytes"]}
-    rows = [row | {"seconds": found["total_seconds"]}]
+    held = course(scene, SIZE).quality(scene.with_name("target.rfpack"))
+    row = {"by": "search", "flags": " ".join(words[2:]), "psnr": held["psnr"], "covered": held["covered"]}
+    rows = [row | {"bytes": found["bytes"], "seconds": found["total_seconds"]}]
     if not enough:
         write_csv(work.out / "smallest.csv", rows)
         return {"picked": f"no point of the chart reaches {WANTED:g} dB", "smallest": "none"}
     best = min(enough, key=lambda p: p["bytes"])
-    rows.insert(0, {"by": "chart", **{k: best[k] for k in ("flags", "psnr", "bytes", "seconds")}})
+    rows.insert(0, {"by": "chart", **{k: best[k] for k in ("flags", "psnr", "covered", "bytes", "seconds")}})
     write_csv(work.out / "smallest.csv", rows)
     return {
-        "picked": f"{found['bytes'] / best['bytes']:.2f} ({psnr:.1f} dB)",
+        "picked": f"{found['bytes'] / best['bytes']:.2f} ({held['psnr']:.1f} dB)",
         "smallest": f"{readable_size(best['bytes'])} ({best['psnr']:.1f} dB)",
     }

@@ -32,7 +32,7 @@ def times(work: Work) -> dict[str, str]:
     held, rows = course(scene, COMPARED), []
 
     def note(way: str, path: Path, seconds: float) -> None:
-        rows.append({"way": way, "seconds": seconds, "psnr": held.quality(path)[0]})
+        rows.append({"way": way, "seconds": seconds, "psnr": held.quality(path)["psnr"]})
         write_csv(work.out / "times.csv", rows)
         figures.times(rows, WANTED, work.out / "times.svg")
 

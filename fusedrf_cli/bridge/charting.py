@@ -24,7 +24,7 @@ from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
-from fusedrf_cli.engine.distillation.judging import JUDGED_SEED
+from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
@@ -53,6 +53,8 @@ class Point:
     psnr: float
     """dB against the scene as composed, mean of VIEWS views over white that nothing was trained on."""
     ssim: float
+    covered: float
+    """dB over the pixels in which the scene as composed shows something."""
     seconds: float
     """Of fusing, once the kernels are loaded."""
     bytes: int
@@ -78,6 +80,8 @@ class Benchmark:
     """In the world."""
     truth: list[np.ndarray]
     """(H, W, 3) float32 over white, of every camera."""
+    covered: list[np.ndarray]
+    """(H, W) bool of every camera: the pixels that the scene covers."""
     source_bytes: int
 
     @classmethod
@@ -102,15 +106,24 @@ class Benchmark:
             cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
         needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * PER_PIXEL_KEPT
         memory.expect(needed, advice="give a smaller --size")
-        truth = [render_image(composed, c, origin=composed.origin).over(WHITE) for c in cameras]
-        return cls(scene, memory, size, allow_outside, place, box, cameras, truth, source_bytes(loaded))
+        shots = [render_image(composed, c, origin=composed.origin) for c in cameras]
+        truth, seen = [shot.over(WHITE) for shot in shots], [shot.opacity > COVERED for shot in shots]
+        total = source_bytes(loaded)
+        return cls(scene, memory, size, allow_outside, place, box, cameras, truth, seen, total)
 
-    def quality(self, bundle: Path) -> tuple[float, float]:
-        """Mean PSNR and SSIM of a fused bundle."""
+    @property
+    def covered_share(self) -> float:
+        """How much of the views the scene covers."""
+        return float(np.mean(self.covered))
+
+    def quality(self, bundle: Path) -> dict[str, float]:
+        """Mean `psnr` and `ssim` of a fused bundle, and `covered`, the PSNR of the pixels that are."""
         render, origin = renderable(load_scene(str(bundle), budget=self.memory, place=self.place))
         shots = [render_image(render, c, origin=origin).over(WHITE) for c in self.cameras]
         pairs = list(zip(shots, self.truth, strict=True))
-        return float(np.mean([psnr(*p) for p in pairs])), float(np.mean([ssim(*p) for p in pairs]))
+        inside = [psnr(a[m], b[m]) for (a, b), m in zip(pairs, self.covered, strict=True) if m.any()]
+        found = {"psnr": [psnr(*p) for p in pairs], "ssim": [ssim(*p) for p in pairs], "covered": inside}
+        return {name: float(np.mean(values)) if values else np.nan for name, values in found.items()}
 
     def frame_times(self, bundles: Sequence[Path], advance: Callable[[int], None]) -> list[float]:
         """Median milliseconds of a frame of the scene as composed, and of every fused bundle: all take
@@ -173,10 +186,11 @@ def chart(request: ChartRequest, progress) -> dict:
             plots.chart(run.points, best, composed, title, folder / f"chart.{suffix}")
     if left:
         progress.warn(f"{left} ladders were left off where --budget {budget:g} ended; give more to go on")
-    columns = ("flags", "psnr", "ssim", "bytes", "seconds", "ms")
+    columns = ("flags", "psnr", "covered", "ssim", "bytes", "seconds", "ms")
     return {
         "output": output,
         "views": f"{len(benchmark.cameras)} of {size[0]}x{size[1]}, which nothing was trained or chosen on",
+        "covered_share": benchmark.covered_share,
         "composed": composed,
         "tried": len(run.points),
         "frontier": [{"no": i} | {c: getattr(p, c) for c in columns} for i, p in enumerate(best, 1)],
@@ -296,7 +310,8 @@ class Charting:
             self.progress.warn(f"left out {' '.join(flags)}: {error}")
             return None
         quality = self.benchmark.quality(path)
-        point = Point(" ".join(flags), kind, *quality, report["total_seconds"], report["bytes"])
+        cost = {"seconds": report["total_seconds"], "bytes": report["bytes"]}
+        point = Point(" ".join(flags), kind, **quality, **cost)
         point.warnings = warnings
         self.points.append(point)
         self.bundles.append(path)
@@ -334,11 +349,11 @@ def mark_frontiers(points: list[Point]) -> None:
 
 def write_csv(path: Path, points: list[Point], composed: dict) -> None:
     """All points, and the scene as composed, one per line."""
-    columns = ("flags", "kind", "psnr", "ssim", "seconds", "bytes", "ms")
+    columns = ("flags", "kind", "psnr", "covered", "ssim", "seconds", "bytes", "ms")
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow([*columns, "frontier"])
-        table.writerow(["", "composed", "", "", "", composed["bytes"], f"{composed['ms']:.3f}"])
+        table.writerow(["", "composed", "", "", "", "", composed["bytes"], f"{composed['ms']:.3f}"])
         for p in points:
-            values = (p.flags, p.kind, f"{p.psnr:.3f}", f"{p.ssim:.5f}", f"{p.seconds:.3f}")
-            table.writerow([*values, p.bytes, f"{p.ms:.3f}", " ".join(p.frontier)])
+            values = (p.flags, p.kind, f"{p.psnr:.3f}", f"{p.covered:.3f}", f"{p.ssim:.5f}")
+            table.writerow([*values, f"{p.seconds:.3f}", p.bytes, f"{p.ms:.3f}", " ".join(p.frontier)])

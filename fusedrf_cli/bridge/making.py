@@ -220,7 +220,8 @@ class Maker:
     ) -> tuple[StoredField, DistillReport]:
         """A student that has learnt; an interrupt saves a checkpoint."""
         request, seconds = self.request, self.budget.part(tries)
-        settings = replace(self.student.lesson, seed=request.seed, time_budget=seconds)
+        lesson = self.student.lesson_of(field.params.numel())
+        settings = replace(lesson, seed=request.seed, time_budget=seconds)
         if seconds is not None:  # more than there is time to learn from need not be asked
             settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * seconds) + 1))
         teacher, boxes = self.student.scene, boxes_of(self.student.scene)

@@ -36,7 +36,7 @@ PER_KNOWN_CELL = 30  # of a scene's grid: the bits of its parts, strides and dis
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
-PER_POINT = 144  # of a teacher's points, in pieces and joined
+PER_POINT = 76  # of a teacher's points, joined, and one of their columns in pieces
 PER_PIXEL_OF_PHOTOS = 4 + 16  # colours, and two orders of drawing
 PER_OWN_RAY = 100  # of a camera's pixel: directions in float64 while they are made, float32 afterwards
 
@@ -178,7 +178,8 @@ def stages(
 ) -> list[tuple[float, dict[str, float]]]:
     """The stages of fusing a scene: making a student, measuring it, learning. Each is so many copies of the
     largest source, and bytes by what they are for."""
-    needs, settings = student.needs(), student.lesson or DistillSettings()
+    needs = student.needs()
+    settings = student.lesson_of(needs.numbers) or DistillSettings()
     numbers, grids = needs.numbers, ownership(scene.aabb)
     if student.lesson is None:
         taught = lesson(RAYS)

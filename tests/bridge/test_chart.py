@@ -72,6 +72,7 @@ def test_the_folder_holds_the_chart_twice_and_its_numbers(charted):
     for row, point in zip(rows, said["points"], strict=True):
         assert row["flags"] == point["flags"] and int(row["bytes"]) == point["bytes"]
         assert float(row["psnr"]) == pytest.approx(point["psnr"], abs=1e-3)
+        assert float(row["covered"]) == pytest.approx(point["covered"], abs=1e-3)
         assert row["frontier"].split() == point["frontier"]
         assert not point["frontier"] or point["flags"] in drawn
     assert {r["flags"] for r in said["frontier"]} == {p["flags"] for p in said["points"] if p["frontier"]}
@@ -147,7 +148,8 @@ def shrinking(kind: str, least_psnr: float):
 
 
 def point(**values):
-    return part("charting").Point(**{"flags": "", "kind": "vm", "ssim": 1.0, "ms": 1.0} | values)
+    same = {"flags": "", "kind": "vm", "ssim": 1.0, "covered": 0.0, "ms": 1.0}
+    return part("charting").Point(**same | values)
 
 
 def test_a_frontier_is_what_no_other_point_surpasses():
@@ -183,8 +185,12 @@ def climbing(
     clock of its own, or is refused; from one to the next the PSNR falls by 5 dB, and the bytes by a tenth of
     those of the kind, a million by default."""
     module, clock, heard = part("charting"), [0.0], NullProgress()
+
+    def quality(path):
+        return {"psnr": 50.0 - 5 * len(run.points), "ssim": 1.0, "covered": 0.0}
+
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
-    benchmark = SimpleNamespace(scene="scene.json", quality=lambda path: (50.0 - 5 * len(run.points), 1.0))
+    benchmark = SimpleNamespace(scene="scene.json", quality=quality)
     paths = iter(map(Path, "abcdefghijklmnop"))
     run = module.Charting(benchmark, paths, CHARTED, heard)
 

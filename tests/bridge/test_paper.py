@@ -112,8 +112,8 @@ class Reports:
 
 def test_smallest_is_the_least_of_those_that_reach_the_psnr(work, monkeypatch):
     sizes = ((40.5, 2_000_000), (41.0, 1_000_000), (39.9, 500_000))
-    points = [{"flags": "", "psnr": q, "bytes": b, "seconds": 1.0} for q, b in sizes]
-    held = SimpleNamespace(quality=lambda path: (40.2, 1.0))
+    points = [{"flags": "", "psnr": q, "covered": q, "bytes": b, "seconds": 1.0} for q, b in sizes]
+    held = SimpleNamespace(quality=lambda path: {"psnr": 40.2, "ssim": 1.0, "covered": 38.0})
     monkeypatch.setattr(smallest, "course", lambda scene, size: held)
     monkeypatch.setattr(smallest, "fusedrf", Reports(points))
     seen = smallest.smallest(work)

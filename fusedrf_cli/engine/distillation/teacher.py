@@ -40,7 +40,7 @@ class Points:
 
     where: torch.Tensor
     dirs: torch.Tensor
-    """(N, 3) float64 samples on rays in front of what is opaque, empty ones among them."""
+    """(N, 3) float32 samples on rays in front of what is opaque, empty ones among them."""
     sigma: torch.Tensor
     """(N,) float32, per unit of length."""
     rgb: torch.Tensor
@@ -124,12 +124,12 @@ def ask(
     for start in range(0, len(rays_o), at_once):
         part = slice(start, start + at_once)
         parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
-    pixels, *columns = (torch.cat(column) for column in zip(*parts, strict=True))
-    parts.clear()  # hundreds of megabytes
-    order = torch.randperm(len(columns[0]), generator=generator)
-    for i, column in enumerate(columns):
-        columns[i] = column[order]
-    return TeacherPool(rays_o, rays_d, pixels, Points(*columns))
+    pixels, *points = (list(column) for column in zip(*parts, strict=True))
+    parts.clear()
+    order = torch.randperm(sum(map(len, points[0])), generator=generator)
+    for i in range(len(points)):  # one after the other: together they can be a gigabyte, and two while joined
+        points[i] = torch.cat(points[i])[order]
+    return TeacherPool(rays_o, rays_d, torch.cat(pixels), Points(*points))
 
 
 def points_kept(teacher: RadianceField, boxes: list[np.ndarray], rays: int, step: float, seed: int) -> int:
@@ -150,8 +150,7 @@ def _ask_part(
     n = len(rays_o)
     trans, pixels = np.ones(n, np.float32), np.zeros((n, 4), np.float32)
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
-    place = torch.zeros(0, 3, dtype=torch.float64)
-    kept = [(place, place, torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
+    kept = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
     reach = reach_of(len(rays_o), 0.0, np.inf)
     for ray, ts, spans, counts in waves(teacher, rays_o, rays_d, reach, jitter, step, lambda: trans > 1e-3):
         mask = np.arange(ts.shape[1]) < counts[:, None]
@@ -173,6 +172,6 @@ def _ask_part(
         rgb = np.zeros((*ts.shape, 3), np.float32)
         rgb[mask] = colour.numpy()
         pixels[ray, :3] += (weights[..., None] * rgb).sum(1)
-        kept.append(tuple(column[chosen] for column in (points, dirs, found, colour, before)))
+        kept.append(tuple(column[chosen].float() for column in (points, dirs, found, colour, before)))
     pixels[:, 3] = 1 - trans
     return torch.from_numpy(pixels), *(torch.cat(column) for column in zip(*kept, strict=True))

@@ -46,6 +46,8 @@ class Kind:
     """That are tried where a quality is asked for, the cheapest first."""
     faithful = "float16"
     """The precision where only a size is given."""
+    distilled = "float16"
+    """The same of a student that learns from nothing: fewer bits leave room for more numbers."""
 
     # -- making ----------------------------------------------------------------------------------------------
 

@@ -26,6 +26,8 @@ GROWTH = 2  # of the numbers, from one size to the next
 SMALLEST = 32  # times fewer numbers than the limit allows: where growing begins
 NOTHING = "nothing"  # what a student starts from that takes over no numbers
 SHRINK = 0.98  # steps in which a size is looked for that fits
+TOLD_NUMBERS = 12_000_000  # of a student, for which a lesson's rays do
+MOST_TOLD = 2.0  # four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all
 
 
 @dataclass(frozen=True)
@@ -223,12 +225,21 @@ class Student:
         """scene: what it learns from."""
         self.kind, self.scene, self.request = kind, scene, request
 
+    def lesson_of(self, numbers: int) -> DistillSettings | None:
+        """How a student of so many numbers learns: the more there are, the more it is told, up to
+        MOST_TOLD times."""
+        if not self.learnt or self.lesson is None:
+            return self.lesson
+        more = min(max(1.0, numbers / TOLD_NUMBERS), MOST_TOLD)
+        rays, steps = round(more * self.lesson.rays), round(more * self.lesson.steps)
+        return replace(self.lesson, rays=rays, steps=steps)
+
     # -- ways and sizes --------------------------------------------------------------------------------------
 
     def ways(self) -> list[list[Way]]:
         """The ways that are left to choose from, in groups of one precision, the cheapest first."""
         request = self.request
-        choice = self.kind.precisions if request.target is not None else (self.kind.faithful,)
+        choice = self.kind.precisions if request.target is not None else (self.kind.distilled,)
         found = (request.precision,) if request.precision else choice
         return [[Way(p, request.ranks, request.sh_degree)] for p in found]
 

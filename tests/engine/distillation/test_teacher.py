@@ -62,9 +62,9 @@ def test_points_are_samples_with_the_teachers_answers():
     points = ask(field, rays_o, rays_d, 0.05, seeded(3), everything).points
     sigma, rgb = field.query(points.where, points.dirs)
     assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
-    assert torch.equal(sigma, points.sigma)
+    torch.testing.assert_close(sigma, points.sigma, rtol=1e-4, atol=1e-6)  # places are kept in float32
     shown = sigma * 0.05 > 1e-5
-    assert torch.equal(rgb[shown], points.rgb[shown])
+    torch.testing.assert_close(rgb[shown], points.rgb[shown], rtol=1e-4, atol=1e-5)
 
 
 def everything(depth, transmittance):

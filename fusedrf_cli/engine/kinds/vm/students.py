@@ -54,6 +54,7 @@ class VMKind(Kind):
     takes = frozenset({"ranks", "sh_degree"})
     takes_over = True
     hashes = True
+    distilled = "int8"  # measured: four objects in 25 MB, 0.6 dB more than half the numbers in float16
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """Planes, lines, the colour basis and the detail of one tensor."""
