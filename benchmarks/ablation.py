@@ -1,8 +1,9 @@
 """What each part of distilling is worth: python -m benchmarks.ablation FOLDER [SCENE.json] [--share S]
 
-Distils a scene into one `vm` tensor of 25 MB by the recipe of `fuse --kind vm`, with five seeds, and with one
-part at a time left out or put back to what FusedRF says; all within the same steps, and judged on the same
-views, which nothing is trained on. Without a scene, one is made in FOLDER: four objects of
+Distils a scene into one `vm` tensor of 12 million numbers by the recipe of `fuse --kind vm`, with five seeds,
+and with one part at a time left out or put back to what FusedRF says; within the same steps where nothing
+else is said, and judged on the same views, which nothing is trained on: of the scene, and of each object from
+where and as large as it was photographed. Without a scene, one is made in FOLDER: four objects of
 examples/make_scene.py, trained briefly. With --share, a share of the rays and steps that `fuse` takes. Prints
 a Markdown table and writes FOLDER/ablation.csv.
 """
@@ -17,19 +18,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fusedrf_cli.bridge.fusing import DEFAULT_MAX_SIZE
+from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.scene import background_of, load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
+from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.losses import OPAQUE
 from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Way
+from fusedrf_cli.engine.kinds.student import TOLD_NUMBERS, DistillSettings, Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 
-BESIDES = 16384  # bytes of a bundle that are no numbers, about
+VIEWS, VIEW_SIZE, VIEWS_SEED = 8, (200, 200), 11
 TRAINED = ("--quality", "draft", "--views", "40", "--size", "200", "--max-size", "4MB")
 PLACES = (
     ("ground.rfpack", ("--background-node",)),
@@ -49,6 +51,10 @@ class Variant:
     rgb: bool = True
     rays: float = 1.0
     """The share of the rays that are asked."""
+    steps: float = 1.0
+    """The share of the steps from points."""
+    numbers: float = 1.0
+    """The share of the numbers."""
     seed: int = 0
 
 
@@ -106,6 +112,10 @@ VARIANTS = (
     Variant("the background's weights", from_scratch=True),
     Variant("the rays: half of them", rays=0.5),
     Variant("the rays: a quarter", rays=0.25),
+    Variant("told more: twice the steps", steps=2.0),
+    Variant("told more: twice the rays and steps", rays=2.0, steps=2.0),
+    Variant("more numbers: twice", numbers=2.0),
+    Variant("more of all: twice the numbers, rays and steps", rays=2.0, steps=2.0, numbers=2.0),
     Variant("points where matter is seen: evenly instead", replace(WHOLE, chance=evenly)),
     Variant("points by transmittance: all alike", replace(WHOLE, visibility=all_alike)),
     Variant("log1p of depth: raw depth", replace(WHOLE, density_loss=raw_depth)),
@@ -137,13 +147,13 @@ def made_scene(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Task:
-    """A scene to be distilled, and how large the student may be."""
+    """A scene to be distilled, and what its students are judged by."""
 
     composed: ComposedField
     background: Placed
     boxes: list[np.ndarray]
-    plan: Plan
     settings: DistillSettings
+    judge: Judge
 
     @classmethod
     def of(cls, scene: Path, share: float) -> "Task":
@@ -154,23 +164,27 @@ class Task:
         placed = composed.placed[[p.name for p in loaded.placed].index(name)]
         background = Placed(name, opened(placed.field), placed.object_to_world)
         boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
-        numbers = (DEFAULT_MAX_SIZE - composed.occupancy.occupied.size // 8 - BESIDES) // 2
-        plan = VM.plan(composed.aabb, composed.voxel_size, Way(), numbers)
+        looks = looks_of(loaded, composed, VIEWS, VIEW_SIZE, VIEWS_SEED)
+        judge = Judge(composed, [look.camera for look in looks], composed.origin)
         whole = DistillSettings()
         fewer = {name: round(share * getattr(whole, name)) for name in ("rays", "steps", "rgb_steps")}
         settings = replace(whole, **fewer)
-        return cls(composed, background, boxes, plan, settings)
+        return cls(composed, background, boxes, settings, judge)
 
     def distilled(self, variant: Variant) -> DistillReport:
         """What distilling by a variant's recipe gives."""
-        rays = round(variant.rays * self.settings.rays)
-        settings = replace(self.settings, seed=variant.seed, rays=rays)
+        told = round(variant.rays * self.settings.rays), round(variant.steps * self.settings.steps)
+        settings = replace(self.settings, seed=variant.seed, rays=told[0], steps=told[1])
+        most = round(variant.numbers * TOLD_NUMBERS)
+        plan = VM.plan(self.composed.aabb, self.composed.voxel_size, Way(), most)
         generator, student = torch.Generator().manual_seed(settings.seed), None
         if not variant.from_scratch:
-            student = VM.taken_over(self.background, self.plan, self.composed, generator)
+            student = VM.taken_over(self.background, plan, self.composed, generator)
         if student is None:
-            student = VM.empty(self.composed, Way(), self.plan.allowed, generator, "fused")
-        run = DistillRun(self.composed, student, self.boxes, settings, variant.rgb, variant.recipe)
+            student = VM.empty(self.composed, Way(), most, generator, "fused")
+        run = DistillRun(
+            self.composed, student, self.boxes, settings, variant.rgb, variant.recipe, self.judge
+        )
         return run.finish()[1]
 
 

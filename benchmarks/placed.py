@@ -2,24 +2,27 @@
 
 DATA is a folder with bear/, chair/, tankard/ and fuze/fuze.obj. Each is trained (--share multiplies the
 seconds), the objects are put onto the bear's rock, and the scene is fused under 50 MB as blocks, vm and
-sparse, or as each --kind. OUT gets placed.md: what each reaches by its own views, before finishing on rays
-and after, bytes, seconds, and a frame over the background's alone.
+sparse, or as each --kind. OUT gets placed.csv and placed.md: what each reaches by its own views, before
+finishing on rays and after, bytes, seconds, and a frame over the background's alone. Rows of kinds that are
+not measured stay as they were.
 """
 
 import argparse
+import csv
 import statistics
 import tempfile
 import time
+from math import prod
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, tell
+from benchmarks.paper.work import fusedrf, tell, write_csv
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import rig_of
-from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.engine.rendering.volume import render_image
 
 SOURCES = {
@@ -95,14 +98,33 @@ def frame_seconds(bundles: list[Path]) -> list[float]:
     """The median seconds of a frame of each, taking turns after one that loads kernels."""
     loaded = [load_scene(str(path)) for path in bundles]
     camera = camera_of(rig_of(loaded[-1]).typical.reframed(*FRAME))
+    fields = [looked_at(scene) for scene in loaded]
     took: list[list[float]] = [[] for _ in bundles]
     for _ in range(1 + FRAMES):
-        for scene, times in zip(loaded, took, strict=True):
-            shown, origin = renderable(scene)
+        for (shown, origin), times in zip(fields, took, strict=True):
             started = time.perf_counter()
             render_image(shown, camera, origin=origin)
             times.append(time.perf_counter() - started)
     return [statistics.median(times[1:]) for times in took]
+
+
+def looked_at(scene: LoadedScene) -> tuple[object, np.ndarray]:
+    """A fused scene as `render` makes pictures of it, and where its frame lies."""
+    field, origin = renderable(scene)
+    return field.for_pictures(prod(FRAME)), origin
+
+
+def write_page(out: Path, rows: list[dict]) -> None:
+    """placed.csv and placed.md, with the rows that are there of other kinds."""
+    path = out / "placed.csv"
+    if path.exists():
+        measured = {row["kind"] for row in rows}
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = rows + [row for row in csv.DictReader(file) if row["kind"] not in measured]
+    rows = sorted(rows, key=lambda row: list(KINDS).index(row["kind"]))
+    write_csv(path, rows)
+    text = f"# Objects on a real background\n\n{ABOUT}\n\n{markdown(rows)}"
+    (out / "placed.md").write_text(text, encoding="utf-8")
 
 
 def main() -> None:
@@ -121,8 +143,7 @@ def main() -> None:
         sources(folder, asked.data.resolve(), asked.share)
         scene(folder)
         rows = [measured(folder, kind, KINDS[kind], asked.share) for kind in asked.kind or KINDS]
-    text = f"# Objects on a real background\n\n{ABOUT}\n\n{markdown(rows)}"
-    (asked.out / "placed.md").write_text(text, encoding="utf-8")
+    write_page(asked.out, rows)
 
 
 if __name__ == "__main__":

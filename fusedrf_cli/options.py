@@ -376,7 +376,10 @@ edited_precision = click.option(
     "--precision", type=PRECISION, help="How numbers are stored; default: as those of FUSED are."
 )
 fused_precision = click.option(
-    "--precision", type=PRECISION, help="How numbers are stored; default: float16, or what the size asks for."
+    "--precision",
+    type=PRECISION,
+    help="How numbers are stored; default: float16, for the kinds vm and sparse int8, or what the size "
+    "asks for.",
 )
 ranks = click.option(
     "--ranks", type=RANKS, help="Keep at most so many density and colour components per mode, such as 8,16."

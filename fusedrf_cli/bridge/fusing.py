@@ -122,6 +122,7 @@ def student_request(
         ranks=request.ranks,
         sh_degree=request.sh_degree,
         source_bytes=tuple(loaded.sizes),
+        seconds=request.time_budget,
         from_scratch=request.from_scratch,
         views=views_of_place(loaded, composed),
     )

@@ -51,11 +51,14 @@ def render(request: RenderRequest, progress) -> dict:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
             )
-        needed = picture_memory(field, views, suffix in FILMS)
-        loaded.shelf.resize(budget.room(needed))
-        budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
+        whole = None
         if loaded.lone() is None and not request.naive:
-            field = joined(loaded, field, needed, budget, place)
+            whole = joined(loaded, field, picture_memory(None, views, suffix in FILMS), budget, place)
+        if whole is None:
+            needed = picture_memory(field, views, suffix in FILMS)
+            loaded.shelf.resize(budget.room(needed))
+            budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
+        field = field if whole is None else whole
         if hasattr(field, "for_pictures"):
             field = field.for_pictures(rays_of(views))
         progress.phase("rendering", len(views))
@@ -78,10 +81,11 @@ def render(request: RenderRequest, progress) -> dict:
 
 
 def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
-    """What rendering needs beside the sources."""
+    """What rendering needs beside the sources; field None: of a field that is still to be put together."""
     largest = max(views, key=lambda view: view.width * view.height)
     pixels = largest.width * largest.height
-    needed = picture(largest.width, largest.height, composed=not hasattr(field, "render_rays"))
+    composed = field is not None and not hasattr(field, "render_rays")
+    needed = picture(largest.width, largest.height, composed=composed)
     if len(getattr(field, "blocks", ())) > 1 and rays_of(views) >= WORTH_TELLING:
         needed |= insides(field.aabb)
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
@@ -103,8 +107,8 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
 
 
 def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: Memory, place: str):
-    """A scene as one field with the numbers of its sources, which is looked at as fast as a fused one; the
-    scene itself where no kind of field can be that, or there is no memory for it."""
+    """A scene as one field with the numbers of its sources, which is looked at as fast as a fused one; None
+    where no kind of field can be that, or there is no memory for it. needed: for its pictures."""
     around = any(p.unbounded for p in composed.placed)
     box = WHOLE if around else enclosing([p.aabb for p in composed.placed])  # no grid is made to know it
     most = (
@@ -115,14 +119,14 @@ def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: M
         | needed
     )
     if budget.room(most) < 0:
-        return composed
+        return None
     loaded.shelf.resize(sum(loaded.sizes))
     for kind in registry.kinds():
         field = kind.joined(composed)
         if field is not None:
             budget.expect(most, advice="use --naive")
             return field.to(place)
-    return composed
+    return None
 
 
 def check_sizes(output: str, views: list[Camera]) -> None:

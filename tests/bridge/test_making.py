@@ -15,7 +15,15 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
-from fusedrf_cli.engine.kinds.student import Made, MadeStudent, StudentRequest, Way
+from fusedrf_cli.engine.kinds.student import (
+    NUMBERS_PER_SECOND,
+    TOLD_NUMBERS,
+    Made,
+    MadeStudent,
+    Student,
+    StudentRequest,
+    Way,
+)
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.progress import NullProgress
 from tests.analytic.export import SHAPE, way_of
@@ -161,3 +169,27 @@ def test_where_the_time_is_over_a_student_stays_as_it_was_made(monkeypatch):
     monkeypatch.setattr(maker, "finished", lambda field: pytest.fail("learnt"))
     maker.budget.spent = 1.0
     assert maker.make(WAYS[0], 4000, True).psnr == 20.0
+
+
+def test_a_student_of_more_numbers_is_told_more_up_to_twice_as_much():
+    student = Student(VM, SCENE, StudentRequest(BundleSizes(), 10_000_000))
+    wanted = {1: 1, TOLD_NUMBERS: 1, TOLD_NUMBERS * 3 // 2: 1.5, TOLD_NUMBERS * 9: 2}
+    for numbers, times in wanted.items():
+        found = student.lesson_of(numbers)
+        assert (found.rays, found.steps) == (times * student.lesson.rays, times * student.lesson.steps)
+        assert found.rgb_steps == student.lesson.rgb_steps
+    assert Restless(None).lesson_of(TOLD_NUMBERS * 9) is None
+
+
+def test_one_learnt_tensor_keeps_eight_bits_where_nothing_else_is_asked_for():
+    for asked, kept in ((None, "int8"), ("float16", "float16"), ("int4", "int4")):
+        request = StudentRequest(BundleSizes(), 10_000_000, precision=asked)
+        assert [[way.precision for way in group] for group in Student(VM, SCENE, request).ways()] == [[kept]]
+
+
+def test_a_short_time_teaches_fewer_numbers_unless_a_quality_is_asked_for():
+    def most(**words) -> int:
+        return Student(VM, SCENE, StudentRequest(BundleSizes(), 10_000_000, **words)).largest().allowed
+
+    assert most(seconds=0.1) == int(0.1 * NUMBERS_PER_SECOND) + 1 < most()
+    assert most(seconds=1e6) == most() and most(seconds=0.1, target=40.0) == most(target=40.0)

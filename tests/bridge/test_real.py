@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import edits, real, spoiled
+from benchmarks import edits, placed, real, spoiled
 from formats.captures import hold_out, read_capture
 from formats.images import read_image, read_image_header, write_png
 from fusedrf_cli.bridge.pictures import over_white
@@ -95,3 +95,10 @@ def test_the_page_of_edits(folder, tmp_path, monkeypatch):
     edits.write_page(out, {"sparse": edits.row(folder, "sparse")})
     assert json.loads((out / "edits.json").read_text()) == found
     assert "![PSNR along additions](edits.svg)" in (out / "edits.md").read_text()
+
+
+def test_rows_of_kinds_that_are_not_measured_stay(tmp_path):
+    placed.write_page(tmp_path, [{"kind": "sparse", "MB": "1"}, {"kind": "vm", "MB": "2"}])
+    placed.write_page(tmp_path, [{"kind": "blocks", "MB": "3"}, {"kind": "vm", "MB": "4"}])
+    page = (tmp_path / "placed.md").read_text()
+    assert "| blocks | 3 |\n| vm | 4 |\n| sparse | 1 |" in page

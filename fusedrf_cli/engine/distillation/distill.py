@@ -45,6 +45,7 @@ OPACITY_WEIGHT = 0.1
 POINTS_PER_STEP = 1 << 15
 COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
 RAYS_AT_FIRST = 1024
+POINTS_PART = 0.75  # of a time budget
 
 
 @dataclass(frozen=True)
@@ -251,8 +252,8 @@ class DistillRun:
         self.report.curve.append((working_time() - self.began, made, found))
 
     def _share(self, steps: int, seconds: float) -> float:
-        """The share of the phase that is done: of its steps, or of its seconds where a budget is given, which
-        the phases that have steps share alike."""
+        """The share of the phase that is done: of its steps, or of its seconds where a budget is given, of
+        which points have POINTS_PART where pictures follow."""
         if not steps:
             return self.schedule.end
         settings = self.settings
@@ -260,8 +261,9 @@ class DistillRun:
             return self.steps / steps
         if settings.time_budget <= 0:
             return self.schedule.end
-        phases = (settings.steps > 0) + (self.rgb and settings.rgb_steps > 0)
-        return seconds / (settings.time_budget / phases)
+        part = POINTS_PART if self.phase == "points" else 1 - POINTS_PART
+        alone = not settings.steps or not (self.rgb and settings.rgb_steps)
+        return seconds / (settings.time_budget * (1.0 if alone else part))
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""

@@ -3,6 +3,7 @@
 import contextlib
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -282,3 +283,13 @@ def test_pruned_drops_empty_cells_only():
     dense = random_vm(THIRTY_TWO, dtype=torch.float32, cells=8, scale=100.0)
     assert np.array_equal(pruned(dense).occupied, dense.occupancy.occupied)
     assert not pruned(random_vm(THIRTY_TWO, dtype=torch.float32, cells=8, scale=1e-6)).occupied.any()
+
+
+def test_points_have_three_quarters_of_the_seconds_and_all_where_nothing_else_is_learnt():
+    def share(phase: str, rgb: bool = True, **words) -> float:
+        settings = DistillSettings(time_budget=8.0, **words)
+        run = SimpleNamespace(settings=settings, rgb=rgb, phase=phase)
+        return DistillRun._share(run, settings.steps if phase == "points" else settings.rgb_steps, 3.0)
+
+    assert share("points") == pytest.approx(3 / 6) and share("pictures") == pytest.approx(3 / 2)
+    assert share("points", rgb=False) == share("pictures", steps=0) == pytest.approx(3 / 8)
