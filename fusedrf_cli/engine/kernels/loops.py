@@ -37,8 +37,8 @@ from fusedrf_cli.engine.kernels.parts import accumulate, along, cell_of, compare
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
 LEARN_FROM = COLOUR_FROM  # the same in training
-LENT_FROM = 5e-3  # the same in pictures, behind a ray's first colour
-REST_FROM = 0.01  # transmittance from which, in pictures that may stop early, all that is left shows a sample
+LENT_FROM = 2e-3  # the same in pictures, behind a ray's first colour
+REST_FROM = 0.0  # transmittance from which, in pictures that may stop early, all that is left shows a sample
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 SAMPLES_AHEAD = 2

@@ -25,7 +25,7 @@ ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
 SIDE = 2.0  # coordinates lie between -SIDE and SIDE
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
-LEARN_FROM, LENT_FROM = 3e-3, 1e-2
+LEARN_FROM, LENT_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
 WHOLE = np.array([-SIDE] * 3 + [SIDE] * 3)
 SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
 
