@@ -12,6 +12,8 @@ from pathlib import Path
 
 from fusedrf_cli.bridge.charting import Benchmark
 from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.main import cli
 
 MOST_BYTES = 25_000_000
@@ -70,8 +72,15 @@ def fusedrf(folder: Path, *words: str) -> dict:
 
 
 def course(scene: Path, size: int, box=None) -> Benchmark:
-    """Views of a scene that nothing was trained or chosen on; box (6,) is what they frame."""
+    """Views of a scene that nothing was trained or chosen on; box (6,) is what they frame, by default the
+    whole and its objects as they were photographed."""
     return Benchmark.prepare(str(scene), Memory(), (size, size), box=box)
+
+
+def whole_course(scene: Path, size: int) -> Benchmark:
+    """Views that frame the whole scene."""
+    composed = load_scene(str(scene)).composed()
+    return course(scene, size, placed_box(composed.occupancy.subject, composed.origin))
 
 
 def frame_times(held: Benchmark, bundles: Sequence[Path]) -> list[float]:
