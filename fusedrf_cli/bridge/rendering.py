@@ -111,20 +111,16 @@ def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: M
     where no kind of field can be that, or there is no memory for it. needed: for its pictures."""
     around = any(p.unbounded for p in composed.placed)
     box = WHOLE if around else enclosing([p.aabb for p in composed.placed])  # no grid is made to know it
-    most = (
-        sources(loaded.sizes, copies=JOINING)
-        | {"the sources put together": sum(loaded.sizes)}
-        | ownership(box)
-        | insides(box)
-        | needed
-    )
-    if budget.room(most) < 0:
+    result = {"the sources put together": sum(loaded.sizes)} | ownership(box)
+    joining = sources(loaded.sizes, copies=JOINING) | result
+    looking = sources(loaded.sizes) | result | insides(box) | needed
+    if min(budget.room(joining), budget.room(looking)) < 0:
         return None
     loaded.shelf.resize(sum(loaded.sizes))
     for kind in registry.kinds():
         field = kind.joined(composed)
         if field is not None:
-            budget.expect(most, advice="use --naive")
+            budget.expect(joining, looking, advice="use --naive")
             return field.to(place)
     return None
 
