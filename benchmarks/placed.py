@@ -8,7 +8,6 @@ not measured stay as they were.
 """
 
 import argparse
-import csv
 import statistics
 import tempfile
 import time
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, tell, write_csv
+from benchmarks.paper.work import fusedrf, kept_rows, tell, write_csv
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import rig_of
@@ -117,11 +116,8 @@ def looked_at(scene: LoadedScene) -> tuple[object, np.ndarray]:
 def write_page(out: Path, rows: list[dict]) -> None:
     """placed.csv and placed.md, with the rows that are there of other kinds."""
     path = out / "placed.csv"
-    if path.exists():
-        measured = {row["kind"] for row in rows}
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = rows + [row for row in csv.DictReader(file) if row["kind"] not in measured]
-    rows = sorted(rows, key=lambda row: list(KINDS).index(row["kind"]))
+    rows = rows + kept_rows(path, "kind", {row["kind"] for row in rows})
+    rows.sort(key=lambda row: list(KINDS).index(row["kind"]))
     write_csv(path, rows)
     text = f"# Objects on a real background\n\n{ABOUT}\n\n{markdown(rows)}"
     (out / "placed.md").write_text(text, encoding="utf-8")

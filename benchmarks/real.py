@@ -19,7 +19,7 @@ from PIL import Image
 
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, tell, write_csv
+from benchmarks.paper.work import fusedrf, kept_rows, tell, write_csv
 from formats.captures import hold_out, is_capture, read_capture
 from formats.errors import FormatError
 from formats.views import Capture, View
@@ -118,14 +118,6 @@ def write_pair(field: Path, view: View, path: Path) -> None:
 # -- the page ------------------------------------------------------------------------------------------------
 
 
-def kept_rows(path: Path, names: set[str]) -> list[dict]:
-    """Rows that are there of other captures than the named."""
-    if not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return [row for row in csv.DictReader(file) if row["capture"] not in names]
-
-
 def chart(rows: list[dict], path: Path) -> None:
     """PSNR over minutes of each capture, and as a dotted line what a copy of the nearest photo reaches."""
     lines, copies = {}, {}
@@ -163,7 +155,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         field = Path(folder) / "field.rfpack"
         for name, capture in captures(asked.data):
-            rows = kept_rows(asked.out / "real.csv", {name})
+            rows = kept_rows(asked.out / "real.csv", "capture", {name})
             for seconds in BUDGETS.get(name, OTHERS):
                 rows.append(measured(asked.data / name, name, capture, seconds * asked.share, field))
             write_pair(field, capture.test[len(capture.test) // 2], asked.out / f"{name}.jpg")

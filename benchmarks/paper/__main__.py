@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from benchmarks.paper.capacity import capacity
-from benchmarks.paper.quality import closeup, kinds, seeds
+from benchmarks.paper.quality import closeup, kinds, seeds, sizes
 from benchmarks.paper.smallest import smallest
 from benchmarks.paper.table import update
 from benchmarks.paper.times import times
@@ -18,6 +18,7 @@ from benchmarks.paper.work import Work, tell
 ROOT = Path(__file__).parents[2]
 EXPERIMENTS = {
     "kinds": kinds,
+    "sizes": sizes,
     "times": times,
     "smallest": smallest,
     "closeup": closeup,

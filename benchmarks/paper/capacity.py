@@ -5,16 +5,7 @@ from pathlib import Path
 
 from benchmarks.paper import figures
 from benchmarks.paper.sources import things_on_ground
-from benchmarks.paper.work import (
-    MOST_BYTES,
-    Work,
-    frame_times,
-    fusedrf,
-    peak_of,
-    tell,
-    whole_course,
-    write_csv,
-)
+from benchmarks.paper.work import MOST_BYTES, Work, course, frame_times, fusedrf, peak_of, tell, write_csv
 
 COUNTS = (1, 2, 4, 8, 16, 32)
 LIMITS = {"25MB": MOST_BYTES}
@@ -48,7 +39,7 @@ def of_count(work: Work, count: int) -> list[dict]:
         for limit, path in bundles.items()
     }
     alone = work.folder / f"things_{COUNTS[0]:02d}_25MB.rfpack"
-    held = whole_course(scene, COMPARED)
+    held = course(scene, COMPARED)
     naive, one, *fused = frame_times(replace(held, size=(FRAME, FRAME)), [alone, *bundles.values()])
     naive_peak = peak_of(scene, FRAME)
     rows = []

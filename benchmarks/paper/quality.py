@@ -5,20 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.paper.sources import TINY, four_objects, with_a_tiny_one
-from benchmarks.paper.work import (
-    KINDS,
-    MOST_BYTES,
-    SIZES,
-    Work,
-    course,
-    fusedrf,
-    tell,
-    whole_course,
-    write_csv,
-)
+from benchmarks.paper.work import KINDS, MOST_BYTES, SIZES, Work, course, fusedrf, tell, write_csv
 
 SIZE = 400  # pixels a side
 SEEDS = 5
+FEWER = (5_000_000, 2_000_000)  # bytes
 
 
 def kinds(work: Work) -> dict[str, str]:
@@ -39,7 +30,7 @@ def kinds(work: Work) -> dict[str, str]:
 def seeds(work: Work) -> dict[str, str]:
     """Write seeds.csv; the figures of the table."""
     scene = four_objects(work)
-    held, rows = whole_course(scene, SIZE // 2), []
+    held, rows = course(scene, SIZE // 2), []
     drawn = [kind for kind in KINDS if kind not in SIZES]
     for kind in drawn:
         for seed in range(SEEDS):
@@ -47,6 +38,17 @@ def seeds(work: Work) -> dict[str, str]:
             write_csv(work.out / "seeds.csv", rows)
     spread = {k: float(np.ptp([r["psnr"] for r in rows if r["kind"] == k])) for k in drawn}
     return {"seeds": listed(spread, digits=2)}
+
+
+def sizes(work: Work) -> dict[str, str]:
+    """Write sizes.csv."""
+    scene = four_objects(work)
+    held, rows = course(scene, SIZE), []
+    for limit in FEWER:
+        found, seconds = fused(held, scene, "blocks", most=limit)
+        rows.append({"at most": limit} | found | {"seconds": seconds})
+        write_csv(work.out / "sizes.csv", rows)
+    return {}
 
 
 def closeup(work: Work) -> dict[str, str]:
@@ -66,11 +68,11 @@ def bundle_of(scene: Path, kind: str) -> Path:
     return scene.with_name(f"{scene.stem}_{kind}.rfpack")
 
 
-def fused(held, scene: Path, kind: str, *words: str) -> tuple[dict, float]:
-    """Fuse a scene to a kind of at most MOST_BYTES, and hold it to views: the row, and seconds."""
+def fused(held, scene: Path, kind: str, *words: str, most: int = MOST_BYTES) -> tuple[dict, float]:
+    """Fuse a scene to a kind of at most so many bytes, and hold it to views: the row, and seconds."""
     tell(f"{scene.stem}: {kind} {' '.join(words)}")
     path = bundle_of(scene, kind)
-    line = ("--kind", kind, "--max-size", str(SIZES.get(kind, MOST_BYTES)), *words)
+    line = ("--kind", kind, "--max-size", str(SIZES.get(kind, most)), *words)
     report = fusedrf(scene.parent, "fuse", scene.name, "-o", path.name, *line)
     found = {"covered share": held.covered_share, **held.quality(path), "bytes": report["bytes"]}
     return found, report["total_seconds"]

@@ -20,7 +20,7 @@ MEASURES = {
 }
 PARTS = {  # CSVs that the page shows whole, and what it says of them
     "capacity": "N different things stand on one ground, all of one size, at places that do not depend on N "
-    "(a sunflower's seeds); all cameras frame the ground, and the timed one is the same for all N. "
+    "(a sunflower's seeds); the timed camera frames the ground and is the same for all N. "
     "`ms at n = 1` is the fused scene of one thing, whose frames take turns with the others of the row. "
     "Peak memory is that of a process that reads the scene and renders one frame of 400 × 400.",
     "kinds": "Four objects, at most 25 MB (bricks 6 MB, since more take minutes to fill), on views of "
@@ -28,14 +28,15 @@ PARTS = {  # CSVs that the page shows whole, and what it says of them
     "times": "Seconds of the whole command once kernels are loaded. Retraining first renders 60 views of "
     "300 × 300 of the scene as composed, which counts, and is told the scene's box.",
     "closeup": "Views that frame the small object alone.",
-    "seeds": "Views of 200 × 200 of the whole scene.",
+    "seeds": "Views of 200 × 200.",
+    "sizes": "Blocks of the four objects in fewer bytes.",
     "smallest": "The smallest point of the chart at 40 dB, and what the search picks.",
 }
 ABOUT = (
     "Written by `make bench-paper` on {cores} CPU cores. PSNR and SSIM are against the naive composition, "
-    "mean over views that nothing was trained or chosen on: of the whole scene, and, but for capacity and "
-    "seeds, of each object from where and as large as it was photographed. *Covered* is the PSNR of the "
-    "pixels that the scene covers, *covered share* how many of all they are."
+    "mean over views that nothing was trained or chosen on: of the whole scene, and of each object from "
+    "where and as large as it was photographed. *Covered* is the PSNR of the pixels that the scene covers, "
+    "*covered share* how many of all they are."
 )
 PLOTS = {"capacity": "capacity", "times": "times", "smallest": "chart"}
 

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from fusedrf_cli.bridge.charting import Benchmark
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.main import cli
 
 MOST_BYTES = 25_000_000
@@ -77,12 +75,6 @@ def course(scene: Path, size: int, box=None) -> Benchmark:
     return Benchmark.prepare(str(scene), Memory(), (size, size), box=box)
 
 
-def whole_course(scene: Path, size: int) -> Benchmark:
-    """Views that frame the whole scene."""
-    composed = load_scene(str(scene)).composed()
-    return course(scene, size, placed_box(composed.occupancy.subject, composed.origin))
-
-
 def frame_times(held: Benchmark, bundles: Sequence[Path]) -> list[float]:
     """Median ms of a frame of the scene as composed and of each bundle, all taking turns."""
     return held.frame_times(bundles, lambda done: None)
@@ -95,6 +87,14 @@ def peak_of(scene: Path, size: int) -> int:
     line = [sys.executable, "-m", "fusedrf_cli", *words]
     done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=True)
     return json.loads(done.stdout)["memory"]["peak_bytes"]
+
+
+def kept_rows(path: Path, key: str, measured: set[str]) -> list[dict]:
+    """Rows that are in a file, if it is there, but for those whose `key` is among what was measured anew."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if row[key] not in measured]
 
 
 def write_csv(path: Path, rows: Iterable[dict]) -> None:

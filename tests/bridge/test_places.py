@@ -305,3 +305,16 @@ def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     for bundle, against in (("more.rfpack", "two.json"), ("less.rfpack", "one.json")):
         like = done(fused, "eval", bundle, "--against", against, "--size", "48x48")["mean"]
         assert like["psnr"] > 35
+
+
+def test_a_short_time_leaves_a_student_of_a_place_room_to_begin_as_it_is():
+    """Densities that add up are learnt by one tensor, which may take over the place's numbers."""
+    objects = [Placed("ball", random_vm(dtype=torch.float32, cells=4), np.eye(4))]
+    scene = ComposedField([Placed("walls", fine_walls(), np.eye(4)), *objects], "add")
+
+    def most(scene: ComposedField, seconds: float | None) -> int:
+        request = StudentRequest(BundleSizes(), 10_000_000, seconds=seconds)
+        return registry.kind("vm").student(scene, request).largest().allowed
+
+    assert most(scene, 0.01) == most(scene, None)
+    assert most(ComposedField(objects), 0.01) < most(ComposedField(objects), None)

@@ -262,9 +262,11 @@ class Student:
 
     def largest(self) -> Plan:
         """The largest that the limit allows at the dearest precision, and that there is time to teach where
-        nothing but a size is asked for; TooSmall where the limit allows none."""
+        nothing but a size is asked for; TooSmall where the limit allows none. What holds a place may begin as
+        that place, and has little to be taught."""
         plan, request = self.largest_of(self.ways()[-1][-1], self.request.limit), self.request
-        if request.seconds is None or request.target is not None:
+        around = any(p.unbounded for p in self.scene.placed)
+        if request.seconds is None or request.target is not None or around:
             return plan
         taught = int(NUMBERS_PER_SECOND * request.seconds) + 1
         return plan if plan.allowed <= taught else self.plan(plan.way, taught)
