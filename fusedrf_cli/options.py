@@ -391,6 +391,9 @@ time_budget = click.option(
     "--time-budget", type=POSITIVE, metavar="S", help="Stop learning after S seconds, all tries together."
 )
 max_size = click.option("--max-size", type=BYTES, help="Largest output file, such as 25MB.")
+fused_max_size = click.option(
+    "--max-size", type=BYTES, help="Largest output file; default: 25MB, and what places of the scene take."
+)
 memory = click.option(
     "--memory", type=BYTES, help="Most memory to take, such as 8GiB; default: 80 % of what is free."
 )

@@ -1,8 +1,9 @@
 """`fuse`: a scene to one field, of any kind, by one search over the ways and sizes it can be made in."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from pathlib import Path
 
 from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
@@ -30,7 +31,7 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
 
-DEFAULT_MAX_SIZE = 25_000_000
+DEFAULT_MAX_SIZE = 25_000_000  # and what the places among the sources take
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -115,7 +116,7 @@ def student_request(
     """What is asked of the kind's student; overhead: bytes of the bundle besides its field."""
     return StudentRequest(
         sizes=BundleSizes(),
-        limit=request.max_size or DEFAULT_MAX_SIZE,
+        limit=request.max_size or DEFAULT_MAX_SIZE + place_bytes(loaded),
         overhead=overhead,
         target=request.target_psnr,
         precision=request.precision,
@@ -279,9 +280,17 @@ def check_target(report: dict, target_psnr: float | None, output: str) -> None:
 
 def source_bytes(loaded: LoadedScene) -> int:
     """Bytes of the distinct source files."""
-    return sum(
-        path.stat().st_size for path in {f.path for f in loaded.fields} if path is not None and path.is_file()
-    )
+    return file_bytes(f.path for f in loaded.fields)
+
+
+def place_bytes(loaded: LoadedScene) -> int:
+    """Bytes of the distinct source files of fields that fill all of space."""
+    return file_bytes(f.path for f in loaded.fields if f.placed.unbounded)
+
+
+def file_bytes(paths: Iterable[Path | None]) -> int:
+    """Bytes of the distinct files that are there."""
+    return sum(path.stat().st_size for path in set(paths) if path is not None and path.is_file())
 
 
 def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:

@@ -21,7 +21,7 @@ def brief(report: dict) -> dict:
     show_default=True,
     help="Kind of field, or way of fusing; auto: what suits the scene best.",
 )
-@options.max_size
+@options.fused_max_size
 @options.smallest
 @options.time_budget
 @options.rgb

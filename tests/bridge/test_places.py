@@ -10,7 +10,8 @@ import torch
 
 from formats.images import read_image, write_png
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import write_field
+from fusedrf_cli.bridge.fusing import place_bytes, source_bytes
+from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -318,3 +319,10 @@ def test_a_short_time_leaves_a_student_of_a_place_room_to_begin_as_it_is():
 
     assert most(scene, 0.01) == most(scene, None)
     assert most(ComposedField(objects), 0.01) < most(ComposedField(objects), None)
+
+
+def test_what_a_place_takes_comes_on_top_of_the_default_size(fused):
+    """So that a place of more than that is not squeezed, nor is what stands in it."""
+    loaded = load_scene(str(fused / "place.json"))
+    assert place_bytes(loaded) == (fused / "room.rfpack").stat().st_size < source_bytes(loaded)
+    assert place_bytes(load_scene(str(fused / "scene.json"))) == 0
