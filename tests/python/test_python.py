@@ -1,6 +1,9 @@
 """The Python face: the page in docs/ as it is written, and what a scene promises."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -159,3 +162,12 @@ def test_what_cannot_be_done_is_said():
     scene.placements["red"] = torch.diag(torch.tensor([1.0, 1, 0, 1]))
     with pytest.raises(ValueError, match="'red' is singular"):
         scene.query(torch.zeros(1, 3), torch.eye(3)[:1])
+
+
+@pytest.mark.parametrize("asked", [None, "7"])
+def test_threads_that_wait_do_not_keep_others_from_running_unless_the_user_says_so(asked):
+    code = "import fusedrf_cli, os, sys; print(os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
+    place = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+    place |= {} if asked is None else {"GOMP_SPINCOUNT": asked}
+    run = subprocess.run([sys.executable, "-c", code], env=place, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == [asked or "1000", "False"]
