@@ -4,7 +4,11 @@ import os
 
 __version__ = "0.1.0"
 
-# Torch's threads wait for each other by spinning, for milliseconds. Where other work shares the cores, the
-# one that is waited for cannot run meanwhile: of two fits at a time each got through 277 steps in 67 seconds,
-# and with this, which costs a fit alone nothing, through 662 in 46. It is read when torch is loaded.
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+SHORT_WAIT = "1000"
+"""Turns for which a thread of torch's spins while it waits for another, before it sleeps."""
+
+# Torch's threads spin for milliseconds. Where other work shares the cores, the one that is waited for cannot
+# run meanwhile: two trainings at a time got through less than half the steps (benchmarks/beside.py), while
+# one alone loses nothing. It is read when torch is loaded.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", SHORT_WAIT)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import fusedrf_cli
 from formats.errors import FormatError, OutputExists
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, write_field
@@ -164,10 +165,13 @@ def test_what_cannot_be_done_is_said():
         scene.query(torch.zeros(1, 3), torch.eye(3)[:1])
 
 
-@pytest.mark.parametrize("asked", [None, "7"])
-def test_threads_that_wait_do_not_keep_others_from_running_unless_the_user_says_so(asked):
-    code = "import fusedrf_cli, os, sys; print(os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
-    place = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
-    place |= {} if asked is None else {"GOMP_SPINCOUNT": asked}
-    run = subprocess.run([sys.executable, "-c", code], env=place, capture_output=True, text=True, check=True)
-    assert run.stdout.split() == [asked or "1000", "False"]
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [({}, fusedrf_cli.SHORT_WAIT), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
+)
+def test_how_long_threads_wait_is_settled_before_torch_is_loaded_unless_the_user_has_said_it(asked, found):
+    code = "import fusedrf_cli, os, sys; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"
+    unsaid = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+    words = [sys.executable, "-c", code]
+    run = subprocess.run(words, env=unsaid | asked, capture_output=True, text=True, check=True)
+    assert run.stdout.split() == [found, "False"]
