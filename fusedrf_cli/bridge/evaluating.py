@@ -106,7 +106,11 @@ def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Ite
     capture = read_capture(against)
     views = {"test": capture.test, "train": capture.train, "all": (*capture.train, *capture.test)}[split]
     if not views:
-        raise InvalidInput(f"{against}: the capture has no {split} views; choose another --split")
+        other, count = ("train", len(capture.train)) if capture.train else ("test", len(capture.test))
+        raise InvalidInput(
+            f"{against}: the capture has no {split} views; compare with its {count} {other} views by --split "
+            f"{other}"
+        )
     if size is not None and size != (views[0].width, views[0].height):
         raise InvalidInput(
             f"{against}: the photos are {views[0].width}x{views[0].height}; leave --size out to compare "

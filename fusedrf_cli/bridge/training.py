@@ -296,6 +296,7 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     started = time.monotonic()
     with resumable(output, run.checkpoint) as uninterrupted:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
+    run.forget()
     warn_of_numbers(run.guard.figures(), progress)
     if not run.found_matter:
         progress.warn(

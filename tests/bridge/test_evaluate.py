@@ -75,4 +75,4 @@ def test_what_cannot_be_compared(run, words, code, says):
 def test_a_split_without_views_is_said(run, folder):
     (folder / "photos" / "transforms_test.json").unlink()
     result = run("eval", "red.rfpack", "--against", "photos")
-    assert result.exit_code == 3 and "no test views" in result.stderr
+    assert result.exit_code == 3 and "no test views" in result.stderr and "--split train" in result.stderr

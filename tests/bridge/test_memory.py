@@ -1,6 +1,7 @@
 """`--memory`: what is foretold is what is taken, and too much is refused before any of it is."""
 
 import contextlib
+import gc
 import json
 import os
 import subprocess
@@ -13,10 +14,11 @@ import numpy as np
 import pytest
 
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge import memory
+from fusedrf_cli.bridge import memory, training
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.shelf import Shelf
+from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.kinds.vm.field import VMShape
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.errors import ResourceProblem
@@ -42,6 +44,21 @@ def test_too_much_is_refused_with_the_numbers(run, folder, name):
     assert result.exit_code == 5 and sorted(folder.iterdir()) == before
     assert "needs about" in result.stderr and "20 MB --memory allows; " in result.stderr
     assert result.stderr.startswith("Error: ") and result.stderr.count("\n") == 1
+
+
+def test_moments_and_gradients_are_gone_before_a_field_is_measured(run, folder, monkeypatch):
+    """They are six times its numbers, and measuring makes copies of those."""
+    alive, measure = [], training.measure
+
+    def noted(*words):
+        alive.append(sum(type(held) is Adam for held in gc.get_objects()))
+        return measure(*words)
+
+    monkeypatch.setattr(training, "measure", noted)
+    words = "--holdout", "4", "--time-budget", "1"
+    result = run("train", "photos", "-o", "out.rfpack", *words)
+    assert result.exit_code == 0, result.stderr
+    assert alive == [0]
 
 
 def test_nothing_is_read_before_the_refusal(folder, monkeypatch):

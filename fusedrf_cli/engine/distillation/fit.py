@@ -263,6 +263,11 @@ class FitRun:
         target = self.settings.target_psnr
         return target is not None and not self.stages and self.psnr > target + TARGET_MARGIN
 
+    def forget(self) -> None:
+        """Let go of what only another step would need, several times the field's numbers."""
+        self.optimiser = None
+        self.guard.renew()
+
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
         arrays, metadata = self.field.state()
