@@ -9,7 +9,7 @@ from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.looks import views_of_place
 from fusedrf_cli.bridge.making import Kept, Maker, Scene
-from fusedrf_cli.bridge.memory import READING, Memory, stages
+from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
 from fusedrf_cli.bridge.running import Saved, checkpoint_path, engine, load_checkpoint
@@ -312,6 +312,10 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
     where not even the largest does. Whether all of them may be held at once, as a teacher."""
     needed = stages(student, scene.composed, scene.boxes, request)
     sizes, shelf = scene.loaded.sizes, scene.loaded.shelf
+    _, learning = needed[-1]
+    together = memory.room(learning) > 2 * sum(sizes)
+    if not together and student.lesson is None and learning_is_asked(student, request):
+        needed.append((0.0, asking_in_waves(student, scene.composed)))
     room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
     if room < sum(sizes):  # then one is read now and then in every stage
         needed = [(max(copies, READING), parts) for copies, parts in needed]
@@ -321,8 +325,7 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
         *(in_memory(sizes, shelf.room, copies) | parts for copies, parts in needed),
         advice="give a smaller --max-size",
     )
-    _, learning = needed[-1]
-    return memory.room(learning) > 2 * sum(sizes)
+    return together
 
 
 def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:

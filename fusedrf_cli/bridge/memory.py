@@ -206,6 +206,12 @@ def stages(
     ]
 
 
+def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
+    """Rays that a made student learns from, while they are asked of sources that are read one by one."""
+    made = result(student.needs().numbers, measured=False)
+    return made | lesson(RAYS) | ownership(scene.aabb) | picture(256, 256, composed=True)
+
+
 def learning_is_asked(student: Student, request: FuseRequest) -> bool:
     """Whether anything is going to be learnt."""
     return student.learnt or request.rgb

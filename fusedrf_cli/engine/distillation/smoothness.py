@@ -20,10 +20,10 @@ def add_roughness(field: ComputedField, gradient: torch.Tensor, weight: float, s
         height = -(-plane.shape[0] // STRIPS)
         start, scale = strip * height, 4 * weight * STRIPS / plane.numel()
         part = plane[start : start + height]
-        across = (part[:, 1:] - part[:, :-1]) * scale
-        slope[start : start + height, 1:] += across
-        slope[start : start + height, :-1] -= across
+        across = part[:, 1:] - part[:, :-1]
+        slope[start : start + height, 1:].add_(across, alpha=scale)
+        slope[start : start + height, :-1].sub_(across, alpha=scale)
         tall = plane[start : start + height + 1]
-        down = (tall[1:] - tall[:-1]) * scale
-        slope[start + 1 : start + 1 + len(down)] += down
-        slope[start : start + len(down)] -= down
+        down = tall[1:] - tall[:-1]
+        slope[start + 1 : start + 1 + len(down)].add_(down, alpha=scale)
+        slope[start : start + len(down)].sub_(down, alpha=scale)

@@ -50,6 +50,7 @@ class Batch(NamedTuple):
     step: float
     early_stop: float
     distortion: float = 0.0  # weight of the loss by which a ray's matter draws together
+    light: float = 0.0  # weight under which a sample is followed back by chance alone; 0: every one is
 
 
 WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
@@ -326,7 +327,8 @@ class ComputedField:
         opacity_weight (A - target_3)² + distortion (Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i), with A the
         opacity, w the weights, s = t / (1 + t) and δ the lengths of the samples in s (Mip-NeRF 360, eq. 15).
         loss (parts, 3) gains the sums over rays of the
-        colour term, of the opacity term and of the samples taken.
+        colour term, of the opacity term and of the samples taken. With batch.light above 0 the gradient is an
+        estimate, whose mean over jitters is that of the loss (loops.py, `followed`).
         """
         count = len(batch.rays_o)
         most = self.space.most_samples(self.aabb, batch.step)

@@ -121,7 +121,7 @@ def sweep_kernel(item, scratch_size: int, memory_size: int, real):
             kept = Kept(
                 wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
                 wholes[4, :, thread], wholes[5, :, thread], reals[0, :, thread], reals[1, :, thread],
-                reals[2, :, thread], reals[3, :, thread], reals[4:7, :, thread].T, memory,
+                reals[2, :, thread], reals[3, :, thread], reals[4, :, thread], reals[5:8, :, thread].T, memory,
             )  # fmt: skip
             for i in range(thread, count, threads):
                 item(field, grid, batch, i, kept, scratch, grads[0], loss[0])
@@ -131,10 +131,10 @@ def sweep_kernel(item, scratch_size: int, memory_size: int, real):
 
 @lru_cache(maxsize=2)
 def sweep_memory(most: int, threads: int, kind: np.dtype) -> tuple:
-    """What the ways back of so many threads need: (6, most, threads) whole numbers and (7, ..) reals, a
+    """What the ways back of so many threads need: (6, most, threads) whole numbers and (8, ..) reals, a
     thread's own next to its neighbours', as threads read them."""
     shape = most, threads
-    return cuda.device_array((6, *shape), np.int32), cuda.device_array((7, *shape), kind)
+    return cuda.device_array((6, *shape), np.int32), cuda.device_array((8, *shape), kind)
 
 
 @cache
@@ -147,12 +147,13 @@ def loops_for(bodies: ModuleType, sizes: tuple[tuple[str, int], ...], space: Mod
 def plain_kernels() -> SimpleNamespace:
     """Kernels that know no kind of field."""
     names = as_device_functions(vars(parts))
-    adam_line, sum_of_rows, line = names["adam_line"], names["sum_of_rows"], parts.LINE
+    touched, adam_line, line = names["touched"], names["adam_line"], parts.LINE
+    sum_of_rows = names["sum_of_rows"]
 
     @cuda.jit(fastmath=True)
     def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
         start = low + line * cuda.grid(1)
-        if start < high:
+        if start < high and touched(grads, np.uint64(start)):
             adam_line(
                 params, grads, moment1, moment2, rate, np.uint64(start), beta1, beta2, eps, correction1,
                 correction2,
@@ -161,7 +162,7 @@ def plain_kernels() -> SimpleNamespace:
     @cuda.jit(fastmath=True)
     def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2):
         i = cuda.grid(1)
-        if i < lines.shape[0]:
+        if i < lines.shape[0] and touched(grads, np.uint64(lines[i])):
             adam_line(
                 params, grads, moment1, moment2, rate, np.uint64(lines[i]), beta1, beta2, eps, correction1,
                 correction2,

@@ -129,6 +129,7 @@ class Kept(NamedTuple):
     weight: object
     carried: object  # weight that its colour stands for
     along: object  # how far along the ray, from 0 at its origin to 1 at infinity, where that is needed
+    times: object  # how many times what it sends back counts; 0: it is not followed back
     rgb: object  # (K, 3)
     memory: object
 
@@ -317,12 +318,35 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
     out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
 
 
+def drawn(jitter):
+    """A number in [0, 1) that has nothing to do with where a ray's samples lie, of the jitter's last digits."""
+    last = jitter * 1048576.0
+    return last - math.floor(last)
+
+
+def followed(batch, weight, chance):
+    """How many times the gradient of a ray's next sample counts, 0 where it is not followed back; and the
+    chance for the sample behind it.
+
+    A sample of less than batch.light is followed by a chance in proportion to its weight and counts for those
+    that are not, so that the mean is the gradient of all. `chance` is summed along the ray, and one sample is
+    taken wherever it passes a whole number: systematic sampling, which varies less than a draw for each.
+    """
+    if batch.light <= 0.0:
+        return 1.0, chance
+    part = min(1.0, weight / batch.light)
+    chance += part
+    if chance < 1.0:
+        return 0.0, chance
+    return 1.0 / part, chance - 1.0
+
+
 def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     """Ray i of a batch: forward as in `render_ray`, compare, and back along the ray into grad (P,)."""
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
     red, green, blue = 0.0, 0.0, 0.0
     trans, waiting = 1.0, 0.0
-    count, shaded, current = 0, 0, -1
+    count, shaded, current, chance = 0, 0, -1, drawn(batch.jitter[i])
     last, begun = kept.memory.shape[0] - KEPT, entered(o, d, batch.near)
     for number in range(PIECES):
         if trans <= batch.early_stop:
@@ -337,10 +361,14 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
             )
             if steps > 0:
                 held, reach = keep(place), SAMPLES_AHEAD * many * steps * step
-                ahead_density(field, field.params, held, along(origin, way, u + reach))
-                ahead_density(field, grad, held, p)
+                beyond = along(origin, way, u + reach)
+                ahead_density(field, field.params, held, beyond)
                 weight = trans * opacity
                 trans -= weight
+                times, chance = followed(batch, weight + waiting, chance)
+                if times > 0.0:
+                    ahead_density(field, grad, held, p)
+                kept.times[count] = times
                 kept.k[count], kept.many[count], kept.steps[count] = between(k, many), many, steps
                 kept.piece[count], kept.held[count] = number, held
                 kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
@@ -352,7 +380,9 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                         current = frame_of(place)
                         begin(field, current, d, scratch)
                     at = min(shaded * KEPT, last)
-                    ahead_colour(field, grad, held, p)
+                    ahead_colour(field, field.params, held, beyond)
+                    if times > 0.0:
+                        ahead_colour(field, grad, held, p)
                     r, g, b = colour(field, place, p, d, scratch, kept.memory, at)
                     red += waiting * r
                     green += waiting * g
@@ -422,7 +452,9 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         d_sigma = length * (after * (own + spread) - behind)
         behind += weight * (own + spread)
         after += weight
-        if weight > 0.0:
+        times = kept.times[q]
+        if weight > 0.0 and times > 0.0:
+            d_sigma, d_rgb = times * d_sigma, (times * d_rgb[0], times * d_rgb[1], times * d_rgb[2])
             backward(
                 field, place, p, d, kept.pre[q], d_sigma, at >= 0, rgb, d_rgb, scratch, kept.memory, at, grad
             )
@@ -526,10 +558,10 @@ def sweep(field, grid, batch, count, most, grads, loss):
     parts = grads.shape[0]
     for p in prange(parts):
         real = field.params.dtype
-        whole, reals = np.empty((6, most), np.int64), np.empty((4, most))
+        whole, reals = np.empty((6, most), np.int64), np.empty((5, most))
         kept = Kept(
             whole[0], whole[1], whole[2], whole[3], whole[4], whole[5], reals[0], reals[1], reals[2],
-            reals[3], np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
+            reals[3], reals[4], np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
         )  # fmt: skip
         low, high = p * count // parts, (p + 1) * count // parts
         sweep_task(field, grid, batch, low, high, kept, np.zeros(SCRATCH, real), grads[p], loss[p])

@@ -8,7 +8,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from fusedrf_cli.engine.kernels.parts import LINE, adam_line, bit_of, body, pinhole_ray, sum_of_rows
+from fusedrf_cli.engine.kernels.parts import LINE, adam_line, bit_of, body, pinhole_ray, sum_of_rows, touched
+from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
 FLAGS = dict(fastmath=True, error_model="numpy", cache=True)
@@ -20,14 +21,42 @@ task = njit(**FLAGS, _nrt=False)
 RAYS_PER_TASK = 2048
 ENTRIES_PER_TASK = 1 << 16
 LINES_PER_TASK = ENTRIES_PER_TASK // LINE
+LINES_AHEAD = 8  # a line's moments are asked for so many lines before it
 
 
 @task
-def adam_task(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
-    """`adam` for entries low..high."""
+def touched_of_all(grads, low, high, found):
+    """How many of the cache lines of entries low..high some sample touched, and their starts in found."""
+    count = 0
     for line in range(low, high, LINE):
+        found[count] = line
+        count += touched(grads, np.uint64(line))
+    return count
+
+
+@task
+def touched_of_some(grads, lines, low, high, found):
+    """`touched_of_all` of the cache lines that begin at lines[low:high]."""
+    count = 0
+    for i in range(low, high):
+        found[count] = lines[i]
+        count += touched(grads, np.uint64(lines[i]))
+    return count
+
+
+@task
+def adam_task(
+    params, grads, moment1, moment2, rate, found, count, beta1, beta2, eps, correction1, correction2
+):
+    """`adam` for the cache lines that begin at found[:count]. What only they need is asked for early: which
+    they are follows no pattern, so that each would be waited for."""
+    for i in range(count):
+        ahead = found[min(i + LINES_AHEAD, count - 1)]
+        prefetch(params, ahead)
+        prefetch(moment1, ahead)
+        prefetch(moment2, ahead)
         adam_line(
-            params, grads, moment1, moment2, rate, np.uint64(line), beta1, beta2, eps, correction1,
+            params, grads, moment1, moment2, rate, np.uint64(found[i]), beta1, beta2, eps, correction1,
             correction2,
         )  # fmt: skip
 
@@ -40,26 +69,13 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     An entry whose gradient is exactly 0 was touched by no sample: it and its moments keep their values (lazy
     Adam).
     """
-    parts = (high - low + ENTRIES_PER_TASK - 1) // ENTRIES_PER_TASK
-    for part in prange(parts):
+    for part in prange((high - low + ENTRIES_PER_TASK - 1) // ENTRIES_PER_TASK):
         start = low + part * ENTRIES_PER_TASK
-        end = min(high, start + ENTRIES_PER_TASK)
+        found = np.empty(LINES_PER_TASK, np.int64)
+        count = touched_of_all(grads, start, min(high, start + ENTRIES_PER_TASK), found)
         adam_task(
-            params, grads, moment1, moment2, rate, start, end, beta1, beta2, eps, correction1, correction2
+            params, grads, moment1, moment2, rate, found, count, beta1, beta2, eps, correction1, correction2
         )
-
-
-@task
-def adam_lines_task(
-    params, grads, moment1, moment2, rate, lines, part, beta1, beta2, eps, correction1, correction2
-):
-    """`adam_lines` for the part-th of them."""
-    low, high = part * LINES_PER_TASK, min(len(lines), (part + 1) * LINES_PER_TASK)
-    for i in range(low, high):
-        adam_line(
-            params, grads, moment1, moment2, rate, np.uint64(lines[i]), beta1, beta2, eps, correction1,
-            correction2,
-        )  # fmt: skip
 
 
 @loop
@@ -67,8 +83,11 @@ def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, 
     """`adam` on the cache lines that begin at lines (L,) alone: of a large field most are never touched, and
     looking at them would cost more than the rest of a step."""
     for part in prange((len(lines) + LINES_PER_TASK - 1) // LINES_PER_TASK):
-        adam_lines_task(
-            params, grads, moment1, moment2, rate, lines, part, beta1, beta2, eps, correction1, correction2
+        low, high = part * LINES_PER_TASK, min(len(lines), (part + 1) * LINES_PER_TASK)
+        found = np.empty(LINES_PER_TASK, np.int64)
+        count = touched_of_some(grads, lines, low, high, found)
+        adam_task(
+            params, grads, moment1, moment2, rate, found, count, beta1, beta2, eps, correction1, correction2
         )
 
 

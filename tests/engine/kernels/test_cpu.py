@@ -344,6 +344,30 @@ def test_train_rays_is_autograd(early_stop, scale):
     np.testing.assert_allclose(grads, params.grad.numpy(), rtol=1e-7, atol=1e-11)
 
 
+@pytest.mark.parametrize("scale", [3.0, 20.0])
+def test_light_samples_that_are_followed_by_chance_send_back_the_gradient_in_the_mean(scale):
+    """Over chances that fill [0, 1) evenly, which are the last digits of the jitter; none by itself does."""
+    field, count, chances = random_vm(cells=5, scale=scale), 8, 500
+    rays = [np.repeat(part, chances, axis=0) for part in rays_at(BOX, count)]
+    rng = np.random.default_rng(5)
+    target, background = (np.repeat(rng.random((count, n)), chances, axis=0) for n in (4, 3))
+    whole = np.repeat(rng.integers(1 << 20, size=count), chances)
+    jitter = (whole + np.tile((np.arange(chances) + 0.5) / chances, count)) / (1 << 20)
+
+    def gradient(light: float, which: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        grads, loss = np.zeros((2, field.params.numel())), np.zeros((2, 3))
+        taken = [part[which] for part in (*rays, jitter, target, background)]
+        field.train_rays(Batch(*taken, 0.3, 0.0, 0.05, 0.0, 0.01, light), grads, loss)
+        return grads.sum(0), loss.sum(0)
+
+    (wanted, loss), (found, same) = gradient(0.0), gradient(0.1)
+    np.testing.assert_allclose(same, loss, rtol=1e-12)
+    most = np.abs(wanted).max()
+    assert np.abs(found - wanted).max() < 0.004 * most
+    alone = [gradient(light, slice(None, None, chances))[0] for light in (0.0, 0.1)]
+    assert np.abs(alone[1] - alone[0]).max() > 0.05 * np.abs(alone[0]).max()
+
+
 def test_train_rays_of_float32_is_close_to_float64():
     field = random_vm(THIRTY_TWO, dtype=torch.float32, cells=5)
     rays_o, rays_d = rays_at(BOX, 30)
