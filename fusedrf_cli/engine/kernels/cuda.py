@@ -121,7 +121,8 @@ def sweep_kernel(item, scratch_size: int, memory_size: int, real):
             kept = Kept(
                 wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
                 wholes[4, :, thread], wholes[5, :, thread], reals[0, :, thread], reals[1, :, thread],
-                reals[2, :, thread], reals[3, :, thread], reals[4, :, thread], reals[5:8, :, thread].T, memory,
+                reals[2, :, thread], reals[3, :, thread], reals[4, :, thread], reals[5:8, :, thread].T,
+                memory,
             )  # fmt: skip
             for i in range(thread, count, threads):
                 item(field, grid, batch, i, kept, scratch, grads[0], loss[0])

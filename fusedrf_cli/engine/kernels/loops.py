@@ -319,7 +319,7 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
 
 
 def drawn(jitter):
-    """A number in [0, 1) that has nothing to do with where a ray's samples lie, of the jitter's last digits."""
+    """A number in [0, 1) that has nothing to do with where a ray's samples lie: the jitter's last digits."""
     last = jitter * 1048576.0
     return last - math.floor(last)
 
