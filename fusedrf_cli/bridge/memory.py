@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.finish import RAYS
+from fusedrf_cli.engine.distillation.finish import ASKED_AT_ONCE, RAYS
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
 from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
@@ -209,7 +209,7 @@ def stages(
 def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
     """Rays that a made student learns from, while they are asked of sources that are read one by one."""
     made = result(student.needs().numbers, measured=False)
-    return made | lesson(RAYS) | ownership(scene.aabb) | picture(256, 256, composed=True)
+    return made | lesson(RAYS) | ownership(scene.aabb) | picture(ASKED_AT_ONCE, 1, composed=True)
 
 
 def learning_is_asked(student: Student, request: FuseRequest) -> bool:
