@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.finish import ASKED_AT_ONCE, RAYS
+from fusedrf_cli.engine.distillation.finish import RAYS
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
 from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
@@ -30,13 +30,13 @@ COMPILED = 130 << 20  # kernels, once they are loaded, and the libraries that co
 READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
 RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
 PER_PIXEL = 190  # of a band: rays in float64, their directions before and after turning, pixels
-PER_SAMPLE = 165  # of a wave through the general renderer: distances, points, directions, σ, colour, indices
+PER_SAMPLE = 300  # of a wave through the general renderer: distances, points in each field, σ, colour
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
 PER_KNOWN_CELL = 30  # of a scene's grid: the bits of its parts, strides and distances
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
-PER_POINT = 76  # of a teacher's points, joined, and one of their columns in pieces
+PER_POINT = 60  # of a teacher's points in pieces, one of their columns joined, and its place there
 PER_PIXEL_OF_PHOTOS = 4 + 16  # colours, and two orders of drawing
 PER_OWN_RAY = 100  # of a camera's pixel: directions in float64 while they are made, float32 afterwards
 
@@ -209,7 +209,7 @@ def stages(
 def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
     """Rays that a made student learns from, while they are asked of sources that are read one by one."""
     made = result(student.needs().numbers, measured=False)
-    return made | lesson(RAYS) | ownership(scene.aabb) | picture(ASKED_AT_ONCE, 1, composed=True)
+    return made | lesson(RAYS) | ownership(scene.aabb) | picture(256, 256, composed=True)
 
 
 def learning_is_asked(student: Student, request: FuseRequest) -> bool:

@@ -17,7 +17,6 @@ from fusedrf_cli.engine.rendering.volume import render_rays
 
 RATE, RATE_DECAY = 3e-3, 0.1
 RAYS = 200_000
-ASKED_AT_ONCE = 1 << 14  # rays: waves of more through many sources would take more memory than the student
 RAYS_PER_STEP = 3000
 STEPS = 160
 OPACITY_WEIGHT = 0.1
@@ -32,8 +31,7 @@ class RayLesson:
         self.seed = seed
         generator = torch.Generator().manual_seed(seed)
         self.rays_o, self.rays_d = random_rays(boxes, rays, generator)
-        parts = [slice(start, start + ASKED_AT_ONCE) for start in range(0, rays, ASKED_AT_ONCE)]
-        shown = np.concatenate([render_rays(teacher, self.rays_o[part], self.rays_d[part]) for part in parts])
+        shown = render_rays(teacher, self.rays_o, self.rays_d)
         self.target = shown[:, :4].copy()
         """(R, 4) float32: colour over white, opacity."""
         self.target[:, :3] += 1 - self.target[:, 3:]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, reach_of, waves, weights_from_depths
 
@@ -115,7 +116,7 @@ def ask(
     step: float,
     generator: torch.Generator,
     chance: Chance = matter_first,
-    at_once: int = 1 << 16,
+    at_once: int = 1 << 14,
 ) -> TeacherPool:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
@@ -124,12 +125,27 @@ def ask(
     for start in range(0, len(rays_o), at_once):
         part = slice(start, start + at_once)
         parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
-    pixels, *points = (list(column) for column in zip(*parts, strict=True))
+    pixels, *columns = (list(column) for column in zip(*parts, strict=True))
     parts.clear()
-    order = torch.randperm(sum(map(len, points[0])), generator=generator)
-    for i in range(len(points)):  # one after the other: together they can be a gigabyte, and two while joined
-        points[i] = torch.cat(points[i])[order]
-    return TeacherPool(rays_o, rays_d, torch.cat(pixels), Points(*points))
+    places = torch.randperm(sum(map(len, columns[0])), generator=generator, dtype=torch.int32)
+    points = Points(*(_shuffled(column, places) for column in columns))
+    return TeacherPool(rays_o, rays_d, torch.cat(pixels), points)
+
+
+def _shuffled(pieces: list[torch.Tensor], places: torch.Tensor) -> torch.Tensor:
+    """The rows of the pieces, which are taken away, each at its place (N,) of the whole."""
+    whole, start = _like(pieces[0], len(places)), 0
+    while pieces:  # one after the other: together they can be a gigabyte, and would be two
+        piece = pieces.pop(0)
+        whole[places[start : start + len(piece)].long()] = piece
+        start += len(piece)
+    return whole
+
+
+def _like(rows: torch.Tensor, count: int) -> torch.Tensor:
+    """Room for so many of such rows. Pages of their own go back to the system with them, whereas freed pieces
+    of a heap may stay."""
+    return pages.zeros(count * rows.shape[1:].numel()).view(count, *rows.shape[1:])
 
 
 def points_kept(teacher: RadianceField, boxes: list[np.ndarray], rays: int, step: float, seed: int) -> int:
@@ -174,4 +190,6 @@ def _ask_part(
         pixels[ray, :3] += (weights[..., None] * rgb).sum(1)
         kept.append(tuple(column[chosen].float() for column in (points, dirs, found, colour, before)))
     pixels[:, 3] = 1 - trans
-    return torch.from_numpy(pixels), *(torch.cat(column) for column in zip(*kept, strict=True))
+    columns = list(zip(*kept, strict=True))
+    count = sum(map(len, columns[0]))
+    return torch.from_numpy(pixels), *(torch.cat(c, out=_like(c[-1], count)) for c in columns)

@@ -5,7 +5,7 @@ import mmap
 
 import torch
 
-LARGE = 1 << 22  # bytes from which an array gets them
+LARGE = 1 << 20  # bytes from which an array gets them
 ADVICE = getattr(mmap, "MADV_HUGEPAGE", None)  # of Linux
 
 

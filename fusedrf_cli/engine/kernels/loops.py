@@ -326,10 +326,10 @@ def drawn(jitter):
 
 def followed(batch, weight, chance):
     """How many times the gradient of a ray's next sample counts, 0 where it is not followed back; and the
-    chance for the sample behind it.
+    chance for the sample behind it. weight: its own, and what waits before it for a colour.
 
-    A sample of less than batch.light is followed by a chance in proportion to its weight and counts for those
-    that are not, so that the mean is the gradient of all. `chance` is summed along the ray, and one sample is
+    A sample of less than batch.light is followed by a chance in proportion to that and counts for those that
+    are not, so that the mean is the gradient of all. `chance` is summed along the ray, and one sample is
     taken wherever it passes a whole number: systematic sampling, which varies less than a draw for each.
     """
     if batch.light <= 0.0:

@@ -387,26 +387,14 @@ def touched(grads, start):
 
 
 @body
-def gather_8(out, part, o):
-    """Move part[o : o + 8] to out[o : o + 8], which gains it. All are read before any is written: the
-    compiler would move them one by one."""
-    p, q, r = o + np.uint64(1), o + np.uint64(2), o + np.uint64(3)
-    s, t, u, v = o + np.uint64(4), o + np.uint64(5), o + np.uint64(6), o + np.uint64(7)
-    e0, e1, e2, e3 = out[o] + part[o], out[p] + part[p], out[q] + part[q], out[r] + part[r]
-    e4, e5, e6, e7 = out[s] + part[s], out[t] + part[t], out[u] + part[u], out[v] + part[v]
-    zero = part.dtype.type(0)
-    store_8(out, o, e0, e1, e2, e3, e4, e5, e6, e7)
-    store_8(part, o, zero, zero, zero, zero, zero, zero, zero, zero)
-
-
-@body
 def adam_line(params, grads, moment1, moment2, rate, start, beta1, beta2, eps, correction1, correction2):
     """`adam` of plain.py for the cache line that starts at entry `start`."""
     real = params.dtype.type
     one, zero = real(1), real(0)
     for p in range(1, grads.shape[0]):
-        for tile in range(np.uint64(LINE // 8)):
-            gather_8(grads[0], grads[p], start + tile * np.uint64(8))
+        add_scaled(LINE, grads[0], start, one, grads[p], start)
+        for i in range(np.uint64(LINE)):
+            grads[p, start + i] = zero
     for i in range(np.uint64(LINE)):
         g = grads[0, start + i]
         m, v = moment1[start + i], moment2[start + i]

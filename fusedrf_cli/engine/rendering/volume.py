@@ -13,7 +13,7 @@ from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
 
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
 SEEN_WEIGHT = 1e-6  # samples lighter than this stay black
-RAYS_AT_ONCE = 1 << 16
+RAYS_AT_ONCE = 1 << 14  # of any field: waves through many fields would take more memory than these do
 HALVINGS = 6  # of the rays done at once, where memory is short
 SAMPLES_PER_WAVE = 32
 ROWS_AT_ONCE_PIXELS = 1 << 18

@@ -56,10 +56,11 @@ def test_pixels_are_those_of_the_renderer():
         np.testing.assert_array_equal(pool.rays_o, rays_o)
 
 
-def test_points_are_samples_with_the_teachers_answers():
+@pytest.mark.parametrize("at_once", [1 << 14, 30])
+def test_points_are_samples_with_the_teachers_answers(at_once):
     field = Gaussian(density=8.0)
     rays_o, rays_d = random_rays([BOX], 100, seeded())
-    points = ask(field, rays_o, rays_d, 0.05, seeded(3), everything).points
+    points = ask(field, rays_o, rays_d, 0.05, seeded(3), everything, at_once).points
     sigma, rgb = field.query(points.where, points.dirs)
     assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
     torch.testing.assert_close(sigma, points.sigma, rtol=1e-4, atol=1e-6)  # places are kept in float32

@@ -9,7 +9,8 @@ import torch
 
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, reference
+from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, plain, reference
+from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
@@ -648,3 +649,31 @@ def test_adam_of_a_slice_stays_in_it(rng):
     inside = (np.arange(size) >= 32) & (np.arange(size) < 64)
     np.testing.assert_allclose(params, np.where(inside, -0.5, 0), rtol=1e-5)
     assert (grads[:, inside] == 0).all() and (grads[:, ~inside] == 1).all()
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_adam_takes_the_touched_lines_of_many_tasks_and_no_others(rng, listed):
+    """By the formula in float64, of all lines or of a list of them; what is not listed keeps its gradient."""
+    lines, f = 3 * plain.LINES_PER_TASK + 5, np.float32
+    size = lines * LINE
+    sent = rng.random((2, lines, LINE)) * (rng.random((2, lines, 1)) < 0.15)
+    sent[rng.random(sent.shape) < 0.3] = 0
+    asked = rng.random(lines) < (0.6 if listed else 1.1)
+    params, moment1, moment2 = (rng.random(size).astype(f) + f(0.5) for _ in range(3))
+    grads = sent.reshape(2, size).astype(f)
+    gradient = (grads[0] + grads[1]).astype(float)
+    moved = np.repeat(asked, LINE) & (gradient != 0)
+    m, v = 0.9 * moment1 + 0.1 * gradient, 0.99 * moment2 + 0.01 * gradient**2
+    wanted = np.where(moved, params - 0.5 * 10 * m / (np.sqrt(100 * v) + 1e-15), params)
+    rest = f(0.9), f(0.99), f(1e-15), f(10), f(100)
+    kept = np.where(np.repeat(asked, LINE), 0, grads)
+    moments = np.where(moved, m, moment1), np.where(moved, v, moment2)
+    if listed:
+        starts = LINE * np.flatnonzero(asked)
+        cpu.adam_lines(params, grads, moment1, moment2, f(0.5), starts, *rest)
+    else:
+        cpu.adam(params, grads, moment1, moment2, f(0.5), 0, size, *rest)
+    np.testing.assert_allclose(params, wanted, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose((moment1, moment2), moments, rtol=1e-5)
+    assert (params[~moved] == wanted[~moved].astype(f)).all() and (grads == kept).all()
+    assert 0.1 < moved.mean() < 0.3
