@@ -10,7 +10,13 @@ import torch
 
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.rendering.volume import SEEN_WEIGHT, reach_of, waves, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import (
+    RAYS_AT_ONCE,
+    SEEN_WEIGHT,
+    reach_of,
+    waves,
+    weights_from_depths,
+)
 
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
 MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
@@ -116,7 +122,7 @@ def ask(
     step: float,
     generator: torch.Generator,
     chance: Chance = matter_first,
-    at_once: int = 1 << 14,
+    at_once: int = RAYS_AT_ONCE,
 ) -> TeacherPool:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
