@@ -1,5 +1,5 @@
 """Arrays in large pages of memory: a field's numbers are read in random order, and with pages of 4 kB most
-reads would have to look for their page first. Such an array goes back to the system as soon as it is let go."""
+reads would have to look for their page first. They go back to the system as soon as they are let go."""
 
 import mmap
 
