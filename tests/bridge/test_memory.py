@@ -200,17 +200,12 @@ def test_the_peak_is_as_foretold(large, name):
 
 @pytest.mark.slow
 def test_teachers_are_streamed_where_memory_is_short(large):
-    """From two teachers to eight under one limit: a tenth of a teacher each, at the most, besides what one
-    run's peak differs from another's, and the same bytes as with all of them in memory."""
+    """Eight teachers in little more than two need: the same bytes as with all of them in memory, and no more
+    memory than is allowed. The peaks of two teachers are no measure: they differ by 30 MB from run to run."""
     limit = ("--max-size", "1.5MB")  # what two hold would not fit, so that as many numbers learn from eight
-    free = [measured(large, "fuse", f"s{n}.json", *limit, "-o", f"free{n}.rfpack") for n in (2, 8)]
-    allowed = str(free[0][0]["memory"]["predicted_bytes"] + (8 << 20))  # little more than two need
-    tight = [
-        measured(large, "fuse", f"s{n}.json", *limit, "--memory", allowed, "-o", f"tight{n}.rfpack")
-        for n in (2, 8)
-    ]
-    teacher = 4 * VMShape().size((120,) * 3)
+    two, _ = measured(large, "fuse", "s2.json", *limit, "-o", "free2.rfpack")
+    measured(large, "fuse", "s8.json", *limit, "-o", "free8.rfpack")
+    allowed = two["memory"]["predicted_bytes"] + (8 << 20)
+    _, peak = measured(large, "fuse", "s8.json", *limit, "--memory", str(allowed), "-o", "tight8.rfpack")
     assert (large / "free8.rfpack").read_bytes() == (large / "tight8.rfpack").read_bytes()
-    noise = 16 << 20  # peaks of one command have differed by 30 MB; all eight in memory would be 42 MB more
-    assert tight[1][1] - tight[0][1] <= 6 * 0.1 * teacher + noise
-    assert tight[1][1] <= 1.05 * int(allowed)
+    assert peak <= 1.02 * allowed  # with all of them in memory it is 1.03 to 1.05 times that
