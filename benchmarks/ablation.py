@@ -15,7 +15,6 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from fusedrf_cli.bridge.looks import looks_of
@@ -25,6 +24,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.losses import OPAQUE
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.student import TOLD_NUMBERS, DistillSettings, Way
@@ -151,7 +151,7 @@ class Task:
 
     composed: ComposedField
     background: Placed
-    boxes: list[np.ndarray]
+    sampler: RaySampler
     settings: DistillSettings
     judge: Judge
 
@@ -163,13 +163,12 @@ class Task:
         name = background_of(loaded).placed.name
         placed = composed.placed[[p.name for p in loaded.placed].index(name)]
         background = Placed(name, opened(placed.field), placed.object_to_world)
-        boxes = [composed.occupancy.tight_aabb(0), *sorted((p.aabb for p in composed.placed), key=list)]
         looks = looks_of(loaded, composed, VIEWS, VIEW_SIZE, VIEWS_SEED)
         judge = Judge(composed, [look.camera for look in looks], composed.origin)
         whole = DistillSettings()
         fewer = {name: round(share * getattr(whole, name)) for name in ("rays", "steps", "rgb_steps")}
         settings = replace(whole, **fewer)
-        return cls(composed, background, boxes, settings, judge)
+        return cls(composed, background, RaySampler.of(composed), settings, judge)
 
     def distilled(self, variant: Variant) -> DistillReport:
         """What distilling by a variant's recipe gives."""
@@ -183,7 +182,7 @@ class Task:
         if student is None:
             student = VM.empty(self.composed, Way(), most, generator, "fused")
         run = DistillRun(
-            self.composed, student, self.boxes, settings, variant.rgb, variant.recipe, self.judge
+            self.composed, student, self.sampler, settings, variant.rgb, variant.recipe, self.judge
         )
         return run.finish()[1]
 

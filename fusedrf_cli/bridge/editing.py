@@ -34,6 +34,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge, RegionJudge
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement, transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
@@ -116,7 +117,7 @@ class Teacher:
         self.tries -= 1
         settings = replace(REGION_SETTINGS, seed=self.seed, time_budget=seconds)
         recipe = DEFAULT_RECIPE if fresh else replace(DEFAULT_RECIPE, coarse=lambda student: False)
-        run = DistillRun(teacher, student.to(self.place), boxes, settings, self.rgb, recipe)
+        run = DistillRun(teacher, student.to(self.place), RaySampler(boxes), settings, self.rgb, recipe)
         learnt, did = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
         self.budget.spent += run.learnt_seconds
         psnr = {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb}

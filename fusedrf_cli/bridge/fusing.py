@@ -7,7 +7,6 @@ from pathlib import Path
 
 from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
-from fusedrf_cli.bridge.looks import views_of_place
 from fusedrf_cli.bridge.making import Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
@@ -54,7 +53,7 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
         kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
         nodes = history_nodes(loaded, request.output, kept)
         cameras = kept_cameras(loaded, progress)
-        asked = student_request(request, loaded, scene.composed, graph_bytes(nodes, cameras))
+        asked = student_request(request, scene, graph_bytes(nodes, cameras))
         try:
             student = kind.student(scene.composed, asked)
             held = make_room(memory, student, scene, request)
@@ -110,22 +109,20 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
     return report
 
 
-def student_request(
-    request: FuseRequest, loaded: LoadedScene, composed: ComposedField, overhead: int
-) -> StudentRequest:
+def student_request(request: FuseRequest, scene: Scene, overhead: int) -> StudentRequest:
     """What is asked of the kind's student; overhead: bytes of the bundle besides its field."""
     return StudentRequest(
         sizes=BundleSizes(),
-        limit=request.max_size or DEFAULT_MAX_SIZE + place_bytes(loaded),
+        limit=request.max_size or DEFAULT_MAX_SIZE + place_bytes(scene.loaded),
         overhead=overhead,
         target=request.target_psnr,
         precision=request.precision,
         ranks=request.ranks,
         sh_degree=request.sh_degree,
-        source_bytes=tuple(loaded.sizes),
+        source_bytes=tuple(scene.loaded.sizes),
         seconds=request.time_budget,
         from_scratch=request.from_scratch,
-        views=views_of_place(loaded, composed),
+        views=scene.views,
     )
 
 
@@ -310,10 +307,12 @@ def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
 def make_room(memory: Memory, student: Student, scene: Scene, request: FuseRequest) -> bool:
     """Keep no more sources in memory than fit beside what every stage of a student needs; ResourceProblem
     where not even the largest does. Whether all of them may be held at once, as a teacher."""
-    needed = stages(student, scene.composed, scene.boxes, request)
+    needed = stages(student, scene.composed, request)
     sizes, shelf = scene.loaded.sizes, scene.loaded.shelf
     _, learning = needed[-1]
     together = memory.room(learning) > 2 * sum(sizes)
+    if together and not student.learnt and learning:
+        learning |= {"the sources put together": sum(sizes)}
     if not together and student.lesson is None and learning_is_asked(student, request):
         needed.append((0.0, asking_in_waves(student, scene.composed)))
     room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)

@@ -8,7 +8,7 @@ import torch
 
 from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.choose import FINALISTS, Tried
-from fusedrf_cli.bridge.looks import looks_of
+from fusedrf_cli.bridge.looks import looks_of, views_of_place
 from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
@@ -17,13 +17,15 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
-from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import NOTHING, DistillSettings, MadeStudent, Plan, Student, Way
+from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.requests import FuseRequest
 
 VIEWS_TO_CHOOSE_BY = 8
-RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
 RATE_IN_PLACE = 0.02  # of a student that begins as a place and has only to learn what stands in it: 3 dB
 TRIES = 6  # that a search for a target makes, about
 
@@ -34,14 +36,16 @@ class Scene:
 
     loaded: LoadedScene
     composed: ComposedField
-    boxes: list
-    """Of `boxes_of`."""
+    sampler: RaySampler
+    views: tuple[Camera, ...] = ()
+    """Of `views_of_place`."""
 
     @classmethod
     def of(cls, loaded: LoadedScene) -> "Scene":
         """A loaded scene."""
         composed = loaded.composed()
-        return cls(loaded, composed, boxes_of(composed))
+        views = views_of_place(loaded, composed)
+        return cls(loaded, composed, RaySampler.of(composed, views), views)
 
     def background(self) -> Placed:
         """The background in the composed scene's frame, its numbers on the CPU."""
@@ -59,12 +63,6 @@ class Kept:
     did: DistillReport | None = None
     start: str | None = None
     """What it started from."""
-
-
-def boxes_of(scene: ComposedField) -> list[np.ndarray]:
-    """(6,) a scene's and its objects', in an order that does not depend on the nodes', so that equal scenes
-    draw equal rays."""
-    return [scene.occupancy.subject, *sorted((p.aabb for p in scene.placed), key=list)]
 
 
 def same_texels(field: StoredField, other: StoredField) -> bool:
@@ -90,6 +88,7 @@ class Maker:
         self.sources_in_memory = True
         """Whether all sources may be in memory at once, as a teacher."""
         self._rays: RayLesson | None = None
+        self._teacher: RadianceField | None = None
         self.finished_tries = 0
 
     def measured(self, field: StoredField, way: Way) -> float:
@@ -148,7 +147,7 @@ class Maker:
                 rays.teach(learnt, seconds=seconds)
             return learnt, None
         settings = replace(self.student.lesson, seed=self.request.seed, time_budget=seconds)
-        run = DistillRun(self.scene.composed, learnt, self.scene.boxes, settings, True, judge=self.judge)
+        run = DistillRun(self.teacher(), learnt, self.scene.sampler, settings, True, judge=self.judge)
         student, did = run.finish(*self.telling())
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)
@@ -163,10 +162,16 @@ class Maker:
     def rays(self) -> RayLesson:
         """What there is to learn from, drawn once."""
         if self._rays is None:
-            teacher = self.student.teacher(self.sources_in_memory)
-            teacher = teacher.to(self.place) if hasattr(teacher, "to") else teacher
-            self._rays = RayLesson(teacher, self.scene.boxes, self.request.seed)
+            self._rays = RayLesson(self.teacher(), self.scene.sampler, self.request.seed)
         return self._rays
+
+    def teacher(self) -> RadianceField:
+        """What shows the scene along rays: its sources put together, where memory holds them and a kind can
+        be that, else the scene."""
+        if self._teacher is None:
+            whole = registry.joined(self.scene.composed) if self.sources_in_memory else None
+            self._teacher = self.scene.composed if whole is None else whole.to(self.place)
+        return self._teacher
 
     # -- students that learn from nothing --------------------------------------------------------------------
 
@@ -220,12 +225,10 @@ class Maker:
     ) -> tuple[StoredField, DistillReport]:
         """A student that has learnt; an interrupt saves a checkpoint."""
         request, seconds = self.request, self.budget.part(tries)
-        lesson = self.student.lesson_of(field.params.numel())
-        settings = replace(lesson, seed=request.seed, time_budget=seconds)
-        if seconds is not None:  # more than there is time to learn from need not be asked
-            settings = replace(settings, rays=min(settings.rays, int(RAYS_PER_SECOND * seconds) + 1))
-        teacher, boxes = self.student.scene, boxes_of(self.student.scene)
-        run = DistillRun(teacher, field, boxes, settings, request.rgb, recipe, self.judged_whole)
+        settings = replace(self.student.lesson_of(field.params.numel(), seconds), seed=request.seed)
+        teacher = self.student.scene
+        sampler = RaySampler.of(teacher, self.scene.views)
+        run = DistillRun(teacher, field, sampler, settings, request.rgb, recipe, self.judged_whole)
         made_with = {  # with other words the saved numbers would go on to something else
             "kind": self.student.kind.name,
             "numbers": field.params.numel(),
@@ -233,7 +236,7 @@ class Maker:
             "start": start if request.target_psnr is None else None,
             "rgb": request.rgb,
             "seed": request.seed,
-            "boxes": [box.tolist() for box in boxes],
+            "boxes": [box.tolist() for box in sampler.boxes],
         }
         if saved is not None:
             if any(saved[1].get(word) != value for word, value in made_with.items()):

@@ -16,6 +16,7 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.finish import RAYS
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
 from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
@@ -174,25 +175,26 @@ def lesson(rays: int) -> dict[str, float]:
 
 
 def stages(
-    student: Student, scene: ComposedField, boxes: list[np.ndarray], request: FuseRequest
+    student: Student, scene: ComposedField, request: FuseRequest
 ) -> list[tuple[float, dict[str, float]]]:
     """The stages of fusing a scene: making a student, measuring it, learning. Each is so many copies of the
     largest source, and bytes by what they are for."""
     needs = student.needs()
-    settings = student.lesson_of(needs.numbers) or DistillSettings()
-    numbers, grids = needs.numbers, ownership(scene.aabb)
+    numbers, learnt, grids = needs.numbers, needs.numbers - needs.settled, ownership(scene.aabb)
+    settings = student.lesson_of(learnt, request.time_budget) or DistillSettings()
     if student.lesson is None:
         taught = lesson(RAYS)
     else:
         points = needs.points
         if points is None:
             step = 0.5 * student.largest().voxel
-            points = points_kept(scene, boxes, settings.rays, step, request.seed)
+            sampler = RaySampler.of(student.scene, student.request.views)
+            points = points_kept(student.scene, sampler, settings.rays, step, request.seed)
         taught = teaching(settings, points)
     # kept beside what learns: the field as it was made, and the numbers that its pictures have to surpass
     kept = (not student.learnt) + (student.lesson is not None and request.rgb)
     learns = (
-        learning(numbers, torch.get_num_threads()) | {"its starts": kept * numbers * FLOAT} | taught | grids
+        learning(learnt, torch.get_num_threads()) | {"its starts": kept * learnt * FLOAT} | taught | grids
         if learning_is_asked(student, request)
         else {}
     )
@@ -202,7 +204,7 @@ def stages(
     return [
         (needs.copies, result(numbers, measured=False) | making | grids),
         (0.0, result(numbers) | grids | judged()),
-        (0.0, learns),
+        (0.0, learns | {"what does not learn": needs.settled * FLOAT} if learns else {}),
     ]
 
 

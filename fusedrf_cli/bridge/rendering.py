@@ -117,12 +117,11 @@ def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: M
     if min(budget.room(joining), budget.room(looking)) < 0:
         return None
     loaded.shelf.resize(sum(loaded.sizes))
-    for kind in registry.kinds():
-        field = kind.joined(composed)
-        if field is not None:
-            budget.expect(joining, looking, advice="use --naive")
-            return field.to(place)
-    return None
+    field = registry.joined(composed)
+    if field is None:
+        return None
+    budget.expect(joining, looking, advice="use --naive")
+    return field.to(place)
 
 
 def check_sizes(output: str, views: list[Camera]) -> None:

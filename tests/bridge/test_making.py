@@ -15,6 +15,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import POINTS_PART, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.student import (
     NUMBERS_PER_SECOND,
     TOLD_NUMBERS,
@@ -25,13 +26,15 @@ from fusedrf_cli.engine.kinds.student import (
     Way,
 )
 from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.progress import NullProgress
 from tests.analytic.export import SHAPE, way_of
 from tests.bridge.conftest import FIELDS, TinySettings
 
 WAYS = [Way("int4"), Way("int8")]
 SCENE = ComposedField([Placed("red", FIELDS["red"], np.eye(4))])
-BOXES = [SCENE.occupancy.tight_aabb(0)]
+SAMPLER = RaySampler([SCENE.occupancy.tight_aabb(0)])
 
 
 class Restless(MadeStudent):
@@ -67,7 +70,7 @@ def maker_of(monkeypatch, student, psnr, request) -> making.Maker:
     monkeypatch.setattr(making, "Judge", lambda *words: psnr)
     monkeypatch.setattr(making, "looks_of", lambda *words: [])
     monkeypatch.setattr(making, "stored", lambda field, precision: field)
-    scene = making.Scene(None, SCENE, BOXES)
+    scene = making.Scene(None, SCENE, SAMPLER)
     return making.Maker(student, scene, request, "cpu", NullProgress())
 
 
@@ -98,6 +101,17 @@ def test_of_two_tries_the_better_is_kept():
     assert large.better(small, None) and large.better(small, 34.0)
     assert large.better(poor, 30.0) and not poor.better(small, 30.0) and small.better(poor, 40.0)
     assert poor.better(None, 30.0)
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_rays_show_the_scene_whether_or_not_it_is_put_together(monkeypatch, in_memory):
+    maker = maker_of(monkeypatch, Restless(None), lambda field: 0.0, asked())
+    maker.sources_in_memory = in_memory
+    teacher = maker.teacher()
+    assert (teacher is SCENE) != in_memory and maker.teacher() is teacher
+    rays = SAMPLER.draw(300, torch.Generator().manual_seed(5))
+    shown, wanted = (render_rays(field, *rays)[:, :4] for field in (teacher, SCENE))
+    assert wanted[:, 3].max() > 0.5 and psnr(shown, wanted) > 50
 
 
 # -- seconds -------------------------------------------------------------------------------------------------
@@ -136,7 +150,7 @@ def test_all_sizes_together_keep_to_the_budget(run, monkeypatch):
 def test_a_phase_without_steps_takes_no_time_from_the_other(steps, part):
     student = VM.empty(SCENE, way_of(SHAPE), SHAPE.size((16,) * 3), torch.Generator().manual_seed(0), "")
     settings = TinySettings(steps=steps, rgb_steps=10, time_budget=8.0)
-    run = DistillRun(SCENE, student, BOXES, settings)
+    run = DistillRun(SCENE, student, SAMPLER, settings)
     assert run._share(10, 8.0 * part) == pytest.approx(1.0)
     assert run._share(10, 2.0) == pytest.approx(2.0 / (8.0 * part))
 
@@ -155,7 +169,7 @@ def test_rays_are_learnt_from_no_longer_than_allowed(monkeypatch):
         step(self, rate)
 
     monkeypatch.setattr(finish.Adam, "step", counted)
-    lesson = RayLesson(SCENE, BOXES, 0, rays=500)
+    lesson = RayLesson(SCENE, SAMPLER, 0, rays=500)
     field = FIELDS["red"].with_params(FIELDS["red"].params.clone())
     lesson.teach(field, steps=100, seconds=5.0)
     assert len(steps) == 5 and steps[-1] < 0.3 * steps[0]

@@ -17,6 +17,7 @@ from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import distill
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
@@ -297,7 +298,7 @@ def test_b8_an_opaque_teacher_gives_finite_losses(row):
     teacher = scene_of((Box(1e8, 0.5, tint=scenes.RED), np.eye(4))).composed("vm")
     settings, numbers = TinySettings(steps=20, rays=1000), SHAPE.size((16, 16, 16))
     student = VM.empty(teacher, way_of(SHAPE), numbers, torch.Generator().manual_seed(0), "one")
-    student, report = distill(teacher, student, [teacher.occupancy.tight_aabb(0)], settings)
+    student, report = distill(teacher, student, RaySampler([teacher.occupancy.tight_aabb(0)]), settings)
     told = (report.psnr_before_rgb, report.psnr_after_rgb, student.params.abs().max())
     row.check("B8", "finite figures of a distilled opaque box", np.isfinite(told).sum(), 3, scene="S9")
 

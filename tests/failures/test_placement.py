@@ -15,7 +15,7 @@ from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.detail import opacity_off
 from fusedrf_cli.engine.distillation.distill import distill
-from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.student import DistillSettings
 from fusedrf_cli.engine.kinds.vm import KIND as VM
@@ -148,7 +148,8 @@ def test_a2_the_measured_opacity_keeps_to_the_prediction(row, condition):
     settings, numbers = DistillSettings(rays=30_000, steps=400), SHAPE.size((48, 48, 48))
     generator = torch.Generator().manual_seed(0)
     student = VM.empty(composed, way_of(SHAPE), numbers, generator, "one")
-    student, _ = distill(composed, student, [composed.occupancy.tight_aabb(0)], settings, rgb=False)
+    sampler = RaySampler([composed.occupancy.tight_aabb(0)])
+    student, _ = distill(composed, student, sampler, settings, rgb=False)
     rays_o, rays_d = rays_at(composed.occupancy.tight_aabb(0) * 0.5, 1000, seed=5, away=8.0)
     spans = np.tile([0.0, 16.0], (1000, 1))
     found = depth_along(student, rays_o, rays_d, spans, composed.origin)
@@ -367,7 +368,7 @@ def test_a6_every_object_gets_its_share_of_the_questions(row):
     composed = scene_of(*parts).composed("vm")
     boxes = [composed.occupancy.tight_aabb(0), *(p.aabb for p in composed.placed)]
     generator = torch.Generator().manual_seed(0)
-    rays_o, rays_d = random_rays(boxes, 4000, generator)
+    rays_o, rays_d = RaySampler(boxes).draw(4000, generator)
     hits = []
     for p in composed.placed:
         t0, t1 = scenes.interval_of_box(p.aabb[:3], p.aabb[3:], rays_o, rays_d)

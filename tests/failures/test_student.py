@@ -17,6 +17,7 @@ from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.distill import distill
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, without
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -328,7 +329,7 @@ def distilled(scene, seed: int, **more):
     generator = torch.Generator().manual_seed(seed)
     student = VM.empty(teacher, way_of(SHAPE), SHAPE.size((32,) * 3), generator, "student")
     boxes = [teacher.occupancy.tight_aabb(0), *(p.aabb for p in teacher.placed)]
-    return distill(teacher, student, boxes, settings, rgb=False)[0], teacher
+    return distill(teacher, student, RaySampler(boxes), settings, rgb=False)[0], teacher
 
 
 @pytest.mark.slow

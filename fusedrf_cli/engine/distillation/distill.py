@@ -25,15 +25,15 @@ from fusedrf_cli.engine.distillation.losses import (
     point_step,
 )
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import (
     Chance,
     TeacherPool,
     ask,
+    looked_at,
     matter_first,
-    no_point,
-    random_rays,
 )
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
@@ -87,17 +87,17 @@ class DistillReport:
 def distill(
     teacher: RadianceField,
     student: StoredField,
-    boxes: list[np.ndarray],
+    sampler: RaySampler,
     settings: DistillSettings,
     rgb: bool = True,
     phase: Callable[[str], None] = lambda name: None,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
 ) -> tuple[StoredField, DistillReport]:
-    """Teach a student in the teacher's frame; boxes are the scene's and the objects' (6,), for sampling.
+    """Teach a student in the teacher's frame, in which the sampler draws rays.
 
     Raises FloatingPointError when the student's numbers do not stay finite.
     """
-    return DistillRun(teacher, student, boxes, settings, rgb).finish(phase, advance)
+    return DistillRun(teacher, student, sampler, settings, rgb).finish(phase, advance)
 
 
 class DistillRun:
@@ -110,7 +110,7 @@ class DistillRun:
         self,
         teacher: RadianceField,
         student: StoredField,
-        boxes: list[np.ndarray],
+        sampler: RaySampler,
         settings: DistillSettings,
         rgb: bool = True,
         recipe: Recipe = DEFAULT_RECIPE,
@@ -119,7 +119,7 @@ class DistillRun:
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge
         says how near a student comes, in dB; None: one of the same teacher and settings.
         """
-        self.teacher, self.boxes, self.rgb, self.judge = teacher, boxes, rgb, judge
+        self.teacher, self.sampler, self.rgb, self.judge = teacher, sampler, rgb, judge
         self.settings, self.recipe, self.step = settings, recipe, sampling_step(student)
         coarse = settings.steps > 0 and recipe.coarse(student)
         self.student, self.refined = (halved(student), student) if coarse else (student, None)
@@ -156,10 +156,12 @@ class DistillRun:
         judge = self.judge or scattered_judge(
             self.teacher, settings.views, settings.view_size, settings.seed
         )
-        rays_o, rays_d = random_rays(self.boxes, settings.rays, self.generator)
-        chance = self.recipe.chance if settings.steps else no_point
-        pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, chance)
-        held_out = HeldOut(self.teacher, self.boxes, self.step, settings.seed)
+        rays_o, rays_d = self.sampler.draw(settings.rays, self.generator)
+        if settings.steps:
+            pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)
+        else:
+            pool = looked_at(self.teacher, rays_o, rays_d)
+        held_out = HeldOut(self.teacher, self.sampler, self.step, settings.seed)
         if self.random is not None:
             self.generator.set_state(self.random)
         self.asked = True

@@ -9,7 +9,7 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels import working_time
@@ -25,12 +25,11 @@ OPACITY_WEIGHT = 0.1
 class RayLesson:
     """Seeded rays around a scene and its objects, and what a teacher shows along them."""
 
-    def __init__(self, teacher: RadianceField, boxes: list[np.ndarray], seed: int, rays: int = RAYS):
-        """boxes are the scene's and the objects' (6,), in the teacher's frame: half the rays look at the
-        whole scene, the others at the objects in turn."""
+    def __init__(self, teacher: RadianceField, sampler: RaySampler, seed: int, rays: int = RAYS):
+        """The sampler draws rays in the teacher's frame."""
         self.seed = seed
         generator = torch.Generator().manual_seed(seed)
-        self.rays_o, self.rays_d = random_rays(boxes, rays, generator)
+        self.rays_o, self.rays_d = sampler.draw(rays, generator)
         shown = render_rays(teacher, self.rays_o, self.rays_d)
         self.target = shown[:, :4].copy()
         """(R, 4) float32: colour over white, opacity."""

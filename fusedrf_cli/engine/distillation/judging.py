@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.distillation.teacher import ask, random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.distillation.teacher import ask
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, psnr_of_mse
@@ -98,9 +99,9 @@ def scattered_judge(teacher: RadianceField, views: int, size: int, seed: int) ->
 class HeldOut:
     """PSNR of a student on a few rays that nothing is trained on: quick to ask, for curves and schedules."""
 
-    def __init__(self, teacher: RadianceField, boxes: list[np.ndarray], step: float, seed: int):
+    def __init__(self, teacher: RadianceField, sampler: RaySampler, step: float, seed: int):
         generator = torch.Generator().manual_seed(HELD_OUT_SEED + seed)
-        self.rays, self.step = random_rays(boxes, HELD_OUT, generator), step
+        self.rays, self.step = sampler.draw(HELD_OUT, generator), step
         self.truth = over_white(ask(teacher, *self.rays, step, generator).pixels.numpy())
 
     def __call__(self, student: RadianceField) -> float:

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import (
     RAYS_AT_ONCE,
     SEEN_WEIGHT,
     reach_of,
+    render_rays,
     waves,
     weights_from_depths,
 )
@@ -21,11 +23,7 @@ from fusedrf_cli.engine.rendering.volume import (
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
 MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
 EMPTY_SHARE = 0.15  # of the samples with less that are kept: nine in ten are such, and without them fog stays
-WHOLE_SCENE_SHARE = (
-    0.5  # of the rays; the others are shared out over the objects, so that a small one is not missed
-)
 RECKONED_RAYS = 2000  # of which the number of points is reckoned
-BELOW_SHARE = 0.1  # of the rays that look from under the horizon
 
 Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """The chances (N,) that samples are kept as points, by their optical depths (N,) and transmittances (N,)."""
@@ -34,11 +32,6 @@ Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 def matter_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
     """All that can be seen of matter, and a share of the emptiness before it."""
     return torch.where(depth > MATTER, 1.0, EMPTY_SHARE)
-
-
-def no_point(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
-    """None at all, for a student that learns from rays alone."""
-    return torch.zeros_like(depth)
 
 
 @dataclass
@@ -88,33 +81,6 @@ class TeacherPool:
     points: Points
 
 
-def random_rays(
-    boxes: list[np.ndarray], count: int, generator: torch.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """rays_o, rays_d (count, 3) float64 from a shell around boxes[0] and the others in turn, each towards a
-    random point of its box.
-    """
-    others = boxes[1:] or boxes
-    whole = int(count * WHOLE_SCENE_SHARE)
-    counts = [whole] + [
-        (count - whole) // len(others) + (i < (count - whole) % len(others)) for i in range(len(others))
-    ]
-    rays_o, rays_d = [], []
-    for box, n in zip([boxes[0], *others], counts, strict=True):
-        uniform = torch.rand(n, 7, generator=generator, dtype=torch.float64).numpy()
-        lo, hi = box[:3], box[3:]
-        centre, radius = (lo + hi) / 2, np.linalg.norm(hi - lo) / 2
-        z = np.where(uniform[:, 0] < BELOW_SHARE, -uniform[:, 1], uniform[:, 1])
-        ring, angle = np.sqrt(1 - z * z), 2 * np.pi * uniform[:, 2]
-        away = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
-        origin = centre + away * (radius * (1.2 + 2.0 * uniform[:, 3:4]))
-        direction = lo + uniform[:, 4:7] * (hi - lo) - origin
-        rays_o.append(origin)
-        rays_d.append(direction / np.linalg.norm(direction, axis=1, keepdims=True))
-    order = torch.randperm(count, generator=generator).numpy()
-    return np.concatenate(rays_o)[order], np.concatenate(rays_d)[order]
-
-
 def ask(
     teacher: RadianceField,
     rays_o: np.ndarray,
@@ -138,6 +104,13 @@ def ask(
     return TeacherPool(rays_o, rays_d, torch.cat(pixels), points)
 
 
+def looked_at(teacher: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray) -> TeacherPool:
+    """Rays (R, 3) through a teacher without any points, for a student that learns from rays alone."""
+    pixels = torch.from_numpy(render_rays(teacher, rays_o, rays_d)[:, :4])
+    none = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0)
+    return TeacherPool(rays_o, rays_d, pixels, Points(*none))
+
+
 def _shuffled(pieces: list[torch.Tensor], places: torch.Tensor) -> torch.Tensor:
     """The rows of the pieces, which are taken away, each at its place (N,) of the whole."""
     whole, start = _like(pieces[0], len(places)), 0
@@ -154,10 +127,10 @@ def _like(rows: torch.Tensor, count: int) -> torch.Tensor:
     return pages.zeros(count * rows.shape[1:].numel()).view(count, *rows.shape[1:])
 
 
-def points_kept(teacher: RadianceField, boxes: list[np.ndarray], rays: int, step: float, seed: int) -> int:
+def points_kept(teacher: RadianceField, sampler: RaySampler, rays: int, step: float, seed: int) -> int:
     """About how many points `ask` keeps of so many rays, reckoned from a few of them."""
     generator = torch.Generator().manual_seed(seed)
-    few = random_rays(boxes, RECKONED_RAYS, generator)
+    few = sampler.draw(RECKONED_RAYS, generator)
     return len(ask(teacher, *few, step, generator).points) * rays // RECKONED_RAYS
 
 

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -175,7 +175,7 @@ class AskedStudent(MadeStudent, GridStudent):
         features = np.clip(inverse_softplus(sigma / field.scale), LEAST, MOST)
         field.fill_vertices(vertices.index, features, np.zeros((len(sigma), field.shape.numbers), np.float32))
         generator = torch.Generator().manual_seed(SHOWN_SEED)
-        rays_o, rays_d = random_rays([self.scene.occupancy.subject], SHOWN_RAYS, generator)
+        rays_o, rays_d = RaySampler([self.scene.occupancy.subject]).draw(SHOWN_RAYS, generator)
         jitter = torch.rand(len(rays_o), generator=generator, dtype=torch.float64).numpy()
         weights = field.weights_in_cells(rays_o, rays_d, jitter, 0.0, sampling_step(field))
         found = self.scene.occupancy.marked(weights > SHOWN_FROM)

@@ -13,7 +13,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail
-from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -28,6 +28,7 @@ NOTHING = "nothing"  # what a student starts from that takes over no numbers
 SHRINK = 0.98  # steps in which a size is looked for that fits
 TOLD_NUMBERS = 12_000_000  # of a student, for which a lesson's rays do
 NUMBERS_PER_SECOND = 1_000_000  # four objects after 5, 15, 45 s: best with 6, 12, 25 of 3, 6, 12, 25 million
+RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
 MOST_TOLD = 2.0  # four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all
 
 
@@ -197,6 +198,8 @@ class Needs:
     """Of the largest source's numbers, while it is made."""
     making: dict[str, float] = field(default_factory=dict)
     """Bytes while it is made, by what they are for."""
+    settled: int = 0
+    """Of the numbers, those that are known and do not learn."""
     points: int | None = None
     """Of the teachers that it keeps while it learns; None: to be reckoned from a few rays."""
 
@@ -222,20 +225,23 @@ class Student:
     learnt = True
     """Whether it learns from nothing; else it is made (MadeStudent) and learning only finishes it."""
     lesson: DistillSettings | None = DistillSettings()
-    """None: rays drawn once for all tries, from its own `teacher` (distillation/finish.py)."""
+    """None: rays drawn once for all tries (distillation/finish.py)."""
 
     def __init__(self, kind: "Kind", scene: ComposedField, request: StudentRequest):
         """scene: what it learns from."""
         self.kind, self.scene, self.request = kind, scene, request
 
-    def lesson_of(self, numbers: int) -> DistillSettings | None:
-        """How a student of so many numbers learns: the more there are, the more it is told, up to
-        MOST_TOLD times."""
+    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistillSettings | None:
+        """How a student of so many numbers learns, in so many seconds where they are given: the more numbers
+        there are, the more it is told, up to MOST_TOLD times, but no more than there is time to learn
+        from."""
         if not self.learnt or self.lesson is None:
             return self.lesson
         more = min(max(1.0, numbers / TOLD_NUMBERS), MOST_TOLD)
         rays, steps = round(more * self.lesson.rays), round(more * self.lesson.steps)
-        return replace(self.lesson, rays=rays, steps=steps)
+        if seconds is not None:
+            rays = min(rays, int(RAYS_PER_SECOND * seconds) + 1)
+        return replace(self.lesson, rays=rays, steps=steps, time_budget=seconds)
 
     # -- ways and sizes --------------------------------------------------------------------------------------
 
@@ -356,8 +362,3 @@ class MadeStudent(Student):
     def smallest(self) -> int:
         """Bytes of the file with the coarsest student."""
         raise NotImplementedError
-
-    def teacher(self, in_memory: bool) -> RadianceField:
-        """What it learns from where that is no composition; in_memory: whether all sources may be held at
-        once."""
-        return self.scene

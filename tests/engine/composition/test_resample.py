@@ -9,14 +9,22 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.asking import colours, even_directions
-from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, key_places, node_keys
+from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.kinds.sparse.bricks import (
+    MAX_LEVEL,
+    BrickTree,
+    Lattice,
+    key_places,
+    node_keys,
+)
 from fusedrf_cli.engine.kinds.sparse.field import SparseShape
-from fusedrf_cli.engine.kinds.sparse.resample import frame_of, leaves, resampled
+from fusedrf_cli.engine.kinds.sparse.resample import frame_of, leaves, one_of_eight, resampled, voxels_wanted
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from tests.analytic.fields import Ball, Box, Gaussian, Tint
 from tests.analytic.rays import unit
+from tests.bridge.test_places import fine_walls
 
 RED = Tint.of(0.8, 0.2, 0.1)
 
@@ -147,6 +155,31 @@ def test_levels_stay_within_what_a_tree_can_be():
     tiny = ComposedField([placed(ball(), 1e-3), placed(ball(), 3.0)])
     _, top, counts, levels = frame_of(tiny, 1e-6)
     assert max(levels) <= MAX_LEVEL and np.prod(counts) <= 1 << 20 and (top > 0).all()
+
+
+def test_what_stands_in_a_place_gives_way_less_than_the_place():
+    """By half in logarithms, and neither is finer than its own; without a place all keep their order."""
+    thing, room = placed(ball(), 0.01), Placed("room", fine_walls(), np.eye(4))
+    own = thing.voxel_size, room.voxel_size
+    for order in ([thing, room], [room, thing]):
+        wanted = dict(zip([p.name for p in order], voxels_wanted(ComposedField(order), 9.0), strict=True))
+        np.testing.assert_allclose([wanted[thing.name], wanted["room"]], [3 * own[0], 9 * own[1]])
+    np.testing.assert_allclose(voxels_wanted(ComposedField([thing, room]), 0.2), own)
+    alone = ComposedField([thing, placed(ball(), 1.0)])
+    small, large = voxels_wanted(alone, 4.0)
+    assert large == pytest.approx(4 * alone.placed[1].voxel_size) and small > 4 * own[0]
+
+
+def test_one_voxel_of_eight_touches_every_vertex():
+    """Once, but for those on the far faces of the box, where no voxel of even places begins."""
+    at = np.argwhere(np.ones((2, 2, 2), bool))
+    masks = np.ones((8, SIDE, SIDE, SIDE), bool)
+    lattice = Lattice(BrickTree.of(np.zeros(3), 1.0, (2, 2, 2), np.zeros(8, np.uint8), at, masks), SIDE)
+    chosen = one_of_eight(lattice)
+    assert chosen.sum() * 8 == len(chosen) == (2 * SIDE) ** 3
+    touched = np.bincount(lattice.corners[chosen].ravel(), minlength=len(lattice.vertices))
+    inner = (lattice.vertices < 2 * SIDE).all(1)
+    assert (touched[inner] == 1).all()
 
 
 def test_directions_are_even():

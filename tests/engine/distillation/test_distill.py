@@ -14,6 +14,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import DistillRun, distill
 from fusedrf_cli.engine.distillation.judging import scattered_judge
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
 from fusedrf_cli.engine.kinds.student import DistillSettings, finest_within
@@ -24,6 +25,7 @@ from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
 
 TEACHER = Ball(density=40.0, radius=0.7).occupy(16)
+SAMPLER = RaySampler([TEACHER.occupancy.tight_aabb(0)])
 SETTINGS = DistillSettings(
     rays=4000, steps=60, rgb_steps=30, rgb_samples=1 << 13, views=2, view_size=32
 )  # fmt: skip
@@ -40,7 +42,7 @@ def small_steps(monkeypatch):
 
 def taught(settings: DistillSettings, rgb: bool = True, recipe: module.Recipe = module.DEFAULT_RECIPE):
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
-    return DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings, rgb, recipe).finish()
+    return DistillRun(TEACHER, student, SAMPLER, settings, rgb, recipe).finish()
 
 
 def test_a_ball_is_learnt():
@@ -52,7 +54,7 @@ def test_a_ball_is_learnt():
     student, report = distill(
         TEACHER,
         student,
-        [TEACHER.occupancy.tight_aabb(0)],
+        SAMPLER,
         SETTINGS,
         True,
         told.append,
@@ -192,7 +194,7 @@ def test_pictures_alone_go_on_from_the_student_that_is_there(monkeypatch):
     known = taught(SETTINGS, rgb=False)[0]
     start = known.params.clone()
     settings = replace(SETTINGS, steps=0, rgb_steps=0)
-    run = DistillRun(TEACHER, known, [TEACHER.occupancy.tight_aabb(0)], settings)
+    run = DistillRun(TEACHER, known, SAMPLER, settings)
     student, report = run.finish()
     assert torch.equal(student.params, start) and report.psnr_before_rgb == report.psnr_after_rgb > 20
 
@@ -205,7 +207,7 @@ def test_several_blocks_are_finished_on_pictures():
     student, teacher = blocks_of(placed), blocks_of(placed)
     student.params.mul_(0.9)
     settings = replace(SETTINGS, steps=0, rgb_steps=40)
-    run = DistillRun(teacher, student, [teacher.occupancy.tight_aabb(0)], settings)
+    run = DistillRun(teacher, student, RaySampler([teacher.occupancy.tight_aabb(0)]), settings)
     cells = student.occupancy.occupied
     finished, report = run.finish()
     assert report.psnr_after_rgb > report.psnr_before_rgb + 1 and report.rgb_kept
@@ -232,7 +234,7 @@ def test_the_coarse_student_learns_too(monkeypatch):
 
 def a_run(settings: DistillSettings) -> module.DistillRun:
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
-    return module.DistillRun(TEACHER, student, [TEACHER.occupancy.tight_aabb(0)], settings)
+    return module.DistillRun(TEACHER, student, SAMPLER, settings)
 
 
 def test_without_rgb_nothing_is_said_of_it():

@@ -7,7 +7,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.finish import RayLesson
-from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.rays import affine, turn
@@ -31,8 +31,8 @@ def pair(monkeypatch):
 
 def test_a_student_comes_nearer_on_rays_it_never_saw(pair):
     whole, few = pair
-    lesson = RayLesson(whole, [whole.aabb], seed=0, rays=4000)
-    rays = random_rays([whole.aabb], 1000, torch.Generator().manual_seed(99))
+    lesson = RayLesson(whole, RaySampler([whole.aabb]), seed=0, rays=4000)
+    rays = RaySampler([whole.aabb]).draw(1000, torch.Generator().manual_seed(99))
     wanted = render_rays(whole, *rays)[:, :4]
 
     def error() -> float:
@@ -48,13 +48,13 @@ def test_the_same_seed_teaches_the_same(pair):
     start, ends = few.params.clone(), []
     for seed in (0, 0, 1):
         few.params.copy_(start)
-        RayLesson(whole, [whole.aabb], seed, rays=1000).teach(few, steps=5)
+        RayLesson(whole, RaySampler([whole.aabb]), seed, rays=1000).teach(few, steps=5)
         ends.append(few.params.clone())
     assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
 
 
 def test_what_the_teacher_shows_is_over_white(pair):
     whole, _ = pair
-    lesson = RayLesson(whole, [whole.aabb], seed=0, rays=500)
+    lesson = RayLesson(whole, RaySampler([whole.aabb]), seed=0, rays=500)
     empty = lesson.target[:, 3] == 0
     assert empty.any() and np.array_equal(lesson.target[empty, :3], np.ones((empty.sum(), 3)))

@@ -1,53 +1,23 @@
-"""What is asked of a teacher: rays that hit, and pixels as the renderer has them."""
+"""What is asked of a teacher: pixels as the renderer has them, and points."""
 
 import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.teacher import EMPTY_SHARE, MATTER, ask, random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.distillation.teacher import EMPTY_SHARE, MATTER, ask
 from fusedrf_cli.engine.rendering.volume import render_rays
-from tests.engine.conftest import BOX, Gaussian, Slab, chord_of_box
-
-SMALL = np.array([0.5, 0.4, 0.6, 0.55, 0.45, 0.65])
-OTHER = np.array([-0.8, -0.9, -0.5, -0.7, -0.8, -0.4])
+from tests.engine.conftest import BOX, Gaussian, Slab
 
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def hits(box, rays_o, rays_d) -> np.ndarray:
-    grown = box + 1e-9 * np.array([-1, -1, -1, 1, 1, 1])
-    return chord_of_box(grown[:3], grown[3:], rays_o, rays_d) > 0
-
-
-@pytest.mark.parametrize("count", [1, 7, 3000])
-def test_every_ray_hits_the_box_and_starts_outside(count):
-    rays_o, rays_d = random_rays([BOX], count, seeded())
-    assert rays_o.shape == rays_d.shape == (count, 3)
-    assert hits(BOX, rays_o, rays_d).all()
-    np.testing.assert_allclose(np.linalg.norm(rays_d, axis=1), 1)
-    centre, radius = (BOX[:3] + BOX[3:]) / 2, np.linalg.norm(BOX[3:] - BOX[:3]) / 2
-    assert (np.linalg.norm(rays_o - centre, axis=1) >= 1.19 * radius).all()
-
-
-def test_small_objects_get_their_share():
-    """A box of a millionth of the volume gets a quarter of all rays, as the other one does."""
-    rays_o, rays_d = random_rays([BOX, SMALL, OTHER], 4000, seeded())
-    for box in (SMALL, OTHER):
-        assert 1000 <= hits(box, rays_o, rays_d).sum() < 1400
-    assert (hits(BOX, rays_o, rays_d) | hits(SMALL, rays_o, rays_d) | hits(OTHER, rays_o, rays_d)).all()
-
-
-def test_rays_follow_the_seed():
-    first, again, other = (random_rays([BOX], 50, seeded(s))[0] for s in (1, 1, 2))
-    assert np.array_equal(first, again) and not np.array_equal(first, other)
-
-
 def test_pixels_are_those_of_the_renderer():
     """In one part and in several; a smooth field hides the jitter."""
     field = Gaussian(density=8.0).occupy(12)
-    rays_o, rays_d = random_rays([BOX], 400, seeded())
+    rays_o, rays_d = RaySampler([BOX]).draw(400, seeded())
     wanted = render_rays(field, rays_o, rays_d, step=0.01, early_stop=1e-3)[:, :4]
     for at_once in (1 << 16, 150):
         pool = ask(field, rays_o, rays_d, 0.01, seeded(3), at_once=at_once)
@@ -59,7 +29,7 @@ def test_pixels_are_those_of_the_renderer():
 @pytest.mark.parametrize("at_once", [1 << 14, 30])
 def test_points_are_samples_with_the_teachers_answers(at_once):
     field = Gaussian(density=8.0)
-    rays_o, rays_d = random_rays([BOX], 100, seeded())
+    rays_o, rays_d = RaySampler([BOX]).draw(100, seeded())
     points = ask(field, rays_o, rays_d, 0.05, seeded(3), everything, at_once).points
     sigma, rgb = field.query(points.where, points.dirs)
     assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
@@ -73,7 +43,7 @@ def everything(depth, transmittance):
 
 
 def test_all_matter_is_kept_and_a_share_of_the_emptiness():
-    field, rays = Gaussian(density=8.0), random_rays([BOX], 2000, seeded())
+    field, rays = Gaussian(density=8.0), RaySampler([BOX]).draw(2000, seeded())
     whole = ask(field, *rays, 0.05, seeded(3), everything).points
     kept = ask(field, *rays, 0.05, seeded(3)).points
     matter = [(points.sigma * 0.05 > MATTER).sum() for points in (whole, kept)]
@@ -91,7 +61,7 @@ def test_transmittance_of_points_is_the_rays():
 
 
 def test_points_come_in_random_order_and_round_again():
-    points = ask(Gaussian(density=8.0), *random_rays([BOX], 100, seeded()), 0.05, seeded(3)).points
+    points = ask(Gaussian(density=8.0), *RaySampler([BOX]).draw(100, seeded()), 0.05, seeded(3)).points
     jumps = (points.where[1:] - points.where[:-1]).norm(dim=1)
     assert jumps.mean() > 0.3  # along a ray they would be 0.05 apart
     n, size = len(points), len(points) // 3 + 5

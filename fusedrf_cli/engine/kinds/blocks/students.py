@@ -6,7 +6,6 @@ from itertools import product
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import LOST_NOTED, Detail
-from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung, shrinking
@@ -126,10 +125,6 @@ class BlocksStudent(MadeStudent):
     def smallest(self) -> int:
         """Bytes of the file with the coarsest blocks."""
         return min(self.joined(way, 1)[1] for group in self.ways() for way in group)
-
-    def teacher(self, in_memory: bool) -> RadianceField:
-        """The blocks as they are, which render fast, or the scene where memory does not hold them."""
-        return blocks_of(self.scene.placed) if in_memory else self.scene
 
     def why(self, field: VMField) -> str:
         """How many blocks over how many fields."""

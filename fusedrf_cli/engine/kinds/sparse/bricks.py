@@ -226,9 +226,10 @@ class Lattice:
         for a, b, c in OCTANTS:
             used[:, a : a + n, b : b + n, c : c + n] |= wide
         self.used = used.reshape(-1, (n + 1) ** 3)
-        keys, first, inverse = np.unique(self._keys(), return_index=True, return_inverse=True)
+        used = self._keys()
+        keys, first, inverse = np.unique(used, return_index=True, return_inverse=True)
         vertices = key_places(keys)
-        hanging, parents = self._constraints(vertices)
+        hanging, parents = self._constraints(vertices, used)
         rank = np.empty(len(keys), np.int64)
         rank[np.lexsort((first, hanging))] = np.arange(len(keys))
         self.free = int(np.count_nonzero(~hanging))
@@ -310,21 +311,20 @@ class Lattice:
 
     def _keys(self) -> np.ndarray:
         """Keys of all used vertices, brick by brick."""
-        brick, vertex = np.nonzero(self.used)
-        n = self.n + 1
-        inner = np.stack([vertex // n**2, vertex // n % n, vertex % n], 1)
-        width = self.width[brick][:, None]
-        return node_keys((self.tree.at[brick] * self.n + inner) * width)
+        width = self.width[:, None]
+        inner = np.stack(np.meshgrid(*[np.arange(self.n + 1)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        # the key of a sum of places is the sum of their keys
+        return (node_keys(self.tree.at * (self.n * width))[:, None] + node_keys(inner) * width)[self.used]
 
-    def _constraints(self, vertices: np.ndarray) -> tuple[np.ndarray, tuple]:
+    def _constraints(self, vertices: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, tuple]:
         """(V,) bool which vertices hang, and of those (rows' keys (H, 8), weights (H, 8)) of what they hang
-        on."""
+        on; used: the keys of all used vertices, brick by brick."""
         tree, n = self.tree, self.n
         hanging = np.zeros(len(vertices), bool)
         nothing = np.zeros((0, 8), np.int64), np.zeros((0, 8))
         if len(np.unique(tree.level)) < 2:
             return hanging, nothing
-        tried = np.flatnonzero(self._beside_wider(vertices))
+        tried = np.flatnonzero(self._beside_wider(vertices, used))
         widest = np.zeros(len(tried), np.int64)
         holder = np.zeros((2, len(tried)), np.int64)
         for octant in OCTANTS:
@@ -344,8 +344,9 @@ class Lattice:
         weights = np.where(OCTANTS == 1, share[:, None], 1 - share[:, None]).prod(2)
         return hanging, (node_keys(corners.reshape(-1, 3)).reshape(-1, 8), weights)
 
-    def _beside_wider(self, vertices: np.ndarray) -> np.ndarray:
-        """(V,) bool, which vertices belong to bricks beside, or at a corner of, one of a coarser level."""
+    def _beside_wider(self, vertices: np.ndarray, used: np.ndarray) -> np.ndarray:
+        """(V,) bool, which vertices belong to bricks beside, or at a corner of, one of a coarser level; used
+        as `_constraints` has it."""
         tree = self.tree
         span = 2 * SIDE << (tree.depth - tree.level.astype(np.int64))
         everywhere = np.ones((len(tree.level), 1), bool)
@@ -354,7 +355,7 @@ class Lattice:
             beside = tree.at * span[:, None] + span[:, None] // 2 + step * span[:, None]
             brick, _, _ = tree.voxels_at(beside, 1, everywhere)
             found |= (brick >= 0) & (tree.level[brick] < tree.level)
-        keys = self._keys()[np.repeat(found, self.used.sum(1))]
+        keys = used[np.repeat(found, self.used.sum(1))]
         return np.isin(node_keys(vertices), keys)
 
     def _spread(

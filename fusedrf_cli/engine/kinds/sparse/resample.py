@@ -33,11 +33,13 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 )
 from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.seen import can_be_cut
 from fusedrf_cli.engine.kinds.sparse.training import of_voxels
 from fusedrf_cli.engine.spaces import bounded
 
 FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
 YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way
+IN_PLACE = 0.5  # of the widening of a place, in logarithms, that of what stands in it: it takes few bricks
 DEEPEST = 6  # levels under the coarsest: where voxels differ by more, the widest are finer than needed
 FAINT = 1e-4  # optical depth of a voxel under which there is nothing
 LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
@@ -51,7 +53,7 @@ ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has
 AIMED, FULL_ENOUGH = 0.98, 0.88  # of the numbers allowed
 FIRST_WIDENING = 2.0  # what is tried first is cheap
 FIRST_IN_PLACE = 6.0  # the same of a place, of which much more shows
-USUAL_SLOPE = -2.7  # of the logarithm of numbers over that of the widening, as seen
+USUAL_SLOPE, SLOPE_IN_PLACE = -2.7, -2.1  # of the logarithm of numbers over that of the widening, as seen
 
 
 class TooFewNumbers(ValueError):
@@ -70,10 +72,9 @@ def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> S
 
 def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tuple[Lattice, list[np.ndarray]]:
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
-    own = [p.voxel_size for p in placed_in(teacher)]
-    least = (min(own) / max(own)) ** YIELD  # no voxel is wider than needed then
-    first = FIRST_WIDENING if teacher.occupancy.space is bounded else FIRST_IN_PLACE
-    widening, best, tried = max(first, least), None, []
+    own, in_place = own_voxels(teacher), teacher.occupancy.space is not bounded
+    least = 1.0 if in_place else (own.min() / own.max()) ** YIELD  # no voxel is wider than needed then
+    widening, best, tried = FIRST_IN_PLACE if in_place else max(FIRST_WIDENING, least), None, []
     for attempt in range(MOST_ATTEMPTS):
         if attempt >= ATTEMPTS and best is not None:
             break
@@ -84,7 +85,7 @@ def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tupl
             best = widening, found
         if count <= max_numbers and (widening <= least or count >= FULL_ENOUGH * max_numbers):
             break
-        slope = USUAL_SLOPE
+        slope = SLOPE_IN_PLACE if in_place else USUAL_SLOPE
         if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
             slope = min(-1.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
         wanted = tried[-1][0] + (np.log(AIMED * max_numbers) - tried[-1][1]) / slope
@@ -102,12 +103,8 @@ def number_count(lattice: Lattice, shape: SparseShape) -> int:
 
 def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
     """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels are
-    FINER times each placed field's own, or as much wider than that as a widening says.
-
-    What is finer than the widest own voxel gives way a little more: by YIELD of the distance, in logarithms.
-    """
-    own = np.array([p.voxel_size for p in placed_in(teacher)])
-    needs = FINER * np.maximum(own, widening * own ** (1 - YIELD) * own.max() ** YIELD)
+    FINER times as wide as `voxels_wanted` has it."""
+    needs = FINER * voxels_wanted(teacher, widening)
     depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
     top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
     box = teacher.occupancy.tight_aabb(0)
@@ -119,6 +116,24 @@ def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.nd
     lo = (box[:3] + box[3:] - top * counts) / 2
     levels = np.clip(np.round(np.log2(top / (SIDE * needs))), 0, depth).astype(int)
     return lo, sides(top), tuple(counts), [int(level) for level in levels]
+
+
+def own_voxels(teacher: RadianceField) -> np.ndarray:
+    """(P,) the voxels of each placed field."""
+    return np.array([p.voxel_size for p in placed_in(teacher)])
+
+
+def voxels_wanted(teacher: RadianceField, widening: float) -> np.ndarray:
+    """(P,) how wide a voxel may be for each placed field: as its own, or as much wider as a widening says.
+
+    What is finer than the widest own voxel gives way a little more: by YIELD of the distance, in logarithms.
+    What stands in a place gives way less than the place (IN_PLACE).
+    """
+    own = own_voxels(teacher)
+    if teacher.occupancy.space is bounded:
+        return np.maximum(own, widening * own ** (1 - YIELD) * own.max() ** YIELD)
+    place = np.array([p.unbounded for p in placed_in(teacher)])
+    return own * np.maximum(1, widening) ** np.where(place, 1, IN_PLACE)
 
 
 def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.ndarray]]:
@@ -136,8 +151,22 @@ def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.
     lattice, (sigma,) = thinned(lattice, dense, sigma)
     field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree), space=teacher.occupancy.space)
     set_density(field, sigma)
-    kept, facing = shown(field)
-    return thinned(lattice, kept, sigma, facing)
+    place = in_a_place(teacher, lattice, levels)
+    kept, facing = shown(field, ~place | one_of_eight(lattice))
+    return thinned(lattice, kept | place, sigma, facing)
+
+
+def in_a_place(teacher: RadianceField, lattice: Lattice, levels: list[int]) -> np.ndarray:
+    """(K,) bool: which active voxels are no finer than a place needs that seen.py has cut down to what its
+    views show, so that there is nothing to be left out of it."""
+    found = [level for p, level in zip(placed_in(teacher), levels, strict=True) if can_be_cut(p)]
+    return np.repeat(lattice.tree.level <= max(found, default=-1), lattice.active.sum(1))
+
+
+def one_of_eight(lattice: Lattice) -> np.ndarray:
+    """(K,) bool: active voxels of which every vertex has one beside it, where all around it are active."""
+    i, j, k = np.unravel_index(np.nonzero(lattice.active)[1], (SIDE,) * 3)
+    return (i | j | k) % 2 == 0
 
 
 class EmptyField(ValueError):

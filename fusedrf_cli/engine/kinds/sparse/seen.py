@@ -10,7 +10,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.teacher import random_rays
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
 from fusedrf_cli.engine.fields.streamed import opened
@@ -61,6 +61,6 @@ def rays_of(scene: ComposedField, views: Sequence[Camera]) -> tuple[np.ndarray, 
     and its objects."""
     if not views:
         generator = torch.Generator().manual_seed(SEED)
-        return random_rays([scene.occupancy.subject, *(p.aabb for p in scene.placed)], RAYS, generator)
+        return RaySampler.of(scene).draw(RAYS, generator)
     rays_o, rays_d = (np.concatenate(parts) for parts in zip(*(v.rays() for v in views), strict=True))
     return rays_o, rays_d

@@ -2,6 +2,7 @@
 rays."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from math import prod
@@ -44,6 +45,8 @@ DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leav
 DEGREES = (0, 1, 2)
 LEAST_BYTES = 20_000  # told where nothing fits: a few hundred vertices and their bricks
 HELD_SHARE = 0.2  # of the vertices of a box: about what surfaces need
+LESSON = DistillSettings(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
+LESSON_IN_PLACE = replace(LESSON, rays=1_000_000, rgb_steps=1200, rgb_samples=1 << 17)
 LADDER_BYTES = (1_000_000, 3_000_000, 8_000_000)
 
 
@@ -148,9 +151,12 @@ class SparseKind(Kind):
 class SparseStudent(MadeStudent):
     """Bricks about as fine as each object of a scene needs, all wider by one factor under a limit."""
 
-    # what was asked needs no learning from points
-    lesson = DistillSettings(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
     compares = False
+
+    @property
+    def lesson(self) -> DistillSettings:
+        """Rays alone: what was asked needs no learning from points."""
+        return LESSON_IN_PLACE if any(p.unbounded for p in self.scene.placed) else LESSON
 
     @cached_property
     def seen(self) -> ComposedField:

@@ -86,7 +86,8 @@ class PlaceStudent(Student):
 
     def needs(self) -> Needs:
         """See Student: the tensor, and the place beside it."""
-        return Needs(self.largest().numbers + opened(self.place.field).params.numel(), COPIES)
+        place = opened(self.place.field).params.numel()
+        return Needs(self.largest().numbers + place, COPIES, settled=place)
 
 
 def place_student(
