@@ -39,7 +39,7 @@ STANDS = {
 """The size and the position in the bear's world of each object."""
 UPRIGHT = np.array([[0.46212, 0.13039, -0.87718], [0.0, 0.98913, 0.14703], [0.88682, -0.06794, 0.45709]])
 """Columns: an object's axes in the bear's world, whose photos were taken with a tilted up."""
-KINDS = {"blocks": (), "vm": ("--time-budget", 40), "sparse": ("--time-budget", 60)}
+KINDS = {"blocks": (), "vm": ("--time-budget", 40), "sparse": ()}
 MOST = "50MB"
 FRAME, FRAMES = (800, 533), 9
 ABOUT = (
