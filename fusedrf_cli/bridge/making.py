@@ -146,7 +146,8 @@ class Maker:
             with self.budget.learning():
                 rays.teach(learnt, seconds=seconds)
             return learnt, None
-        settings = replace(self.student.lesson, seed=self.request.seed, time_budget=seconds)
+        lesson = self.student.lesson_of(field.params.numel(), seconds)
+        settings = replace(lesson, seed=self.request.seed)
         run = DistillRun(self.teacher(), learnt, self.scene.sampler, settings, True, judge=self.judge)
         student, did = run.finish(*self.telling())
         self.budget.spent += run.learnt_seconds

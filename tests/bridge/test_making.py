@@ -1,5 +1,6 @@
 """What is written is what was measured, and learning keeps to one command's seconds."""
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import POINTS_PART, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.kinds.sparse import KIND as SPARSE
 from fusedrf_cli.engine.kinds.student import (
     NUMBERS_PER_SECOND,
     TOLD_NUMBERS,
@@ -193,6 +195,17 @@ def test_a_student_of_more_numbers_is_told_more_up_to_twice_as_much():
         assert (found.rays, found.steps) == (times * student.lesson.rays, times * student.lesson.steps)
         assert found.rgb_steps == student.lesson.rgb_steps
     assert Restless(None).lesson_of(TOLD_NUMBERS * 9) is None
+
+
+def test_bricks_learn_from_more_rays_the_more_numbers_they_hold():
+    """More numbers than rays say anything of learn those rays by heart."""
+    student = SPARSE.student(SCENE, StudentRequest(BundleSizes(), 10_000_000))
+    found = [student.lesson_of(n) for n in (1, 3_000_000, 6_000_000, 15_000_000, 21_000_000, 90_000_000)]
+    assert found[0] == found[1] == student.lesson
+    assert [lesson.rays // 150_000 for lesson in found] == [1, 1, 2, 5, 7, 7]
+    assert [lesson.rgb_steps // 400 for lesson in found] == [1, 1, 1, 2, 3, 3]
+    assert all(a.rgb_samples <= b.rgb_samples for a, b in itertools.pairwise(found))
+    assert student.lesson_of(1, 5.0).time_budget == 5.0
 
 
 def test_one_learnt_tensor_keeps_eight_bits_where_nothing_else_is_asked_for():

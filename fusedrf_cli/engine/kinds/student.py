@@ -236,7 +236,7 @@ class Student:
         there are, the more it is told, up to MOST_TOLD times, but no more than there is time to learn
         from."""
         if not self.learnt or self.lesson is None:
-            return self.lesson
+            return self.lesson and replace(self.lesson, time_budget=seconds)
         more = min(max(1.0, numbers / TOLD_NUMBERS), MOST_TOLD)
         rays, steps = round(more * self.lesson.rays), round(more * self.lesson.steps)
         if seconds is not None:
