@@ -292,9 +292,6 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
                 field, grid, (origin, way, course), k, many, u, step, d, scratch
             )
             if steps > 0:
-                if PIECES > 1:  # of a place a frame takes a tenth less by it, of an object a tenth more
-                    reach = SAMPLES_AHEAD * many * step
-                    ahead_density(field, field.params, keep(place), along(origin, way, u + reach))
                 weight = trans * opacity
                 if rays.early_stop > 0.0 and trans - weight <= REST_FROM:
                     weight = trans

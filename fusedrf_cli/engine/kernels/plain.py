@@ -8,7 +8,16 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from fusedrf_cli.engine.kernels.parts import LINE, adam_line, bit_of, body, pinhole_ray, sum_of_rows, touched
+from fusedrf_cli.engine.kernels.parts import (
+    LINE,
+    adam_line,
+    bit_of,
+    body,
+    pinhole_ray,
+    sum_of_rows,
+    touched,
+    unbend,
+)  # fmt: skip
 from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
@@ -106,6 +115,23 @@ def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
         pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d)
+
+
+@task
+def unbend_task(distorted, distortion, low, high, ideal):
+    """`unbent` for points low..high."""
+    for i in range(low, high):
+        ideal[i, 0], ideal[i, 1] = unbend(distorted[i, 0], distorted[i, 1], distortion)
+
+
+@loop
+def unbent(distorted, distortion, ideal):
+    """For every of distorted (N, 2) normalised image coordinates the ideal ones (`parts.unbend`), by a lens
+    of `distortion`, a tuple of nine."""
+    n = distorted.shape[0]
+    for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
+        low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
+        unbend_task(distorted, distortion, low, high, ideal)
 
 
 @task

@@ -10,10 +10,11 @@ from functools import lru_cache
 import numpy as np
 
 from fusedrf_cli.engine.kernels import cpu
+from fusedrf_cli.engine.kernels.parts import NEWTON_NEAR, NEWTON_STEPS
+from fusedrf_cli.engine.kernels.parts import bend as bend_numbers
 
 TILE = 16  # pixels along the side of a tile
-NEWTON_STEPS = 50
-NEWTON_NEAR = 1e-13  # focal lengths, or radians
+bend = bend_numbers.py_func  # of arrays
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class Camera:
     width: int
     height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `bend`); of a fisheye k1, k2, k3, k4
-    (see `bend_angle`)."""
+    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `parts.bend`); of a fisheye k1, k2,
+    k3, k4 (see `bend_angle`)."""
     name: str = ""
     fisheye: bool = False
     """The distance from the image's centre grows with the angle from the axis, not with its tangent."""
@@ -95,55 +96,17 @@ def tile_order(width: int, rows: int) -> np.ndarray:
     return order[order >= 0]
 
 
-def bend(
-    u: np.ndarray, v: np.ndarray, distortion: tuple[float, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """OpenCV's distortion: ideal normalised image coordinates (y down) to distorted ones, and the derivatives
-    of x by u, of x by v (which is that of y by u) and of y by v, stacked first.
-
-    With r² = u² + v² the radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) / (1 + d1 r² + d2 r⁴ + d3 r⁶);
-    p1 and p2 are tangential. d1 to d3 are what OpenCV calls k4 to k6; k4 is here Metashape's.
-    """
-    k1, k2, k3, p1, p2, k4, d1, d2, d3 = (*distortion, *(0.0,) * (9 - len(distortion)))
-    r2 = u * u + v * v
-    over = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-    under = 1 + r2 * (d1 + r2 * (d2 + r2 * d3))
-    d_over = k1 + r2 * (2 * k2 + r2 * (3 * k3 + r2 * 4 * k4))
-    d_under = d1 + r2 * (2 * d2 + r2 * 3 * d3)
-    radial = over / under
-    slope = 2 * (d_over - radial * d_under) / under  # twice the derivative of the factor by r²
-    x = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
-    y = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
-    x_u = radial + u * u * slope + 2 * p1 * v + 6 * p2 * u
-    x_v = u * v * slope + 2 * p1 * u + 2 * p2 * v
-    y_v = radial + v * v * slope + 6 * p1 * v + 2 * p2 * u
-    return x, y, np.stack([x_u, x_v, y_v])
-
-
 def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Invert `bend` by Newton steps, halved where one would lead away: distorted to ideal normalised image
-    coordinates (y down). A pixel that no ray reaches gets the nearest that was found."""
-    u, v = np.array(x, np.float64), np.array(y, np.float64)
-    found_x, found_y, slopes = bend(u, v, distortion)
-    far = np.hypot(found_x - x, found_y - y)
-    share = np.ones_like(far)
-    for _ in range(NEWTON_STEPS):
-        if far.size == 0 or far.max() < NEWTON_NEAR:
-            break
-        a, b, d = slopes
-        dx, dy = x - found_x, y - found_y
-        # Never singular: a step along a fold of the lens is long, is seen to lead away, and is halved.
-        area = a * d - b * b
-        area = np.where(np.abs(area) < 1e-12, 1e-12, area)
-        next_u, next_v = u + share * (d * dx - b * dy) / area, v + share * (a * dy - b * dx) / area
-        next_x, next_y, next_slopes = bend(next_u, next_v, distortion)
-        next_far = np.hypot(next_x - x, next_y - y)
-        better = next_far < far
-        u, v = np.where(better, next_u, u), np.where(better, next_v, v)
-        found_x, found_y = np.where(better, next_x, found_x), np.where(better, next_y, found_y)
-        slopes, far = np.where(better, next_slopes, slopes), np.where(better, next_far, far)
-        share = np.where(better, np.minimum(2 * share, 1), share / 2)
-    return u, v
+    """Invert `parts.bend`: distorted to ideal normalised image coordinates (y down). A pixel that no ray
+    reaches gets the nearest that was found."""
+    ideal = np.empty((np.size(x), 2))
+    cpu.unbent(np.stack([np.ravel(x), np.ravel(y)], 1), of_nine(distortion), ideal)
+    return ideal[:, 0].reshape(np.shape(x)), ideal[:, 1].reshape(np.shape(x))
+
+
+def of_nine(distortion: tuple[float, ...]) -> tuple[float, ...]:
+    """A lens's numbers as `parts.bend` takes them."""
+    return tuple(map(float, distortion)) + (0.0,) * (9 - len(distortion))
 
 
 def bend_angle(angle: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +129,7 @@ def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarra
     else:
         away = -back
         before = np.where(away > 0, away, np.inf)
-        u, v, (a, b, d) = bend(x / before, -y / before, camera.distortion)
+        (u, v), (a, b, d) = bend(x / before, -y / before, of_nine(camera.distortion))
         slope = a * d - b * b
     pixels = np.stack([camera.cx + camera.fl_x * u, camera.cy + camera.fl_y * v], 1)
     unfolded = (away > 0) & (slope > 0)  # beyond a fold of the lens points would come back into the picture

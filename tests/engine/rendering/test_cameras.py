@@ -13,6 +13,7 @@ from fusedrf_cli.engine.rendering.cameras import (
     framing_lens,
     level,
     look_at,
+    of_nine,
     orbit,
     scattered,
     undistort,
@@ -82,7 +83,7 @@ def test_the_slopes_of_a_lens_are_its_differences(distortion):
         / (2 * h)
         for i, j in ((1, 0), (0, 1))
     )
-    x, y, (x_u, x_v, y_v) = bend(u, v, distortion)
+    (x, y), (x_u, x_v, y_v) = bend(u, v, of_nine(distortion))
     np.testing.assert_allclose([x, y], distort(u, v, distortion), rtol=1e-12)
     np.testing.assert_allclose([x_u, x_v, x_v, y_v], [by_u[0], by_v[0], by_u[1], by_v[1]], atol=1e-8)
 
