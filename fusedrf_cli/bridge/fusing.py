@@ -307,12 +307,14 @@ def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
 def make_room(memory: Memory, student: Student, scene: Scene, request: FuseRequest) -> bool:
     """Keep no more sources in memory than fit beside what every stage of a student needs; ResourceProblem
     where not even the largest does. Whether all of them may be held at once, as a teacher."""
-    needed = stages(student, scene.composed, request)
+    needed = stages(student, scene.composed, request, student.scene)
     sizes, shelf = scene.loaded.sizes, scene.loaded.shelf
-    _, learning = needed[-1]
-    together = memory.room(learning) > 2 * sum(sizes)
-    if together and not student.learnt and learning:
-        learning |= {"the sources put together": sum(sizes)}
+    together = memory.room(needed[-1][1]) > 2 * sum(sizes)
+    whole = registry.joined(student.scene) if together and student.learnt else None
+    if whole is not None:  # of which fewer empty points are asked
+        needed = stages(student, scene.composed, request, whole)
+    if together and needed[-1][1]:
+        needed[-1][1]["the sources put together"] = sum(sizes)
     if not together and student.lesson is None and learning_is_asked(student, request):
         needed.append((0.0, asking_in_waves(student, scene.composed)))
     room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)

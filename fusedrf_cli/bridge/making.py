@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -87,8 +88,6 @@ class Maker:
         self.best: Kept | None = None
         self.sources_in_memory = True
         """Whether all sources may be in memory at once, as a teacher."""
-        self._rays: RayLesson | None = None
-        self._teacher: RadianceField | None = None
         self.finished_tries = 0
 
     def measured(self, field: StoredField, way: Way) -> float:
@@ -142,13 +141,13 @@ class Maker:
         seconds = self.budget.part(self.tries_to_come())
         self.finished_tries += 1
         if self.student.lesson is None:
-            rays = self.rays()
+            rays = self.rays
             with self.budget.learning():
                 rays.teach(learnt, seconds=seconds)
             return learnt, None
         lesson = self.student.lesson_of(field.params.numel(), seconds)
         settings = replace(lesson, seed=self.request.seed)
-        run = DistillRun(self.teacher(), learnt, self.scene.sampler, settings, True, judge=self.judge)
+        run = DistillRun(self.teacher, learnt, self.scene.sampler, settings, True, judge=self.judge)
         student, did = run.finish(*self.telling())
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)
@@ -160,19 +159,17 @@ class Maker:
             return max(2, TRIES - self.finished_tries)  # how many a search takes is not known
         return max(1, (FINALISTS if self.student.compares else 1) - self.finished_tries)
 
+    @cached_property
     def rays(self) -> RayLesson:
         """What there is to learn from, drawn once."""
-        if self._rays is None:
-            self._rays = RayLesson(self.teacher(), self.scene.sampler, self.request.seed)
-        return self._rays
+        return RayLesson(self.teacher, self.scene.sampler, self.request.seed)
 
+    @cached_property
     def teacher(self) -> RadianceField:
-        """What shows the scene along rays: its sources put together, where memory holds them and a kind can
-        be that, else the scene."""
-        if self._teacher is None:
-            whole = registry.joined(self.scene.composed) if self.sources_in_memory else None
-            self._teacher = self.scene.composed if whole is None else whole.to(self.place)
-        return self._teacher
+        """What the student learns from: the sources put together, where memory holds them and a kind can be
+        that, else the scene that it stands for."""
+        whole = registry.joined(self.student.scene) if self.sources_in_memory else None
+        return self.student.scene if whole is None else whole.to(self.place)
 
     # -- students that learn from nothing --------------------------------------------------------------------
 
@@ -227,9 +224,8 @@ class Maker:
         """A student that has learnt; an interrupt saves a checkpoint."""
         request, seconds = self.request, self.budget.part(tries)
         settings = replace(self.student.lesson_of(field.params.numel(), seconds), seed=request.seed)
-        teacher = self.student.scene
-        sampler = RaySampler.of(teacher, self.scene.views)
-        run = DistillRun(teacher, field, sampler, settings, request.rgb, recipe, self.judged_whole)
+        sampler = RaySampler.of(self.student.scene, self.scene.views)
+        run = DistillRun(self.teacher, field, sampler, settings, request.rgb, recipe, self.judged_whole)
         made_with = {  # with other words the saved numbers would go on to something else
             "kind": self.student.kind.name,
             "numbers": field.params.numel(),

@@ -18,6 +18,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.finish import RAYS
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
+from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
 from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
@@ -175,10 +176,10 @@ def lesson(rays: int) -> dict[str, float]:
 
 
 def stages(
-    student: Student, scene: ComposedField, request: FuseRequest
+    student: Student, scene: ComposedField, request: FuseRequest, teacher: RadianceField
 ) -> list[tuple[float, dict[str, float]]]:
-    """The stages of fusing a scene: making a student, measuring it, learning. Each is so many copies of the
-    largest source, and bytes by what they are for."""
+    """The stages of fusing a scene: making a student, measuring it, learning from a teacher. Each is so many
+    copies of the largest source, and bytes by what they are for."""
     needs = student.needs()
     numbers, learnt, grids = needs.numbers, needs.numbers - needs.settled, ownership(scene.aabb)
     settings = student.lesson_of(learnt, request.time_budget) or DistillSettings()
@@ -189,7 +190,7 @@ def stages(
         if points is None:
             step = 0.5 * student.largest().voxel
             sampler = RaySampler.of(student.scene, student.request.views)
-            points = points_kept(student.scene, sampler, settings.rays, step, request.seed)
+            points = points_kept(teacher, sampler, settings.rays, step, request.seed)
         taught = teaching(settings, points)
     # kept beside what learns: the field as it was made, and the numbers that its pictures have to surpass
     kept = (not student.learnt) + (student.lesson is not None and request.rgb)

@@ -109,11 +109,26 @@ def test_of_two_tries_the_better_is_kept():
 def test_rays_show_the_scene_whether_or_not_it_is_put_together(monkeypatch, in_memory):
     maker = maker_of(monkeypatch, Restless(None), lambda field: 0.0, asked())
     maker.sources_in_memory = in_memory
-    teacher = maker.teacher()
-    assert (teacher is SCENE) != in_memory and maker.teacher() is teacher
+    teacher = maker.teacher
+    assert (teacher is SCENE) != in_memory
     rays = SAMPLER.draw(300, torch.Generator().manual_seed(5))
     shown, wanted = (render_rays(field, *rays)[:, :4] for field in (teacher, SCENE))
     assert wanted[:, 3].max() > 0.5 and psnr(shown, wanted) > 50
+
+
+def test_a_student_that_learns_from_nothing_is_taught_by_the_sources_put_together(monkeypatch):
+    taught_by = []
+
+    def run(teacher, *words):
+        taught_by.append(teacher)
+        raise InterruptedError
+
+    monkeypatch.setattr(making, "DistillRun", run)
+    student = Student(VM, SCENE, StudentRequest(BundleSizes(), 10_000_000))
+    maker = maker_of(monkeypatch, student, lambda field: 0.0, asked())
+    with pytest.raises(InterruptedError):
+        next(maker.learn(None))
+    assert taught_by == [maker.teacher] and maker.teacher is not SCENE
 
 
 # -- seconds -------------------------------------------------------------------------------------------------

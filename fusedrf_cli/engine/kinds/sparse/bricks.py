@@ -226,10 +226,10 @@ class Lattice:
         for a, b, c in OCTANTS:
             used[:, a : a + n, b : b + n, c : c + n] |= wide
         self.used = used.reshape(-1, (n + 1) ** 3)
-        used = self._keys()
-        keys, first, inverse = np.unique(used, return_index=True, return_inverse=True)
+        of_bricks = self._keys()
+        keys, first, inverse = np.unique(of_bricks, return_index=True, return_inverse=True)
         vertices = key_places(keys)
-        hanging, parents = self._constraints(vertices, used)
+        hanging, parents = self._constraints(vertices, of_bricks)
         rank = np.empty(len(keys), np.int64)
         rank[np.lexsort((first, hanging))] = np.arange(len(keys))
         self.free = int(np.count_nonzero(~hanging))
