@@ -4,8 +4,9 @@ from the distances and in the resolutions at which their sources were photograph
 A view of everything shows objects small, before much that is empty, and what is lost of them does not show.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -18,6 +19,8 @@ from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
+from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.spaces import unbounded
 
 WHOLE = 3
 """Of the views, at least so many show the whole scene; the others show objects."""
@@ -29,6 +32,9 @@ UNPHOTOGRAPHED = 400
 """Pixels a side of the pictures of an object that no photo shows, in which it is framed."""
 OWN_VIEWS, MORE_VIEWS, SMALL = 100, 60, 96
 """Of `views_of_place`: so many cameras of the photos at most, so many between them, and pixels a side."""
+TRIES, ROUGH, SHOWN = 12, 12, 0.2
+"""So many views of an object in a place are drawn until one, of so many pixels a side, shows it in that share
+of them."""
 VIEWS_SEED = 5_000_011
 LOWEST, HIGHEST = 0.05, 1.3
 """Radians above the horizon of such views."""
@@ -76,7 +82,28 @@ def looks_of(
 ) -> list[Look]:
     """At least `count` seeded views (see `looks`) of a scene, which `composed` is as one field."""
     box = placed_box(composed.occupancy.subject, composed.origin)
-    return looks(rig_of(scene), box, subjects_of(scene), count, size, seed)
+    sees = partial(shows, composed) if composed.occupancy.space is unbounded else anything
+    return looks(rig_of(scene), box, subjects_of(scene), count, size, seed, sees)
+
+
+def anything(camera: Camera, subject: Subject) -> bool:
+    """That any view of an object will do."""
+    return True
+
+
+def shows(composed: ComposedField, camera: Camera, subject: Subject) -> bool:
+    """Whether an object can be seen in a view: a place may stand before it, or around the camera, since the
+    object was photographed elsewhere."""
+    wide, high = camera.width / ROUGH, camera.height / ROUGH
+    rough = replace(
+        camera, width=ROUGH, height=ROUGH,
+        fl_x=camera.fl_x / wide, cx=camera.cx / wide, fl_y=camera.fl_y / high, cy=camera.cy / high,
+    )  # fmt: skip
+    depth = render_image(composed, rough, origin=composed.origin).depth.ravel()
+    rays_o, rays_d = (rays[np.isfinite(depth)] for rays in rough.rays())
+    at = rays_o + depth[np.isfinite(depth), None] * rays_d
+    inside = ((at >= subject.box[:3]) & (at <= subject.box[3:])).all(1)
+    return np.count_nonzero(inside) >= SHOWN * depth.size
 
 
 def looks(
@@ -86,10 +113,11 @@ def looks(
     count: int,
     size: tuple[int, int],
     seed: int | tuple,
+    sees: Callable[[Camera, Subject], bool] = anything,
 ) -> list[Look]:
     """`count` seeded views of a size (width, height), or more where there are objects: of the whole scene, as
     a rig that shows its surroundings saw it, else from around a box (6,) of the world; and of its objects in
-    turn, in an order drawn anew for every seed."""
+    turn, in an order drawn anew for every seed, from where a view `sees` them."""
     rng = np.random.default_rng(seed)
     close = max(min(len(objects), MOST_OBJECTS), count - WHOLE) if objects else 0
     whole = max(count - close, WHOLE) if close else count
@@ -101,7 +129,9 @@ def looks(
     order = rng.permutation(len(objects)) if close else []
     for number in range(close):
         subject = objects[order[number % len(objects)]]
-        found.append(Look(close_up(subject, size, rng), subject.name))
+        drawn = (close_up(subject, size, rng) for _ in range(TRIES))
+        camera = next((camera for camera in drawn if sees(camera, subject)), None)
+        found.append(Look(camera or close_up(subject, size, rng), subject.name))
     named = enumerate(found)
     return [replace(look, camera=replace(look.camera, name=f"view_{i:04d}")) for i, look in named]
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusedrf_cli.bridge.looks import Subject, between, looks
+from fusedrf_cli.bridge.looks import Subject, between, looks, shows
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.judging import Judge
-from fusedrf_cli.engine.rendering.cameras import framing_camera
+from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, look_at
 from tests.analytic.fields import Box, Tint
 from tests.bridge.conftest import part
 from tests.bridge.test_views import FOCUS, photo
@@ -89,6 +89,29 @@ def test_views_follow_their_seed():
     found = (looks(PLACE, BOX, OBJECTS, 6, (32, 32), seed) for seed in (1, 1, 2))
     poses = [[look.camera.camera_to_world for look in drawn] for drawn in found]
     assert np.array_equal(poses[0], poses[1]) and not np.array_equal(poses[0], poses[2])
+
+
+def test_views_of_an_object_that_something_hides_are_drawn_anew():
+    """A wall stands on one side of a ball; the camera in the wall sees nothing either."""
+    ball = Placed("ball", Box(500.0, (0.2, 0.2, 0.2)), np.eye(4))
+    wall = np.eye(4)
+    wall[0, 3] = 1.0
+    scene = ComposedField([ball, Placed("wall", Box(500.0, (0.1, 3.0, 3.0)), wall)])
+    subject_of = Subject("ball", np.array([-0.2] * 3 + [0.2] * 3), None)
+
+    def seen_from(x: float) -> bool:
+        eye = np.array([x, 0.01, 0.01])
+        pose = look_at(eye, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        return shows(scene, Camera(pose, 100.0, 100.0, 20.0, 10.0, 40, 20), subject_of)
+
+    assert seen_from(-1.5) and not seen_from(2.5) and not seen_from(1.02)
+
+    def sees(camera, subject) -> bool:
+        return camera.camera_to_world[0, 3] < 0
+
+    found = (looks(None, BOX, [subject_of], 8, (32, 32), seed, sees) for seed in range(4))
+    eyes = np.array([[look.camera.camera_to_world[:3, 3] for look in drawn] for drawn in found])
+    assert (eyes[:, 3:, 0] < 0).all() and (eyes[:, :3, 0] > 0).any()
 
 
 def test_a_camera_between_two_looks_where_they_look():
