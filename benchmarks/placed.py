@@ -39,7 +39,7 @@ STANDS = {
 """The size and the position in the bear's world of each object."""
 UPRIGHT = np.array([[0.46212, 0.13039, -0.87718], [0.0, 0.98913, 0.14703], [0.88682, -0.06794, 0.45709]])
 """Columns: an object's axes in the bear's world, whose photos were taken with a tilted up."""
-KINDS = {"blocks": (), "vm": ("--time-budget", 40), "sparse": ()}
+KINDS = ("blocks", "vm", "sparse")
 MOST = "50MB"
 FRAME, FRAMES = (800, 533), 9
 ABOUT = (
@@ -71,12 +71,11 @@ def scene(folder: Path) -> None:
     fusedrf(folder, "compose", *words, "-o", "scene.json")
 
 
-def measured(folder: Path, kind: str, more: tuple, share: float) -> dict:
+def measured(folder: Path, kind: str) -> dict:
     """Fuse the scene as a kind: a row of the table."""
     tell(kind)
-    words = [str(share * w) if isinstance(w, int) else w for w in more]
     fused = f"{kind}.rfpack"
-    said = fusedrf(folder, "fuse", "scene.json", "--kind", kind, "--max-size", MOST, "-o", fused, *words)
+    said = fusedrf(folder, "fuse", "scene.json", "--kind", kind, "--max-size", MOST, "-o", fused)
     own, alone = frame_seconds([folder / fused, folder / "bear.rfpack"])
     psnr = said["psnr"]
     figures = {
@@ -117,7 +116,7 @@ def write_page(out: Path, rows: list[dict]) -> None:
     """placed.csv and placed.md, with the rows that are there of other kinds."""
     path = out / "placed.csv"
     rows = rows + kept_rows(path, "kind", {row["kind"] for row in rows})
-    rows.sort(key=lambda row: list(KINDS).index(row["kind"]))
+    rows.sort(key=lambda row: KINDS.index(row["kind"]))
     write_csv(path, rows)
     text = f"# Objects on a real background\n\n{ABOUT}\n\n{markdown(rows)}"
     (out / "placed.md").write_text(text, encoding="utf-8")
@@ -128,7 +127,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.placed", description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "real")
-    parser.add_argument("--share", type=float, default=1.0, help="of the time budgets")
+    parser.add_argument("--share", type=float, default=1.0, help="of the seconds of training")
     parser.add_argument("--kind", action="append", choices=KINDS, help="this kind; may be repeated")
     parser.add_argument("--keep", type=Path, help="a folder in which trained sources are kept")
     asked = parser.parse_args()
@@ -138,7 +137,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         sources(folder, asked.data.resolve(), asked.share)
         scene(folder)
-        rows = [measured(folder, kind, KINDS[kind], asked.share) for kind in asked.kind or KINDS]
+        rows = [measured(folder, kind) for kind in asked.kind or KINDS]
     write_page(asked.out, rows)
 
 
