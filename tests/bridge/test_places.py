@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from formats.images import read_image, write_png
 from formats.scene import SceneGraph, make_node, write_scene
@@ -21,7 +22,7 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Student, StudentRequest, Way
 from fusedrf_cli.engine.kinds.vm.blocks import reshaped
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.places import PlaceStudent
+from fusedrf_cli.engine.kinds.vm.places import PlaceStudent, turn_of
 from fusedrf_cli.engine.kinds.vm.students import place_of
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.spaces import bounded, unbounded
@@ -121,14 +122,51 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
     assert taken(part, ComposedField([part, replace(small, object_to_world=np.eye(4))])) is None
 
 
+def test_the_tensor_of_what_stands_in_a_place_is_turned_as_most_of_that_is():
+    """Mirrored and scaled as they may be; and it is put back where all stands."""
+    turn = Rotation.from_euler("xyz", [0.5, -0.2, 0.3]).as_matrix()
+    room, thing = walls(), random_vm(dtype=torch.float32, cells=4)
+
+    def placed(linear: np.ndarray, x: float) -> Placed:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[0, 3] = linear, x
+        return Placed("thing", thing, matrix)
+
+    mirrored = turn @ np.diag([0.2, 0.2, -0.2])
+    askew = [placed(0.2 * turn, -0.5), placed(mirrored, 0.5), placed(0.2 * np.eye(3), 0)]
+    assert np.abs(turn_of(askew)[:3, :3] - turn).max() < 1e-9
+    assert np.array_equal(turn_of([askew[2]]), np.eye(4))
+    request = StudentRequest(BundleSizes(), 25_000_000)
+    scene = ComposedField([Placed("room", room, np.eye(4)), *askew])
+    student = registry.kind("vm").student(scene, request)
+    box = student.scene.occupancy.aabb
+    plan = student.plan(student.ways()[0][0], 50_000)
+    field, _ = student.begun(plan, None, None, torch.Generator().manual_seed(0))
+    whole = student.whole(field)
+    lies = whole.blocks[0].object_to_field
+    assert np.abs(lies[:3, :3] - turn).max() < 1e-9
+    assert np.array_equal(whole.blocks[1].object_to_field, np.eye(4))
+    middles = np.array([p.object_to_world @ [0.05, -0.1, 0.2, 1.0] for p in askew])  # of their boxes
+    own = middles @ np.linalg.inv(lies).T
+    assert ((own[:, :3] > box[:3]) & (own[:, :3] < box[3:])).all()
+
+
 @pytest.mark.slow
-def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report):
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report, turn):
     """The place stays as it is; what is deleted leaves it so, and all others stay."""
     path = str(folder / "room.rfpack")
     write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
     places = {"room": (0, 0, 0), "red": (-0.5, 0, 0), "blue": (0.7, 0, 0)}
     nodes = [
-        make_node(n, source=f"{n}.rfpack", translation=at, background=n == "room") for n, at in places.items()
+        make_node(
+            n,
+            source=f"{n}.rfpack",
+            translation=at,
+            rotation=None if n == "room" else (0.0, np.sin(turn / 2), 0.0, np.cos(turn / 2)),
+            background=n == "room",
+        )
+        for n, at in places.items()
     ]
     write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
     words = ("fuse", "two.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")

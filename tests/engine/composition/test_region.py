@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.region import ClippedField
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.editing import cleared, region_of
+from fusedrf_cli.engine.kinds.vm.field import Block, VMField
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.rays import affine
 from tests.engine.conftest import BOX, THIRTY_TWO, Gaussian, chord_of_box, points_in, random_vm, rays_at, unit
@@ -51,7 +53,7 @@ def test_cleared_is_empty_inside_and_bit_equal_outside(moved):
             [Placed("a", field, affine(1, (0.3, 0, 0))), Placed("b", lone, affine(0.5, (4, 0, 0)))]
         )
     region = region_of(field, HOLE)
-    hollow = cleared(field, region)
+    hollow = cleared(field, HOLE)
     points = np.concatenate([points_in(field.aabb, 20000), points_in(region, 4000)])
     dirs = torch.from_numpy(unit(points_in(BOX, len(points), 8)))
     before, after = (f.query(torch.from_numpy(points), dirs) for f in (field, hollow))
@@ -64,10 +66,25 @@ def test_cleared_is_empty_inside_and_bit_equal_outside(moved):
     assert torch.equal(field.params, hollow.params)
 
 
+def test_around_a_turned_tensor_all_cells_of_the_box_are_emptied_and_all_of_those_lie_in_the_region():
+    alone = field_of()
+    turn = affine(1, (0.1, 0.2, 0))
+    turn[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.3, 0.7]).as_matrix()
+    field = VMField.assembled(alone.shape, alone.tensors, (Block(0, turn, "fused"),), alone.params)
+    region, hollow = region_of(field, HOLE), cleared(field, HOLE)
+    points = np.concatenate([points_in(field.aabb, 20000), points_in(HOLE, 4000)])
+    dirs = torch.from_numpy(unit(points_in(BOX, len(points), 8)))
+    before, after = (f.query(torch.from_numpy(points), dirs)[0].numpy() for f in (field, hollow))
+    within = inside(points, HOLE)
+    assert before[within].any() and not after[within].any()
+    changed = before != after
+    assert changed.any() and inside(points[changed], region).all()
+
+
 def test_a_field_that_was_cleared_is_the_only_one_changed():
     field = field_of()
     occupied = field.occupancy.occupied.copy()
-    cleared(field, region_of(field, HOLE))
+    cleared(field, HOLE)
     assert np.array_equal(field.occupancy.occupied, occupied)
 
 

@@ -27,6 +27,7 @@ from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMTensor
 from fusedrf_cli.engine.selection.cells import Selection
 
 NUMBERS = 2_000_000  # of a tensor that a region or an object is learnt into
+ROUNDED = 1e-9  # cells: what ends at the face of a cell may show in the next one too
 
 
 def parts(field: VMField) -> list[Part]:
@@ -143,7 +144,7 @@ def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, t
     """The field whose distilled tensor is empty in the cells of a box (6,), and a tensor of its own that
     holds what the rest shows there, but for what the field holds apart; None where nothing is left."""
     region = region_of(field, box)
-    emptied = cleared(field, region)
+    emptied = cleared(field, box)
     apart = [part.name for part in parts(field)]
     rest = [p for p in rest or [] if p.reaches(region) and not any(goes_by(n, {p.name}) for n in apart)]
     teacher = ComposedField(rest) if rest else None
@@ -159,27 +160,39 @@ def refilled(kind, field: VMField, box: np.ndarray, rest: list[Placed] | None, t
     return Edited(whole, region, how, figures=figures)
 
 
-def region_of(field: VMField, aabb: np.ndarray) -> np.ndarray:
-    """(6,) the box grown to whole cells of the field's distilled tensor (block 0), so that cutting it out
-    leaves no seam.
-    """
-    tensor = field.tensors[field.blocks[0].tensor]
-    at = field.blocks[0].object_to_field[:3, 3]
-    cell, lo = tensor.occupancy.cell, tensor.aabb[:3] + at
-    low = np.floor((aabb[:3] - lo) / cell - 1e-9)
-    high = np.ceil((aabb[3:] - lo) / cell + 1e-9)
-    shape = np.asarray(tensor.occupancy.occupied.shape)
-    return np.concatenate([lo + np.clip(low, 0, shape) * cell, lo + np.clip(high, 0, shape) * cell])
+def own_cells(field: VMField, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(3,), (3,) the first cell, and that behind the last, of the field's distilled tensor (block 0) around a
+    box (6,)."""
+    grid = field.tensors[field.blocks[0].tensor].occupancy
+    reached = transformed_aabb(box, np.linalg.inv(field.blocks[0].object_to_field))
+    low = np.floor((reached[:3] - grid.aabb[:3]) / grid.cell - ROUNDED)
+    high = np.ceil((reached[3:] - grid.aabb[:3]) / grid.cell + ROUNDED)
+    low, high = (np.clip(ends, 0, grid.occupied.shape).astype(int) for ends in (low, high))
+    return low, high
 
 
-def cleared(field: VMField, region: np.ndarray) -> VMField:
-    """The field with the cells of a region (of `region_of`) empty in its distilled tensor, and in the tensors
-    that earlier cuts filled in; no number changes.
+def region_of(field: VMField, box: np.ndarray) -> np.ndarray:
+    """(6,) the box grown to whole cells of the field's distilled tensor, so that cutting it out leaves no
+    seam; around them where the tensor is turned: there what lies between is held twice.
     """
-    blocks = [field.blocks[0], *(b for b in field.blocks[1:] if b.name == RESTORED)]
+    grid, ends = field.tensors[field.blocks[0].tensor].occupancy, own_cells(field, box)
+    grown = np.concatenate([grid.aabb[:3] + end * grid.cell for end in ends])
+    return transformed_aabb(grown, field.blocks[0].object_to_field)
+
+
+def cleared(field: VMField, box: np.ndarray) -> VMField:
+    """The field with the cells around a box empty in its distilled tensor, and those of `region_of` it in the
+    tensors that earlier cuts filled in; no number changes.
+    """
+    region, (low, high), first = region_of(field, box), own_cells(field, box), field.blocks[0].tensor
     emptied = {
-        b.tensor: emptied_tensor(field.tensors[b.tensor], b.object_to_field[:3, 3], region) for b in blocks
+        b.tensor: emptied_tensor(field.tensors[b.tensor], b.object_to_field[:3, 3], region)
+        for b in field.blocks[1:]
+        if b.name == RESTORED
     }
+    occupied = field.tensors[first].occupancy.occupied.copy()
+    occupied[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = False
+    emptied[first] = replace(field.tensors[first], occupied=occupied)
     tensors = tuple(emptied.get(t, tensor) for t, tensor in enumerate(field.tensors))
     return VMField.assembled(field.shape, tensors, field.blocks, field.params)
 

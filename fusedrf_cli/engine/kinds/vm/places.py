@@ -2,9 +2,11 @@
 fine as the objects', learns all that was put into it. So what is far away costs nothing to fuse, a frame
 costs two tensors however many objects there are, and no object is blurred to the texels of a place."""
 
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
@@ -23,18 +25,22 @@ if TYPE_CHECKING:
 
 MOST_OF_FILE = 0.7  # that a place may take, so that what stands in it has texels enough
 PRECISIONS = ("float16", "int8", "int4")  # the dearest first
+ALIKE = 1e-3  # entries of two rotations that count as one
 COPIES = 2.5  # of the place, while it is joined to what was learnt
 
 
 class PlaceStudent(Student):
-    """One tensor for what stands in a place, beside the place."""
+    """One tensor for what stands in a place, beside the place; turned as most of that is."""
 
     def __init__(
         self, kind: "VMKind", place: Placed, objects: list[Placed], request: StudentRequest, shape: VMShape
     ):
         """The place and the objects in the frame of the composed scene; shape: of the field, which holds the
         place's."""
-        super().__init__(kind, ComposedField(objects), request)
+        self.turn = turn_of(objects)
+        back = np.linalg.inv(self.turn)
+        turned = [replace(p, object_to_world=back @ p.object_to_world) for p in objects]
+        super().__init__(kind, ComposedField(turned), request)
         self.place, self.shape, self._bytes = place, shape, {}
 
     def place_bytes(self, precision: str) -> int:
@@ -71,7 +77,8 @@ class PlaceStudent(Student):
 
     def whole(self, field: StoredField) -> VMField:
         """The tensor in its place."""
-        return without_unread(blocks_of([Placed("", field, placement(self.scene.origin)), self.place]))
+        learnt = Placed("", field, self.turn @ placement(self.scene.origin))
+        return without_unread(blocks_of([learnt, self.place]))
 
     def why(self, field: StoredField) -> str:
         """See Student."""
@@ -88,6 +95,25 @@ class PlaceStudent(Student):
         """See Student: the tensor, and the place beside it."""
         place = opened(self.place.field).params.numel()
         return Needs(self.largest().numbers + place, COPIES, settled=place)
+
+
+def turn_of(objects: list[Placed]) -> np.ndarray:
+    """(4, 4) the turn by which most of the objects' texels are placed: a decomposition holds them best along
+    their own axes."""
+    turns = [turned_only(p.object_to_world[:3, :3]) for p in objects]
+    texels = np.array([(extent(p) / p.voxel_size) ** 2 for p in objects])
+    alike = np.array([[np.abs(a - b).max() < ALIKE for a in turns] for b in turns])
+    found, most = np.eye(4), turns[int(np.argmax(alike @ texels))]
+    if np.abs(most - np.eye(3)).max() >= ALIKE:
+        found[:3, :3] = most
+    return found
+
+
+def turned_only(linear: np.ndarray) -> np.ndarray:
+    """(3, 3) the rotation nearest to a linear map, or, of one that mirrors, to it with the third axis
+    reversed."""
+    u, _, v = np.linalg.svd(linear)
+    return u @ v @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
 
 
 def place_student(
