@@ -136,6 +136,8 @@ def test_the_tensor_of_what_stands_in_a_place_is_turned_as_most_of_that_is():
     askew = [placed(0.2 * turn, -0.5), placed(mirrored, 0.5), placed(0.2 * np.eye(3), 0)]
     assert np.abs(turn_of(askew)[:3, :3] - turn).max() < 1e-9
     assert np.array_equal(turn_of([askew[2]]), np.eye(4))
+    even = [askew[0], askew[2]]
+    assert np.array_equal(turn_of(even), turn_of(even[::-1]))
     request = StudentRequest(BundleSizes(), 25_000_000)
     scene = ComposedField([Placed("room", room, np.eye(4)), *askew])
     student = registry.kind("vm").student(scene, request)

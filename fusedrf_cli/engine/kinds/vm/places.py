@@ -99,11 +99,12 @@ class PlaceStudent(Student):
 
 def turn_of(objects: list[Placed]) -> np.ndarray:
     """(4, 4) the turn by which most of the objects' texels are placed: a decomposition holds them best along
-    their own axes."""
+    their own axes. Of as many either way, one that does not depend on the objects' order."""
     turns = [turned_only(p.object_to_world[:3, :3]) for p in objects]
     texels = np.array([(extent(p) / p.voxel_size) ** 2 for p in objects])
     alike = np.array([[np.abs(a - b).max() < ALIKE for a in turns] for b in turns])
-    found, most = np.eye(4), turns[int(np.argmax(alike @ texels))]
+    ranked = [(float(f"{n:.6g}"), turn.tolist()) for n, turn in zip(alike @ texels, turns, strict=True)]
+    found, most = np.eye(4), np.array(max(ranked)[1])
     if np.abs(most - np.eye(3)).max() >= ALIKE:
         found[:3, :3] = most
     return found
