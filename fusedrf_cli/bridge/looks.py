@@ -4,7 +4,7 @@ from the distances and in the resolutions at which their sources were photograph
 A view of everything shows objects small, before much that is empty, and what is lost of them does not show.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,6 +17,7 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.judging import COVERED
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -32,9 +33,9 @@ UNPHOTOGRAPHED = 400
 """Pixels a side of the pictures of an object that no photo shows, in which it is framed."""
 OWN_VIEWS, MORE_VIEWS, SMALL = 100, 60, 96
 """Of `views_of_place`: so many cameras of the photos at most, so many between them, and pixels a side."""
-TRIES, ROUGH, SHOWN = 12, 12, 0.2
+TRIES, ROUGH, SHOWN, VEILED = 12, 12, 0.2, 0.05
 """So many views of an object in a place are drawn until one, of so many pixels a side, shows it in that share
-of them."""
+of them: as far away as it is alone, to that part of its box's diagonal."""
 VIEWS_SEED = 5_000_011
 LOWEST, HIGHEST = 0.05, 1.3
 """Radians above the horizon of such views."""
@@ -82,28 +83,32 @@ def looks_of(
 ) -> list[Look]:
     """At least `count` seeded views (see `looks`) of a scene, which `composed` is as one field."""
     box = placed_box(composed.occupancy.subject, composed.origin)
-    sees = partial(shows, composed) if composed.occupancy.space is unbounded else anything
-    return looks(rig_of(scene), box, subjects_of(scene), count, size, seed, sees)
+    seen = all_of_it
+    if composed.occupancy.space is unbounded:
+        alone = {p.name: ComposedField([p]) for p in scene.placed if not p.unbounded}
+        seen = partial(share_shown, composed, alone)
+    return looks(rig_of(scene), box, subjects_of(scene), count, size, seed, seen)
 
 
-def anything(camera: Camera, subject: Subject) -> bool:
-    """That any view of an object will do."""
-    return True
+def all_of_it(camera: Camera, subject: Subject) -> float:
+    """That a view shows nothing but the object, so that any will do."""
+    return 1.0
 
 
-def shows(composed: ComposedField, camera: Camera, subject: Subject) -> bool:
-    """Whether an object can be seen in a view: a place may stand before it, or around the camera, since the
-    object was photographed elsewhere."""
+def share_shown(
+    composed: ComposedField, alone: Mapping[str, ComposedField], camera: Camera, subject: Subject
+) -> float:
+    """The share of a view in which an object of a scene, `alone` by its name, can be seen: a place may stand
+    before it, or around the camera, since the object was photographed elsewhere."""
     wide, high = camera.width / ROUGH, camera.height / ROUGH
     rough = replace(
         camera, width=ROUGH, height=ROUGH,
         fl_x=camera.fl_x / wide, cx=camera.cx / wide, fl_y=camera.fl_y / high, cy=camera.cy / high,
     )  # fmt: skip
-    depth = render_image(composed, rough, origin=composed.origin).depth.ravel()
-    rays_o, rays_d = (rays[np.isfinite(depth)] for rays in rough.rays())
-    at = rays_o + depth[np.isfinite(depth), None] * rays_d
-    inside = ((at >= subject.box[:3]) & (at <= subject.box[3:])).all(1)
-    return np.count_nonzero(inside) >= SHOWN * depth.size
+    of_all, of_it = (render_image(f, rough, origin=f.origin) for f in (composed, alone[subject.name]))
+    there, veil = of_it.opacity > COVERED, VEILED * np.linalg.norm(subject.box[3:] - subject.box[:3])
+    apart = np.abs(of_all.depth[there] - of_it.depth[there])
+    return np.count_nonzero(apart <= veil) / ROUGH**2
 
 
 def looks(
@@ -113,11 +118,12 @@ def looks(
     count: int,
     size: tuple[int, int],
     seed: int | tuple,
-    sees: Callable[[Camera, Subject], bool] = anything,
+    seen: Callable[[Camera, Subject], float] = all_of_it,
 ) -> list[Look]:
     """`count` seeded views of a size (width, height), or more where there are objects: of the whole scene, as
     a rig that shows its surroundings saw it, else from around a box (6,) of the world; and of its objects in
-    turn, in an order drawn anew for every seed, from where a view `sees` them."""
+    turn, in an order drawn anew for every seed, from where they are `seen` in enough of a
+    view, or in most of those that were tried."""
     rng = np.random.default_rng(seed)
     close = max(min(len(objects), MOST_OBJECTS), count - WHOLE) if objects else 0
     whole = max(count - close, WHOLE) if close else count
@@ -129,9 +135,7 @@ def looks(
     order = rng.permutation(len(objects)) if close else []
     for number in range(close):
         subject = objects[order[number % len(objects)]]
-        drawn = (close_up(subject, size, rng) for _ in range(TRIES))
-        camera = next((camera for camera in drawn if sees(camera, subject)), None)
-        found.append(Look(camera or close_up(subject, size, rng), subject.name))
+        found.append(Look(close_up_seen(subject, size, rng, seen), subject.name))
     named = enumerate(found)
     return [replace(look, camera=replace(look.camera, name=f"view_{i:04d}")) for i, look in named]
 
@@ -160,6 +164,24 @@ def close_up(subject: Subject, size: tuple[int, int], rng: np.random.Generator) 
     azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(LOWEST, HIGHEST)
     camera = framing_camera(subject.box, azimuth, elevation, UNPHOTOGRAPHED, UNPHOTOGRAPHED)
     return window(camera, at, size, rng)
+
+
+def close_up_seen(
+    subject: Subject,
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    seen: Callable[[Camera, Subject], float],
+) -> Camera:
+    """The first close-up that shows enough of the object, or the one of all tries that shows most of it."""
+    most, best = -1.0, None
+    for _ in range(TRIES):
+        camera = close_up(subject, size, rng)
+        share = seen(camera, subject)
+        if share > most:
+            most, best = share, camera
+        if share >= SHOWN:
+            break
+    return best
 
 
 def spot(box: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusedrf_cli.bridge.looks import Subject, between, looks, shows
+from fusedrf_cli.bridge.looks import SHOWN, Subject, between, looks, share_shown
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.judging import Judge
@@ -91,27 +91,46 @@ def test_views_follow_their_seed():
     assert np.array_equal(poses[0], poses[1]) and not np.array_equal(poses[0], poses[2])
 
 
-def test_views_of_an_object_that_something_hides_are_drawn_anew():
-    """A wall stands on one side of a ball; the camera in the wall sees nothing either."""
+def test_what_hides_an_object_counts():
+    """A wall stands on one side of a ball, and mist around its foot: neither from behind the wall nor from
+    inside of it or of the mist is the ball seen, though what little shows of the ball's box lies there."""
     ball = Placed("ball", Box(500.0, (0.2, 0.2, 0.2)), np.eye(4))
-    wall = np.eye(4)
-    wall[0, 3] = 1.0
-    scene = ComposedField([ball, Placed("wall", Box(500.0, (0.1, 3.0, 3.0)), wall)])
+    wall, mist = np.eye(4), np.eye(4)
+    wall[0, 3], mist[1, 3] = 1.0, -2.0
+    fog = Placed("mist", Box(2.0, (0.5, 1.9, 0.5)), mist)
+    scene = ComposedField([ball, Placed("wall", Box(500.0, (0.1, 3.0, 3.0)), wall), fog])
     subject_of = Subject("ball", np.array([-0.2] * 3 + [0.2] * 3), None)
 
-    def seen_from(x: float) -> bool:
-        eye = np.array([x, 0.01, 0.01])
-        pose = look_at(eye, np.zeros(3), np.array([0.0, 0.0, 1.0]))
-        return shows(scene, Camera(pose, 100.0, 100.0, 20.0, 10.0, 40, 20), subject_of)
+    def seen_from(x: float, y: float = 0.01) -> float:
+        pose = look_at(np.array([x, y, 0.01]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        camera = Camera(pose, 100.0, 100.0, 20.0, 10.0, 40, 20)
+        return share_shown(scene, {"ball": ComposedField([ball])}, camera, subject_of)
 
-    assert seen_from(-1.5) and not seen_from(2.5) and not seen_from(1.02)
+    assert seen_from(-0.7) == 1.0  # it fills the view
+    assert seen_from(2.5) == seen_from(1.02) == seen_from(0.0, -1.5) == 0.0
+    assert seen_from(-1.5) == pytest.approx(0.2 * 100 / 1.3 / 20, abs=2 / 12)  # its near side in columns
 
-    def sees(camera, subject) -> bool:
-        return camera.camera_to_world[0, 3] < 0
 
-    found = (looks(None, BOX, [subject_of], 8, (32, 32), seed, sees) for seed in range(4))
+def test_views_of_an_object_are_drawn_anew_until_it_is_seen():
+    """From one half of the directions alone; where none of the tries sees enough, from the best of them."""
+    behind = subject("ball", (0, 0, 0))
+
+    def from_one_half(camera, of) -> float:
+        return float(camera.camera_to_world[0, 3] < 0)
+
+    found = (looks(None, BOX, [behind], 8, (32, 32), seed, from_one_half) for seed in range(4))
     eyes = np.array([[look.camera.camera_to_world[:3, 3] for look in drawn] for drawn in found])
     assert (eyes[:, 3:, 0] < 0).all() and (eyes[:, :3, 0] > 0).any()
+
+    tried = []
+
+    def hardly(camera, of) -> float:
+        tried.append((0.9 * SHOWN / (2 + camera.camera_to_world[2, 3]), camera.camera_to_world))
+        return tried[-1][0]
+
+    (*_, last) = looks(None, BOX, [behind], WHOLE + 1, (32, 32), 0, hardly)
+    assert len(tried) == part("looks").TRIES
+    assert np.array_equal(last.camera.camera_to_world, max(tried, key=lambda one: one[0])[1])
 
 
 def test_a_camera_between_two_looks_where_they_look():

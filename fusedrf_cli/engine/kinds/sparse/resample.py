@@ -50,27 +50,32 @@ CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which
 BLOCKED = 0.05  # transmittance under which nothing is seen
 MOST_TRIED = 1 << 31  # bricks in a placed field's box
 ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has fitted yet
-AIMED, FULL_ENOUGH = 0.98, 0.88  # of the numbers allowed
+AIMED, FULL_ENOUGH = 0.94, 0.85  # of the numbers allowed
 FIRST_WIDENING = 2.0  # what is tried first is cheap
-FIRST_IN_PLACE = 6.0  # the same of a place, of which much more shows
-USUAL_SLOPE, SLOPE_IN_PLACE = -2.7, -2.1  # of the logarithm of numbers over that of the widening, as seen
+FIRST_IN_PLACE = 4.0  # the same of a place, of which much more shows
+USUAL_SLOPE, SLOPE_IN_PLACE = -2.7, -2.05  # of the logarithm of numbers over that of the widening, as seen
 
 
 class TooFewNumbers(ValueError):
     """Not even the widest voxels fit."""
 
 
-def resampled(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> SparseField:
-    """The teacher as a sparse field in its frame with at most so many numbers. Raises EmptyField where the
-    teacher shows nothing, TooFewNumbers where not even the widest voxels fit.
+def resampled(
+    teacher: RadianceField, shape: SparseShape, max_numbers: int, per_brick: float = 0.0
+) -> SparseField:
+    """The teacher as a sparse field in its frame with at most so many numbers, as which each brick counts
+    `per_brick`. Raises EmptyField where the teacher shows nothing, TooFewNumbers where not even the widest
+    voxels fit.
     """
-    lattice, known = fitted(teacher, shape, max_numbers)
+    lattice, known = fitted(teacher, shape, max_numbers, per_brick)
     field = SparseField(shape, lattice, density_scale(lattice.tree), space=teacher.occupancy.space)
     fill(field, teacher, *known)
     return field
 
 
-def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tuple[Lattice, list[np.ndarray]]:
+def fitted(
+    teacher: RadianceField, shape: SparseShape, max_numbers: int, per_brick: float
+) -> tuple[Lattice, list[np.ndarray]]:
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
     own, in_place = own_voxels(teacher), teacher.occupancy.space is not bounded
     least = 1.0 if in_place else (own.min() / own.max()) ** YIELD  # no voxel is wider than needed then
@@ -79,7 +84,7 @@ def fitted(teacher: RadianceField, shape: SparseShape, max_numbers: int) -> tupl
         if attempt >= ATTEMPTS and best is not None:
             break
         found = occupied(teacher, widening)
-        count = number_count(found[0], shape)
+        count = number_count(found[0], shape) + per_brick * len(found[0].tree.level)
         tried.append((np.log(widening), np.log(count)))
         if count <= max_numbers and (best is None or widening < best[0]):
             best = widening, found

@@ -40,9 +40,9 @@ PADDED = 1.6  # floats in memory for each number that is stored: rows are padded
 WHOLE_BELOW = 0.8  # of the numbers allowed: fewer are taken where no object needs more
 PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squares of a vertex
 BYTES_PER_BRICK = 10  # masks and nodes
-VERTICES_PER_BRICK = 25  # at least, in scenes of surfaces
 DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0
 DEGREES = (0, 1, 2)
+TRIES, SMALLER = 3, 0.97  # where a file is larger than was reckoned: by that factor under what would do
 LEAST_BYTES = 20_000  # told where nothing fits: a few hundred vertices and their bricks
 HELD_SHARE = 0.2  # of the vertices of a box: about what surfaces need
 # Of a field in memory, for which the lesson's rays do, and its steps. Four objects in 21 million: 0.3 dB lost
@@ -189,19 +189,23 @@ class SparseStudent(MadeStudent):
     def made(self, way: Way, limit: int) -> Made | None:
         """Bricks filled by asking the scene."""
         numbers = self.numbers_within(limit, way.precision)
-        try:
-            field = resampled(self.seen, SparseShape(way.sh_degree), numbers)
-        except TooFewNumbers:
-            return None
-        size = self.bytes_of(field, way)
-        return Made(field, size, field.numbers < WHOLE_BELOW * numbers) if size <= limit else None
+        per_brick = BYTES_PER_BRICK / self.request.sizes.per_number(way.precision)
+        for _ in range(TRIES):
+            try:
+                field = resampled(self.seen, SparseShape(way.sh_degree), numbers, per_brick)
+            except TooFewNumbers:
+                return None
+            size, bricks = self.bytes_of(field, way), len(field.tree.level)
+            if size <= limit:
+                return Made(field, size, field.numbers + per_brick * bricks < WHOLE_BELOW * numbers)
+            numbers = int(SMALLER * numbers * limit / size)
+        return None
 
     def numbers_within(self, limit: int, precision: str) -> int:
-        """How many numbers a file of so many bytes holds beside its bricks' masks."""
+        """How many numbers a file of so many bytes holds if it has no bricks."""
         sizes = self.request.sizes
-        each = sizes.per_number(precision) + BYTES_PER_BRICK / (ROW * VERTICES_PER_BRICK)
         bare = self.request.overhead + sizes.of(Contents((), parts=0, placements=0), precision)
-        return max(0, int((limit - bare) / each))
+        return max(0, int((limit - bare) / sizes.per_number(precision)))
 
     def smallest(self) -> int:
         """About so many bytes for the widest voxels."""
