@@ -63,6 +63,14 @@ def test_a_scene_becomes_bricks(fused, folder, picture):
     assert fused["psnr"]["before_rgb"] > 22
 
 
+@pytest.mark.parametrize("limit", [60_000, 150_000])
+def test_a_file_is_filled_and_no_more_than_that(report, limit):
+    said = report(
+        "fuse", "pair.json", "-o", "small.rfpack", "--kind", "sparse", "--max-size", str(limit), "--no-rgb"
+    )
+    assert 0.75 * limit < said["bytes"] <= limit
+
+
 def test_equal_seeds_give_equal_bytes(report, folder):
     for name in ("one", "two"):
         report("fuse", "pair.json", "-o", f"{name}.rfpack", *SPARSE)

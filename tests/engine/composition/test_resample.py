@@ -63,6 +63,8 @@ def test_the_numbers_are_kept_to():
     for most in (5_000, 20_000):
         field = resampled(teacher, SparseShape(1), most)
         assert 0.4 * most < field.numbers <= most
+    field = resampled(teacher, SparseShape(1), 20_000, 50.0)
+    assert 0.4 * 20_000 < field.numbers + 50 * len(field.tree.level) <= 20_000
     with pytest.raises(ValueError, match="more than 50 numbers"):
         resampled(teacher, SparseShape(0), 50)
 

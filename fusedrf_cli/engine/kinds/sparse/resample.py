@@ -50,10 +50,10 @@ CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which
 BLOCKED = 0.05  # transmittance under which nothing is seen
 MOST_TRIED = 1 << 31  # bricks in a placed field's box
 ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has fitted yet
-AIMED, FULL_ENOUGH = 0.94, 0.85  # of the numbers allowed
+AIMED, FULL_ENOUGH = 0.92, 0.83  # of the numbers allowed
 FIRST_WIDENING = 2.0  # what is tried first is cheap
 FIRST_IN_PLACE = 4.0  # the same of a place, of which much more shows
-USUAL_SLOPE, SLOPE_IN_PLACE = -2.7, -2.05  # of the logarithm of numbers over that of the widening, as seen
+USUAL_SLOPE, SLOPE_IN_PLACE = -2.7, -2.1  # of the logarithm of numbers over that of the widening, as seen
 
 
 class TooFewNumbers(ValueError):
