@@ -18,12 +18,11 @@ import numpy as np
 
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, kept_rows, tell, write_csv
-from fusedrf_cli.bridge.looks import share_shown, subjects_of
+from fusedrf_cli.bridge.looks import share_seen, subjects_of
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
-from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.rendering.volume import render_image
 
 SOURCES = {
@@ -77,11 +76,10 @@ def check_seen(folder: Path) -> None:
     """Raise where an object is seen from none of the photos' cameras: it would be sunk in the rock, and what
     is said of it would be of fog."""
     loaded = load_scene(str(folder / "scene.json"))
-    composed = loaded.composed()
-    alone = {p.name: ComposedField([p]) for p in loaded.placed if not p.unbounded}
+    seen = share_seen(loaded, loaded.composed())
     cameras = [camera_of(view) for view in rig_of(loaded).views]
     for subject in subjects_of(loaded):
-        if not any(share_shown(composed, alone, camera, subject) > 0 for camera in cameras):
+        if not any(seen(camera, subject) > 0 for camera in cameras):
             raise SystemExit(f"{folder / 'scene.json'}: '{subject.name}' is seen in none of the photos")
 
 

@@ -83,16 +83,23 @@ def looks_of(
 ) -> list[Look]:
     """At least `count` seeded views (see `looks`) of a scene, which `composed` is as one field."""
     box = placed_box(composed.occupancy.subject, composed.origin)
-    seen = all_of_it
-    if composed.occupancy.space is unbounded:
-        alone = {p.name: ComposedField([p]) for p in scene.placed if not p.unbounded}
-        seen = partial(share_shown, composed, alone)
+    seen = share_seen(scene, composed) if composed.occupancy.space is unbounded else all_of_it
     return looks(rig_of(scene), box, subjects_of(scene), count, size, seed, seen)
+
+
+Seen = Callable[[Camera, Subject], float]
+"""The share of a view in which an object can be seen."""
 
 
 def all_of_it(camera: Camera, subject: Subject) -> float:
     """That a view shows nothing but the object, so that any will do."""
     return 1.0
+
+
+def share_seen(scene: LoadedScene, composed: ComposedField) -> Seen:
+    """`share_shown` of the objects of a scene, which `composed` is as one field."""
+    alone = {p.name: ComposedField([p]) for p in scene.placed if not p.unbounded}
+    return partial(share_shown, composed, alone)
 
 
 def share_shown(
@@ -118,12 +125,11 @@ def looks(
     count: int,
     size: tuple[int, int],
     seed: int | tuple,
-    seen: Callable[[Camera, Subject], float] = all_of_it,
+    seen: Seen = all_of_it,
 ) -> list[Look]:
     """`count` seeded views of a size (width, height), or more where there are objects: of the whole scene, as
     a rig that shows its surroundings saw it, else from around a box (6,) of the world; and of its objects in
-    turn, in an order drawn anew for every seed, from where they are `seen` in enough of a
-    view, or in most of those that were tried."""
+    turn, in an order drawn anew for every seed, from where they are `seen` in enough of a view."""
     rng = np.random.default_rng(seed)
     close = max(min(len(objects), MOST_OBJECTS), count - WHOLE) if objects else 0
     whole = max(count - close, WHOLE) if close else count
@@ -166,21 +172,16 @@ def close_up(subject: Subject, size: tuple[int, int], rng: np.random.Generator) 
     return window(camera, at, size, rng)
 
 
-def close_up_seen(
-    subject: Subject,
-    size: tuple[int, int],
-    rng: np.random.Generator,
-    seen: Callable[[Camera, Subject], float],
-) -> Camera:
+def close_up_seen(subject: Subject, size: tuple[int, int], rng: np.random.Generator, seen: Seen) -> Camera:
     """The first close-up that shows enough of the object, or the one of all tries that shows most of it."""
     most, best = -1.0, None
     for _ in range(TRIES):
         camera = close_up(subject, size, rng)
         share = seen(camera, subject)
+        if share >= SHOWN:
+            return camera
         if share > most:
             most, best = share, camera
-        if share >= SHOWN:
-            break
     return best
 
 
