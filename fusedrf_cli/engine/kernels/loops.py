@@ -534,9 +534,16 @@ def each_task(field, grid, asked, low, high, scratch, memory, out):
         item(field, grid, asked, i, scratch, memory, out)
 
 
-def each(field, grid, asked, count, per_task, out):
-    """An item of work for each i < count, each filling what is its own in `out`."""
-    for part in prange((count + per_task - 1) // per_task):
+def each(field, grid, asked, count, per_task, threads, out):
+    """An item of work for each i < count, each filling what is its own in `out`.
+
+    A thread gets a run of what is iterated over, so tasks are dealt out to so many threads in turn: half of a
+    picture is often sky, and the thread that had it would wait for the others.
+    """
+    parts = (count + per_task - 1) // per_task
+    each_has = (parts + threads - 1) // threads
+    for turn in prange(each_has * threads):
+        part = turn % each_has * threads + turn // each_has
         real = field.params.dtype
         scratch, memory = np.zeros(SCRATCH, real), np.empty(max(KEPT, 1), real)
         low, high = part * per_task, min(count, (part + 1) * per_task)

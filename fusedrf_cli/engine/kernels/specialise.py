@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType
 
-from numba import njit
+from numba import get_num_threads, njit
 
 from fusedrf_cli.engine.kernels import loops, parts, tinting
 from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
@@ -31,7 +31,7 @@ class Loops:
 
     def each(self, item: str, field, grid, asked, count: int, out, per_task: int = loops.POINTS_PER_TASK):
         """An item of work, a function of loops.py or of the kind, for each i < count, which fills `out`."""
-        self._over("each", item)(field, grid, asked, count, per_task, out)
+        self._over("each", item)(field, grid, asked, count, per_task, get_num_threads(), out)
 
     def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
         """An item of work of at most so many samples for each i < count, which adds to the rows of grads

@@ -10,6 +10,7 @@ import torch
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, plain, reference
+from fusedrf_cli.engine.kernels.loops import Answers, Points
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
@@ -79,6 +80,20 @@ def test_query_of_few_points(count):
     sigma, rgb = query(field, points, dirs)
     assert sigma.shape == (count,) and rgb.shape == (count, 3)
     np.testing.assert_allclose(sigma, expected(field, points, dirs)[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+@pytest.mark.parametrize("count", [1, 20, 97])
+def test_tasks_dealt_to_threads_are_all_done(count, threads):
+    """Whatever the number of threads, of tasks and of items in the last one: each item once, none beyond."""
+    field = random_vm()
+    points, dirs = points_in(BOX, count), unit(np.random.default_rng(1).normal(size=(count, 3)))
+    found = Answers(np.full(count + 1, np.nan, np.float32), np.full((count + 1, 3), np.nan, np.float32))
+    asked, run = Points(points, dirs, True), field.loops._over("each", "query_point")
+    run(field.arrays, field.grid, asked, count, 10, threads, found)
+    sigma, rgb = query(field, points, dirs)
+    assert np.array_equal(found.sigma[:count], sigma) and np.array_equal(found.rgb[:count], rgb)
+    assert np.isnan(found.sigma[count]) and np.isnan(found.rgb[count]).all()
 
 
 def test_box_is_half_open():
