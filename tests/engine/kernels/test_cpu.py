@@ -86,7 +86,7 @@ def test_query_of_few_points(count):
 @pytest.mark.parametrize("count", [1, 20, 97])
 def test_tasks_dealt_to_threads_are_all_done(count, threads):
     """Whatever the number of threads, of tasks and of items in the last one: each item once, none beyond."""
-    field = random_vm()
+    field = random_vm(dtype=torch.float32)
     points, dirs = points_in(BOX, count), unit(np.random.default_rng(1).normal(size=(count, 3)))
     found = Answers(np.full(count + 1, np.nan, np.float32), np.full((count + 1, 3), np.nan, np.float32))
     asked, run = Points(points, dirs, True), field.loops._over("each", "query_point")
