@@ -8,6 +8,7 @@ edit appends or drops a block and leaves the rest as it is.
 """
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -79,7 +80,7 @@ class VMTensor:
         """Its floats in the flat vector."""
         return sum(aligned(int(np.prod(section))) for _, section in self.sections(shape))
 
-    @property
+    @cached_property
     def occupancy(self) -> OccupancyGrid:
         """The occupancy grid in the object's frame."""
         return (
@@ -88,7 +89,7 @@ class VMTensor:
             else OccupancyGrid(self.aabb, self.occupied, self.space)
         )
 
-    @cached_property
+    @property
     def apart(self) -> np.ndarray:
         """(X, Y, Z) uint8, how many cells a cell of its occupancy grid is from the nearest with matter."""
         return self.occupancy.skip
@@ -166,6 +167,8 @@ class VMField(ComputedField):
     update in place."""
 
     kind, bodies = "vm", bodies
+    by_routes = False
+    """Whether rays of pictures go each through the blocks that it meets, by samples of these alone."""
 
     def __init__(
         self,
@@ -332,21 +335,6 @@ class VMField(ComputedField):
 
     def kernel_arrays(self, params: object) -> bodies.Arrays:
         """See ComputedField."""
-        to_unit, to_object = [], []
-        for block, steps in zip(self.blocks, self.crossings, strict=True):
-            box = self.tensors[block.tensor].aabb
-            field_to_object = np.linalg.inv(block.object_to_field)
-            to_object.append(field_to_object[:3, :3])
-            if steps == 2:  # the box is of coordinates, see `part`
-                to_unit.append(field_to_object[:3])
-                continue
-            scale = np.diag(1.0 / (box[3:] - box[:3]))
-            to_unit.append(
-                np.concatenate(
-                    [scale @ field_to_object[:3, :3], (scale @ (field_to_object[:3, 3] - box[:3]))[:, None]],
-                    1,
-                )
-            )
         boxes = [self.tensors[block.tensor].aabb for block in self.blocks]
         first, second = self.owners if self.owners is not None else NO_OWNERS
         owners = first + np.uint16(256) * second
@@ -354,25 +342,77 @@ class VMField(ComputedField):
             params,
             self.layout,
             np.asarray([t.resolution for t in self.tensors], np.int64),
-            np.ascontiguousarray(to_unit, np.float64),
-            np.ascontiguousarray(to_object, np.float64),
+            self.to_unit,
+            np.stack([np.linalg.inv(block.object_to_field)[:3, :3] for block in self.blocks]),
             np.asarray([b.tensor for b in self.blocks], np.int64),
             np.asarray([[t.scale, t.shift] for t in self.tensors], self.real),
             owners,
-            *apart_arrays(self.tensors if self.owners is not None else ()),
+            *(self.apart if self.owners is not None else apart_arrays(())),
             self.cell_sizes(),
             np.asarray(self.crossings, np.uint8),
             np.stack([np.concatenate([box[:3], 1 / (box[3:] - box[:3])]) for box in boxes]),
             *detail_arrays(self.tensors, self.real),
         )
 
+    @property
+    def to_unit(self) -> np.ndarray:
+        """(B, 3, 4) `to_unit` of bodies.py."""
+        found = []
+        for block, steps in zip(self.blocks, self.crossings, strict=True):
+            box, to_cube = self.tensors[block.tensor].aabb, np.eye(4)
+            if steps != 2:  # there the box is of coordinates, see `part`
+                to_cube[:3, :3] = np.diag(1.0 / (box[3:] - box[:3]))
+                to_cube[:3, 3] = -to_cube[:3, :3] @ box[:3]
+            found.append((to_cube @ np.linalg.inv(block.object_to_field))[:3])
+        return np.stack(found)
+
+    @cached_property
+    def apart(self) -> tuple[np.ndarray, np.ndarray]:
+        """`apart` and `apart_at` of bodies.py."""
+        return apart_arrays(self.tensors)
+
+    @cached_property
+    def alone(self) -> tuple["VMField", ...]:
+        """Each block as a field of its own, in its object's frame, over the same numbers."""
+        found = []
+        for block in self.blocks:
+            tensor, start = self.tensors[block.tensor], int(self.layout[block.tensor, 0])
+            numbers = self.params[start : start + tensor.size(self.shape)]
+            own = Block(0, np.eye(4), block.name, block.tint)
+            found.append(VMField(self.shape, (tensor,), (own,), numbers, tensor.occupancy))
+        return tuple(found)
+
+    def _afresh(self, *names: str) -> "VMField":
+        """See ComputedField."""
+        return super()._afresh("alone", *names)
+
+    def render_rays(
+        self,
+        rays_o: np.ndarray,
+        rays_d: np.ndarray,
+        reach: np.ndarray,
+        step: float,
+        early_stop: float,
+        out: np.ndarray,
+    ) -> None:
+        """See ComputedField; in pictures of several blocks most rays meet one, which answers faster alone
+        (`vm/routes.py`)."""
+        if not self.by_routes:
+            return super().render_rays(rays_o, rays_d, reach, step, early_stop, out)
+        from fusedrf_cli.engine.kinds.vm.routes import render_by_routes
+
+        render_by_routes(self, super().render_rays, rays_o, rays_d, reach, step, early_stop, out)
+
     def for_pictures(self, rays: int) -> "VMField":
-        """See ComputedField: of several blocks the insides of cells are told where pictures are worth it."""
+        """See ComputedField: of several blocks the insides of cells are told where pictures are worth it, and
+        rays go each through the blocks that it meets."""
         if self.owners is None or rays < WORTH_TELLING:
             return self
         from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 
-        return with_known_insides(self)
+        shown = copy(with_known_insides(self))
+        shown.by_routes = True
+        return shown
 
     @cached_property
     def crossings(self) -> list[int]:

@@ -1,0 +1,171 @@
+"""Rays through the blocks that they meet: which those are, against a slow walk, and what is seen by them,
+against all blocks together."""
+
+from copy import copy
+
+import numpy as np
+import pytest
+import torch
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.insides import WORTH_TELLING
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels.plain import NOWHERE, first_two
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.spaces import unbounded
+from tests.engine.conftest import THIRTY_TWO, rays_at, unit
+from tests.engine.fields.test_insides import TURNED, ball, shift
+
+STRETCHED = np.array([[1.6, 0.2, 0, 0.3], [0, 0.7, 0, 0.1], [0, 0.3, 0.5, -0.2], [0, 0, 0, 1.0]])
+
+
+def placed_grids(rng) -> tuple[list[np.ndarray], list[OccupancyGrid]]:
+    """Three grids of a few occupied cells, and (3, 4) how the frame comes to the unit cube of each."""
+    grids, to_unit = [], []
+    for _ in range(3):
+        shape = rng.integers(1, 7, 3)
+        grids.append(OccupancyGrid(np.array([0, 0, 0, 1, 1, 1.0]), rng.random(shape) < 0.3))
+        matrix = np.eye(4)
+        matrix[:3, :3] += 0.5 * rng.normal(size=(3, 3))
+        matrix[:3, 3] = 0.5 + 0.5 * rng.normal(size=3)
+        to_unit.append(matrix[:3])
+    return to_unit, grids
+
+
+def inside(matrix: np.ndarray, grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
+    """(N,) bool, which points (N, 3) of the frame lie in an occupied cell."""
+    at = points @ matrix[:, :3].T + matrix[:, 3]
+    index = np.floor(at * grid.occupied.shape).astype(int)
+    held = ((at >= 0) & (at < 1)).all(1)
+    held[held] = grid.occupied[tuple(index[held].T)]
+    return held
+
+
+def found_by_kernel(rays_o, rays_d, to_unit, grids, bounded=(True, True, True), threads: int = 2):
+    """`first_two` of some placed grids."""
+    sizes = np.cumsum([0, *[grid.occupied.size for grid in grids]])
+    at = np.array([[start, *grid.occupied.shape] for start, grid in zip(sizes, grids, strict=False)])
+    apart = np.concatenate([grid.skip.ravel() for grid in grids])
+    first, second = np.empty(len(rays_o), np.int64), np.empty(len(rays_o))
+    whole = rays_o, rays_d, np.stack(to_unit), apart, at, np.array(bounded)
+    first_two(*whole, threads, first, second)
+    return first, second
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_first_two_are_those_of_a_slow_walk(seed):
+    """Where a grid's matter begins lies in it, and nothing of it before, at a thousand places on the way."""
+    rng = np.random.default_rng(seed)
+    to_unit, grids = placed_grids(rng)
+    rays_o, rays_d = rays_at(np.array([-1, -1, -1, 1, 1, 1.0]), 200, seed)
+    rays_d[:3] = np.eye(3)
+    ends = np.linspace(0, 8, 1001)
+    begins = np.full((len(grids), len(rays_o)), NOWHERE)
+    for b, (matrix, grid) in enumerate(zip(to_unit, grids, strict=True)):
+        own, nothing = found_by_kernel(rays_o, rays_d, [matrix], [grid], (True,))
+        assert (nothing == NOWHERE).all()
+        one, begins[b] = found_by_kernel(rays_o, rays_d, [matrix] * 2, [grid] * 2, (False, True))
+        assert (one == 0).all() and np.array_equal(begins[b] < NOWHERE, own == 0)
+        for o, d, begin in zip(rays_o, rays_d, begins[b], strict=True):
+            held = inside(matrix, grid, o + ends[:, None] * d)
+            assert not held[ends < begin - 1e-4].any()
+            near = o + (begin + np.array([1e-7, 1e-5])[:, None]) * d
+            assert begin == NOWHERE or inside(matrix, grid, near).any() or held[ends >= begin][:1].any()
+    assert 0.05 < (begins < NOWHERE).mean() < 0.9
+    first, second = found_by_kernel(rays_o, rays_d, to_unit, grids)
+    inorder = np.sort(begins, axis=0)
+    assert np.array_equal(second, inorder[1])
+    assert np.array_equal(first, np.where(inorder[0] < NOWHERE, begins.argmin(0), -1))
+    for threads in (1, 3, 5):
+        again = found_by_kernel(rays_o, rays_d, to_unit, grids, threads=threads)
+        assert np.array_equal(again[0], first) and np.array_equal(again[1], second)
+
+
+def place() -> VMField:
+    """Fog that fills all of space."""
+    field = VMField.create(unbounded.WHOLE, (24,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
+    return field.with_occupancy(OccupancyGrid.full(unbounded.WHOLE, 24, unbounded))
+
+
+def scenes() -> dict[str, VMField]:
+    """Fields of several blocks."""
+    one, red = ball(), registry.kind("vm").tinted(ball(), (1.0, 0.3, 0.2))
+    small = np.diag([0.3, 0.3, 0.3, 1.0])
+    return {
+        "apart": blocks_of([Placed("one", one, shift(-2.0)), Placed("other", one, shift(2.0) @ TURNED)]),
+        "into each other": blocks_of(
+            [Placed("one", one, STRETCHED), Placed("two", red, shift(0.5)), Placed("three", one, TURNED)]
+        ),
+        "in a place": blocks_of([Placed("place", place(), np.eye(4)), Placed("one", one, small @ TURNED)]),
+    }
+
+
+MIDDLES = {"apart": [[-2.0, 0, 0], [2, 0, 0]], "into each other": [[0, 0, 0]], "in a place": [[0, 0, 0]]}
+
+
+def looks(name: str, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from 3 away towards places around the objects of a scene."""
+    rng, spread = np.random.default_rng(seed), 0.12 if name == "in a place" else 0.4
+    middles, d = rng.choice(MIDDLES[name], count), unit(rng.normal(size=(count, 3)))
+    return middles + spread * rng.uniform(-1, 1, (count, 3)) - 3 * d, d
+
+
+def together_and_by_routes(field: VMField, rays_o, rays_d, **how) -> tuple[np.ndarray, np.ndarray]:
+    shown = field.for_pictures(WORTH_TELLING)
+    assert shown.by_routes and not field.by_routes
+    return render_rays(field, rays_o, rays_d, **how), render_rays(shown, rays_o, rays_d, **how)
+
+
+@pytest.mark.parametrize("name", ["apart", "into each other", "in a place"])
+@pytest.mark.parametrize("how", [{}, {"near": 2.9, "far": 3.2}], ids=["all", "near and far"])
+def test_routes_show_what_all_blocks_do(name, how):
+    """Samples lie elsewhere, so the denser they are, the more alike is what is seen."""
+    field = scenes()[name]
+    rays_o, rays_d = looks(name, 200, 3)
+    fine = sampling_step(field) / 16
+    one, other = together_and_by_routes(field, rays_o, rays_d, step=fine, early_stop=0.0, **how)
+    apart = abs(one - other)
+    assert 0.1 < (one[:, 3] > 0.5).mean() and one[:, 3].max() > 0.9
+    assert apart[:, :4].max() < 0.03 and apart[:, :4].mean() < 2e-3
+    far_fog = name == "in a place" and not how
+    assert far_fog or (apart[:, 4].max() < 0.03 and apart[:, 4].mean() < 5e-3)
+    one, other = together_and_by_routes(field, rays_o, rays_d, **how)
+    assert abs(one - other)[:, :4].mean() < 0.01
+
+
+def test_rays_past_the_objects_in_a_place_are_those_of_the_place():
+    field = scenes()["in a place"]
+    rays_o, rays_d = rays_at(np.array([-0.3, -0.3, -0.3, 0.3, 0.3, 0.3]), 400, 5)
+    shown = field.for_pictures(WORTH_TELLING)
+    alone = render_rays(place(), rays_o, rays_d)
+    found = render_rays(shown, rays_o, rays_d)
+    same = (found == alone).all(1)
+    assert 0.3 < same.mean() < 0.98
+    empty = render_rays(
+        blocks_of([Placed("one", ball(), np.diag([0.3, 0.3, 0.3, 1.0]) @ TURNED)]), rays_o, rays_d
+    )
+    assert (empty[same, 3] < 1e-3).all()  # and what is not the place's comes from the object's cells
+
+
+def test_a_ray_does_not_depend_on_its_company():
+    for name, field in scenes().items():
+        shown = field.for_pictures(WORTH_TELLING)
+        rays_o, rays_d = looks(name, 101, 7)
+        whole = render_rays(shown, rays_o, rays_d)
+        halves = [render_rays(shown, rays_o[part], rays_d[part]) for part in (slice(0, 37), slice(37, 101))]
+        assert np.array_equal(whole, np.concatenate(halves))
+
+
+def test_numbers_that_change_are_seen_by_routes():
+    """A field with other numbers, or other tints, does not show those that it was made from."""
+    shown = scenes()["apart"].for_pictures(WORTH_TELLING)
+    rays_o, rays_d = looks("apart", 100, 9)
+    before = render_rays(shown, rays_o, rays_d)
+    other = shown.with_params(torch.zeros_like(shown.params))
+    assert abs(render_rays(other, rays_o, rays_d) - before).max() > 0.3
+    assert np.array_equal(render_rays(copy(shown), rays_o, rays_d), before)
+    assert render_rays(shown, rays_o, -rays_d).max() == 0
