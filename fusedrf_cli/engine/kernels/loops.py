@@ -20,6 +20,7 @@ gradients are gathered:
                                        adds to grad what d_sigma, and where shaded d_rgb (3), send back; rgb
                                        and memory[at:] are as `colour` left them
 And what it may have, with the defaults below:
+    started                            once per ray of a picture, before its first `density`
     begin, end                         once per ray and frame before the first `colour`, and after the last
                                        `backward`: fold the direction into a basis; scatter its gradient, and
                                        leave 0 what has gathered it
@@ -135,6 +136,10 @@ class Kept(NamedTuple):
 
 
 # -- what a kind may leave out -------------------------------------------------------------------------------
+
+
+def started(field, step, scratch):
+    """Prepare `scratch` for the samples, so far apart, of a ray of a picture."""
 
 
 def begin(field, frame, d, scratch):
@@ -280,6 +285,7 @@ def render_ray(field, grid, rays, i, scratch, memory, out):
     r, g, b = 0.0, 0.0, 0.0
     trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
     current, begun = -1, entered(o, d, rays.reach[i, 0])
+    started(field, step, scratch)
     for _ in range(PIECES):
         if trans <= rays.early_stop:
             break

@@ -16,6 +16,7 @@ from fusedrf_cli.engine.kernels.parts import bit_of
 from fusedrf_cli.engine.kernels.plain import mark_parts
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.engine.spaces import unbounded
@@ -127,7 +128,7 @@ def of_two_boxes(cells: int):
 def test_pictures_stay_and_take_fewer_samples():
     """To the bit, where every sample stands for one step: what is left out is empty."""
     scene = of_two_boxes(24)
-    known = scene.for_pictures(WORTH_TELLING)
+    known = with_known_insides(scene)
     assert parts_of(known.grid.inner).mean() < 0.7 * scene.occupancy.occupied.mean()
     rays_o, rays_d = rays_at(scene.occupancy.tight_aabb(), 400, 1)
     step = scene.occupancy.unit or sampling_step(scene)
@@ -153,7 +154,7 @@ def shift(x: float) -> np.ndarray:
 
 def test_what_stands_in_a_place_is_told_apart_from_it():
     """Where pictures are large enough to be worth it, and there are several blocks."""
-    place = VMField.create(unbounded.WHOLE, (12,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
+    place = VMField.create(unbounded.WHOLE, (200,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
     place = place.with_occupancy(OccupancyGrid.full(unbounded.WHOLE, 16, unbounded))
     small = np.diag([0.2, 0.2, 0.2, 1.0])
     scene = blocks_of([Placed("place", place, np.eye(4)), Placed("thing", ball(), small)])

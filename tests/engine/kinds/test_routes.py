@@ -2,6 +2,7 @@
 against all blocks together."""
 
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.plain import NOWHERE, first_two
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.vm import field as vm_field
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.volume import render_rays
@@ -85,9 +87,9 @@ def test_the_first_two_are_those_of_a_slow_walk(seed):
         assert np.array_equal(again[0], first) and np.array_equal(again[1], second)
 
 
-def place() -> VMField:
+def place(texels: int = 24) -> VMField:
     """Fog that fills all of space."""
-    field = VMField.create(unbounded.WHOLE, (24,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
+    field = VMField.create(unbounded.WHOLE, (texels,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
     return field.with_occupancy(OccupancyGrid.full(unbounded.WHOLE, 24, unbounded))
 
 
@@ -149,6 +151,23 @@ def test_rays_past_the_objects_in_a_place_are_those_of_the_place():
         blocks_of([Placed("one", ball(), np.diag([0.3, 0.3, 0.3, 1.0]) @ TURNED)]), rays_o, rays_d
     )
     assert (empty[same, 3] < 1e-3).all()  # and what is not the place's comes from the object's cells
+
+
+def test_a_place_is_asked_by_its_own_step_before_an_object_too(monkeypatch):
+    """Where an object's cells are, but no matter of it, the place shows what it shows alone: a sample of its
+    own is held for all of the object's, which are many times as dense."""
+    monkeypatch.setattr(vm_field, "OWNERSHIP_CELLS", 8)  # no smaller than the place's voxels
+    noisy, clear = place(), ball()
+    for name, plane in noisy.sections(0).items():
+        plane *= 100 if name.startswith("density_plane") else 1
+    clear.tensors = (replace(clear.tensors[0], shift=-80.0),)
+    field = blocks_of([Placed("place", noisy, np.eye(4)), Placed("one", clear, np.diag([0.3, 0.3, 0.3, 1]))])
+    assert sampling_step(noisy) > 8 * sampling_step(field)
+    rays_o, rays_d = looks("in a place", 200, 11)
+    whole = {"near": 2.3, "far": 2.3 + 8 * sampling_step(noisy), "early_stop": 0.0}  # samples, in the core
+    alone, found = (render_rays(one, rays_o, rays_d, **whole) for one in (noisy, field))
+    apart = abs(found - alone)[:, 3]
+    assert alone[:, 3].std() > 0.1 and apart.max() < 0.1 and apart.mean() < 0.02
 
 
 def test_a_ray_does_not_depend_on_its_company():

@@ -14,7 +14,8 @@ Notation for the whole file.
                  detail was asked
 DENSITY_RANK, COLOUR_RANK and COEFFICIENTS are the field's sizes. A ray's `scratch` holds, one after the
 other, the directional basis (BASIS), its gradient (D_BASIS), the gradient of a sample's colour features
-(D_FEATURES), the spherical harmonics (SH), and room for one mode (TILE) and one number (ONE).
+(D_FEATURES), the spherical harmonics (SH), and room for one mode (TILE), one number (ONE) and a sample of the
+background (HELD, see `started`).
 """
 
 import math
@@ -29,6 +30,7 @@ from fusedrf_cli.engine.kernels.parts import (
     MIXED,
     accumulate,
     add_scaled,
+    along,
     bilinear,
     cell_of,
     exit_distance,
@@ -73,7 +75,7 @@ def sizes(field) -> dict[str, int]:
     rank, colour_rank = field.shape.density_rank, field.shape.colour_rank
     held = {
         "BASIS": 9 * colour_rank, "D_BASIS": 9 * colour_rank, "D_FEATURES": 3 * colour_rank, "SH": 16,
-        "TILE": 2 * max(rank, colour_rank), "ONE": 1,
+        "TILE": 2 * max(rank, colour_rank), "ONE": 1, "HELD": 6,
     }  # fmt: skip
     starts = np.cumsum([0, *held.values()]).tolist()
     return {
@@ -393,12 +395,42 @@ def density(field, grid, k, p, d, scratch):
     b, other = owners_of(field, i, j, m)
     if b == NO_BLOCK:
         return 0.0, 0.0, 0, 0
-    sigma, f, place = block_density(field, b, p, d, True)
-    if other != NO_BLOCK:
-        sigma2, f2, place2 = block_density(field, other, p, d, True)
+    if other == NO_BLOCK:
+        sigma, f, place = block_density(field, b, p, d, True)
+    else:
+        sigma, f, place = held_density(field, b, k, p, d, scratch)
+        sigma2, f2, place2 = held_density(field, other, k, p, d, scratch)
         if sigma2 > sigma:
             return sigma2, f2, 1, place2
     return sigma, f, (1 if sigma > 0.0 else 0), place
+
+
+def started(field, step, scratch):
+    """In scratch[HELD:] the turn, from 1 on, of the sample that is held, -1 while there is none; what
+    `block_density` said there; how many steps the background's own samples are apart, and the step. All 0
+    where nothing is ever held."""
+    if CROSSING != 0:
+        for b in range(field.tensor.shape[0]):
+            if field.crossing[b] == 0:
+                scratch[HELD] = -1
+                scratch[HELD + 4] = max(1, int(field.cell[b, 0] / field.cell[b, 1] / step + 0.5))
+                scratch[HELD + 5] = step
+
+
+def held_density(field, b, k, p, d, scratch):
+    """`block_density` at step k of a picture's ray. The background, the block whose tensor lies in the
+    coordinates of the field, is asked no more often than where it is alone, whatever stands before it: it
+    holds the answer of its own sample, in the core, where coordinates go along with d."""
+    at_hand = CROSSING != 0 and scratch[HELD] != 0 and field.crossing[b] == 0
+    if not at_hand or max(abs(p[0]), max(abs(p[1]), abs(p[2]))) > 1.0:
+        return block_density(field, b, p, d, True)
+    apart = int(scratch[HELD + 4])
+    turn = k // apart + 1
+    if int(scratch[HELD]) != turn:
+        middle = along(p, d, ((turn - 0.5) * apart - 0.5 - k) * scratch[HELD + 5])
+        sigma, f, place = block_density(field, b, middle, d, True)
+        scratch[HELD], scratch[HELD + 1], scratch[HELD + 2], scratch[HELD + 3] = turn, sigma, f, place
+    return float(scratch[HELD + 1]), float(scratch[HELD + 2]), int(scratch[HELD + 3])
 
 
 def owners_of(field, i, j, m):
