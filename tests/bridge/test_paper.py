@@ -35,6 +35,7 @@ def rows_of(work: Work, name: str) -> list[dict]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_kinds_and_seeds(work, monkeypatch):
     monkeypatch.setattr(quality, "KINDS", ("blocks",))
     monkeypatch.setattr(quality, "SEEDS", 2)

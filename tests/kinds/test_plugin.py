@@ -89,8 +89,12 @@ def test_the_page_s_kind_is_listed_trained_and_rendered(cubes):
     ("text", "said"),
     [
         ("raise RuntimeError('no luck')", "does not load (RuntimeError: no luck)"),
-        ("import a_module_that_is_not_there", "does not load (ModuleNotFoundError"),
-        ("KIND = 3", "is no Kind of that name"),
+        pytest.param(
+            "import a_module_that_is_not_there",
+            "does not load (ModuleNotFoundError",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("KIND = 3", "is no Kind of that name", marks=pytest.mark.slow),
     ],
 )
 def test_a_broken_plug_in_breaks_only_itself(tmp_path, text, said):

@@ -20,7 +20,7 @@ gradients are gathered:
                                        adds to grad what d_sigma, and where shaded d_rgb (3), send back; rgb
                                        and memory[at:] are as `colour` left them
 And what it may have, with the defaults below:
-    started                            once per ray of a picture, before its first `density`
+    started, standing                  once per ray of a picture, and before each `density` along a ray
     begin, end                         once per ray and frame before the first `colour`, and after the last
                                        `backward`: fold the direction into a basis; scatter its gradient, and
                                        leave 0 what has gathered it
@@ -142,6 +142,10 @@ def started(field, step, scratch):
     """Prepare `scratch` for the samples, so far apart, of a ray of a picture."""
 
 
+def standing(field, many, scratch):
+    """Prepare `scratch` for a sample that stands for so many steps."""
+
+
 def begin(field, frame, d, scratch):
     """Prepare `scratch` for colours seen along d in a frame."""
 
@@ -220,6 +224,7 @@ def met(field, grid, line, k, many, u, step, d, scratch):
     point; the share of the light that is lost there; and what `density` says besides σ."""
     origin, way, course = line
     p = along(origin, way, u)
+    standing(field, many, scratch)
     sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
     opacity = 0.0
     if steps > 0:

@@ -72,7 +72,7 @@ def test_what_all_poses_have_in_common_is_left_out():
         np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-8)
 
 
-@pytest.mark.parametrize("pixels", [0.7, 3.0])
+@pytest.mark.parametrize("pixels", [pytest.param(0.7, marks=pytest.mark.slow), 3.0])
 def test_poses_are_found_again_from_what_a_field_shows(pixels):
     """Photos of the field itself: after a few rounds its points are where they were in every picture."""
     cameras = orbit(BOX, 5, 48, 48)

@@ -19,10 +19,10 @@ from .test_references import asked, sent_back
 TINT = (0.9, 0.4, 0.0)
 
 
-RARE = pytest.param("vm-mlp", marks=pytest.mark.slow)  # its loops take long to compile
+LONG = "vm-mlp", "sparse, levels and bands"  # their loops take long to compile
 
 
-@pytest.fixture(params=[RARE, "sparse, levels and bands", "dense"])
+@pytest.fixture(params=[*(pytest.param(name, marks=pytest.mark.slow) for name in LONG), "dense"])
 def pair(request) -> tuple[RadianceField, RadianceField]:
     """A field, and the same with a tint."""
     field = KINDS[request.param]()

@@ -75,7 +75,7 @@ def sizes(field) -> dict[str, int]:
     rank, colour_rank = field.shape.density_rank, field.shape.colour_rank
     held = {
         "BASIS": 9 * colour_rank, "D_BASIS": 9 * colour_rank, "D_FEATURES": 3 * colour_rank, "SH": 16,
-        "TILE": 2 * max(rank, colour_rank), "ONE": 1, "HELD": 6,
+        "TILE": 2 * max(rank, colour_rank), "ONE": 1, "HELD": 7,
     }  # fmt: skip
     starts = np.cumsum([0, *held.values()]).tolist()
     return {
@@ -407,14 +407,20 @@ def density(field, grid, k, p, d, scratch):
 
 def started(field, step, scratch):
     """In scratch[HELD:] the turn, from 1 on, of the sample that is held, -1 while there is none; what
-    `block_density` said there; how many steps the background's own samples are apart, and the step. All 0
-    where nothing is ever held."""
+    `block_density` said there; how many steps the background's own samples are apart, the step, and for how
+    many steps the sample at hand stands. All 0 where nothing is ever held."""
     if CROSSING != 0:
         for b in range(field.tensor.shape[0]):
             if field.crossing[b] == 0:
                 scratch[HELD] = -1
                 scratch[HELD + 4] = max(1, int(field.cell[b, 0] / field.cell[b, 1] / step + 0.5))
                 scratch[HELD + 5] = step
+
+
+def standing(field, many, scratch):
+    """See `started`."""
+    if CROSSING != 0:
+        scratch[HELD + 6] = many
 
 
 def held_density(field, b, k, p, d, scratch):
@@ -427,7 +433,8 @@ def held_density(field, b, k, p, d, scratch):
     apart = int(scratch[HELD + 4])
     turn = k // apart + 1
     if int(scratch[HELD]) != turn:
-        middle = along(p, d, ((turn - 0.5) * apart - 0.5 - k) * scratch[HELD + 5])
+        steps = (turn - 0.5) * apart - (k + 0.5 * scratch[HELD + 6])  # from the middle of this sample
+        middle = along(p, d, steps * scratch[HELD + 5])
         sigma, f, place = block_density(field, b, middle, d, True)
         scratch[HELD], scratch[HELD + 1], scratch[HELD + 2], scratch[HELD + 3] = turn, sigma, f, place
     return float(scratch[HELD + 1]), float(scratch[HELD + 2]), int(scratch[HELD + 3])
