@@ -5,9 +5,9 @@ which is the background, for a minute. Prints Markdown tables: of an 800 x 800 f
 and of frames of 400 x 400 in which small copies of a chair and a bottle stand on the bear's rock, seen from
 one of its photos' cameras and from close by. N counts the background too, and frames of all N take turns.
 *Without* is without the insides of cells (engine/fields/insides.py) and by all blocks together instead of by
-those that a ray meets (engine/kinds/vm/routes.py), *telling* what it takes to know insides; samples and shares
-of the time are of all blocks together. *to denser* is the PSNR in dB to samples four times as dense. A hit ray
-is one that takes a sample.
+those that a ray meets (engine/kinds/vm/routes.py), *telling* what it takes to know insides; samples and
+shares of the time are of all blocks together; *to denser* is the PSNR in dB to samples four times as dense. A
+hit ray is one that takes a sample.
 """
 
 import argparse

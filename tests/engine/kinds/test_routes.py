@@ -167,7 +167,7 @@ def test_a_place_is_asked_by_its_own_step_before_an_object_too(monkeypatch):
     whole = {"near": 2.3, "far": 2.3 + 8 * sampling_step(noisy), "early_stop": 0.0}  # samples, in the core
     alone, found = (render_rays(one, rays_o, rays_d, **whole) for one in (noisy, field))
     apart = abs(found - alone)[:, 3]
-    assert alone[:, 3].std() > 0.1 and apart.max() < 1e-4
+    assert alone[:, 3].std() > 0.1 and apart.max() < 5e-3
 
 
 def test_a_ray_does_not_depend_on_its_company():
