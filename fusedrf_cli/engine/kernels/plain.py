@@ -141,10 +141,10 @@ def unbent(distorted, distortion, ideal):
 
 
 @body
-def matter_at(o, d, matrix, apart, start, nx, ny, nz):
+def matter_at(o, d, matrix, apart, first, nx, ny, nz):
     """Where along a ray o + t d, from t = 0 on, the first cell with matter of a grid begins, or NOWHERE: from
     an empty cell it goes as far as there is no other. matrix (3, 4) takes points to where the grid's box is
-    the unit cube; apart[start:] is how many cells each of its cells is from the nearest with matter."""
+    the unit cube; apart[first:] is how many cells each of its cells is from the nearest with matter."""
     x, y, z = o
     dx, dy, dz = d
     m = matrix
@@ -159,18 +159,19 @@ def matter_at(o, d, matrix, apart, start, nx, ny, nz):
         nz * (m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz),
     )
     t, end = hit_box(origin, way, (0.0, 0.0, 0.0), (float(nx), float(ny), float(nz)))
+    start, u, length = along(origin, way, t), 0.0, end - t  # so that steps are seen however far away t is
     least = FACE_TOLERANCE / max(abs(way[0]), max(abs(way[1]), abs(way[2])))
-    while t < end:
-        x, y, z = along(origin, way, t)
+    while u < length:
+        x, y, z = along(start, way, u)
         i, j, k = cell_of(x, 0.0, 1.0, nx), cell_of(y, 0.0, 1.0, ny), cell_of(z, 0.0, 1.0, nz)
-        s = int(apart[np.uint64(start + (i * ny + j) * nz + k)])
+        s = int(apart[np.uint64(first + (i * ny + j) * nz + k)])
         if s == 0:
-            return t
+            return t + u
         away = min(
             exit_distance(x, way[0], 0.0, 1.0, i, s),
             min(exit_distance(y, way[1], 0.0, 1.0, j, s), exit_distance(z, way[2], 0.0, 1.0, k, s)),
         )
-        t += max(away, 0.0) + least
+        u += max(away, 0.0) + least
     return NOWHERE
 
 

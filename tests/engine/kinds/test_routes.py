@@ -82,6 +82,8 @@ def test_the_first_two_are_those_of_a_slow_walk(seed):
     inorder = np.sort(begins, axis=0)
     assert np.array_equal(second, inorder[1])
     assert np.array_equal(first, np.where(inorder[0] < NOWHERE, begins.argmin(0), -1))
+    far, far_second = found_by_kernel(rays_o - 1e9 * rays_d, rays_d, to_unit, grids)
+    assert (far == first).mean() > 0.95 and (far_second[far == first] > 1e9).all()
     for threads in (1, 3, 5):
         again = found_by_kernel(rays_o, rays_d, to_unit, grids, threads=threads)
         assert np.array_equal(again[0], first) and np.array_equal(again[1], second)
