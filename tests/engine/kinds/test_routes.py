@@ -181,6 +181,13 @@ def test_a_ray_does_not_depend_on_its_company():
         assert np.array_equal(whole, np.concatenate(halves))
 
 
+def test_rays_of_many_blocks_ask_all_together(monkeypatch):
+    field = scenes()["into each other"]
+    for most, by_routes in ((3, True), (2, False)):
+        monkeypatch.setattr(vm_field, "BY_ROUTES", most)
+        assert field.for_pictures(WORTH_TELLING).by_routes is by_routes
+
+
 def test_numbers_that_change_are_seen_by_routes():
     """A field with other numbers, or other tints, does not show those that it was made from."""
     shown = scenes()["apart"].for_pictures(WORTH_TELLING)

@@ -45,6 +45,7 @@ from fusedrf_cli.engine.kinds.vm.reference import MODES
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
+BY_ROUTES = 40  # blocks at most: which of them it meets, each ray is asked for each
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 BASIS_RATE = 0.05  # TensoRF: 1e-3 for the colour basis where factors learn at 2e-2
@@ -405,13 +406,13 @@ class VMField(ComputedField):
 
     def for_pictures(self, rays: int) -> "VMField":
         """See ComputedField: of several blocks the insides of cells are told where pictures are worth it, and
-        rays go each through the blocks that it meets."""
+        rays go each through the blocks that it meets, where they are not too many."""
         if self.owners is None or rays < WORTH_TELLING:
             return self
         from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 
         shown = copy(with_known_insides(self))
-        shown.by_routes = True
+        shown.by_routes = len(self.blocks) <= BY_ROUTES
         return shown
 
     @cached_property
