@@ -251,8 +251,11 @@ class ComputedField:
     ) -> None:
         """March, shade and composite in one pass, each ray from and to its distances reach (N, 2): the fast
         path of `render_rays` in volume.py, with the same columns in out (N, 5)."""
-        rays = Rays(exact(rays_o), exact(rays_d), exact(reach), float(step), float(early_stop))
-        self.loops.each("render_ray", self.arrays, self.grid, rays, len(rays_o), out, RAYS_PER_TASK)
+        self.show(Rays(exact(rays_o), exact(rays_d), exact(reach), float(step), float(early_stop)), out)
+
+    def show(self, rays: Rays, out: np.ndarray) -> None:
+        """`render_rays` of rays as the loops take them."""
+        self.loops.each("render_ray", self.arrays, self.grid, rays, len(out), out, RAYS_PER_TASK)
 
     def peaks(
         self, lo: np.ndarray, cell: np.ndarray, cells: np.ndarray, offsets: np.ndarray, frame: int = 0

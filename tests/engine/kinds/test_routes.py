@@ -189,7 +189,7 @@ def test_rays_of_many_blocks_ask_all_together(monkeypatch):
 
 
 def test_numbers_that_change_are_seen_by_routes():
-    """A field with other numbers, or other tints, does not show those that it was made from."""
+    """A field with other numbers does not show those that it was made from."""
     shown = scenes()["apart"].for_pictures(WORTH_TELLING)
     rays_o, rays_d = looks("apart", 100, 9)
     before = render_rays(shown, rays_o, rays_d)

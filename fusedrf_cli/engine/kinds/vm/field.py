@@ -38,6 +38,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     transformed_aabb,
     unbounded_cells,
 )
+from fusedrf_cli.engine.kernels.loops import Rays
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm import bodies, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
@@ -387,22 +388,14 @@ class VMField(ComputedField):
         """See ComputedField."""
         return super()._afresh("alone", *names)
 
-    def render_rays(
-        self,
-        rays_o: np.ndarray,
-        rays_d: np.ndarray,
-        reach: np.ndarray,
-        step: float,
-        early_stop: float,
-        out: np.ndarray,
-    ) -> None:
+    def show(self, rays: Rays, out: np.ndarray) -> None:
         """See ComputedField; in pictures of several blocks most rays meet one, which answers faster alone
         (`vm/routes.py`)."""
         if not self.by_routes:
-            return super().render_rays(rays_o, rays_d, reach, step, early_stop, out)
-        from fusedrf_cli.engine.kinds.vm.routes import render_by_routes
+            return super().show(rays, out)
+        from fusedrf_cli.engine.kinds.vm.routes import show_by_routes
 
-        render_by_routes(self, super().render_rays, rays_o, rays_d, reach, step, early_stop, out)
+        show_by_routes(self, super().show, rays, out)
 
     def for_pictures(self, rays: int) -> "VMField":
         """See ComputedField: of several blocks the insides of cells are told where pictures are worth it, and
