@@ -175,15 +175,26 @@ def matter_at(o, d, matrix, apart, first, nx, ny, nz):
     return NOWHERE
 
 
+@body
+def comes_near(o, d, ball, end):
+    """Whether a ray o + t d comes into a ball (centre and radius) with 0 <= t < end."""
+    x, y, z = ball[0] - o[0], ball[1] - o[1], ball[2] - o[2]
+    t = x * d[0] + y * d[1] + z * d[2]
+    x, y, z = along((x, y, z), d, -t)  # past the centre: exact however far away that is
+    return x * x + y * y + z * z <= ball[3] * ball[3] and t + ball[3] >= 0 and t - ball[3] < end
+
+
 @task
-def first_two_task(rays_o, rays_d, to_unit, apart, apart_at, bounded, low, high, first, second):
+def first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, low, high, first, second):
     """`first_two` for rays low..high."""
     for i in range(low, high):
         o, d = (rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]), (rays_d[i, 0], rays_d[i, 1], rays_d[i, 2])
         nearest, next_nearest, which = NOWHERE, NOWHERE, -1
         for b in range(to_unit.shape[0]):
             at = -1.0
-            if bounded[b]:
+            if balls[b, 3] < NOWHERE:
+                if not comes_near(o, d, balls[b], next_nearest):
+                    continue
                 nx, ny, nz = apart_at[b, 1], apart_at[b, 2], apart_at[b, 3]
                 at = matter_at(o, d, to_unit[b], apart, apart_at[b, 0], nx, ny, nz)
             if at < nearest:
@@ -194,15 +205,16 @@ def first_two_task(rays_o, rays_d, to_unit, apart, apart_at, bounded, low, high,
 
 
 @loop
-def first_two(rays_o, rays_d, to_unit, apart, apart_at, bounded, threads, first, second):
+def first_two(rays_o, rays_d, to_unit, apart, apart_at, balls, threads, first, second):
     """For every ray (N, 3) the first of several placed grids in which it comes to a cell with matter, or -1,
     into first (N,) int64, and how far along it such cells of a second one begin, or NOWHERE, into second
     (N,).
 
     to_unit (B, 3, 4) takes points to where the box of a grid is the unit cube; apart is how many cells each
     cell is from the nearest with matter, flat, of all grids, and apart_at (B, 4) where in it that of a grid
-    begins, and its cells per axis. One that is not bounded, (B,) bool, is everywhere. Tasks are dealt to so
-    many threads as in `each` of loops.py.
+    begins, and its cells per axis; balls (B, 4) is where a ball around its matter has its centre, and its
+    radius: of a grid without end it is infinite, and its matter is everywhere. Tasks are dealt to so many
+    threads as in `each` of loops.py.
     """
     n = rays_o.shape[0]
     tasks = (n + RAYS_PER_TASK - 1) // RAYS_PER_TASK
@@ -210,7 +222,7 @@ def first_two(rays_o, rays_d, to_unit, apart, apart_at, bounded, threads, first,
     for turn in prange(each_has * threads):
         part = turn % each_has * threads + turn // each_has
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
-        first_two_task(rays_o, rays_d, to_unit, apart, apart_at, bounded, low, high, first, second)
+        first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, low, high, first, second)
 
 
 @task

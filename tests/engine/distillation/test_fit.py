@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.fit import FitSettings, Pictures, RayPool, fit, occupancy_of
+from fusedrf_cli.engine.distillation.fit import (
+    FALL,
+    FALLS_FROM,
+    FitSettings,
+    Pictures,
+    RayPool,
+    decay,
+    fit,
+    occupancy_of,
+)
 from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -44,6 +53,12 @@ def test_a_ball_is_learnt(capture):
     assert 0.02 < field.occupancy.occupied.mean() < 0.9
     shares, quality = zip(*told, strict=True)
     assert list(shares) == sorted(shares) and quality[-1] > quality[0] + 5
+
+
+def test_the_rate_holds_and_then_falls_by_equal_factors():
+    assert decay(0) == decay(FALLS_FROM) == 1 and decay(1) == pytest.approx(FALL)
+    late = [decay(FALLS_FROM + part * (1 - FALLS_FROM)) for part in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    assert np.diff(np.log(late)) == pytest.approx([np.log(FALL) / 4] * 4)
 
 
 def test_the_same_seed_gives_the_same_bits(capture):

@@ -47,13 +47,26 @@ def inside(matrix: np.ndarray, grid: OccupancyGrid, points: np.ndarray) -> np.nd
     return held
 
 
+CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3), -1).reshape(-1, 3)  # of a unit cube
+
+
+def ball_around(matrix: np.ndarray, bounded: bool = True) -> np.ndarray:
+    """(4,) the smallest ball around what a matrix (3, 4) takes to the unit cube."""
+    if not bounded:
+        return np.array([0, 0, 0, np.inf])
+    corners = np.linalg.solve(matrix[:, :3], (CORNERS - matrix[:, 3]).T).T
+    middle = corners.mean(0)
+    return np.array([*middle, np.linalg.norm(corners - middle, axis=1).max() * (1 + 1e-6)])
+
+
 def found_by_kernel(rays_o, rays_d, to_unit, grids, bounded=(True, True, True), threads: int = 2):
     """`first_two` of some placed grids."""
     sizes = np.cumsum([0, *[grid.occupied.size for grid in grids]])
     at = np.array([[start, *grid.occupied.shape] for start, grid in zip(sizes, grids, strict=False)])
     apart = np.concatenate([grid.skip.ravel() for grid in grids])
     first, second = np.empty(len(rays_o), np.int64), np.empty(len(rays_o))
-    whole = rays_o, rays_d, np.stack(to_unit), apart, at, np.array(bounded)
+    balls = np.stack([ball_around(*one) for one in zip(to_unit, bounded, strict=False)])
+    whole = rays_o, rays_d, np.stack(to_unit), apart, at, balls
     first_two(*whole, threads, first, second)
     return first, second
 
@@ -106,6 +119,21 @@ def scenes() -> dict[str, VMField]:
         ),
         "in a place": blocks_of([Placed("place", place(), np.eye(4)), Placed("one", one, small @ TURNED)]),
     }
+
+
+def test_balls_hold_the_matter_of_their_blocks_and_no_more_than_its_box_asks():
+    for field in scenes().values():
+        for block, (*middle, radius) in zip(field.blocks, field.balls, strict=True):
+            tensor = field.tensors[block.tensor]
+            assert np.isinf(radius) == (tensor.space is unbounded)
+            if np.isinf(radius):
+                continue
+            grid = tensor.occupancy
+            at = grid.aabb[:3] + (np.argwhere(grid.occupied)[:, None] + CORNERS) * grid.cell
+            at = at.reshape(-1, 3) @ block.object_to_field[:3, :3].T + block.object_to_field[:3, 3]
+            assert np.linalg.norm(at - middle, axis=1).max() <= radius
+            apart = [np.linalg.norm(at - corner, axis=1).max() for corner in at[:: len(at) // 50]]
+            assert max(apart) > radius
 
 
 MIDDLES = {"apart": [[-2.0, 0, 0], [2, 0, 0]], "into each other": [[0, 0, 0]], "in a place": [[0, 0, 0]]}

@@ -33,6 +33,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     SCENE_CELLS,
     OccupancyGrid,
     Pace,
+    box_corners,
     placed_cells,
     squeezed,
     transformed_aabb,
@@ -46,6 +47,7 @@ from fusedrf_cli.engine.kinds.vm.reference import MODES
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
+ROUNDING = 1e-6  # share of a ball's radius by which it is larger
 BY_ROUTES = 40  # blocks at most: which of them it meets, each ray is asked for each
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
@@ -372,6 +374,20 @@ class VMField(ComputedField):
     def apart(self) -> tuple[np.ndarray, np.ndarray]:
         """`apart` and `apart_at` of bodies.py."""
         return apart_arrays(self.tensors)
+
+    @cached_property
+    def balls(self) -> np.ndarray:
+        """(B, 4) the centre and the radius of a ball around each block's matter in the field's frame, infinite
+        where it fills all of space."""
+        boxes = [box_corners(tensor.occupancy.tight_aabb(0)) for tensor in self.tensors]
+        found = []
+        for block in self.blocks:
+            matrix, corners = block.object_to_field, boxes[block.tensor]
+            middle = corners.mean(0) @ matrix[:3, :3].T + matrix[:3, 3]
+            reach = np.linalg.norm((corners - corners.mean(0)) @ matrix[:3, :3].T, axis=1).max()
+            endless = self.tensors[block.tensor].space is not bounded
+            found.append([*middle, np.inf if endless else reach * (1 + ROUNDING)])
+        return np.array(found)
 
     @cached_property
     def alone(self) -> tuple["VMField", ...]:

@@ -16,7 +16,6 @@ from fusedrf_cli.engine.kernels.loops import Rays
 from fusedrf_cli.engine.kernels.plain import NOWHERE
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.volume import seen_from
-from fusedrf_cli.engine.spaces import bounded
 
 
 def show_by_routes(
@@ -29,8 +28,8 @@ def show_by_routes(
     finer than its step, so that a ray must be on one lattice of samples from end to end, and only rays that
     meet nothing else are its alone.
     """
-    bounds = is_bounded(field)
-    first, second = met_blocks(field, rays, bounds)
+    first, second = met_blocks(field, rays)
+    bounds = np.isfinite(field.balls[:, 3])
     near, far = rays.reach.T
     out[:], begin = 0, near.copy()
     for b in np.flatnonzero(np.bincount(first + 1)[1:]).tolist():
@@ -54,20 +53,15 @@ def picked(rays: Rays, chosen: np.ndarray, begin: np.ndarray, end: np.ndarray) -
     return rays._replace(rays_o=rays.rays_o[chosen], rays_d=rays.rays_d[chosen], reach=reach)
 
 
-def met_blocks(field: VMField, rays: Rays, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def met_blocks(field: VMField, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     """(N,) the first block that each of the rays comes to, or -1, and (N,) where it comes to a second one, or
-    NOWHERE; bounds as `is_bounded` says."""
+    NOWHERE."""
     first, second = np.empty(len(rays.rays_o), np.int64), np.empty(len(rays.rays_o))
     apart, apart_at = field.apart
     at = apart_at[[block.tensor for block in field.blocks]]
-    placed = field.to_unit, apart, at, bounds
+    placed = field.to_unit, apart, at, field.balls
     cpu.first_two(rays.rays_o, rays.rays_d, *placed, get_num_threads(), first, second)
     return first, second
-
-
-def is_bounded(field: VMField) -> np.ndarray:
-    """(B,) bool, which blocks do not fill all of space."""
-    return np.array([field.tensors[block.tensor].space is bounded for block in field.blocks])
 
 
 def shown_alone(field: VMField, b: int, rays: Rays) -> np.ndarray:
