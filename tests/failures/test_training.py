@@ -15,7 +15,7 @@ import torch
 
 from fusedrf_cli.bridge.training import QUALITY
 from fusedrf_cli.engine.distillation import fit as module
-from fusedrf_cli.engine.distillation.fit import RATE, RETRY_AFTER, FitRun, FitSettings, fit
+from fusedrf_cli.engine.distillation.fit import CALM_AFTER, RATE, RETRY_AFTER, FitRun, FitSettings, fit
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
@@ -72,9 +72,9 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
     """The first two searches find nothing: the box stays, it is tried again soon, and the run ends well."""
     find, boxes = module.occupancy_of, []
 
-    def blind_twice(field):
+    def blind_twice(field, *box):
         boxes.append(field.tensors[0].aabb)
-        return nothing(field) if len(boxes) <= 2 else find(field)
+        return nothing(field) if len(boxes) <= 2 else find(field, *box)
 
     monkeypatch.setattr(module, "occupancy_of", blind_twice)
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
@@ -88,13 +88,25 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
 def test_t1_tries_again_soon_but_not_twice(images, monkeypatch):
     monkeypatch.setattr(module, "occupancy_of", nothing)
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
-    run.steps, run.refreshes = 32, [0.4, 0.9]
+    run.steps, run.optimiser.steps, run.refreshes = 32, CALM_AFTER, [0.4, 0.9]
     run.refresh(run.share())
     assert run.refreshes == [pytest.approx(0.4 + RETRY_AFTER), 0.9]
-    run.steps = 70
+    run.steps, run.optimiser.steps = 70, CALM_AFTER
     run.refreshes = [0.5, 0.88]
     run.refresh(run.share())
     assert run.refreshes == [0.88]
+
+
+def test_t1_nothing_is_cut_off_while_an_optimiser_is_new(images, monkeypatch):
+    """It is waited for, and then it is done."""
+    searches = []
+    monkeypatch.setattr(FitRun, "refresh_occupancy", lambda run: searches.append(run.optimiser.steps))
+    run = FitRun.start(CAMERAS, images, BOX, BRIEF)
+    run.refreshes, run.stages = [0.0, 0.9], []
+    for _ in range(CALM_AFTER + 2):
+        run.refresh(0.5)
+        run.step(0.5)
+    assert searches == [CALM_AFTER] and run.refreshes == [0.9]
 
 
 def test_t1_a_cut_box_that_turns_out_empty_is_not_taken(images, monkeypatch):
@@ -166,7 +178,7 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
     run.guard.renew()
     run.guard.keep()
     good = run.field.params.clone()
-    run.field.params[11] = float("nan")
+    run.field.params[11], run.optimiser.steps = float("nan"), CALM_AFTER
     run.refresh(0.04)
     assert run.guard.roll_backs == 1 and run.field.params.shape == good.shape
     row.check("T7", "numbers that are not finite", (~torch.isfinite(run.field.params)).sum(), 0, at_most=True)
@@ -175,7 +187,8 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
 
 def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
     """One step in twenty is NaN: they change nothing, and 0.5 dB of the rest is lost at most."""
-    clean = unseen_psnr(fit(CAMERAS, images, BOX, BRIEF))
+    longer = replace(BRIEF, steps=160)
+    clean = unseen_psnr(fit(CAMERAS, images, BOX, longer))
     train_rays, calls = ComputedField.train_rays, []
 
     def poisoned(field, batch, grads, loss):
@@ -186,9 +199,9 @@ def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
             loss[:, 0] = np.nan
 
     monkeypatch.setattr(ComputedField, "train_rays", poisoned)
-    run = FitRun.start(CAMERAS, images, BOX, BRIEF)
+    run = FitRun.start(CAMERAS, images, BOX, longer)
     figure = clean - unseen_psnr(run.finish())
-    assert run.guard.figures() == {"skipped_steps": 4, "roll_backs": 0} and run.steps == 80
+    assert run.guard.figures() == {"skipped_steps": 8, "roll_backs": 0} and run.steps == 160
     assert np.isfinite(run.mse)
     row.check("T9", "PSNR lost to one bad step in twenty", figure, 0.5, at_most=True, unit="dB")
 

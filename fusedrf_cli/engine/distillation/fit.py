@@ -57,6 +57,9 @@ UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.
 UNBOUNDED_SAMPLES = 5  # times the samples of a step in a box: a ray has more of them
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
+# Steps of an optimiser that begins anew, whose first move every number by the whole rate, before what the
+# numbers say of empty cells is believed: of a ball half was cut off three steps after a change of resolution.
+CALM_AFTER = 8
 RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
 RAYS_PER_STEP = (512, 1 << 14)
@@ -335,7 +338,7 @@ class FitRun:
 
     def refresh(self, share: float) -> None:
         """Occupancy, box and resolution changes that are due."""
-        if self.refreshes and share >= self.refreshes[0]:
+        if self.refreshes and share >= self.refreshes[0] and self.optimiser.steps >= CALM_AFTER:
             self.refreshes.pop(0)
             if self.settings.unbounded and self.steps < STEPS_TO_SHOW:
                 return  # all is fog still, and nothing of it shows

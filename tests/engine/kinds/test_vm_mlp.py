@@ -11,6 +11,7 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
 from fusedrf_cli.engine.kinds.vm.reference import vm_products
 from fusedrf_cli.engine.kinds.vm_mlp import bodies
 from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untrained
@@ -221,7 +222,7 @@ def test_what_fills_a_layer_up_stays_zero():
 def test_the_network_learns_at_a_rate_of_its_own():
     field = random_field(torch.float32)
     *others, network = field.groups()
-    assert [g.rate for g in others] == [1.0, 0.05] and network.rate == NETWORK_RATE
+    assert [g.rate for g in others] == [1.0, BASIS_RATE] and network.rate == NETWORK_RATE
     assert network.low == field.factors.params.numel() == others[-1].high
     assert network.high == field.params.numel() and network.low % 16 == network.high % 16 == 0
 
