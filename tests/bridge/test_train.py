@@ -154,7 +154,7 @@ def test_refined_poses_are_told_kept_and_measured_apart(report, folder, monkeypa
     for before, after in zip(given.test, kept.test, strict=True):
         np.testing.assert_array_equal(after.camera_to_world, before.camera_to_world)
     aligned = said["holdout"]["aligned"]
-    assert aligned["views"] == said["holdout"]["views"] and min(aligned["psnr"], aligned["unaligned"]) > 5
+    assert aligned["views"] == said["holdout"]["views"]  # what alignment finds: test_refined.py
 
 
 def test_poses_of_a_mesh_are_exact(run, folder):
