@@ -186,9 +186,10 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
 
 
 def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
-    """One step in twenty is NaN: they change nothing, and 0.5 dB of the rest is lost at most."""
-    longer = replace(BRIEF, steps=160)
-    clean = unseen_psnr(fit(CAMERAS, images, BOX, longer))
+    """One step in twenty is NaN: not a bit of what is learnt changes by it, and beside runs of as many good
+    steps 0.5 dB is lost at most, on the average of eight seeds: two runs differ by as much."""
+    clean = [replace(BRIEF, steps=152, seed=seed) for seed in range(8)]
+    figure = np.mean([unseen_psnr(fit(CAMERAS, images, BOX, settings)) for settings in clean])
     train_rays, calls = ComputedField.train_rays, []
 
     def poisoned(field, batch, grads, loss):
@@ -199,10 +200,21 @@ def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
             loss[:, 0] = np.nan
 
     monkeypatch.setattr(ComputedField, "train_rays", poisoned)
-    run = FitRun.start(CAMERAS, images, BOX, longer)
-    figure = clean - unseen_psnr(run.finish())
-    assert run.guard.figures() == {"skipped_steps": 8, "roll_backs": 0} and run.steps == 160
-    assert np.isfinite(run.mse)
+    for settings in clean:
+        run = FitRun.start(CAMERAS, images, BOX, replace(settings, steps=160))
+        step = run.step
+
+        def watched(share, run=run, step=step):
+            before = [values.clone() for values in run.optimiser.numbers()]
+            bad = len(calls) % 20 == 6
+            step(share)
+            after = run.optimiser.numbers()
+            assert bad == all(torch.equal(*pair) for pair in zip(before, after, strict=True))
+
+        run.step = watched
+        figure -= unseen_psnr(run.finish()) / len(clean)
+        assert run.guard.figures() == {"skipped_steps": 8, "roll_backs": 0} and run.steps == 160
+        assert np.isfinite(run.mse)
     row.check("T9", "PSNR lost to one bad step in twenty", figure, 0.5, at_most=True, unit="dB")
 
 
