@@ -1,4 +1,4 @@
-"""Loops that know no kind of field, for the CPU: Adam, rays of a camera, sums of rows, samples of a ray.
+"""Loops that know no kind of field, for the CPU: Adam, rays of a camera, cells to mark, sums of rows.
 
 Each part of the work runs on one core and writes only what is its own, so that a sum has one order.
 """
@@ -9,15 +9,10 @@ import numpy as np
 from numba import njit, prange
 
 from fusedrf_cli.engine.kernels.parts import (
-    FACE_TOLERANCE,
     LINE,
     adam_line,
-    along,
     bit_of,
     body,
-    cell_of,
-    exit_distance,
-    hit_box,
     pinhole_ray,
     sum_of_rows,
     touched,
@@ -35,7 +30,6 @@ task = njit(**FLAGS, _nrt=False)
 RAYS_PER_TASK = 2048
 ENTRIES_PER_TASK = 1 << 16
 LINES_PER_TASK = ENTRIES_PER_TASK // LINE
-NOWHERE = 1e30  # further than any ray goes
 LINES_AHEAD = 8  # a line's moments are asked for so many lines before it
 
 
@@ -138,91 +132,6 @@ def unbent(distorted, distortion, ideal):
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
         unbend_task(distorted, distortion, low, high, ideal)
-
-
-@body
-def matter_at(o, d, matrix, apart, first, nx, ny, nz):
-    """Where along a ray o + t d, from t = 0 on, the first cell with matter of a grid begins, or NOWHERE: from
-    an empty cell it goes as far as there is no other. matrix (3, 4) takes points to where the grid's box is
-    the unit cube; apart[first:] is how many cells each of its cells is from the nearest with matter."""
-    x, y, z = o
-    dx, dy, dz = d
-    m = matrix
-    origin = (
-        nx * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]),
-        ny * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]),
-        nz * (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]),
-    )
-    way = (
-        nx * (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz),
-        ny * (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz),
-        nz * (m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz),
-    )
-    t, end = hit_box(origin, way, (0.0, 0.0, 0.0), (float(nx), float(ny), float(nz)))
-    start, u, length = along(origin, way, t), 0.0, end - t  # so that steps are seen however far away t is
-    least = FACE_TOLERANCE / max(abs(way[0]), max(abs(way[1]), abs(way[2])))
-    while u < length:
-        x, y, z = along(start, way, u)
-        i, j, k = cell_of(x, 0.0, 1.0, nx), cell_of(y, 0.0, 1.0, ny), cell_of(z, 0.0, 1.0, nz)
-        s = int(apart[np.uint64(first + (i * ny + j) * nz + k)])
-        if s == 0:
-            return t + u
-        away = min(
-            exit_distance(x, way[0], 0.0, 1.0, i, s),
-            min(exit_distance(y, way[1], 0.0, 1.0, j, s), exit_distance(z, way[2], 0.0, 1.0, k, s)),
-        )
-        u += max(away, 0.0) + least
-    return NOWHERE
-
-
-@body
-def comes_near(o, d, ball, end):
-    """Whether a ray o + t d comes into a ball (centre and radius) with 0 <= t < end."""
-    x, y, z = ball[0] - o[0], ball[1] - o[1], ball[2] - o[2]
-    t = x * d[0] + y * d[1] + z * d[2]
-    x, y, z = along((x, y, z), d, -t)  # past the centre: exact however far away that is
-    return x * x + y * y + z * z <= ball[3] * ball[3] and t + ball[3] >= 0 and t - ball[3] < end
-
-
-@task
-def first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, low, high, first, second):
-    """`first_two` for rays low..high."""
-    for i in range(low, high):
-        o, d = (rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]), (rays_d[i, 0], rays_d[i, 1], rays_d[i, 2])
-        nearest, next_nearest, which = NOWHERE, NOWHERE, -1
-        for b in range(to_unit.shape[0]):
-            at = -1.0
-            if balls[b, 3] < NOWHERE:
-                if not comes_near(o, d, balls[b], next_nearest):
-                    continue
-                nx, ny, nz = apart_at[b, 1], apart_at[b, 2], apart_at[b, 3]
-                at = matter_at(o, d, to_unit[b], apart, apart_at[b, 0], nx, ny, nz)
-            if at < nearest:
-                which, nearest, next_nearest = b, at, nearest
-            elif at < next_nearest:
-                next_nearest = at
-        first[i], second[i] = which, next_nearest
-
-
-@loop
-def first_two(rays_o, rays_d, to_unit, apart, apart_at, balls, threads, first, second):
-    """For every ray (N, 3) the first of several placed grids in which it comes to a cell with matter, or -1,
-    into first (N,) int64, and how far along it such cells of a second one begin, or NOWHERE, into second
-    (N,).
-
-    to_unit (B, 3, 4) takes points to where the box of a grid is the unit cube; apart is how many cells each
-    cell is from the nearest with matter, flat, of all grids, and apart_at (B, 4) where in it that of a grid
-    begins, and its cells per axis; balls (B, 4) is where a ball around its matter has its centre, and its
-    radius: of a grid without end it is infinite, and its matter is everywhere. Tasks are dealt to so many
-    threads as in `each` of loops.py.
-    """
-    n = rays_o.shape[0]
-    tasks = (n + RAYS_PER_TASK - 1) // RAYS_PER_TASK
-    each_has = (tasks + threads - 1) // threads
-    for turn in prange(each_has * threads):
-        part = turn % each_has * threads + turn // each_has
-        low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
-        first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, low, high, first, second)
 
 
 @task

@@ -12,12 +12,14 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels.plain import NOWHERE, first_two
+from fusedrf_cli.engine.kernels.loops import Rays
+from fusedrf_cli.engine.kernels.routing import NOWHERE, first_two
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.vm import field as vm_field
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.kinds.vm.routes import by_number, show_behind
+from fusedrf_cli.engine.rendering.volume import render_rays, seen_from
 from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import THIRTY_TWO, rays_at, unit
 from tests.engine.fields.test_insides import TURNED, ball, shift
@@ -64,7 +66,7 @@ def found_by_kernel(rays_o, rays_d, to_unit, grids, bounded=(True, True, True), 
     sizes = np.cumsum([0, *[grid.occupied.size for grid in grids]])
     at = np.array([[start, *grid.occupied.shape] for start, grid in zip(sizes, grids, strict=False)])
     apart = np.concatenate([grid.skip.ravel() for grid in grids])
-    first, second = np.empty(len(rays_o), np.int64), np.empty(len(rays_o))
+    first, second = np.empty(len(rays_o), np.int16), np.empty(len(rays_o))
     balls = np.stack([ball_around(*one) for one in zip(to_unit, bounded, strict=False)])
     whole = rays_o, rays_d, np.stack(to_unit), apart, at, balls
     first_two(*whole, threads, first, second)
@@ -100,6 +102,42 @@ def test_the_first_two_are_those_of_a_slow_walk(seed):
     for threads in (1, 3, 5):
         again = found_by_kernel(rays_o, rays_d, to_unit, grids, threads=threads)
         assert np.array_equal(again[0], first) and np.array_equal(again[1], second)
+
+
+@pytest.mark.parametrize("matrix", [STRETCHED, np.eye(4)], ids=["stretched", "as it is"])
+def test_some_rays_are_shown_in_another_frame_and_put_behind_what_there_is(matrix):
+    rng = np.random.default_rng(4)
+    rays_o, rays_d = rays_at(np.array([-1, -1, -1, 1, 1, 1.0]), 5000, 2)
+    begin, end = rng.random(5000), 2 + rng.random(5000)
+    chosen = rng.permutation(5000)[:4321]
+    before = rng.random((5000, 5)).astype(np.float32)
+    behind = rng.random((4321, 5)).astype(np.float32)
+    seen = []
+
+    def show(rays, found):
+        seen.append(rays)
+        found[:] = behind
+
+    out = before.copy()
+    show_behind(show, Rays(rays_o, rays_d, None, 0.1, 0.0), chosen, begin, end, matrix, out)
+    own_o, own_d, lengths = seen_from(matrix, rays_o[chosen], rays_d[chosen])
+    lengths = np.broadcast_to(lengths, 4321)
+    np.testing.assert_allclose(seen[0].rays_o, own_o, atol=1e-12)
+    np.testing.assert_allclose(seen[0].rays_d, own_d, atol=1e-12)
+    reach = np.stack([begin[chosen] * lengths, end[chosen] * lengths], 1)
+    np.testing.assert_allclose(seen[0].reach, reach, atol=1e-12)
+    behind[:, 4] /= lengths
+    wanted = before.copy()
+    wanted[chosen] += (1 - before[chosen, 3:4]) * behind
+    np.testing.assert_allclose(out, wanted, atol=1e-6)
+
+
+def test_places_are_told_by_the_number_there():
+    numbers = np.random.default_rng(0).integers(-1, 250, 3000).astype(np.int16)
+    told = dict(by_number(numbers))
+    assert sorted(told) == sorted({*numbers.tolist()} - {-1})
+    assert all(np.array_equal(places, np.flatnonzero(numbers == n)) for n, places in told.items())
+    assert not list(by_number(np.full(5, -1, np.int16))) and not list(by_number(numbers[:0]))
 
 
 def place(texels: int = 24) -> VMField:

@@ -5,22 +5,21 @@ matter of one block alone, or end in a first one before they come to that of a s
 answers alone, as a field of one tensor does.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numba import get_num_threads
 
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.kernels.loops import Rays
-from fusedrf_cli.engine.kernels.plain import NOWHERE
+from fusedrf_cli.engine.kernels.routing import NOWHERE, first_two, put_behind, taken
 from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.rendering.volume import seen_from
+
+Shown = Callable[[Rays, np.ndarray], None]
+"""Fills out (N, 5) with what rays show, as ComputedField.show does."""
 
 
-def show_by_routes(
-    field: VMField, together: Callable[[Rays, np.ndarray], None], rays: Rays, out: np.ndarray
-) -> None:
+def show_by_routes(field: VMField, together: Shown, rays: Rays, out: np.ndarray) -> None:
     """Fill out (N, 5) as ComputedField.show does; `together` is that of all blocks.
 
     A ray is followed through its first block up to where it comes to cells with matter of a second one, and
@@ -29,49 +28,62 @@ def show_by_routes(
     meet nothing else are its alone.
     """
     first, second = met_blocks(field, rays)
-    bounds = np.isfinite(field.balls[:, 3])
-    near, far = rays.reach.T
-    out[:], begin = 0, near.copy()
-    for b in np.flatnonzero(np.bincount(first + 1)[1:]).tolist():
-        chosen = first == b
-        if bounds[b]:
-            begin[chosen] = np.maximum(near, second)[chosen]
-        else:
-            chosen &= (second == NOWHERE) & (field.crossings[b] == 0)
-            begin[chosen] = NOWHERE
-        chosen = np.flatnonzero(chosen)
-        out[chosen] = shown_alone(field, b, picked(rays, chosen, near, np.minimum(far, second)))
+    near, far = np.ascontiguousarray(rays.reach.T)
+    out[:], before = 0, np.minimum(far, second)
+    alone = goes_alone(field, first, second)
+    for b, chosen in by_number(np.where(alone, first, -1)):
+        matrix, own = field.blocks[b].object_to_field, field.alone[b]
+        # samples in the object's frame that are as dense for it as those of all blocks are for the field
+        step = sampling_step(own) * rays.step / sampling_step(field)
+        show_behind(own.show, rays._replace(step=step), chosen, near, before, matrix, out)
+    begin = np.where(alone, np.maximum(near, second), near)
     left = np.flatnonzero((begin < np.minimum(far, NOWHERE)) & (out[:, 3] < 1 - rays.early_stop))
-    behind = np.zeros((len(left), out.shape[1]), out.dtype)
-    together(picked(rays, left, begin, far), behind)
-    out[left] += (1 - out[left, 3:4]) * behind
+    show_behind(together, rays, left, begin, far, np.eye(4), out)
 
 
-def picked(rays: Rays, chosen: np.ndarray, begin: np.ndarray, end: np.ndarray) -> Rays:
-    """Some of the rays, from and to the distances (N,) that are said of all."""
-    reach = np.stack([begin[chosen], end[chosen]], 1)
-    return rays._replace(rays_o=rays.rays_o[chosen], rays_d=rays.rays_d[chosen], reach=reach)
+def goes_alone(field: VMField, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether a ray whose `met_blocks` these are is the first block's alone until it comes to the
+    second; so is one that meets none, of which nothing is left."""
+    bounded = np.isfinite(field.balls[:, 3])
+    direct = np.equal(field.crossings, 0)
+    return np.append(bounded, True)[first] | (np.append(direct, True)[first] & (second == NOWHERE))
+
+
+def by_number(numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Every one of numbers (N,) int16 that is at least 0, with the places (M,) where it is, in order."""
+    order = np.argsort(numbers, kind="stable")
+    ends = np.cumsum(np.bincount(numbers + 1))
+    for number, (low, high) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+        if low < high:
+            yield number, order[low:high]
 
 
 def met_blocks(field: VMField, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     """(N,) the first block that each of the rays comes to, or -1, and (N,) where it comes to a second one, or
     NOWHERE."""
-    first, second = np.empty(len(rays.rays_o), np.int64), np.empty(len(rays.rays_o))
+    first, second = np.empty(len(rays.rays_o), np.int16), np.empty(len(rays.rays_o))
     apart, apart_at = field.apart
     at = apart_at[[block.tensor for block in field.blocks]]
     placed = field.to_unit, apart, at, field.balls
-    cpu.first_two(rays.rays_o, rays.rays_d, *placed, get_num_threads(), first, second)
+    first_two(rays.rays_o, rays.rays_d, *placed, get_num_threads(), first, second)
     return first, second
 
 
-def shown_alone(field: VMField, b: int, rays: Rays) -> np.ndarray:
-    """(N, 5) what rays show of block b, by samples in its object's frame that are as dense for it as theirs
-    are for the field."""
-    alone = field.alone[b]
-    rays_o, rays_d, lengths = seen_from(field.blocks[b].object_to_field, rays.rays_o, rays.rays_d)
-    step = sampling_step(alone) * rays.step / sampling_step(field)
-    found = np.zeros((len(rays_o), 5), np.float32)
-    reach = rays.reach * np.reshape(lengths, (-1, 1))
-    alone.show(Rays(rays_o, rays_d, reach, float(step), rays.early_stop), found)
-    found[:, 4] /= lengths
-    return found
+def show_behind(
+    show: Shown,
+    rays: Rays,
+    chosen: np.ndarray,
+    begin: np.ndarray,
+    end: np.ndarray,
+    matrix: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Composite behind what out (N, 5) has what rays chosen (M,) show, from and to distances begin and end
+    (N,), in a frame that lies at matrix (4, 4) of theirs; the step is that frame's."""
+    count, turn = len(chosen), matrix[:3, :3]
+    own_o, own_d, reach = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2))
+    lengths, found = np.empty(count), np.zeros((count, 5), out.dtype)
+    placing = np.linalg.inv(turn), matrix[:3, 3].copy(), not np.array_equal(turn, np.eye(3))
+    taken(rays.rays_o, rays.rays_d, begin, end, chosen, placing, own_o, own_d, reach, lengths)
+    show(rays._replace(rays_o=own_o, rays_d=own_d, reach=reach), found)
+    put_behind(found, lengths, chosen, out)
