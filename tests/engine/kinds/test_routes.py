@@ -18,7 +18,7 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.vm import field as vm_field
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.kinds.vm.routes import by_number, show_behind
+from fusedrf_cli.engine.kinds.vm.routes import alone_until, by_number, met_blocks, own_steps, show_behind
 from fusedrf_cli.engine.rendering.volume import render_rays, seen_from
 from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import THIRTY_TWO, rays_at, unit
@@ -233,9 +233,29 @@ def test_a_place_is_asked_by_its_own_step_before_an_object_too(monkeypatch):
     assert sampling_step(noisy) > 8 * sampling_step(field)
     rays_o, rays_d = looks("in a place", 200, 11)
     whole = {"near": 2.3, "far": 2.3 + 8 * sampling_step(noisy), "early_stop": 0.0}  # samples, in the core
-    alone, found = (render_rays(one, rays_o, rays_d, **whole) for one in (noisy, field))
-    apart = abs(found - alone)[:, 3]
-    assert alone[:, 3].std() > 0.1 and apart.max() < 5e-3
+    by_routes = copy(field)
+    by_routes.by_routes = True
+    alone, found, handed_on = (render_rays(one, rays_o, rays_d, **whole) for one in (noisy, field, by_routes))
+    assert alone[:, 3].std() > 0.1
+    assert abs(found - alone)[:, 3].max() < 5e-3 and abs(handed_on - alone)[:, 3].max() < 5e-3
+
+
+def test_a_place_hands_a_ray_on_between_two_of_its_samples_in_the_core():
+    field = scenes()["in a place"]
+    step = sampling_step(field) / 2
+    rays_o, rays_d = looks("in a place", 400, 13)
+    near = np.where(np.arange(400) % 2, 2.2, 0.5)  # in the core and outside
+    rays = Rays(rays_o, rays_d, np.stack([near, np.full(400, np.inf)], 1), step, 0.0)
+    first, second = met_blocks(field, rays)
+    steps = own_steps(field, step)
+    until = alone_until(field, rays, first, second, steps)
+    meets, inside = second < NOWHERE, near > 1
+    assert (first == 0).all() and 0.2 < meets.mean() < 0.9 and steps[0] > 4 * step
+    assert (until[~meets] == NOWHERE).all() and (until[meets & ~inside] == near[meets & ~inside]).all()
+    cut, before = until[meets & inside], (until - near)[meets & inside] / steps[0]
+    assert abs(before - before.round()).max() < 1e-9 and (before > 0.5).mean() > 0.9
+    rest = np.maximum(second, near)[meets & inside] - cut
+    assert (rest >= -1e-12).all() and (rest < steps[0]).all()
 
 
 def test_a_ray_does_not_depend_on_its_company():

@@ -23,30 +23,47 @@ def show_by_routes(field: VMField, together: Shown, rays: Rays, out: np.ndarray)
     """Fill out (N, 5) as ComputedField.show does; `together` is that of all blocks.
 
     A ray is followed through its first block up to where it comes to cells with matter of a second one, and
-    from there, if light is left, through all of them. A background is the first of every ray: it has detail
-    finer than its step, so that a ray must be on one lattice of samples from end to end, and only rays that
-    meet nothing else are its alone.
+    from there, if light is left, through all of them.
     """
     first, second = met_blocks(field, rays)
     near, far = np.ascontiguousarray(rays.reach.T)
-    out[:], before = 0, np.minimum(far, second)
-    alone = goes_alone(field, first, second)
-    for b, chosen in by_number(np.where(alone, first, -1)):
-        matrix, own = field.blocks[b].object_to_field, field.alone[b]
-        # samples in the object's frame that are as dense for it as those of all blocks are for the field
-        step = sampling_step(own) * rays.step / sampling_step(field)
-        show_behind(own.show, rays._replace(step=step), chosen, near, before, matrix, out)
-    begin = np.where(alone, np.maximum(near, second), near)
-    left = np.flatnonzero((begin < np.minimum(far, NOWHERE)) & (out[:, 3] < 1 - rays.early_stop))
-    show_behind(together, rays, left, begin, far, np.eye(4), out)
+    steps = own_steps(field, rays.step)
+    until = alone_until(field, rays, first, second, steps)
+    out[:], end = 0, np.minimum(far, until)
+    for b, chosen in by_number(np.where(until > near, first, -1)):
+        own = rays._replace(step=steps[b])
+        show_behind(field.alone[b].show, own, chosen, near, end, field.blocks[b].object_to_field, out)
+    left = np.flatnonzero((until < np.minimum(far, NOWHERE)) & (out[:, 3] < 1 - rays.early_stop))
+    show_behind(together, rays, left, until, far, np.eye(4), out)
 
 
-def goes_alone(field: VMField, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether a ray whose `met_blocks` these are is the first block's alone until it comes to the
-    second; so is one that meets none, of which nothing is left."""
-    bounded = np.isfinite(field.balls[:, 3])
-    direct = np.equal(field.crossings, 0)
-    return np.append(bounded, True)[first] | (np.append(direct, True)[first] & (second == NOWHERE))
+def own_steps(field: VMField, step: float) -> list[float]:
+    """For each block the step in its object's frame that is as dense for it as a step is for the field."""
+    return [sampling_step(own) * step / sampling_step(field) for own in field.alone]
+
+
+def alone_until(
+    field: VMField, rays: Rays, first: np.ndarray, second: np.ndarray, steps: list[float]
+) -> np.ndarray:
+    """(N,) how far along each ray, whose `met_blocks` these are, only the first block needs to be asked; 0
+    or less where a ray begins with all of them, NOWHERE where it meets no second one.
+
+    A background is the first of every ray, and has detail finer than its step: the ray is handed on between
+    two of its samples, in the core, where they are evenly apart, and nowhere else.
+    """
+    near = rays.reach[:, 0]
+    until = np.where(second < NOWHERE, np.maximum(near, second), NOWHERE)
+    for b in np.flatnonzero(np.isinf(field.balls[:, 3])).tolist():
+        his = first == b
+        if field.crossings[b] != 0:
+            until[his] = near[his]
+            continue
+        his &= second < NOWHERE
+        o, d, begin, end = rays.rays_o[his], rays.rays_d[his], near[his, None], until[his, None]
+        in_core = (abs(o + begin * d) <= 1).all(1) & (abs(o + end * d) <= 1).all(1)
+        cut = begin + np.floor((end - begin) / steps[b]) * steps[b]
+        until[his] = np.where(in_core, cut[:, 0], near[his])
+    return until
 
 
 def by_number(numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
