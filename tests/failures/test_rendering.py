@@ -17,7 +17,8 @@ from click.testing import CliRunner
 
 from formats.images import read_image
 from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.engine.distillation.fit import FitSettings, fit, occupancy_of
+from fusedrf_cli.engine.distillation.fit import FitSettings, fit
+from fusedrf_cli.engine.distillation.matter import occupancy_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import framing_camera, look_at, scattered
@@ -152,7 +153,7 @@ def test_d3_the_mask_hides_nothing_that_shows(row, name):
     row.check("D3", f"{name}: mask on against off", psnr(on, off), 60.0, unit="dB")
 
 
-@pytest.mark.xfail(strict=False, reason="fit.EMPTY_BELOW cuts the haze that a short training leaves")
+@pytest.mark.xfail(strict=False, reason="EMPTY_BELOW cuts the haze that a short training leaves")
 def test_d3_of_a_trained_field(row, trained):
     """Against the same numbers with the mask grown by two cells: what lies there is haze below sight."""
     field, cameras, _ = trained
@@ -161,7 +162,7 @@ def test_d3_of_a_trained_field(row, trained):
     row.check("D3", "a trained field, its mask against a wider one", figure, 60.0, unit="dB")
 
 
-@pytest.mark.xfail(strict=True, reason="fit.EMPTY_BELOW cuts fog thinner than 0.01 per cell")
+@pytest.mark.xfail(strict=True, reason="EMPTY_BELOW cuts fog thinner than 0.01 per cell")
 def test_d3_thin_fog_is_not_masked_away(row):
     field = vm_field(Box(0.1, 0.5, tint=scenes.GREY), (64,) * 3)
     camera = framing_camera(field.aabb, 0.7, 0.4, 32, 32)

@@ -153,9 +153,7 @@ class DistillRun:
         clock = _Clock(report.seconds)
         phase("asking the teachers")
         self.generator.manual_seed(settings.seed + 1)
-        judge = self.judge or scattered_judge(
-            self.teacher, settings.views, settings.view_size, settings.seed
-        )
+        judge = self.judge or scattered_judge(self.teacher, settings.views, settings.view_size, settings.seed)
         rays_o, rays_d = self.sampler.draw(settings.rays, self.generator)
         if settings.steps:
             pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)

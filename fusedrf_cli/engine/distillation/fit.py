@@ -12,6 +12,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
+from fusedrf_cli.engine.distillation.matter import occupancy_of, without_haze
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.poses import (
     RAYS_OF_ALL,
@@ -26,7 +27,7 @@ from fusedrf_cli.engine.distillation.poses import (
 from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.computed import Batch
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts, texels
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Way
@@ -48,7 +49,8 @@ DISTORTION = 0.012  # weight of that loss in unbounded space; in a box surfaces 
 WEIGHED_RAYS = 1 << 17  # by which it is found what photos show
 STEPS_TO_SHOW = 100  # after which a field in unbounded space shows where things are
 SHOWN_FROM = 0.005  # weight on a ray from which a cell of unbounded space counts as shown
-EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
+HAZE_LEFT_FROM = 0.5  # share of the run after which no more matter is to come into cells of haze
+RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
 # (share of the run, share of final voxels per axis)
 RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
@@ -377,8 +379,9 @@ class FitRun:
             pool.gains.copy_(torch.from_numpy(pool.gains.double().numpy() * gains**OVERSHOT))
 
     def refresh_occupancy(self) -> None:
-        """Mark the cells that hold matter, and cut the box down to them where that saves much. Where none
-        does, nothing changes, and it is tried again later."""
+        """Mark the cells that hold matter, and cut the box down to them where that saves much; late in a run
+        haze that no picture shows is left out. Where none does, nothing changes, and it is tried again
+        later."""
         occupancy = self.shown_cells() if self.settings.unbounded else occupancy_of(self.field)
         if not occupancy.occupied.any():
             self.found_nothing += 1
@@ -398,6 +401,9 @@ class FitRun:
                 self.optimiser = Adam.of(self.field)
                 return
             self.occupy(occupancy)
+        if self.share() >= HAZE_LEFT_FROM:
+            *rays, _ = self.pool.draw(RAYS_THAT_JUDGE)
+            self.occupy(without_haze(self.field, *rays, self.settings.near))
 
     def shown_cells(self) -> OccupancyGrid:
         """Cells of which some training ray shows anything, grown by one: haze that no photo shows, and what
@@ -497,23 +503,3 @@ def part_of(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]
 def volume(aabb: np.ndarray) -> float:
     """Volume of a box (6,)."""
     return float(np.prod(aabb[3:] - aabb[:3]))
-
-
-def occupancy_of(
-    field: StoredField, box: np.ndarray | None = None, cells: int = DEFAULT_CELLS
-) -> OccupancyGrid:
-    """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
-    optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
-
-    Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
-    """
-    space = field.occupancy.space
-    box = field.aabb if box is None else box
-    counts = cell_counts(box, min(cells, max(field.resolution)))
-    cell = (box[3:] - box[:3]) / counts
-    index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
-    index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
-    sigma = field.peaks(box[:3], cell, index, PROBES)
-    occupied = np.zeros(counts, bool)
-    occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
-    return OccupancyGrid(box, occupied, space).dilated()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fusedrf_cli.engine.distillation.fit import EMPTY_BELOW
+from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
 

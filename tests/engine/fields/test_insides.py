@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.distillation.fit import occupancy_of
+from fusedrf_cli.engine.distillation.matter import occupancy_of
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.insides import SIDE, WORTH_TELLING, with_insides
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid

@@ -1,0 +1,57 @@
+"""Cells of a field's grid that hold matter."""
+
+import numpy as np
+
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.rendering.volume import render_rays
+
+EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
+# Where in a cell haze is looked for: about as close together as the texels of a fine field.
+CLOSE_PROBES = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="ij"), -1).reshape(-1, 3)
+TRIES = 4  # at leaving haze out, a quarter as thick each time
+SAME = 1e-6  # mean square by which pictures differ that show the same: 60 dB
+
+
+def occupancy_of(
+    field: StoredField, box: np.ndarray | None = None, cells: int = DEFAULT_CELLS
+) -> OccupancyGrid:
+    """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
+    optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
+
+    Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
+    """
+    space = field.occupancy.space
+    box = field.aabb if box is None else box
+    counts = cell_counts(box, min(cells, max(field.resolution)))
+    cell = (box[3:] - box[:3]) / counts
+    index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
+    index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
+    sigma = field.peaks(box[:3], cell, index, PROBES)
+    occupied = np.zeros(counts, bool)
+    occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
+    return OccupancyGrid(box, occupied, space).dilated()
+
+
+def without_haze(
+    field: StoredField, rays_o: np.ndarray, rays_d: np.ndarray, near: float = 0.0
+) -> OccupancyGrid:
+    """The field's occupancy but for cells in which the optical depth across the cell passes EMPTY_BELOW
+    nowhere; where rays (N, 3) from `near` on show it by more than SAME, but for those of thinner haze, and at
+    last with all of them.
+
+    Cells found while a field learns are grown by one, for matter to grow into; that room would be sampled in
+    every picture.
+    """
+    grid = field.occupancy
+    index = np.argwhere(grid.occupied)
+    depth = np.zeros(grid.occupied.shape, np.float32)
+    depth[tuple(index.T)] = field.peaks(grid.aabb[:3], grid.cell, index, CLOSE_PROBES) * grid.cell.min()
+    whole = render_rays(field, rays_o, rays_d, near=near)
+    for most in EMPTY_BELOW * 0.25 ** np.arange(TRIES):
+        fewer = grid.marked(grid.occupied & (depth > most))
+        if fewer.occupied.any():
+            found = render_rays(field.with_occupancy(fewer), rays_o, rays_d, near=near)
+            if np.square(found - whole)[:, :4].mean() <= SAME:
+                return fewer
+    return grid
