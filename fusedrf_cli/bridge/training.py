@@ -58,8 +58,8 @@ LARGEST_PLACE = 95_000_000
 fine as planes are, would take a hundred times those of the planes."""
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
-    "draft": FitSettings(longest=128, steps=1500, samples=1 << 14),
-    "normal": FitSettings(longest=224, steps=4000, samples=1 << 14),
+    "draft": FitSettings(longest=128, steps=1500, samples=1 << 15),
+    "normal": FitSettings(longest=224, steps=4000, samples=1 << 15),
     "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
     "best": FitSettings(longest=256, steps=24000, samples=1 << 15),
 }

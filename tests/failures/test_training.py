@@ -15,7 +15,15 @@ import torch
 
 from fusedrf_cli.bridge.training import QUALITY
 from fusedrf_cli.engine.distillation import fit as module
-from fusedrf_cli.engine.distillation.fit import CALM_AFTER, RATE, RETRY_AFTER, FitRun, FitSettings, fit
+from fusedrf_cli.engine.distillation.fit import (
+    CALM_AFTER,
+    RATE,
+    RETRY_AFTER,
+    STEPS_TO_SHOW,
+    FitRun,
+    FitSettings,
+    fit,
+)
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
@@ -77,7 +85,7 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
         return nothing(field) if len(boxes) <= 2 else find(field, *box)
 
     monkeypatch.setattr(module, "occupancy_of", blind_twice)
-    run = FitRun.start(CAMERAS, images, BOX, BRIEF)
+    run = FitRun.start(CAMERAS, images, BOX, replace(BRIEF, steps=2 * STEPS_TO_SHOW))
     field = run.finish()
     assert run.found_nothing >= 2 and run.found_matter
     moved = max(abs(box - BOX).max() for box in boxes[:3])
@@ -87,26 +95,27 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
 
 def test_t1_tries_again_soon_but_not_twice(images, monkeypatch):
     monkeypatch.setattr(module, "occupancy_of", nothing)
-    run = FitRun.start(CAMERAS, images, BOX, BRIEF)
-    run.steps, run.optimiser.steps, run.refreshes = 32, CALM_AFTER, [0.4, 0.9]
+    run = FitRun.start(CAMERAS, images, BOX, replace(BRIEF, steps=320))
+    run.steps, run.optimiser.steps, run.refreshes = 128, CALM_AFTER, [0.4, 0.9]
     run.refresh(run.share())
     assert run.refreshes == [pytest.approx(0.4 + RETRY_AFTER), 0.9]
-    run.steps, run.optimiser.steps = 70, CALM_AFTER
+    run.steps, run.optimiser.steps = 280, CALM_AFTER
     run.refreshes = [0.5, 0.88]
     run.refresh(run.share())
     assert run.refreshes == [0.88]
 
 
-def test_t1_nothing_is_cut_off_while_an_optimiser_is_new(images, monkeypatch):
-    """It is waited for, and then it is done."""
+@pytest.mark.parametrize(("steps", "due"), [(STEPS_TO_SHOW, CALM_AFTER), (STEPS_TO_SHOW - 12, 12)])
+def test_t1_nothing_is_cut_off_while_a_field_or_its_optimiser_is_new(images, monkeypatch, steps, due):
+    """It is waited for, and then what was to be done by then is done once."""
     searches = []
     monkeypatch.setattr(FitRun, "refresh_occupancy", lambda run: searches.append(run.optimiser.steps))
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
-    run.refreshes, run.stages = [0.0, 0.9], []
-    for _ in range(CALM_AFTER + 2):
+    run.steps, run.refreshes, run.stages = steps, [0.0, 0.1, 0.9], []
+    for _ in range(due + 2):
         run.refresh(0.5)
         run.step(0.5)
-    assert searches == [CALM_AFTER] and run.refreshes == [0.9]
+    assert searches == [due] and run.refreshes == [0.9]
 
 
 def test_t1_a_cut_box_that_turns_out_empty_is_not_taken(images, monkeypatch):
@@ -178,7 +187,8 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
     run.guard.renew()
     run.guard.keep()
     good = run.field.params.clone()
-    run.field.params[11], run.optimiser.steps = float("nan"), CALM_AFTER
+    run.field.params[11] = float("nan")
+    run.steps, run.optimiser.steps = STEPS_TO_SHOW, CALM_AFTER
     run.refresh(0.04)
     assert run.guard.roll_backs == 1 and run.field.params.shape == good.shape
     row.check("T7", "numbers that are not finite", (~torch.isfinite(run.field.params)).sum(), 0, at_most=True)

@@ -47,7 +47,9 @@ SETTLED = 0.25  # share of the run after which a scene has taken shape
 EARLY_NEAR = 5.0  # times the near distance of such a scene, at first
 DISTORTION = 0.012  # weight of that loss in unbounded space; in a box surfaces come out sharp without it
 WEIGHED_RAYS = 1 << 17  # by which it is found what photos show
-STEPS_TO_SHOW = 100  # after which a field in unbounded space shows where things are
+# Steps after which a field shows where things are. What is cut off before is lost: of a chair whose cells
+# were looked for after 30 steps a corner was missing in every third run, and 0.9 dB in all.
+STEPS_TO_SHOW = 100
 SHOWN_FROM = 0.005  # weight on a ray from which a cell of unbounded space counts as shown
 HAZE_LEFT_FROM = 0.5  # share of the run after which no more matter is to come into cells of haze
 RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
@@ -56,7 +58,7 @@ RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36,
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
 # explain each photo by itself: a start at a twentieth of the texels, not at a fifth, gained 3 dB held out.
 UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.7), (0.5, 1.0))
-UNBOUNDED_SAMPLES = 5  # times the samples of a step in a box: a ray has more of them
+UNBOUNDED_SAMPLES = 2.5  # times the samples of a step in a box: a ray has more of them
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 # Steps of an optimiser that begins anew, whose first move every number by the whole rate, before what the
@@ -341,10 +343,9 @@ class FitRun:
 
     def refresh(self, share: float) -> None:
         """Occupancy, box and resolution changes that are due."""
-        if self.refreshes and share >= self.refreshes[0] and self.optimiser.steps >= CALM_AFTER:
-            self.refreshes.pop(0)
-            if self.settings.unbounded and self.steps < STEPS_TO_SHOW:
-                return  # all is fog still, and nothing of it shows
+        shows = self.steps >= STEPS_TO_SHOW and self.optimiser.steps >= CALM_AFTER
+        if shows and self.refreshes and share >= self.refreshes[0]:
+            self.refreshes = [at for at in self.refreshes if at > share]
             self.guard.check()
             self.refresh_occupancy()
         if self.stages and share >= self.stages[0][0]:

@@ -1,0 +1,51 @@
+"""Haze that is left out of a field's cells: what goes is thin wherever it is looked for, what rays show stays
+the same, and fog that they show stays."""
+
+import numpy as np
+
+from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, SAME, without_haze
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.rendering.volume import render_rays
+from tests.engine.conftest import BOX, rays_at
+from tests.engine.fields.test_insides import ball
+
+
+def fog(depth: float):
+    """Fog of an optical depth across each of 32 x 32 x 32 cells, all occupied."""
+    field = ball().with_occupancy(OccupancyGrid.full(BOX, 32))
+    sigma = depth / field.occupancy.cell.min()
+    sections, (tensor,) = field.sections(0), field.tensors
+    sections["density_plane_0"].zero_()
+    sections["density_plane_0"][..., 0] = float(np.log(np.expm1(sigma / tensor.scale))) - tensor.shift
+    return field
+
+
+def deepest(field, cells: np.ndarray) -> np.ndarray:
+    """(N,) the optical depth across each of cells (N, 3) at the densest of 500 random points of it."""
+    grid, points = field.occupancy, np.random.default_rng(1).random((500, 3))
+    return field.peaks(grid.aabb[:3], grid.cell, cells, points) * grid.cell.min()
+
+
+def test_the_room_around_matter_goes_and_rays_show_the_same():
+    field = ball()
+    rays = rays_at(BOX, 3000, 3)
+    kept = without_haze(field, *rays)
+    gone = field.occupancy.occupied & ~kept.occupied
+    assert 0.1 < gone.sum() / field.occupancy.occupied.sum() < 0.9
+    assert deepest(field, np.argwhere(gone)).max() < 4 * EMPTY_BELOW  # between probes it grows steeply
+    assert deepest(field, np.argwhere(kept.occupied)).min() > EMPTY_BELOW
+    apart = render_rays(field.with_occupancy(kept), *rays) - render_rays(field, *rays)
+    assert np.square(apart[:, :4]).mean() < SAME
+
+
+def test_fog_that_rays_show_stays():
+    """0.008 across each of 32 cells is a quarter of what a ray shows; a thousandth of that is nothing."""
+    field, rays = fog(0.8 * EMPTY_BELOW), rays_at(BOX, 3000, 5)
+    seen = render_rays(field, *rays)[:, 3].max()
+    assert deepest(field, np.argwhere(field.occupancy.occupied)).max() < EMPTY_BELOW and seen > 0.15
+    assert without_haze(field, *rays).occupied.all()
+
+
+def test_where_all_is_haze_nothing_goes():
+    field, rays = fog(1e-6), rays_at(BOX, 300, 5)
+    assert without_haze(field, *rays).occupied.all()
