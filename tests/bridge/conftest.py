@@ -19,7 +19,7 @@ from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.composition import composed
-from fusedrf_cli.engine.distillation import distill, finish
+from fusedrf_cli.engine.distillation import distill, finish, fit
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.kinds.blocks import students as blocks
@@ -110,6 +110,7 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(editing, "NUMBERS", SHAPE.size((20, 20, 20)))
     draft = FitSettings(longest=24, steps=60, samples=1 << 13)
     patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high", "best"), draft))
+    patch.setattr(fit, "STEPS_TO_SHOW", 1)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -24,6 +24,7 @@ from fusedrf_cli.engine.distillation.losses import (
     mostly_seen,
     point_step,
 )
+from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, without_haze
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
@@ -181,6 +182,8 @@ class DistillRun:
             if not report.rgb_kept:
                 self.student.params.copy_(self.before)
             clock.lap("pictures")
+        with uninterrupted():
+            self._leave_haze_out(rays_o[:RAYS_THAT_JUDGE], rays_d[:RAYS_THAT_JUDGE])
         report.numeric = self.guard.figures()
         return self.student, report
 
@@ -205,10 +208,18 @@ class DistillRun:
         self.optimiser = Adam.of(self.student)
         self.guard.renew()
 
+    def _has_cells_to_give(self) -> bool:
+        """Whether the student learnt where there is nothing; only one on one grid over its own box did."""
+        return self.student.resolution is not None and self.settings.steps > 0
+
+    def _leave_haze_out(self, rays_o: np.ndarray, rays_d: np.ndarray) -> None:
+        """Leave out the room that cells had for matter to grow into, as `without_haze` does."""
+        if self._has_cells_to_give() and not self.report.found_nothing:
+            self.student = self.student.with_occupancy(without_haze(self.student, rays_o, rays_d))
+
     def _prune(self) -> None:
-        """Leave out the cells that turned out empty, unless that would be all of them; only a student on one
-        grid over its own box has cells to give up."""
-        if self.student.resolution is None or not self.settings.steps:
+        """Leave out the cells that turned out empty, unless that would be all of them."""
+        if not self._has_cells_to_give():
             return
         occupancy = pruned(self.student)
         self.report.found_nothing = bool(self.teacher.occupancy.occupied.any() > occupancy.occupied.any())

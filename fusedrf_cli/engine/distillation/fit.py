@@ -12,7 +12,7 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
-from fusedrf_cli.engine.distillation.matter import occupancy_of, without_haze
+from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.poses import (
     RAYS_OF_ALL,
@@ -52,7 +52,6 @@ WEIGHED_RAYS = 1 << 17  # by which it is found what photos show
 STEPS_TO_SHOW = 100
 SHOWN_FROM = 0.005  # weight on a ray from which a cell of unbounded space counts as shown
 HAZE_LEFT_FROM = 0.5  # share of the run after which no more matter is to come into cells of haze
-RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
 # (share of the run, share of final voxels per axis)
 RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would

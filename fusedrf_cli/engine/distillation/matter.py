@@ -9,6 +9,7 @@ from fusedrf_cli.engine.rendering.volume import render_rays
 EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
 # Where in a cell haze is looked for: about as close together as the texels of a fine field.
 CLOSE_PROBES = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="ij"), -1).reshape(-1, 3)
+RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
 TRIES = 4  # at leaving haze out, a quarter as thick each time
 SAME = 1e-6  # mean square by which pictures differ that show the same: 60 dB
 
