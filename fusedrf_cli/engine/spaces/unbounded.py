@@ -19,8 +19,7 @@ import torch
 from fusedrf_cli.engine.kernels.parts import hit_box
 
 PIECES = 6  # a straight line meets at most five of the seven regions, and a sixth by rounding at an edge
-# A park's frame is 56 dB of that by steps four times as dense; whole voxels take 5 % less time and show 54 dB.
-STEP_PER_VOXEL = 0.9
+STEP_PER_VOXEL = 1.0  # a step of half a voxel shows the same (DESIGN, Kernels) in 1.7 times the time
 FAR = 1e3  # n at which rays end
 ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
