@@ -57,7 +57,7 @@ RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36,
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
 # explain each photo by itself: a start at a twentieth of the texels, not at a fifth, gained 3 dB held out.
 UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.7), (0.5, 1.0))
-UNBOUNDED_SAMPLES = 2.5  # times the samples of a step in a box: a ray has more of them
+UNBOUNDED_SAMPLES = 5  # times the samples of a step in a box: a ray has more of them
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 # Steps of an optimiser that begins anew, whose first move every number by the whole rate, before what the
