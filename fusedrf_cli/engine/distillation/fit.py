@@ -51,13 +51,13 @@ WEIGHED_RAYS = 1 << 17  # by which it is found what photos show
 # were looked for after 30 steps a corner was missing in every third run, and 0.9 dB in all.
 STEPS_TO_SHOW = 100
 SHOWN_FROM = 0.005  # weight on a ray from which a cell of unbounded space counts as shown
-HAZE_LEFT_FROM = 0.5  # share of the run after which no more matter is to come into cells of haze
+HAZE_LEFT_FROM = 0.5  # share of the run from which no more matter is to come into cells of haze
 # (share of the run, share of final voxels per axis)
 RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36, 1.0))
 # The same in unbounded space. Photos of a place say little of how far away things are, and fine voxels would
 # explain each photo by itself: a start at a twentieth of the texels, not at a fifth, gained 3 dB held out.
 UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.7), (0.5, 1.0))
-UNBOUNDED_SAMPLES = 5  # times the samples of a step in a box: a ray has more of them
+UNBOUNDED_SAMPLES = 2.5  # times those of a step in a box, for longer rays; with twice that a fox shows less
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 # Steps of an optimiser that begins anew, whose first move every number by the whole rate, before what the
@@ -401,7 +401,7 @@ class FitRun:
                 self.optimiser = Adam.of(self.field)
                 return
             self.occupy(occupancy)
-        if self.share() >= HAZE_LEFT_FROM:
+        if self.share() >= HAZE_LEFT_FROM or not self.refreshes:
             *rays, _ = self.pool.draw(RAYS_THAT_JUDGE)
             self.occupy(without_haze(self.field, *rays, self.settings.near))
 

@@ -34,6 +34,16 @@ def occupancy_of(
     return OccupancyGrid(box, occupied, space).dilated()
 
 
+def depths_across(field: StoredField, probes: np.ndarray) -> np.ndarray:
+    """(X, Y, Z) optical depth across each cell of the field's occupancy at the densest of probes (K, 3) in
+    [0, 1] of it; 0 in empty ones."""
+    grid = field.occupancy
+    cells = np.argwhere(grid.occupied)
+    depth = np.zeros(grid.occupied.shape, np.float32)
+    depth[tuple(cells.T)] = field.peaks(grid.aabb[:3], grid.cell, cells, probes) * grid.cell.min()
+    return depth
+
+
 def without_haze(
     field: StoredField, rays_o: np.ndarray, rays_d: np.ndarray, near: float = 0.0
 ) -> OccupancyGrid:
@@ -44,10 +54,7 @@ def without_haze(
     Cells found while a field learns are grown by one, for matter to grow into; that room would be sampled in
     every picture.
     """
-    grid = field.occupancy
-    index = np.argwhere(grid.occupied)
-    depth = np.zeros(grid.occupied.shape, np.float32)
-    depth[tuple(index.T)] = field.peaks(grid.aabb[:3], grid.cell, index, CLOSE_PROBES) * grid.cell.min()
+    grid, depth = field.occupancy, depths_across(field, CLOSE_PROBES)
     whole = render_rays(field, rays_o, rays_d, near=near)
     for most in EMPTY_BELOW * 0.25 ** np.arange(TRIES):
         fewer = grid.marked(grid.occupied & (depth > most))

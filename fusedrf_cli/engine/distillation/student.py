@@ -1,8 +1,7 @@
 """A student on a grid while it learns: half its resolution first, and the cells it gives up."""
 
-import numpy as np
 
-from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW
+from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, depths_across
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
 
@@ -28,10 +27,7 @@ def resampled_like(student: StoredField, other: StoredField) -> StoredField:
 
 def pruned(student: StoredField) -> OccupancyGrid:
     """The student's occupancy without the cells in which it turned out to hold nothing."""
-    grid = student.occupancy
-    cells = np.argwhere(grid.occupied)
-    depth = np.zeros(grid.occupied.shape, np.float32)
-    depth[tuple(cells.T)] = student.peaks(grid.aabb[:3], grid.cell, cells, PROBES) * grid.cell.min()
+    grid, depth = student.occupancy, depths_across(student, PROBES)
     occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)
     kept = grid.marked(occupied).dilated().occupied & grid.occupied
     return grid.marked(kept)

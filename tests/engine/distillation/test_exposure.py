@@ -111,7 +111,7 @@ def drifting():
     images = pictures(cameras)
     images[..., :3] = np.rint(images[..., :3] * 0.7)
     k = np.arange(len(cameras))[:, None] + np.array([0, 0.5, 1])
-    gains = np.exp(0.4 * np.sin(2 * np.pi * k / 5))
+    gains = np.exp(0.5 * np.sin(2 * np.pi * k / 5))
     photos = images.copy()
     photos[..., :3] = np.rint(np.clip(images[..., :3] * gains[:, None, None], 0, 255))
     return cameras, images, photos, gauged(gains)

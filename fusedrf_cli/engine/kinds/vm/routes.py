@@ -45,8 +45,8 @@ def own_steps(field: VMField, step: float) -> list[float]:
 def alone_until(
     field: VMField, rays: Rays, first: np.ndarray, second: np.ndarray, steps: list[float]
 ) -> np.ndarray:
-    """(N,) how far along each ray, whose `met_blocks` these are, only the first block needs to be asked; 0
-    or less where a ray begins with all of them, NOWHERE where it meets no second one.
+    """(N,) how far along each ray, whose `met_blocks` these are, only the first block needs to be asked;
+    its beginning where that is not so from there on, NOWHERE where it meets no second one.
 
     A background is the first of every ray, and has detail finer than its step: the ray is handed on between
     two of its samples, in the core, where they are evenly apart, and nowhere else.
