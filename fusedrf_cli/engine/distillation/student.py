@@ -1,6 +1,5 @@
 """A student on a grid while it learns: half its resolution first, and the cells it gives up."""
 
-
 from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, depths_across
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
