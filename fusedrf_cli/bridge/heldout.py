@@ -8,7 +8,7 @@ import torch
 from formats.frame import scene_frame
 from formats.views import Capture, View
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, over_white, truth_of
-from fusedrf_cli.engine.distillation.fit import Pictures
+from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.rendering.metrics import colour_corrected, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 

@@ -39,7 +39,8 @@ PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM 
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
 PER_POINT = 60  # of a teacher's points in pieces, one of their columns joined, and its place there
-PER_PIXEL_OF_PHOTOS = 4 + 16  # colours, and two orders of drawing
+PER_PIXEL_OF_PHOTOS = 4  # its colour
+PER_MASKED_PIXEL = 10  # more where masks leave some out: which, and the numbers of those that are left
 PER_OWN_RAY = 100  # of a camera's pixel: directions in float64 while they are made, float32 afterwards
 
 
@@ -152,10 +153,12 @@ def learning(numbers: int, threads: int) -> dict[str, float]:
     return {"the field that learns": numbers * FLOAT * (1 + threads + 2 + 3)}
 
 
-def photos(count: int, width: int, height: int, cameras: int) -> dict[str, float]:
-    """Photos as they are drawn from, and the rays of so many different cameras."""
+def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> dict[str, float]:
+    """Photos as they are drawn from, some pixels left out where they are `masked`, and the rays of so many
+    different cameras."""
     pixels = width * height
-    return {"the photos": count * pixels * PER_PIXEL_OF_PHOTOS + cameras * pixels * PER_OWN_RAY}
+    per_pixel = PER_PIXEL_OF_PHOTOS + PER_MASKED_PIXEL * masked
+    return {"the photos": count * pixels * per_pixel + cameras * pixels * PER_OWN_RAY}
 
 
 def fitting(plan: Plan, longest: int, threads: int) -> dict[str, float]:

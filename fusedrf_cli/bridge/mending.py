@@ -16,7 +16,8 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.training import fit_memory, fit_settings, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.distillation.fit import FitRun, Pictures
+from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.distillation.visibility import shown_cells
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement

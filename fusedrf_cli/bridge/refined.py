@@ -9,7 +9,8 @@ import torch
 from formats.views import Capture
 from fusedrf_cli.bridge.extent import Extent
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, truth_of
-from fusedrf_cli.engine.distillation.fit import FitRun, Pictures, RayPool
+from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
     angles_between,

@@ -27,7 +27,8 @@ from fusedrf_cli.bridge.running import (
 )
 from fusedrf_cli.bridge.scene import refuse_options, stored, unusable_kind, write_field
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
@@ -285,7 +286,7 @@ def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str,
     pixels = max(view.width * view.height for view in capture.train)
     cameras = len({camera_of(v).intrinsics for v in capture.train})
     return {
-        **photos(len(capture.train), pixels, 1, cameras),
+        **photos(len(capture.train), pixels, 1, cameras, any(view.mask_path for view in capture.train)),
         **fitting(plan, settings.longest, torch.get_num_threads()),
     }
 

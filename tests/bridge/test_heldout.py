@@ -9,7 +9,7 @@ import pytest
 from formats.images import write_png
 from formats.views import Capture, View
 from fusedrf_cli.bridge.heldout import mean_colour, measure, nearest, nearest_photo, warn_of_holdout
-from fusedrf_cli.engine.distillation.fit import Pictures
+from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.progress import NullProgress
 from tests.bridge.conftest import FIELDS
 from tests.formats.test_captures import looking_at

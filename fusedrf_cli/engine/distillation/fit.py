@@ -4,16 +4,15 @@ occupancy grid is set."""
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
     RAYS_OF_ALL,
     RAYS_OF_ONE,
@@ -21,7 +20,6 @@ from fusedrf_cli.engine.distillation.poses import (
     TRIED_BY,
     Poses,
     changed,
-    poses_of,
     refined,
 )
 from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
@@ -110,80 +108,6 @@ class FitSettings:
     def stages(self) -> tuple[tuple[float, float], ...]:
         """(share of the run, share of the final voxels per axis from then on)."""
         return UNBOUNDED_STAGES if self.unbounded else RESOLUTION_STAGES
-
-
-class Pictures(NamedTuple):
-    """Pictures of any sizes, pixel after pixel, row by row, picture after picture."""
-
-    pixels: np.ndarray
-    """(P, 4) uint8 straight alpha."""
-    ignored: np.ndarray | None = None
-    """(P,) bool: pixels that are never drawn, as a mask asks."""
-
-
-class RayPool:
-    """Random pixels of posed pictures as rays with target colours."""
-
-    def __init__(self, cameras: list[Camera], images: np.ndarray | Pictures, generator: torch.Generator):
-        """images (n, H, W, 4) uint8 straight alpha, or pictures of the cameras' sizes."""
-        pictures = images if isinstance(images, Pictures) else Pictures(images.reshape(-1, 4))
-        self.images = torch.from_numpy(pictures.pixels)
-        self.first = torch.tensor(np.cumsum([0, *(camera.width * camera.height for camera in cameras)]))
-        self.ignored = None if pictures.ignored is None else torch.from_numpy(pictures.ignored)
-        drawn = None if pictures.ignored is None else np.flatnonzero(~pictures.ignored)
-        self.drawn = None if drawn is None else torch.from_numpy(drawn)
-        keys = {camera.intrinsics: camera for camera in cameras}
-        own = [torch.from_numpy(c.local_directions()).reshape(-1, 3).float() for c in keys.values()]
-        starts = dict(zip(keys, np.cumsum([0, *map(len, own[:-1])]).tolist(), strict=True))
-        self.local = torch.cat(own)
-        self.start = torch.tensor([starts[camera.intrinsics] for camera in cameras])
-        self.place(poses_of(cameras))
-        self.pixel = np.array([1 / camera.fl_x for camera in cameras])
-        """(n,) the angle of a pixel in the middle of each picture, in radians."""
-        self.gains = torch.ones(len(cameras), 3)
-        """What the colours of each picture are divided by."""
-        self.epochs = Epochs(len(self.images) if drawn is None else len(drawn), generator)
-
-    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel that is not
-        ignored once before any comes again."""
-        chosen = self.epochs.draw(count)
-        if self.drawn is not None:
-            chosen = self.drawn[chosen]
-        view = torch.searchsorted(self.first, chosen, right=True) - 1
-        pixels = self.images[chosen].float() / 255
-        pixels[:, :3] /= self.gains[view]
-        return *self.rays(chosen, view), pixels
-
-    def sample(self, count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """As many random pixels of each picture, one picture after the other: rays_o, rays_d (n * count, 3)
-        float64 and colours (n, count, 3) over the gains, nan where a pixel is ignored or not opaque."""
-        sizes = self.first.diff()[:, None]
-        places = (torch.rand(len(sizes), count, generator=generator, dtype=torch.float64) * sizes).long()
-        chosen = (self.first[:-1, None] + places).reshape(-1)
-        pixels = self.images[chosen]
-        colours = pixels[:, :3].float() / 255
-        colours[pixels[:, 3] < 255] = torch.nan
-        if self.ignored is not None:
-            colours[self.ignored[chosen]] = torch.nan
-        colours = colours.reshape(len(sizes), count, 3) / self.gains[:, None]
-        return *self.rays(chosen, torch.arange(len(sizes)).repeat_interleave(count)), colours
-
-    @property
-    def poses(self) -> Poses:
-        """Where the pictures were taken from."""
-        return Poses(self.rotation.numpy(), self.position.numpy())
-
-    def place(self, poses: Poses) -> None:
-        """Have the pictures taken from elsewhere."""
-        self.rotation, self.position = (torch.from_numpy(part.copy()) for part in poses)
-
-    def rays(self, chosen: torch.Tensor, view: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """rays_o, rays_d (N, 3) float64 through pixels (N,) of pictures (N,)."""
-        local = self.local[self.start[view] + chosen - self.first[view]].double()
-        d = torch.einsum("nij,nj->ni", self.rotation[view], local)
-        d /= d.norm(dim=1, keepdim=True)
-        return self.position[view].contiguous().numpy(), d.numpy()
 
 
 def fit(

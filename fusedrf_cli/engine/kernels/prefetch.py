@@ -14,7 +14,8 @@ def prefetch(typing, array, index):
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        line, whole = builder.gep(data, [arguments[1]]), ir.IntType(32)
+        byte = ir.IntType(8).as_pointer()  # one hint serves arrays of every kind
+        line, whole = builder.bitcast(builder.gep(data, [arguments[1]]), byte), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [line.type, whole, whole, whole])
         known = builder.module.globals.get("llvm.prefetch.p0")
         hint = known or ir.Function(builder.module, kind, "llvm.prefetch.p0")

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.exposure import CLIPPED, FEW, gains_of, spread
-from fusedrf_cli.engine.distillation.fit import FitRun, Pictures, RayPool
+from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.rendering.cameras import look_at, orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays

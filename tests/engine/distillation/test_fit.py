@@ -8,12 +8,11 @@ from fusedrf_cli.engine.distillation.fit import (
     FALL,
     FALLS_FROM,
     FitSettings,
-    Pictures,
-    RayPool,
     decay,
     fit,
     occupancy_of,
 )
+from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, Pictures
+from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import orbit
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation import poses
-from fusedrf_cli.engine.distillation.fit import FitRun, RayPool
+from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.engine.distillation.pixels import RayPool
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
     angles_between,
