@@ -58,11 +58,12 @@ LARGEST_PLACE = 95_000_000
 """Bytes of a place, stored as its kind is by default, where no size is asked for: voxels of all of space, as
 fine as planes are, would take a hundred times those of the planes."""
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
+PLACE_SAMPLES = 1 << 15  # of a step, at most, times UNBOUNDED_SAMPLES; as many in all come in more steps
 QUALITY = {
     "draft": FitSettings(longest=128, steps=1500, samples=1 << 15),
     "normal": FitSettings(longest=224, steps=4000, samples=1 << 15),
     "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
-    "best": FitSettings(longest=256, steps=24000, samples=1 << 15),
+    "best": FitSettings(longest=256, steps=12000, samples=1 << 16),
 }
 PATIENT = {"best": 200.0, "high": 90.0, "normal": 0.0}
 """Seconds of a time budget from which an object is learnt so where no quality is asked for. Of places the
@@ -262,6 +263,8 @@ def of_place(settings: FitSettings, kind: Kind, box: np.ndarray, room: int | Non
     """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
     learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
     longer they learn."""
+    samples = min(settings.samples, PLACE_SAMPLES)
+    settings = replace(settings, samples=samples, steps=settings.steps * settings.samples // samples)
     seconds = np.inf if settings.time_budget is None else settings.time_budget
     takes = section_bytes(Section("detail", HASHED.shape), settings.way.precision)
     fits = room is None or takes <= HASHED_SHARE * room

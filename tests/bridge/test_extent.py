@@ -152,6 +152,9 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
         assert found.way.hashed is training.HASHED
         assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
     assert settings(quality="draft").way.hashed is None
+    best, asked = settings(quality="best"), training.QUALITY["best"]
+    assert best.samples == training.PLACE_SAMPLES < asked.samples
+    assert best.samples * best.steps == asked.samples * asked.steps
     assert settings(max_size=12_000_000).way.hashed is None
     assert settings("cp").way.hashed is None and settings(bounded=True).way.hashed is None
 

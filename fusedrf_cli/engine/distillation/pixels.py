@@ -57,7 +57,7 @@ class RayPool:
         chosen = (self.first[:-1, None] + places).reshape(-1)
         rays_o, rays_d, pixels = self.of(chosen)
         colours = pixels[:, :3]
-        colours[pixels[:, 3] < 1] = torch.nan
+        colours[pixels[:, 3] < 0.999] = torch.nan  # opaque is 1 within a rounding
         if self.ignored is not None:
             colours[self.ignored[chosen]] = torch.nan
         return rays_o, rays_d, colours.reshape(len(sizes), count, 3)

@@ -1,5 +1,7 @@
 """Fitting a field to pictures of a ball: quality, sameness, and the parts of the loop."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,9 @@ import torch
 from fusedrf_cli.engine.distillation.fit import (
     FALL,
     FALLS_FROM,
+    FINE_SAMPLES,
+    UNBOUNDED_SAMPLES,
+    FitRun,
     FitSettings,
     decay,
     fit,
@@ -58,6 +63,22 @@ def test_the_rate_holds_and_then_falls_by_equal_factors():
     assert decay(0) == decay(FALLS_FROM) == 1 and decay(1) == pytest.approx(FALL)
     late = [decay(FALLS_FROM + part * (1 - FALLS_FROM)) for part in (0.0, 0.25, 0.5, 0.75, 1.0)]
     assert np.diff(np.log(late)) == pytest.approx([np.log(FALL) / 4] * 4)
+
+
+@pytest.mark.parametrize("unbounded, factor", [(False, FINE_SAMPLES), (True, 1)])
+def test_steps_take_more_samples_at_full_resolution_of_a_box(capture, unbounded, factor):
+    """Rays of eight samples each are as many as make up what a step is to take."""
+    run = FitRun.start(*capture, BOX, replace(SETTINGS, samples=1 << 14, unbounded=unbounded))
+
+    def steered() -> int:
+        for _ in range(200):
+            run.learn(np.array([1.0, 0.0, 8.0 * 100]), 100, 1.0)
+        return run.rays
+
+    coarse = steered()
+    assert coarse == pytest.approx((1 << 14) / 8 * (UNBOUNDED_SAMPLES if unbounded else 1), rel=0.01)
+    run.stages.clear()
+    assert steered() == pytest.approx(factor * coarse, rel=0.01)
 
 
 def test_the_same_seed_gives_the_same_bits(capture):
@@ -115,6 +136,14 @@ def test_pictures_of_several_sizes_and_pixels_that_are_ignored():
     wanted_o, wanted_d = (np.concatenate(part) for part in zip(*[c.rays() for c in cameras], strict=True))
     np.testing.assert_allclose(rays_o, wanted_o[found])
     np.testing.assert_allclose(rays_d, wanted_d[found], atol=1e-6)
+
+    gains = torch.tensor([[0.5, 2.0, 1.25], [1.0, 4.0, 0.75], [2.0, 1.0, 3.0]])
+    pool.gains.copy_(gains)
+    evened = pool.draw(1000)[2]  # colours over the gains of the picture; the alpha as it is
+    pixel = np.rint(evened[:, 3].numpy() * 255).astype(int)
+    assert np.array_equal(np.sort(pixel), np.flatnonzero(~ignored))
+    picture = np.repeat(np.arange(3), [w * h for w, h in sizes])[pixel]
+    np.testing.assert_allclose(evened[:, :3], pixel[:, None] / 255 / gains[picture].numpy(), rtol=1e-6)
 
 
 def test_texels_are_near_cubic_but_for_flat_boxes():
