@@ -162,7 +162,8 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
 @pytest.mark.parametrize("precision", ("float16", "float32"))
 def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, monkeypatch):
     """Where no size is asked for, however the numbers are stored; and within one that is."""
-    monkeypatch.setitem(training.QUALITY, "normal", FitSettings(longest=256))
+    plain = FitSettings(longest=256, samples=training.PLACE_SAMPLES)
+    monkeypatch.setitem(training.QUALITY, "normal", plain)
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
     asked = replace(request(), quality="normal", precision=precision, ranks=(16, 24))

@@ -576,7 +576,7 @@ def test_b16_every_object_is_told_its_voxels(row, tmp_path):
         nodes.append(make_node(p.name, source=f"{p.name}.rfpack", matrix=p.object_to_world.tolist()))
     write_scene(tmp_path / "scene.json", SceneGraph(tuple(nodes)))
     told = 0
-    for size, coarse in (("25MB", 0), ("400kB", 1)):
+    for size, coarse in (("25MB", 0), ("120kB", 1)):
         said = done(tmp_path, "fuse", "scene.json", "-o", f"{size}.rfpack", "--max-size", size)
         objects = {o["name"]: o for o in said["objects"]}
         assert objects["small"]["own_voxel"] == pytest.approx(0.6 / 63, rel=1e-6)
