@@ -97,14 +97,19 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     words = replace(request(), unbounded=False, aabb=(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0))
     extent = extent_of(words, capture, False)
 
-    def longest(seconds, quality=None, sharper=1.0):
+    def found(seconds, quality=None, sharper=1.0):
         views = tuple(replace(v, fl_x=v.fl_x * sharper, fl_y=v.fl_y * sharper) for v in capture.train)
         asked = replace(words, time_budget=seconds, quality=quality)
-        return quality_of(asked, replace(capture, train=views), extent).longest
+        return quality_of(asked, replace(capture, train=views), extent)
+
+    def longest(*words):
+        return found(*words).longest
 
     assert [longest(s) for s in (None, 20, 100, 300)] == [224, 224, 256, 256]
-    assert longest(300, sharper=10) == round(0.7 * 870 * 2 / 4) == longest(None, "best", 10)
-    assert longest(300, sharper=100) == 512 and longest(300, "normal", 100) == 224
+    assert longest(300, None, 10) == round(0.7 * 870 * 2 / 4) == longest(None, "best", 10)
+    assert longest(300, None, 100) == 512 and longest(300, "normal", 100) == 224
+    best, plain = found(300), FitSettings()
+    assert best.samples > plain.samples and best.samples * best.steps == plain.samples * plain.steps
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():
@@ -152,9 +157,6 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
         assert found.way.hashed is training.HASHED
         assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
     assert settings(quality="draft").way.hashed is None
-    best, asked = settings(quality="best"), training.QUALITY["best"]
-    assert best.samples == training.PLACE_SAMPLES < asked.samples
-    assert best.samples * best.steps == asked.samples * asked.steps
     assert settings(max_size=12_000_000).way.hashed is None
     assert settings("cp").way.hashed is None and settings(bounded=True).way.hashed is None
 
@@ -162,8 +164,7 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
 @pytest.mark.parametrize("precision", ("float16", "float32"))
 def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, monkeypatch):
     """Where no size is asked for, however the numbers are stored; and within one that is."""
-    plain = FitSettings(longest=256, samples=training.PLACE_SAMPLES)
-    monkeypatch.setitem(training.QUALITY, "normal", plain)
+    monkeypatch.setitem(training.QUALITY, "normal", FitSettings(longest=256))
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
     asked = replace(request(), quality="normal", precision=precision, ranks=(16, 24))

@@ -57,7 +57,7 @@ RESOLUTION_STAGES = ((0.0, 0.22), (0.05, 0.36), (0.12, 0.5), (0.22, 0.7), (0.36,
 UNBOUNDED_STAGES = ((0.0, 0.05), (0.06, 0.1), (0.12, 0.2), (0.2, 0.4), (0.35, 0.7), (0.5, 1.0))
 UNBOUNDED_SAMPLES = 2.5  # times those of a step in a box, for longer rays; with twice that a fox shows less
 # Times as many in a box at full resolution: what a step evens out counts for more then, and looking through
-# all gradients, which any step does, takes half of the time of small ones. A place learns less by it.
+# all gradients, which any step does, takes two fifths of the time of small ones. A place learns less by it.
 FINE_SAMPLES = 2
 # shares of the run after which the occupancy is built anew
 OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
