@@ -31,8 +31,8 @@ class Adam:
 
     @classmethod
     def of(cls, field: ComputedField) -> "Adam":
-        """An optimiser with a row of gradients for each thread of the CPU; a GPU's threads share one."""
-        return cls(field, torch.get_num_threads() if field.params.device.type == "cpu" else 1)
+        """An optimiser with as many rows of gradients as the field's loops add to."""
+        return cls(field, field.parts)
 
     def numbers(self) -> list[torch.Tensor]:
         """What steps change: the field's numbers and both moments."""

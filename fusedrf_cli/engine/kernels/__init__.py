@@ -112,6 +112,7 @@ def telling_of_compilation(tell: Callable[[], None]) -> AbstractContextManager:
 
 _compiling = event.TimingListener()
 event.register("numba:compile", _compiling)
+event.register("fusedrf:gpu", _compiling)  # what kernels/cuda.py tells of the GPU's compiler
 
 
 def working_time() -> float:

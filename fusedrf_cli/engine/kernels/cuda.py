@@ -11,6 +11,7 @@ from types import FunctionType, ModuleType, SimpleNamespace
 import numba
 import numpy as np
 from numba import cuda
+from numba.core import event
 from numba.np.numpy_support import from_dtype
 
 from fusedrf_cli.engine.kernels import parts, specialise
@@ -21,7 +22,39 @@ THREADS = 1 if SIMULATED else 128  # the simulator's threads are Python's, one a
 RAYS_IN_FLIGHT = 1 << 14  # rays of a training pass that have scratch memory at the same time
 POINTS_IN_FLIGHT = 1 << 18
 
+if not SIMULATED:  # whose compiler has settings of its own
+    from numba.cuda.core import config
+    from numba.cuda.core import event as gpu_event
+
+    from fusedrf_cli.engine.kernels.atomics import add_4
+
+    config.CACHE_DIR = numba.config.CACHE_DIR
+
+    class Forwarded(gpu_event.Listener):
+        """Tells numba's own listeners what the GPU's compiler does, as an event of a kind of theirs."""
+
+        def __init__(self, kind: str):
+            self.kind = kind
+
+        def on_start(self, heard: gpu_event.Event) -> None:
+            event.start_event(self.kind)
+
+        def on_end(self, heard: gpu_event.Event) -> None:
+            event.end_event(self.kind)
+
+    gpu_event.register("numba-cuda:run_pass", Forwarded("numba:compile"))
+    # all that its compiler does, with linking and with what it loads from the cache
+    gpu_event.register("numba-cuda:compiler_lock", Forwarded("fusedrf:gpu"))
+
 device = cuda.jit(device=True, fastmath=True)
+
+
+if SIMULATED:
+
+    def add_4(out, o, e0, e1, e2, e3):
+        """`atomics.add_4`, for threads that run one after the other."""
+        for r, value in enumerate((e0, e1, e2, e3)):
+            out[o + np.uint64(r)] += value
 
 
 @device
@@ -31,10 +64,20 @@ def accumulate(out, i, value):
 
 
 @device
+def raise_to(out, i, value):
+    """`parts.raise_to`, atomic."""
+    cuda.atomic.max(out, i, value)
+
+
+@device
 def scatter_8(out, o, weight, values, v):
     """`parts.scatter_8`, atomic."""
-    for r in range(8):
-        cuda.atomic.add(out, o + np.uint64(r), weight * values[v + np.uint64(r)])
+    for r in range(2):
+        at = v + np.uint64(4 * r)
+        add_4(
+            out, o + np.uint64(4 * r), weight * values[at], weight * values[at + np.uint64(1)],
+            weight * values[at + np.uint64(2)], weight * values[at + np.uint64(3)],
+        )  # fmt: skip
 
 
 @device
@@ -48,8 +91,10 @@ def literally(value):
     return value
 
 
-REPLACED = {"accumulate": accumulate, "scatter_8": scatter_8, "ahead_density": ahead, "ahead_colour": ahead}
-REPLACED["literally"] = literally
+REPLACED = {
+    "accumulate": accumulate, "raise_to": raise_to, "scatter_8": scatter_8,
+    "ahead_density": ahead, "ahead_colour": ahead, "literally": literally,
+}  # fmt: skip
 
 
 def as_device_functions(names: dict) -> dict:
@@ -67,75 +112,74 @@ class Loops:
     """The GPU's loops for the fields of a kind that share some sizes; see specialise.Loops."""
 
     def __init__(self, bodies: ModuleType, sizes: dict[str, int], space: ModuleType):
-        _, names = specialise.specialised(bodies, sizes, space)
-        self.names = as_device_functions(names)
-        self.scratch, self.memory = max(sizes["SCRATCH"], 1), max(sizes["KEPT"], 1)
+        self.tag, names = specialise.specialised(bodies, sizes, space)
+        room = {"SCRATCH_ROOM": max(sizes["SCRATCH"], 1), "MEMORY_ROOM": max(sizes["KEPT"], 1)}
+        self.names = {**as_device_functions(names), **room, "cuda": cuda, "Kept": Kept}
         self.kernels = {}
 
     def each(self, item: str, field, grid, asked, count: int, out, per_task: int = POINTS_PER_TASK):
         """See specialise.Loops."""
-        kernel = self._kernel(each_kernel, item, field)
-        launch(kernel, count, (field, grid, asked, count), (out,))
+        launch(self._kernel(each_thread, item, field), count, (field, grid, asked, count), (out,))
 
     def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
         """See specialise.Loops; all is added to row 0 of grads and loss."""
-        kernel = self._kernel(sweep_kernel, item, field)
+        kernel = self._kernel(sweep_thread, item, field)
         # as much for few rays as for many: their number changes from step to step, and memory is slow to be
         # had
         in_flight = RAYS_IN_FLIGHT if most > 1 else min(count, POINTS_IN_FLIGHT)
-        room = sweep_memory(most, in_flight, field.params.dtype) if count else ()
-        launch(kernel, min(count, in_flight), (field, grid, batch, count, *room), (grads, loss))
+        if count:
+            *room, losses = sweep_memory(most, in_flight, field.params.dtype)
+            launch(kernel, in_flight, (field, grid, batch, count, *room, losses), (grads,))
+            loss[0] += losses.copy_to_host().sum(0)
 
-    def _kernel(self, make, item: str, field):
+    def _kernel(self, template: FunctionType, item: str, field):
         """The kernel of an item, for the type of a field's numbers."""
-        key = make, item, field.params.dtype
+        kind = np.dtype(field.params.dtype)
+        key = template, item, kind
         if key not in self.kernels:
-            real = from_dtype(np.dtype(field.params.dtype))
-            self.kernels[key] = make(self.names[item], self.scratch, self.memory, real)
+            names = {**self.names, "item": self.names[item], "REAL": from_dtype(kind)}
+            self.kernels[key] = kernel_of(template, names, f"{self.tag}_{item}_{kind}")
         return self.kernels[key]
 
 
-def each_kernel(item, scratch_size: int, memory_size: int, real):
+def kernel_of(template: FunctionType, names: dict, tag: str):
+    """A kernel whose names mean those of a dictionary, which `tag` tells from all others."""
+    return cuda.jit(fastmath=True, cache=True)(specialise.rebound(template, names, tag))
+
+
+def each_thread(field, grid, asked, count, out):
     """`each` of loops.py, a thread for each item."""
-
-    @cuda.jit(fastmath=True)
-    def each(field, grid, asked, count, out):
-        i = cuda.grid(1)
-        if i < count:
-            scratch, memory = cuda.local.array(scratch_size, real), cuda.local.array(memory_size, real)
-            item(field, grid, asked, i, scratch, memory, out)
-
-    return each
+    i = cuda.grid(1)
+    if i < count:
+        scratch, memory = cuda.local.array(SCRATCH_ROOM, REAL), cuda.local.array(MEMORY_ROOM, REAL)
+        item(field, grid, asked, i, scratch, memory, out)
 
 
-def sweep_kernel(item, scratch_size: int, memory_size: int, real):
-    """`sweep` of loops.py: threads that share the items out, with memory for one shaded sample each."""
-
-    @cuda.jit(fastmath=True)
-    def sweep(field, grid, batch, count, wholes, reals, grads, loss):
-        thread, threads = cuda.grid(1), reals.shape[2]
-        scratch, memory = cuda.local.array(scratch_size, real), cuda.local.array(memory_size, real)
-        if thread < threads:
-            for r in range(scratch_size):
-                scratch[r] = 0
-            kept = Kept(
-                wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
-                wholes[4, :, thread], wholes[5, :, thread], reals[0, :, thread], reals[1, :, thread],
-                reals[2, :, thread], reals[3, :, thread], reals[4, :, thread], reals[5:8, :, thread].T,
-                memory,
-            )  # fmt: skip
-            for i in range(thread, count, threads):
-                item(field, grid, batch, i, kept, scratch, grads[0], loss[0])
-
-    return sweep
+def sweep_thread(field, grid, batch, count, wholes, reals, losses, grads):
+    """`sweep` of loops.py: threads that share the items out, with memory for one shaded sample each, and with
+    losses of their own: all would wait for each other to add to the same."""
+    thread, threads = cuda.grid(1), reals.shape[2]
+    scratch, memory = cuda.local.array(SCRATCH_ROOM, REAL), cuda.local.array(MEMORY_ROOM, REAL)
+    if thread < threads:
+        for r in range(SCRATCH_ROOM):
+            scratch[r] = 0
+        kept = Kept(
+            wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
+            wholes[4, :, thread], wholes[5, :, thread], reals[0, :, thread], reals[1, :, thread],
+            reals[2, :, thread], reals[3, :, thread], reals[4, :, thread], reals[5:8, :, thread].T,
+            memory,
+        )  # fmt: skip
+        losses[thread, 0], losses[thread, 1], losses[thread, 2] = 0, 0, 0
+        for i in range(thread, count, threads):
+            item(field, grid, batch, i, kept, scratch, grads[0], losses[thread])
 
 
 @lru_cache(maxsize=2)
 def sweep_memory(most: int, threads: int, kind: np.dtype) -> tuple:
     """What the ways back of so many threads need: (6, most, threads) whole numbers and (8, ..) reals, a
-    thread's own next to its neighbours', as threads read them."""
-    shape = most, threads
-    return cuda.device_array((6, *shape), np.int32), cuda.device_array((8, *shape), kind)
+    thread's own next to its neighbours', as threads read them; and (threads, 3) losses."""
+    whole, real = cuda.device_array((6, most, threads), np.int32), cuda.device_array((8, most, threads), kind)
+    return whole, real, cuda.device_array((threads, 3))
 
 
 @cache
@@ -147,35 +191,40 @@ def loops_for(bodies: ModuleType, sizes: tuple[tuple[str, int], ...], space: Mod
 @lru_cache(maxsize=1)
 def plain_kernels() -> SimpleNamespace:
     """Kernels that know no kind of field."""
-    names = as_device_functions(vars(parts))
-    touched, adam_line, line = names["touched"], names["adam_line"], parts.LINE
-    sum_of_rows = names["sum_of_rows"]
+    names = {**as_device_functions(vars(parts)), "cuda": cuda}
+    made = {t.__name__: kernel_of(t, names, "plain") for t in (adam_thread, adam_lines_thread, sums_thread)}
+    return SimpleNamespace(**made)
 
-    @cuda.jit(fastmath=True)
-    def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
-        start = low + line * cuda.grid(1)
-        if start < high and touched(grads, np.uint64(start)):
-            adam_line(
-                params, grads, moment1, moment2, rate, np.uint64(start), beta1, beta2, eps, correction1,
-                correction2,
-            )  # fmt: skip
 
-    @cuda.jit(fastmath=True)
-    def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2):
-        i = cuda.grid(1)
-        if i < lines.shape[0] and touched(grads, np.uint64(lines[i])):
-            adam_line(
-                params, grads, moment1, moment2, rate, np.uint64(lines[i]), beta1, beta2, eps, correction1,
-                correction2,
-            )  # fmt: skip
+def adam_thread(
+    params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2
+):
+    """`adam` of plain.py, a thread for each cache line."""
+    start = low + LINE * cuda.grid(1)
+    if start < high and touched(grads, np.uint64(start)):
+        adam_line(
+            params, grads, moment1, moment2, rate, np.uint64(start), beta1, beta2, eps, correction1,
+            correction2,
+        )  # fmt: skip
 
-    @cuda.jit(fastmath=True)
-    def sums_of_rows(base, width, start, source, weight, target, keep, values):
-        i = cuda.grid(1)
-        if i < target.shape[0]:
-            sum_of_rows(values, base, width, start, source, weight, target, i, keep)
 
-    return SimpleNamespace(adam=adam, adam_lines=adam_lines, sums_of_rows=sums_of_rows)
+def adam_lines_thread(
+    params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2
+):
+    """`adam_lines` of plain.py, a thread for each cache line."""
+    i = cuda.grid(1)
+    if i < lines.shape[0] and touched(grads, np.uint64(lines[i])):
+        adam_line(
+            params, grads, moment1, moment2, rate, np.uint64(lines[i]), beta1, beta2, eps, correction1,
+            correction2,
+        )  # fmt: skip
+
+
+def sums_thread(base, width, start, source, weight, target, keep, values):
+    """`sums_of_rows` of plain.py, a thread for each sum."""
+    i = cuda.grid(1)
+    if i < target.shape[0]:
+        sum_of_rows(values, base, width, start, source, weight, target, i, keep)
 
 
 def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
@@ -185,7 +234,7 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     rest = rate, low, high, beta1, beta2, eps, correction1, correction2
     lines = -(-(high - low) // parts.LINE)
     if lines > 0:
-        plain_kernels().adam[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
+        plain_kernels().adam_thread[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
     fetch(arrays, placed)
 
 
@@ -195,14 +244,14 @@ def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, 
     placed = [on_device(array) for array in arrays]
     rest = rate, on_device(lines), beta1, beta2, eps, correction1, correction2
     if len(lines):
-        plain_kernels().adam_lines[(len(lines) + THREADS - 1) // THREADS, THREADS](*placed, *rest)
+        plain_kernels().adam_lines_thread[(len(lines) + THREADS - 1) // THREADS, THREADS](*placed, *rest)
     fetch(arrays, placed)
 
 
 def sums_of_rows(values, base, width, start, source, weight, target, keep):
     """See plain.sums_of_rows."""
     inputs = base, width, start, source, weight, target, keep
-    launch(plain_kernels().sums_of_rows, len(target), inputs, (values,))
+    launch(plain_kernels().sums_thread, len(target), inputs, (values,))
 
 
 # -- numbers there and here ----------------------------------------------------------------------------------

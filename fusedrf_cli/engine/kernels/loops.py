@@ -34,7 +34,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from fusedrf_cli.engine.kernels.parts import accumulate, along, cell_of, compared, next_sample, occupied  # noqa: F401
+from fusedrf_cli.engine.kernels.parts import (  # noqa: F401
+    accumulate,
+    along,
+    cell_of,
+    compared,
+    next_sample,
+    occupied,
+    raise_to,
+)
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
 LEARN_FROM = COLOUR_FROM  # the same in training
@@ -492,7 +500,7 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
                 y = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
                 z = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
                 c = (x * ny + y) * nz + z
-                most[c] = max(most[c], weight)
+                raise_to(most, c, weight)
             k = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
             k, many = next_sample(grid, origin, way, u0, u1, step, k)
 
@@ -519,7 +527,7 @@ def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
                 y = math.floor((p[1] - rays.lo[1]) / rays.cell[1])
                 z = math.floor((p[2] - rays.lo[2]) / rays.cell[2])
                 if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-                    votes[2 * ((x * ny + y) * nz + z) + rays.inside[i]] += weight
+                    accumulate(votes, 2 * ((x * ny + y) * nz + z) + rays.inside[i], weight)
             k = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
             k, many = next_sample(grid, origin, way, u0, u1, step, k)
 

@@ -217,6 +217,12 @@ def accumulate(out, i, value):
 
 
 @body
+def raise_to(out, i, value):
+    """out[i] = max(out[i], value), where others may be raising it too."""
+    out[i] = max(out[i], value)
+
+
+@body
 def compared(batch, i, colour, trans, work, loss):
     """Gradients of the loss of a batch of rays (ComputedField.train_rays) in ray i's colour and in the
     transmittance behind it; its colour error, opacity error and work are added to `loss`.

@@ -13,6 +13,7 @@ import torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 from fusedrf_cli.engine.rendering.cameras import framing_camera
@@ -124,11 +125,11 @@ def test_render(name, dtype):
 def test_pictures_under_a_grid_that_knows_the_insides_of_cells():
     blocks = two_blocks(TURNED)
     rays_o, rays_d = rays_at(blocks.aabb, 4)
+    assert with_known_insides(blocks).grid.inner.any()
 
     def picture(field):
         out = np.zeros((4, 5))
         known = with_known_insides(field)
-        assert known.grid.inner.any()
         known.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
         return (out,)
 
@@ -178,6 +179,25 @@ def test_peaks():
     for frame in (0, 1):
         for wanted, found in twice(two_blocks(TURNED), lambda f, b=frame: (f.peaks(*asked, b),)):
             check(found, wanted)
+
+
+@on_a_device
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_weights_and_votes_of_cells(dtype):
+    """Many rays meet in a cell at the same time, and none of them is lost."""
+    field = vm(dtype)
+    count = 4 if SIMULATED else 4000
+    rays_o, rays_d = rays_at(field.aabb, count)
+    jitter, inside = np.random.default_rng(3).random(count), np.arange(count) % 3 == 0
+    cells = OccupancyGrid.full(field.aabb, 4)
+
+    def found(field):
+        weights = field.weights_in_cells(rays_o, rays_d, jitter, 0.0, 0.1)
+        return weights, field.votes(rays_o, rays_d, jitter, inside, 0.1, cells)
+
+    for wanted, other in twice(field, found):
+        check(other, wanted, torch.float32)
+        assert wanted.max() > 0.05
 
 
 @on_a_device
