@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.exposure import CLIPPED, FEW, gains_of, spread
-from fusedrf_cli.engine.distillation.fit import FitRun
+from fusedrf_cli.engine.distillation.fit import FINE_SAMPLES, FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.rendering.cameras import look_at, orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -119,7 +119,9 @@ def drifting():
 
 
 def run(cameras, photos, exposure: bool) -> FitRun:
-    fitting = FitRun.start(cameras, photos, BOX, replace(LONG, exposure=exposure))
+    """A fit in a box, with as many samples at full resolution as a place, which alone has exposure, takes."""
+    settings = replace(LONG, samples=LONG.samples // FINE_SAMPLES, exposure=exposure)
+    fitting = FitRun.start(cameras, photos, BOX, settings)
     fitting.finish()
     return fitting
 
