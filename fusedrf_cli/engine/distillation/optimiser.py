@@ -32,7 +32,7 @@ class Adam:
     @classmethod
     def of(cls, field: ComputedField) -> "Adam":
         """An optimiser with as many rows of gradients as the field's loops add to."""
-        return cls(field, field.parts)
+        return cls(field, field.gradient_rows)
 
     def numbers(self) -> list[torch.Tensor]:
         """What steps change: the field's numbers and both moments."""

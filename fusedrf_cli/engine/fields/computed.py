@@ -194,7 +194,7 @@ class ComputedField:
         return kernels.device_loops(self.params.device.type)
 
     @property
-    def parts(self) -> int:
+    def gradient_rows(self) -> int:
         """How many rows loops add gradients to: one for each thread of the CPU; a GPU's threads share one."""
         return torch.get_num_threads() if self.params.device.type == "cpu" else 1
 
@@ -278,7 +278,7 @@ class ComputedField:
         """(X, Y, Z) for each cell of the occupancy the largest weight (NeRF, eq. 3) that a sample in it has
         on any of rays (N, 3)."""
         asked = Weighed(exact(rays_o), exact(rays_d), exact(jitter), float(near), float(step), 1e-3)
-        parts = self.parts
+        parts = self.gradient_rows
         most = np.zeros((parts, self.occupancy.occupied.size), np.float32)
         self.loops.sweep(
             "weigh_ray", self.arrays, self.grid, asked, len(rays_o), 1, most, np.zeros((parts, 3))
@@ -302,7 +302,7 @@ class ComputedField:
             exact(rays_o), exact(rays_d), exact(jitter), np.ascontiguousarray(inside, np.uint8), float(step),
             1e-3, exact(cells.aabb[:3]), exact(cells.cell), counts,
         )  # fmt: skip
-        parts = self.parts
+        parts = self.gradient_rows
         sums = np.zeros((parts, 2 * cells.occupied.size), np.float32)
         self.loops.sweep(
             "vote_ray", self.arrays, self.grid, asked, len(rays_o), 1, sums, np.zeros((parts, 3))
