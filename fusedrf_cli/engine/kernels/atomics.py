@@ -1,4 +1,4 @@
-"""Atomic sums of eight neighbours at once, which newer GPUs do in two instructions instead of eight."""
+"""Atomic sums of four neighbours at once, which newer GPUs do in one instruction instead of four."""
 
 from llvmlite import ir
 from numba.core import types
@@ -18,7 +18,7 @@ def add_4(typingctx, out, o, e0, e1, e2, e3):
     multiple of 4, and the array starts at one of 16 bytes."""
 
     def code(context, builder, signature, arguments):
-        array_type, at_type = signature.args[:2]
+        array_type = signature.args[0]
         array = arrayobj.make_array(array_type)(context, builder, arguments[0])
         start = cgutils.get_item_pointer(
             context, builder, array_type, array, [arguments[1]], wraparound=False, boundscheck=False
