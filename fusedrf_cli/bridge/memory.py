@@ -147,10 +147,10 @@ def result(numbers: int, measured: bool = True) -> dict[str, float]:
     return {"the result": numbers * (FLOAT + (2 + FLOAT) * measured)}
 
 
-def learning(numbers: int, threads: int) -> dict[str, float]:
-    """A field while it learns: numbers, a row of gradients per thread, Adam's two moments, and what the guard
-    keeps to go back to."""
-    return {"the field that learns": numbers * FLOAT * (1 + threads + 2 + 3)}
+def learning(numbers: int, threads: int, moments: int = 2) -> dict[str, float]:
+    """A field while it learns: numbers and Adam's moments, both once more for the guard to go back to, and a
+    row of gradients per thread."""
+    return {"the field that learns": numbers * FLOAT * (2 * (1 + moments) + threads)}
 
 
 def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> dict[str, float]:
@@ -161,11 +161,12 @@ def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> d
     return {"the photos": count * pixels * per_pixel + cameras * pixels * PER_OWN_RAY}
 
 
-def fitting(plan: Plan, longest: int, threads: int) -> dict[str, float]:
+def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str, float]:
     """The field of a fit at its full resolution, with so many texels along the longest axis, while its
     occupancy is made anew."""
     grid = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, longest)))
-    return {**learning(plan.numbers, threads), "its occupancy": float(grid) * PER_TRIED_CELL}
+    learns = learning(plan.numbers, threads, 1 if unbounded else 2)
+    return {**learns, "its occupancy": float(grid) * PER_TRIED_CELL}
 
 
 def teaching(settings: DistillSettings, points: int) -> dict[str, float]:

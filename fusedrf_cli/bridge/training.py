@@ -291,7 +291,7 @@ def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str,
     cameras = len({camera_of(v).intrinsics for v in capture.train})
     return {
         **photos(len(capture.train), pixels, 1, cameras, any(view.mask_path for view in capture.train)),
-        **fitting(plan, settings.longest, torch.get_num_threads()),
+        **fitting(plan, settings.longest, torch.get_num_threads(), settings.unbounded),
     }
 
 

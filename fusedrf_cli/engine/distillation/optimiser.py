@@ -18,21 +18,23 @@ class Adam:
 
     field: ComputedField
     parts: int
+    beta1: float = BETA1
+    """How much of the moves before each step goes on; with 0 no first moment is kept."""
 
     def __post_init__(self):
         params = self.field.params
         # Rows start on a cache line, so that a run of numbers touches no more lines than it must.
         count, kind = len(params), (params.dtype, params.device)
         self.gradient = pages.zeros(self.parts * count, *kind).view(self.parts, count)
-        self.moments = pages.zeros(count, *kind), pages.zeros(count, *kind)
+        self.moments = pages.zeros(count if self.beta1 else 0, *kind), pages.zeros(count, *kind)
         shared = self.field.device_loops.shared
         self.grads, self.moment1, self.moment2 = shared(self.gradient), *map(shared, self.moments)
         self.steps = 0
 
     @classmethod
-    def of(cls, field: ComputedField) -> "Adam":
+    def of(cls, field: ComputedField, beta1: float = BETA1) -> "Adam":
         """An optimiser with as many rows of gradients as the field's loops add to."""
-        return cls(field, field.gradient_rows)
+        return cls(field, field.gradient_rows, beta1)
 
     def numbers(self) -> list[torch.Tensor]:
         """What steps change: the field's numbers and both moments."""
@@ -51,8 +53,8 @@ class Adam:
     def step(self, rate: float) -> None:
         """Apply and clear the gradients: each group of numbers at `rate` times its own."""
         self.steps += 1
-        correction1, correction2 = 1 / (1 - BETA1**self.steps), 1 / (1 - BETA2**self.steps)
-        rest = [np.float32(x) for x in (BETA1, BETA2, EPS, correction1, correction2)]
+        correction1, correction2 = 1 / (1 - self.beta1**self.steps), 1 / (1 - BETA2**self.steps)
+        rest = [np.float32(x) for x in (self.beta1, BETA2, EPS, correction1, correction2)]
         moved = self.field.arrays.params, self.grads, self.moment1, self.moment2
         for group in self.field.groups():
             own = np.float32(rate * group.rate)

@@ -7,6 +7,7 @@ import torch
 
 LARGE = 1 << 20  # bytes from which an array gets them
 ADVICE = getattr(mmap, "MADV_HUGEPAGE", None)  # of Linux
+# Private memory: most systems keep what processes could share, which is Python's default, in small pages.
 
 
 def zeros(count: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> torch.Tensor:
@@ -14,7 +15,7 @@ def zeros(count: int, dtype: torch.dtype = torch.float32, device: torch.device |
     size = count * dtype.itemsize
     if ADVICE is None or size < LARGE or torch.device(device).type != "cpu":
         return torch.zeros(count, dtype=dtype, device=device)
-    memory = mmap.mmap(-1, size)
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     try:
         memory.madvise(ADVICE)
     except OSError:  # a system that was built without them

@@ -50,7 +50,6 @@ LENT_FROM = 2e-3  # the same in pictures, behind a ray's first colour
 REST_FROM = 0.0  # transmittance from which, in pictures that may stop early, all that is left shows a sample
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
-SAMPLES_AHEAD = 2
 POINTS_PER_TASK = 2048
 RAYS_PER_TASK = 256
 
@@ -357,6 +356,16 @@ def followed(batch, weight, chance):
     return 1.0 / part, chance - 1.0
 
 
+def ask_for(field, held, origin, way, u0, step, k, many):
+    """Ask for what the sample of `many` steps from step k of a piece on, if there is one, will read; `held`
+    is of the one before it. Planes and rows lie all over memory: asked for one sample early, their misses
+    overlap with the work on the one before."""
+    if k >= 0:
+        p = along(origin, way, u0 + 0.5 * between(k, many) * step)
+        ahead_density(field, field.params, held, p)
+        ahead_colour(field, field.params, held, p)
+
+
 def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     """Ray i of a batch: forward as in `render_ray`, compare, and back along the ray into grad (P,)."""
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
@@ -364,21 +373,23 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     trans, waiting = 1.0, 0.0
     count, shaded, current, chance = 0, 0, -1, drawn(batch.jitter[i])
     last, begun = kept.memory.shape[0] - KEPT, entered(o, d, batch.near)
+    held = 0
     for number in range(PIECES):
         if trans <= batch.early_stop:
             break
         (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, math.inf)
         u0 = u0 + batch.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
+        ask_for(field, held, origin, way, u0, step, k, many)
         while k >= 0 and trans > batch.early_stop and count < kept.k.shape[0]:
             u = u0 + 0.5 * between(k, many) * step
+            following, wide = next_sample(grid, origin, way, u0, u1, step, k + many)
+            ask_for(field, held, origin, way, u0, step, following, wide)
             p, opacity, pre, steps, place = met(
                 field, grid, (origin, way, course), k, many, u, step, d, scratch
             )
             if steps > 0:
-                held, reach = keep(place), SAMPLES_AHEAD * many * steps * step
-                beyond = along(origin, way, u + reach)
-                ahead_density(field, field.params, held, beyond)
+                held = keep(place)
                 weight = trans * opacity
                 trans -= weight
                 times, chance = followed(batch, weight + waiting, chance)
@@ -396,7 +407,6 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                         current = frame_of(place)
                         begin(field, current, d, scratch)
                     at = min(shaded * KEPT, last)
-                    ahead_colour(field, field.params, held, beyond)
                     if times > 0.0:
                         ahead_colour(field, grad, held, p)
                     r, g, b = colour(field, place, p, d, scratch, kept.memory, at)
@@ -408,8 +418,10 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                     waiting = 0.0
                     shaded += 1
                 count += 1
-            k = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
-            k, many = next_sample(grid, origin, way, u0, u1, step, k)
+            to = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
+            if to != k + many:
+                following, wide = next_sample(grid, origin, way, u0, u1, step, to)
+            k, many = following, wide
     work = count + SHADING_COST * shaded
     d_colour, d_trans = compared(batch, i, (red, green, blue), trans, work, loss)
     if count > 0:

@@ -62,7 +62,8 @@ def adam_task(
     for i in range(count):
         ahead = found[min(i + LINES_AHEAD, count - 1)]
         prefetch(params, ahead)
-        prefetch(moment1, ahead)
+        if moment1.shape[0] != 0:
+            prefetch(moment1, ahead)
         prefetch(moment2, ahead)
         adam_line(
             params, grads, moment1, moment2, rate, np.uint64(found[i]), beta1, beta2, eps, correction1,
@@ -76,7 +77,7 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     of grads (parts, P).
 
     An entry whose gradient is exactly 0 was touched by no sample: it and its moments keep their values (lazy
-    Adam).
+    Adam). moment1 (0,) stands for β1 = 0.
     """
     for part in prange((high - low + ENTRIES_PER_TASK - 1) // ENTRIES_PER_TASK):
         start = low + part * ENTRIES_PER_TASK

@@ -1,6 +1,7 @@
 """Arrays in large pages are arrays like any other."""
 
 import mmap
+import os
 
 import pytest
 import torch
@@ -46,3 +47,15 @@ def test_a_system_without_them_gives_small_ones(monkeypatch):
     assert not pages.zeros(MANY).any()
     monkeypatch.setattr(pages, "ADVICE", None)
     assert not pages.zeros(MANY).any()
+
+
+@pytest.mark.skipif(pages.ADVICE is None, reason="a system without large pages")
+def test_large_ones_are_not_shared_with_children():
+    """Shared memory, which a mapping is unless it says otherwise, stays in small pages on most systems."""
+    numbers = pages.zeros(MANY)
+    child = os.fork()
+    if child == 0:
+        numbers.numpy()[:] = 1
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    assert not numbers.any()

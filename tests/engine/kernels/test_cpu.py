@@ -616,7 +616,9 @@ def adam(params, gradients, rate=0.1, beta1=0.9, beta2=0.99, eps=1e-8, parts=3) 
     """Steps of the kernel, each gradient split into parts at random."""
     size = len(params)
     run = SimpleNamespace(
-        params=params.copy(), moment1=np.zeros(size, np.float32), moment2=np.zeros(size, np.float32)
+        params=params.copy(),
+        moment1=np.zeros(size if beta1 else 0, np.float32),
+        moment2=np.zeros(size, np.float32),
     )
     run.grads = np.zeros((parts, size), np.float32)
     rng = np.random.default_rng(0)
@@ -632,26 +634,28 @@ def adam(params, gradients, rate=0.1, beta1=0.9, beta2=0.99, eps=1e-8, parts=3) 
     return run
 
 
-def test_adam_is_torchs_where_every_entry_is_touched(rng):
+@pytest.mark.parametrize("beta1", [0.9, 0.0])
+def test_adam_is_torchs_where_every_entry_is_touched(rng, beta1):
     start = rng.normal(size=160).astype(np.float32)
     gradients = rng.normal(size=(25, 160)) * 10.0 ** rng.integers(-6, 3, 160)
-    found = adam(start, gradients)
+    found = adam(start, gradients, beta1=beta1)
     parameter = torch.from_numpy(start.astype(float)).requires_grad_()
-    optimiser = torch.optim.Adam([parameter], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    optimiser = torch.optim.Adam([parameter], lr=0.1, betas=(beta1, 0.99), eps=1e-8)
     for gradient in gradients:
         parameter.grad = torch.from_numpy(gradient)
         optimiser.step()
     np.testing.assert_allclose(found.params, parameter.detach().numpy(), rtol=1e-4, atol=1e-4)
 
 
-def test_adam_leaves_untouched_entries_alone(rng):
+@pytest.mark.parametrize("beta1", [0.9, 0.0])
+def test_adam_leaves_untouched_entries_alone(rng, beta1):
     """No gradient, no change: neither entry nor moments, in a line of its own or beside touched ones."""
     start = rng.normal(size=64).astype(np.float32)
     first, second = rng.normal(size=64) + 5, np.zeros(64)
     second[40] = 2.0
-    before, after = adam(start, [first]), adam(start, [first, second])
+    before, after = adam(start, [first], beta1=beta1), adam(start, [first, second], beta1=beta1)
     same = np.arange(64) != 40
-    for name in ("params", "moment1", "moment2"):
+    for name in ("params", *["moment1"] * (beta1 > 0), "moment2"):
         assert (getattr(before, name)[same] == getattr(after, name)[same]).all()
         assert getattr(before, name)[40] != getattr(after, name)[40]
 

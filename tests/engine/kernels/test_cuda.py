@@ -243,8 +243,8 @@ def test_adam(rng):
 
 
 @on_a_device
-@pytest.mark.parametrize("name", ["vm", "sparse"])
-def test_a_field_there_learns_and_renders_as_here(name):
+@pytest.mark.parametrize(("name", "beta1"), [("vm", 0.0), ("sparse", 0.9)])
+def test_a_field_there_learns_and_renders_as_here(name, beta1):
     """One step of training and one picture by the engine's own classes."""
     field = FIELDS[name](torch.float64)
     rays_o, rays_d = rays_at(field.aabb, 2)
@@ -253,7 +253,7 @@ def test_a_field_there_learns_and_renders_as_here(name):
 
     def learn(field):
         field = field.with_params(field.params.clone())
-        optimiser, loss = Adam(field, 1), np.zeros((1, 3))
+        optimiser, loss = Adam(field, 1, beta1), np.zeros((1, 3))
         field.train_rays(batch, optimiser.grads, loss)
         assert optimiser.sound()
         optimiser.step(0.01)

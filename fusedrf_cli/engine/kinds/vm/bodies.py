@@ -14,8 +14,8 @@ Notation for the whole file.
                  detail was asked
 DENSITY_RANK, COLOUR_RANK and COEFFICIENTS are the field's sizes. A ray's `scratch` holds, one after the
 other, the directional basis (BASIS), its gradient (D_BASIS), the gradient of a sample's colour features
-(D_FEATURES), the spherical harmonics (SH), and room for one mode (TILE), one number (ONE) and a sample of the
-background (HELD, see `started`).
+(D_FEATURES), the spherical harmonics (SH), and room for one mode (TILE), one number (ONE), a sample of the
+background (HELD, see `started`) and what the hashed detail said last (DETAIL_AT, see `detail`).
 """
 
 import math
@@ -75,7 +75,7 @@ def sizes(field) -> dict[str, int]:
     rank, colour_rank = field.shape.density_rank, field.shape.colour_rank
     held = {
         "BASIS": 9 * colour_rank, "D_BASIS": 9 * colour_rank, "D_FEATURES": 3 * colour_rank, "SH": 16,
-        "TILE": 2 * max(rank, colour_rank), "ONE": 1, "HELD": 7,
+        "TILE": 2 * max(rank, colour_rank), "ONE": 1, "HELD": 7, "DETAIL_AT": 7,
     }  # fmt: skip
     starts = np.cumsum([0, *held.values()]).tolist()
     return {
@@ -264,12 +264,21 @@ def scatter_colour(field, grads, t, u, v, w, scratch):
 # -- a tensor's hashed detail --------------------------------------------------------------------------------
 
 
-def row_at(field, t, level, i, j, k):
-    """Offset in params of the row of a vertex. RUN vertices along z share a hash and lie side by side."""
-    rows = int(field.rows[t, 0])
-    h = (i * 2654435761) ^ (j * 805459861) ^ (k // RUN * 3674653429)  # wraps around at 64 bits
-    run = (h ^ (h >> 15)) & (rows // RUN - 1)
-    return np.uint64(field.layout[t, 13] + (level * rows + run * RUN + k % RUN) * WIDTH)
+def run_at(field, t, level, i, j, run):
+    """Offset in params of the rows of the `run`-th RUN vertices along z at (i, j): they share a hash and lie
+    side by side."""
+    h = (i * 2654435761) ^ (j * 805459861) ^ (run * 3674653429)  # wraps around at 64 bits
+    return (field.layout[t, 13] + level * field.rows[t, 0] * WIDTH) + (
+        (h ^ (h >> 15)) & (field.rows[t, 0] // RUN - 1)
+    ) * (RUN * WIDTH)
+
+
+def edge(field, t, level, i, j, k):
+    """Offsets in params of the rows of vertices (i, j, k) and (i, j, k + 1)."""
+    last = k % RUN == RUN - 1
+    low = run_at(field, t, level, i, j, k // RUN)
+    high = run_at(field, t, level, i, j, k // RUN + 1) if last else low + (k % RUN + 1) * WIDTH
+    return np.uint64(low + k % RUN * WIDTH), np.uint64(high)
 
 
 def vertex_below(field, t, level, u, v, w):
@@ -282,58 +291,68 @@ def vertex_below(field, t, level, u, v, w):
     return (int(i), int(j), int(k)), (real(x - i), real(y - j), real(z - k))
 
 
-def corner(field, t, level, n, below, share):
-    """The row of the n-th of the eight vertices around a point, and its part in what is interpolated there;
-    below and share as `vertex_below` returns them."""
+def edges_around(field, t, level, n, below, share):
+    """The rows at both ends of the n-th of the four edges along z around a point, and their parts in what is
+    interpolated there; below and share as `vertex_below` returns them."""
     one = field.params.dtype.type(1)
-    di, dj, dk = n >> 2, (n >> 1) & 1, n & 1
-    part = share[0] if di == 1 else one - share[0]
-    part *= share[1] if dj == 1 else one - share[1]
-    part *= share[2] if dk == 1 else one - share[2]
-    return row_at(field, t, level, below[0] + di, below[1] + dj, below[2] + dk), part
+    part = share[0] if n >> 1 == 1 else one - share[0]
+    part *= share[1] if n & 1 == 1 else one - share[1]
+    low, high = edge(field, t, level, below[0] + (n >> 1), below[1] + (n & 1), below[2])
+    return low, high, part * (one - share[2]), part * share[2]
 
 
-def detail_density(field, t, u, v, w):
+def detail(field, t, u, v, w, scratch):
     """What the rows of tensor t add to the density at a unit point, before activation: trilinear between
-    vertices, summed over the levels."""
+    vertices, summed over the levels. Leaves in scratch[DETAIL_AT:] where that was, the tensor from 1 on and
+    the point, and what they add to the logits of red, green and blue."""
     p = field.params
-    total = p.dtype.type(0)
+    zero = p.dtype.type(0)
+    total, red, green, blue = zero, zero, zero, zero
     for level in range(field.rows[t, 1]):
         below, share = vertex_below(field, t, level, u, v, w)
-        for n in range(8):
-            row, part = corner(field, t, level, n, below, share)
-            total += part * p[row]
+        for n in range(4):
+            low, high, near, far = edges_around(field, t, level, n, below, share)
+            total += near * p[low] + far * p[high]
+            red += near * p[low + np.uint64(1)] + far * p[high + np.uint64(1)]
+            green += near * p[low + np.uint64(2)] + far * p[high + np.uint64(2)]
+            blue += near * p[low + np.uint64(3)] + far * p[high + np.uint64(3)]
+    at = np.uint64(DETAIL_AT)
+    scratch[at], scratch[at + np.uint64(1)] = t + 1, u
+    scratch[at + np.uint64(2)], scratch[at + np.uint64(3)] = v, w
+    scratch[at + np.uint64(4)], scratch[at + np.uint64(5)], scratch[at + np.uint64(6)] = red, green, blue
     return total
 
 
-def detail_colour(field, t, u, v, w):
-    """As `detail_density`, what they add to the logits of red, green and blue."""
-    p = field.params
-    red, green, blue = p.dtype.type(0), p.dtype.type(0), p.dtype.type(0)
-    for level in range(field.rows[t, 1]):
-        below, share = vertex_below(field, t, level, u, v, w)
-        for n in range(8):
-            row, part = corner(field, t, level, n, below, share)
-            red += part * p[row + np.uint64(1)]
-            green += part * p[row + np.uint64(2)]
-            blue += part * p[row + np.uint64(3)]
-    return red, green, blue
+def detail_colour(field, t, u, v, w, scratch):
+    """What the rows of tensor t add to the logits of red, green and blue at a unit point, most often the one
+    whose density was asked last."""
+    at = np.uint64(DETAIL_AT)
+    known = scratch[at] == t + 1 and scratch[at + np.uint64(1)] == u
+    if not (known and scratch[at + np.uint64(2)] == v and scratch[at + np.uint64(3)] == w):
+        detail(field, t, u, v, w, scratch)
+    return scratch[at + np.uint64(4)], scratch[at + np.uint64(5)], scratch[at + np.uint64(6)]
 
 
 def scatter_detail(field, grad, t, u, v, w, d_feature, rgb, d_rgb):
-    """Adjoint of `detail_density` and, where d_rgb is not 0, of `detail_colour` behind its sigmoid."""
+    """Adjoint of `detail` in its density and, where d_rgb is not 0, in its colour behind the sigmoid."""
     real = field.params.dtype.type
     d_red = real(d_rgb[0] * rgb[0] * (1 - rgb[0]))
     d_green = real(d_rgb[1] * rgb[1] * (1 - rgb[1]))
     d_blue = real(d_rgb[2] * rgb[2] * (1 - rgb[2]))
     for level in range(field.rows[t, 1]):
         below, share = vertex_below(field, t, level, u, v, w)
-        for n in range(8):
-            row, part = corner(field, t, level, n, below, share)
-            accumulate(grad, row, part * d_feature)
-            accumulate(grad, row + np.uint64(1), part * d_red)
-            accumulate(grad, row + np.uint64(2), part * d_green)
-            accumulate(grad, row + np.uint64(3), part * d_blue)
+        for n in range(4):
+            low, high, near, far = edges_around(field, t, level, n, below, share)
+            add_row(grad, low, near * d_feature, near * d_red, near * d_green, near * d_blue)
+            add_row(grad, high, far * d_feature, far * d_red, far * d_green, far * d_blue)
+
+
+def add_row(grad, row, density, red, green, blue):
+    """Adds to the WIDTH numbers of a row, to which others may be adding too."""
+    accumulate(grad, row, density)
+    accumulate(grad, row + np.uint64(1), red)
+    accumulate(grad, row + np.uint64(2), green)
+    accumulate(grad, row + np.uint64(3), blue)
 
 
 # -- blocks -------------------------------------------------------------------------------------------------
@@ -351,7 +370,7 @@ def object_direction(field, b, d):
     return x / length, y / length, z / length, length
 
 
-def block_density(field, b, p, d, stretched):
+def block_density(field, b, p, d, stretched, scratch):
     """(σ in the field frame, pre-activation, place) of block b at a field point; (0, 0, b) outside its
     tensor. Not `stretched`: as if its placement did not stretch it along d."""
     u, v, w, inside = unit_point(field, b, p)
@@ -362,7 +381,7 @@ def block_density(field, b, p, d, stretched):
         return 0.0, 0.0, b  # what a tensor says there was never learnt
     f, place = density_feature(field, t, u, v, w), b
     if DETAIL != 0 and field.rows[t, 1] != 0 and f + field.activation[t, 1] > EMPTY_FROM:
-        f += detail_density(field, t, u, v, w)
+        f += detail(field, t, u, v, w, scratch)
         place = b + NEAR
     stretch = object_direction(field, b, d)[3] if stretched else 1.0
     slope = crossed(field, b, p, stretch) * field.activation[t, 0]
@@ -389,14 +408,14 @@ def density(field, grid, k, p, d, scratch):
     """(σ, pre-activation, 1, place) of the densest block at a point; ties go to the lower block (DESIGN).
     With several blocks 0 instead of 1 where none has matter."""
     if field.owners.shape[0] == 0:
-        sigma, f, place = block_density(field, 0, p, d, True)
+        sigma, f, place = block_density(field, 0, p, d, True, scratch)
         return sigma, f, 1, place
     i, j, m = ownership_cell(field, grid, p)
     b, other = owners_of(field, i, j, m)
     if b == NO_BLOCK:
         return 0.0, 0.0, 0, 0
     if other == NO_BLOCK:
-        sigma, f, place = block_density(field, b, p, d, True)
+        sigma, f, place = block_density(field, b, p, d, True, scratch)
     else:
         sigma, f, place = held_density(field, b, k, p, d, scratch)
         sigma2, f2, place2 = held_density(field, other, k, p, d, scratch)
@@ -429,13 +448,13 @@ def held_density(field, b, k, p, d, scratch):
     holds the answer of its own sample, in the core, where coordinates go along with d."""
     at_hand = CROSSING != 0 and scratch[HELD] != 0 and field.crossing[b] == 0
     if not at_hand or max(abs(p[0]), max(abs(p[1]), abs(p[2]))) > 1.0:
-        return block_density(field, b, p, d, True)
+        return block_density(field, b, p, d, True, scratch)
     apart = int(scratch[HELD + 4])
     turn = k // apart + 1
     if int(scratch[HELD]) != turn:
         steps = (turn - 0.5) * apart - (k + 0.5 * scratch[HELD + 6])  # from the middle of this sample
         middle = along(p, d, steps * scratch[HELD + 5])
-        sigma, f, place = block_density(field, b, middle, d, True)
+        sigma, f, place = block_density(field, b, middle, d, True, scratch)
         scratch[HELD], scratch[HELD + 1], scratch[HELD + 2], scratch[HELD + 3] = turn, sigma, f, place
     return float(scratch[HELD + 1]), float(scratch[HELD + 2]), int(scratch[HELD + 3])
 
@@ -493,7 +512,7 @@ def nothing_for(field, b, p, stride):
 
 def unstretched(field, grid, frame, p, scratch):
     """σ of a block at a field point, in units of its object's frame."""
-    return block_density(field, frame, p, (0.0, 0.0, 1.0), False)[0]
+    return block_density(field, frame, p, (0.0, 0.0, 1.0), False, scratch)[0]
 
 
 def frame_of(place):
@@ -556,7 +575,7 @@ def colour(field, place, p, d, scratch, memory, at):
     r, g = dot_row(scratch, 0, memory, at), dot_row(scratch, 1, memory, at)
     b = dot_row(scratch, 2, memory, at)
     if DETAIL != 0 and place >= NEAR:
-        red, green, blue = detail_colour(field, t, u, v, w)
+        red, green, blue = detail_colour(field, t, u, v, w, scratch)
         r, g, b = r + red, g + green, b + blue
     return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
@@ -619,14 +638,16 @@ def ahead_colour(field, array, held, p):
 
 
 def ahead_detail(field, array, held, p):
-    """Ask for the rows on the four edges along z of the lattice's cells around a field point."""
+    """Ask for the rows at the ends of the four edges along z of the lattice's cells around a field point."""
     u, v, w, _ = unit_point(field, frame_of(held), p)
     t = field.tensor[frame_of(held)]
     for level in range(field.rows[t, 1]):
         (i, j, k), _ = vertex_below(field, t, level, u, v, w)
         for di in range(2):
             for dj in range(2):
-                prefetch(array, row_at(field, t, level, i + di, j + dj, k))
+                low, high = edge(field, t, level, i + di, j + dj, k)
+                prefetch(array, low)
+                prefetch(array, high)
 
 
 def ahead_planes(rank, first, field, array, block, p):
