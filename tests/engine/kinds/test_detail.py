@@ -92,6 +92,20 @@ def test_blocks_keep_it_and_share_it():
     same(tensor_field(left, 0), rough)
 
 
+def test_blocks_that_meet_show_the_detail_of_the_denser_one():
+    """Whichever of them was asked last: against the reference, at points where either wins."""
+    rough = random_detail()
+    field = blocks_of([Placed(str(x), rough, affine(1.0, (x, 0.1, 0))) for x in (0.0, 0.33)])
+    points = torch.from_numpy(points_in(field.aabb, 3000))
+    dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(3000, 3))))
+    found, wanted = field.query(points, dirs), field.answers(field.params, points, dirs)
+    one, two = (rough.query(points - torch.tensor([x, 0.1, 0]), dirs)[0] for x in (0.0, 0.33))
+    both = (one > 0) & (two > 0) & (found[0] > 0)
+    assert (both & (one > two)).sum() > 50 < (both & (one < two)).sum()
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
 def test_far_fewer_texels_leave_it_out():
     """Under a limit that its rows alone pass; what is left answers as the tensor without them."""
     hashed = Hashed((0.05,), 1 << 12)
