@@ -41,7 +41,8 @@ PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies
 PER_POINT = 60  # of a teacher's points in pieces, one of their columns joined, and its place there
 PER_PIXEL_OF_PHOTOS = 4  # its colour
 PER_MASKED_PIXEL = 10  # more where masks leave some out: which, and the numbers of those that are left
-PER_OWN_RAY = 100  # of a camera's pixel: directions in float64 while they are made, float32 afterwards
+PER_OWN_RAY = 24  # of each camera's pixel: directions in float32, twice while they are joined
+PER_MADE_RAY = 100  # of one camera's pixel: directions in float64, while they are made
 
 
 class Memory:
@@ -158,7 +159,8 @@ def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> d
     different cameras."""
     pixels = width * height
     per_pixel = PER_PIXEL_OF_PHOTOS + PER_MASKED_PIXEL * masked
-    return {"the photos": count * pixels * per_pixel + cameras * pixels * PER_OWN_RAY}
+    per_ray = cameras * PER_OWN_RAY + PER_MADE_RAY
+    return {"the photos": pixels * (count * per_pixel + per_ray)}
 
 
 def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str, float]:
