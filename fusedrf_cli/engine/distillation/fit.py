@@ -34,7 +34,7 @@ from fusedrf_cli.engine.rendering.cameras import Camera
 RATE = 0.02
 # Adam's β1 in unbounded space. A step meets few of a place's numbers, and where a number was last moved to is
 # out of date by then: with TensoRF's 0.9 a park shows 0.2 dB less after as many steps, ferns 0.4, a room 0.6.
-# Without it a step takes less time and memory, too. Objects end the same, and bear a wrong rate with it.
+# Without it a step takes less time and memory, too. Objects end the same, but bear a wrong rate less well.
 UNBOUNDED_MOMENTUM = 0.0
 # The last step's share of the rate, and the share of the run after which it falls: until then large steps
 # learn most, at the end what single rays say of a texel evens out. A rate that falls from the first step on

@@ -41,14 +41,18 @@ class Adam:
         return [self.field.params, *self.moments]
 
     def state(self) -> dict[str, np.ndarray]:
-        """The moments, for `restore`."""
-        return {f"moment{i + 1}": moment.cpu().numpy() for i, moment in enumerate(self.moments)}
+        """The moments that are kept, for `restore`."""
+        return {name: moment.cpu().numpy() for name, moment in self._kept()}
 
     def restore(self, arrays: dict[str, np.ndarray], steps: int) -> None:
         """Take up saved moments after so many steps."""
-        for i, moment in enumerate(self.moments):
-            moment.copy_(torch.from_numpy(arrays[f"moment{i + 1}"]))
+        for name, moment in self._kept():
+            moment.copy_(torch.from_numpy(arrays[name]))
         self.steps = steps
+
+    def _kept(self) -> list[tuple[str, torch.Tensor]]:
+        moments = zip(("moment1", "moment2"), self.moments, strict=True)
+        return [(name, moment) for name, moment in moments if len(moment)]
 
     def step(self, rate: float) -> None:
         """Apply and clear the gradients: each group of numbers at `rate` times its own."""

@@ -1,6 +1,7 @@
 """Which parameters learn at which rate."""
 
 import numpy as np
+import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
@@ -29,6 +30,18 @@ def test_first_step_moves_factors_by_the_rate_and_bases_by_its_share():
     np.testing.assert_allclose(moved[:basis], 0.5, rtol=1e-4)
     np.testing.assert_allclose(moved[basis:], 0.5 * BASIS_RATE, rtol=1e-3, atol=1e-6)
     assert (optimiser.grads == 0).all()
+
+
+@pytest.mark.parametrize("before", [0.9, 0.0])
+def test_a_saved_run_without_momentum_goes_on_whether_or_not_it_had_some_before(before):
+    """The second moment is taken up, the first left where none is kept."""
+    field = random_vm(THIRTY_TWO, dtype=torch.float32)
+    earlier, later = Adam(field, 1, before), Adam(field, 1, 0.0)
+    earlier.grads[:] = 0.1
+    earlier.step(0.5)
+    later.restore(earlier.state(), earlier.steps)
+    assert later.steps == 1 and torch.equal(later.moments[1], earlier.moments[1])
+    assert later.state().keys() == {"moment2"} and later.moments[1].any()
 
 
 def test_rest_without_gradients():
