@@ -404,25 +404,18 @@ def adam_line(params, grads, moment1, moment2, rate, start, beta1, beta2, eps, c
         add_scaled(LINE, grads[0], start, one, grads[p], start)
         for i in range(np.uint64(LINE)):
             grads[p, start + i] = zero
-    if moment1.shape[0] == 0:
-        for i in range(np.uint64(LINE)):
-            g, v = grads[0, start + i], moment2[start + i]
-            v_new = beta2 * v + (one - beta2) * g * g
-            moment2[start + i] = v_new if g != zero else v
-            change = rate * g / (math.sqrt(v_new * correction2) + eps)
-            params[start + i] -= change if g != zero else zero
-            grads[0, start + i] = zero
-    else:
-        for i in range(np.uint64(LINE)):
-            g = grads[0, start + i]
-            m, v = moment1[start + i], moment2[start + i]
-            m_new = beta1 * m + (one - beta1) * g
-            v_new = beta2 * v + (one - beta2) * g * g
+    kept = moment1.shape[0] != 0
+    for i in range(np.uint64(LINE)):
+        g, v = grads[0, start + i], moment2[start + i]
+        m = moment1[start + i] if kept else zero
+        m_new = beta1 * m + (one - beta1) * g
+        v_new = beta2 * v + (one - beta2) * g * g
+        if kept:
             moment1[start + i] = m_new if g != zero else m
-            moment2[start + i] = v_new if g != zero else v
-            change = rate * (m_new * correction1) / (math.sqrt(v_new * correction2) + eps)
-            params[start + i] -= change if g != zero else zero
-            grads[0, start + i] = zero
+        moment2[start + i] = v_new if g != zero else v
+        change = rate * (m_new * correction1) / (math.sqrt(v_new * correction2) + eps)
+        params[start + i] -= change if g != zero else zero
+        grads[0, start + i] = zero
 
 
 @body
