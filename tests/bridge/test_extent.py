@@ -97,10 +97,10 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     words = replace(request(), unbounded=False, aabb=(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0))
     extent = extent_of(words, capture, False)
 
-    def found(seconds, quality=None, sharper=1.0):
+    def found(seconds, quality=None, sharper=1.0, place="cpu"):
         views = tuple(replace(v, fl_x=v.fl_x * sharper, fl_y=v.fl_y * sharper) for v in capture.train)
         asked = replace(words, time_budget=seconds, quality=quality)
-        return quality_of(asked, replace(capture, train=views), extent)
+        return quality_of(asked, replace(capture, train=views), extent, place)
 
     def longest(*words):
         return found(*words).longest
@@ -110,6 +110,9 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     assert longest(300, None, 100) == 512 and longest(300, "normal", 100) == 224
     best, plain = found(300), FitSettings()
     assert best.samples > plain.samples and best.samples * best.steps == plain.samples * plain.steps
+    there = found(300 / training.GPU_PACE, place="cuda")  # in larger steps, and sooner
+    assert (there.longest, there.steps) == (best.longest, best.steps)
+    assert there.samples == best.samples * training.GPU_SAMPLES
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():
@@ -145,13 +148,14 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
 
-    def settings(kind: str = "vm", bounded: bool = False, **words) -> FitSettings:
+    def settings(kind: str = "vm", bounded: bool = False, place: str = "cpu", **words) -> FitSettings:
         asked = replace(request(), precision="int8", unbounded=not bounded, **words)
         extent = extent_of(asked, capture, False)
-        return fit_settings(asked, registry.kind(kind), capture, extent, "cpu")
+        return fit_settings(asked, registry.kind(kind), capture, extent, place)
 
     plain = settings(time_budget=60.0)
     assert plain.way.hashed is None
+    assert settings(time_budget=60.0, place="cuda").way.hashed is training.HASHED
     for words in ({"time_budget": 600.0}, {}, {"quality": "best"}, {"max_size": 30_000_000}):
         found = settings(**words)
         assert found.way.hashed is training.HASHED

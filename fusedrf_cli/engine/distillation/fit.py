@@ -75,7 +75,9 @@ OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 CALM_AFTER = 8
 RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
-RAYS_PER_STEP = (512, 1 << 16)
+# Rays of a step: at least so many, and at most so many for each sample it is to take. Where few meet anything
+# there would be ever more of them.
+LEAST_RAYS, MOST_PER_SAMPLE = 512, 2
 # Share of the box's volume that its occupied part must fall under for the box to be cut down: haze that was
 # over the chair for a third of a run made a box a sixth too long, and with it all texels.
 SHRINK_BELOW = 0.9
@@ -159,7 +161,7 @@ class FitRun:
         self.stages, self.refreshes = list(settings.stages[1:]), [*OCCUPANCY_AT, 1.0]
         self.exposures = list(MEASURED_AT) if settings.exposure else []
         self.refinements = list(REFINED_AT) if settings.poses else []
-        self.mse, self.rays = None, RAYS_PER_STEP[0]
+        self.mse, self.rays = None, LEAST_RAYS
         self.found_matter, self.found_nothing = False, 0
         self.guard = Guard(lambda: self.optimiser.numbers())
 
@@ -428,7 +430,8 @@ class FitRun:
         per_ray = max(sums[2] / rays, 1.0)
         in_a_box = 1 if self.stages else FINE_SAMPLES
         wanted = self.settings.samples * (UNBOUNDED_SAMPLES if self.settings.unbounded else in_a_box)
-        self.rays = int(np.clip(0.9 * self.rays + 0.1 * wanted / per_ray, *RAYS_PER_STEP))
+        most = MOST_PER_SAMPLE * self.settings.samples
+        self.rays = int(np.clip(0.9 * self.rays + 0.1 * wanted / per_ray, LEAST_RAYS, most))
 
 
 def decay(share: float) -> float:

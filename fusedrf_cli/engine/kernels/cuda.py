@@ -29,6 +29,7 @@ if not SIMULATED:  # whose compiler has settings of its own
     from fusedrf_cli.engine.kernels.atomics import add_4
 
     config.CACHE_DIR = numba.config.CACHE_DIR
+    config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a scene of few rays is no mistake
 
     class Forwarded(gpu_event.Listener):
         """Tells numba's own listeners what the GPU's compiler does, as an event of a kind of theirs."""
