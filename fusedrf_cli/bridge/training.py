@@ -39,7 +39,6 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
 
-UNBOUNDED_DEGREE = 1  # SH: with more, colours that depend on the view explain what places should
 UNBOUNDED_TEXELS = 2.0  # times those of a box, along an axis of all of space: half lie outside the core
 PATIENCE, FOR_MORE, MOST_MORE = 120, 0.23, 1.5
 """Seconds of learning from which a place has more texels, by which power of the time, and times how many at
@@ -247,13 +246,10 @@ def fit_settings(
 ) -> FitSettings:
     """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
     bytes in its bundle."""
-    degree = request.sh_degree
-    if degree is None and extent.unbounded and "sh_degree" in kind.takes:
-        degree = UNBOUNDED_DEGREE
     settings = replace(
         quality_of(request, capture, extent, place),
         kind=kind.name,
-        way=Way(request.precision, request.ranks, degree),
+        way=Way(request.precision, request.ranks, request.sh_degree),
         seed=request.seed,
         time_budget=request.time_budget,
         target_psnr=request.target_psnr,
