@@ -30,7 +30,7 @@ from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.volume import render_image
 
 EVERY = 8
-BUDGETS = {"fox": (30, 120), "bear": (120, 600), "cup": (300,), "fern": (300,)}
+BUDGETS = {"fox": (30, 120, 600), "bear": (120, 600), "cup": (300, 900), "fern": (300,)}
 """Seconds of learning."""
 OTHERS = (120,)
 """Of captures that are not named."""
