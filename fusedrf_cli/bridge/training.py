@@ -220,13 +220,13 @@ def paced(seconds: float | None, place: str) -> float | None:
     return seconds and seconds * (GPU_PACE if place == "cuda" else 1)
 
 
-def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str = "cpu") -> FitSettings:
+def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> FitSettings:
     """The settings of the asked quality, or, of an object, of the one that the time budget is enough for; the
     best of an object has texels as fine as the photos' pixels ask for, and fewer but larger steps."""
     name = request.quality or "normal"
-    time = paced(request.time_budget, place)
-    if request.quality is None and time and not extent.unbounded:
-        name = next(name for name, seconds in PATIENT.items() if time >= seconds)
+    budget = paced(request.time_budget, place)
+    if request.quality is None and budget and not extent.unbounded:
+        name = next(name for name, seconds in PATIENT.items() if budget >= seconds)
     settings = QUALITY[name]
     if place == "cuda":
         settings = replace(settings, samples=settings.samples * GPU_SAMPLES)
@@ -277,13 +277,14 @@ def of_place(settings: FitSettings, kind: Kind, box: np.ndarray, room: int | Non
     """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
     learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
     longer they learn."""
-    time = paced(settings.time_budget, settings.device)
+    budget = paced(settings.time_budget, settings.device)
     takes = section_bytes(Section("detail", HASHED.shape), settings.way.precision)
     fits = room is None or takes <= HASHED_SHARE * room
-    if kind.hashes and fits and (time is None or time >= HASHED_FROM) and settings.steps >= HASHED_STEPS:
+    patient = budget is None or budget >= HASHED_FROM
+    if kind.hashes and fits and patient and settings.steps >= HASHED_STEPS:
         longest = texels_of_place(box, HASHED_TEXELS * settings.longest)
         return replace(settings, longest=longest, way=replace(settings.way, hashed=HASHED))
-    patience = max(1.0, (time or 0) / PATIENCE)
+    patience = max(1.0, (budget or 0) / PATIENCE)
     more = UNBOUNDED_TEXELS * min(MOST_MORE, patience**FOR_MORE)
     return replace(settings, longest=texels_of_place(box, more * settings.longest))
 
