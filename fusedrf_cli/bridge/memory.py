@@ -28,7 +28,7 @@ from fusedrf_cli.requests import FuseRequest
 
 SHARE_OF_FREE = 0.8
 FLOAT = 4
-COMPILED = 130 << 20  # kernels, once they are loaded, and the libraries that come with them
+COMPILED = 100 << 20  # kernels, once they are loaded, and the libraries that come with them
 READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
 RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
 PER_PIXEL = 350  # of a band: rays in float64, before and after turning, those of one block apart, pixels

@@ -2,6 +2,7 @@
 and that it holds what is finer than the texels."""
 
 import json
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -12,11 +13,13 @@ from formats.errors import FormatError
 from formats.records import FieldRecord, decode_field, encode_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, reshaped, tensor_field, without
-from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.field import DETAIL_STEP, VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.reference import hashed_row
 from fusedrf_cli.engine.kinds.vm.trimming import truncated
+from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 from tests.analytic.rays import affine
 
 from ..conftest import BOX, THIRTY_TWO, points_in, random_vm, unit
@@ -79,6 +82,21 @@ def test_it_stays_where_texels_change():
     wider = VMShape(16, 24, 3)
     same(field, reshaped(field, wider))
     same(field, truncated(reshaped(field, wider), field.shape))
+
+
+def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
+    """Whatever is done to the field, and of blocks too."""
+    coarse, fine = random_vm(hashed=Hashed((9.0,), 16)), random_vm(hashed=Hashed((0.25, 0.01), 16))
+    assert sampling_step(coarse) == pytest.approx(STEP_PER_VOXEL * coarse.voxel_size)
+    smaller = fine.resampled(fine.aabb, (9, 9, 9)).with_occupancy(fine.occupancy)
+    stored = VMField.from_state(*fine.state())
+    for field in (fine, smaller, stored, fine.resampled(fine.aabb, (9, 9, 9))):
+        assert sampling_step(field) == pytest.approx(DETAIL_STEP * 0.01)
+    texels = tuple(1000 * (n - 1) + 1 for n in (3, 3, 3))
+    assert replace(fine.tensors[0], resolution=texels).step < DETAIL_STEP * 0.01
+    assert [sampling_step(own) for own in blocks_of([Placed("a", fine, affine(2.0))]).alone] == [
+        pytest.approx(DETAIL_STEP * 0.01)
+    ]
 
 
 def test_blocks_keep_it_and_share_it():

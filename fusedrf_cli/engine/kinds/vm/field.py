@@ -53,6 +53,8 @@ NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less
 DETAIL_RATE = 0.5  # at 1 smooth things come out grainy: a cup after 100 s SSIM 0.77, with 0.5 0.79
+DETAIL_STEP = 1.75
+"""Of the finest spacing of its vertices, at which pictures sample a detail."""
 DETAIL_FROM = 100  # texels from which a detail learns; before, it would learn what is coarse
 
 
@@ -88,9 +90,9 @@ class VMTensor:
     def occupancy(self) -> OccupancyGrid:
         """The occupancy grid in the object's frame."""
         return (
-            OccupancyGrid.full(self.aabb, space=self.space)
+            replace(OccupancyGrid.full(self.aabb, space=self.space), unit=self.unit)
             if self.occupied is None
-            else OccupancyGrid(self.aabb, self.occupied, self.space)
+            else OccupancyGrid(self.aabb, self.occupied, self.space, unit=self.unit)
         )
 
     @property
@@ -105,8 +107,14 @@ class VMTensor:
 
     @property
     def step(self) -> float:
-        """At which it is sampled."""
-        return self.space.STEP_PER_VOXEL * float(self.voxel_size.min())
+        """At which pictures sample it."""
+        step = self.space.STEP_PER_VOXEL * float(self.voxel_size.min())
+        return min(step, DETAIL_STEP * min(self.hashed.spacings)) if self.hashed else step
+
+    @property
+    def unit(self) -> float:
+        """That of its occupancy grid: the step where that follows from the detail, not from the texels."""
+        return self.step if self.hashed else 0.0
 
 
 @dataclass(frozen=True)
@@ -219,8 +227,7 @@ class VMField(ComputedField):
     def with_occupancy(self, occupancy: OccupancyGrid) -> "VMField":
         """The same numbers of a one-block field under another occupancy grid of its box."""
         tensor = replace(self.tensors[0], occupied=occupancy.occupied, space=occupancy.space)
-        evenly = occupancy.marked(occupancy.occupied)
-        return VMField(self.shape, (tensor,), self.blocks, self.params, evenly)
+        return VMField(self.shape, (tensor,), self.blocks, self.params, tensor.occupancy)
 
     @classmethod
     def assembled(
@@ -253,7 +260,8 @@ class VMField(ComputedField):
         aabb = np.asarray(aabb, np.float64)
         resized = replace(tensor, resolution=resolution, aabb=aabb)
         params = pages.zeros(resized.size(self.shape), self.params.dtype)
-        new = VMField(self.shape, (resized,), (block,), params, self.occupancy, None)
+        occupancy = replace(self.occupancy, unit=resized.unit)
+        new = VMField(self.shape, (resized,), (block,), params, occupancy)
         at = [unit_texels(aabb, tensor.aabb, axis, resolution[axis]) for axis in range(3)]
         old, target = self.sections(0), new.sections(0)
         for what in ("density", "colour"):
