@@ -50,7 +50,7 @@ def sampling_step(field: RadianceField) -> float:
     """The distance, in the coordinates of its space, at which pictures sample a field; where its grid says
     how far apart samples may lie in which cells, their smallest distance."""
     grid = field.occupancy
-    return grid.unit or grid.space.STEP_PER_VOXEL * field.voxel_size
+    return grid.unit or grid.space.picture_step(field.voxel_size)
 
 
 NOTHING = 1e-4  # optical depth through a whole box under which a field shows nothing

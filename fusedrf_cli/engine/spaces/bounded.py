@@ -57,6 +57,11 @@ def span(course, u, length):
     return length
 
 
+def picture_step(voxel: float) -> float:
+    """At which pictures sample a field with voxels of a size."""
+    return STEP_PER_VOXEL * voxel
+
+
 def most_samples(aabb: np.ndarray, step: float) -> int:
     """How many samples a ray through a field of a box (6,) can have."""
     return int(float(np.linalg.norm(aabb[3:] - aabb[:3])) / step) + 2

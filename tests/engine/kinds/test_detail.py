@@ -86,7 +86,8 @@ def test_it_stays_where_texels_change():
 
 def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
     """Whatever is done to the field, and of blocks too."""
-    coarse, fine = random_vm(hashed=Hashed((9.0,), 16)), random_vm(hashed=Hashed((0.25, 0.01), 16))
+    coarse, fine = (random_vm(hashed=Hashed(spacings, 16)) for spacings in ((9.0,), (0.25, 0.01)))
+    coarse, fine = (field.with_occupancy(field.occupancy) for field in (coarse, fine))
     assert sampling_step(coarse) == pytest.approx(STEP_PER_VOXEL * coarse.voxel_size)
     smaller = fine.resampled(fine.aabb, (9, 9, 9)).with_occupancy(fine.occupancy)
     stored = VMField.from_state(*fine.state())

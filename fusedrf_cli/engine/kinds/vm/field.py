@@ -53,7 +53,7 @@ NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less
 DETAIL_RATE = 0.5  # at 1 smooth things come out grainy: a cup after 100 s SSIM 0.77, with 0.5 0.79
-DETAIL_STEP = 1.75
+DETAIL_STEP = 2.0
 """Of the finest spacing of its vertices, at which pictures sample a detail."""
 DETAIL_FROM = 100  # texels from which a detail learns; before, it would learn what is coarse
 
@@ -108,7 +108,7 @@ class VMTensor:
     @property
     def step(self) -> float:
         """At which pictures sample it."""
-        step = self.space.STEP_PER_VOXEL * float(self.voxel_size.min())
+        step = self.space.picture_step(float(self.voxel_size.min()))
         return min(step, DETAIL_STEP * min(self.hashed.spacings)) if self.hashed else step
 
     @property
