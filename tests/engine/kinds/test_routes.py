@@ -237,7 +237,7 @@ def test_a_place_is_asked_by_its_own_step_before_an_object_too(monkeypatch):
     by_routes.by_routes = True
     alone, found, handed_on = (render_rays(one, rays_o, rays_d, **whole) for one in (noisy, field, by_routes))
     assert alone[:, 3].std() > 0.1
-    assert abs(found - alone)[:, 3].max() < 5e-3 and abs(handed_on - alone)[:, 3].max() < 5e-3
+    assert abs(found - alone)[:, 3].max() < 1e-2 and abs(handed_on - alone)[:, 3].max() < 1e-2
 
 
 def test_a_place_hands_a_ray_on_between_two_of_its_samples_in_the_core():
