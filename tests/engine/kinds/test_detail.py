@@ -93,11 +93,11 @@ def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
     stored = VMField.from_state(*fine.state())
     for field in (fine, smaller, stored, fine.resampled(fine.aabb, (9, 9, 9))):
         assert sampling_step(field) == pytest.approx(DETAIL_STEP * 0.01)
-    texels = tuple(1000 * (n - 1) + 1 for n in (3, 3, 3))
-    assert replace(fine.tensors[0], resolution=texels).step < DETAIL_STEP * 0.01
-    assert [sampling_step(own) for own in blocks_of([Placed("a", fine, affine(2.0))]).alone] == [
-        pytest.approx(DETAIL_STEP * 0.01)
-    ]
+    many = replace(fine.tensors[0], resolution=(2001, 2001, 2001))
+    assert many.step == pytest.approx(STEP_PER_VOXEL * many.voxel_size.min())
+    blocks = blocks_of([Placed("a", fine, affine(2.0))])
+    assert sampling_step(blocks) == pytest.approx(2 * DETAIL_STEP * 0.01)
+    assert sampling_step(blocks.alone[0]) == pytest.approx(DETAIL_STEP * 0.01)
 
 
 def test_blocks_keep_it_and_share_it():

@@ -88,12 +88,10 @@ class VMTensor:
 
     @cached_property
     def occupancy(self) -> OccupancyGrid:
-        """The occupancy grid in the object's frame."""
-        return (
-            replace(OccupancyGrid.full(self.aabb, space=self.space), unit=self.unit)
-            if self.occupied is None
-            else OccupancyGrid(self.aabb, self.occupied, self.space, unit=self.unit)
-        )
+        """The occupancy grid in the object's frame, which says how closely pictures sample it."""
+        full = OccupancyGrid.full(self.aabb, space=self.space)
+        occupied = full.occupied if self.occupied is None else self.occupied
+        return replace(full, occupied=occupied, unit=self.step)
 
     @property
     def apart(self) -> np.ndarray:
@@ -110,11 +108,6 @@ class VMTensor:
         """At which pictures sample it."""
         step = self.space.picture_step(float(self.voxel_size.min()))
         return min(step, DETAIL_STEP * min(self.hashed.spacings)) if self.hashed else step
-
-    @property
-    def unit(self) -> float:
-        """That of its occupancy grid: the step where that follows from the detail, not from the texels."""
-        return self.step if self.hashed else 0.0
 
 
 @dataclass(frozen=True)
@@ -260,7 +253,7 @@ class VMField(ComputedField):
         aabb = np.asarray(aabb, np.float64)
         resized = replace(tensor, resolution=resolution, aabb=aabb)
         params = pages.zeros(resized.size(self.shape), self.params.dtype)
-        occupancy = replace(self.occupancy, unit=resized.unit)
+        occupancy = replace(self.occupancy, unit=resized.step)
         new = VMField(self.shape, (resized,), (block,), params, occupancy)
         at = [unit_texels(aabb, tensor.aabb, axis, resolution[axis]) for axis in range(3)]
         old, target = self.sections(0), new.sections(0)
