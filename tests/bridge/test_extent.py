@@ -160,6 +160,9 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
         found = settings(**words)
         assert found.way.hashed is training.HASHED
         assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
+        larger = "time_budget" in words or "quality" in words
+        named = training.QUALITY[words.get("quality", "normal")]
+        assert (found.samples / named.samples, named.steps / found.steps) == ((2, 2) if larger else (1, 1))
     assert settings(quality="draft").way.hashed is None
     assert settings(max_size=12_000_000).way.hashed is None
     assert settings("cp").way.hashed is None and settings(bounded=True).way.hashed is None
