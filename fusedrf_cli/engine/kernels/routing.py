@@ -10,13 +10,16 @@ from fusedrf_cli.engine.kernels.parts import FACE_TOLERANCE, along, body, cell_o
 from fusedrf_cli.engine.kernels.plain import RAYS_PER_TASK, loop, task
 
 NOWHERE = 1e30  # further than any ray goes
+RAYS_OF_TILE = 256  # which lie close together in pictures (`tile_order` of rendering/cameras.py)
+ROUNDING = 1e-6  # of angles, in radians, and of distances, by which rays may come nearer than is reckoned
 
 
 @body
-def matter_at(o, d, matrix, apart, first, nx, ny, nz):
-    """Where along a ray o + t d, from t = 0 on, the first cell with matter of a grid begins, or NOWHERE: from
-    an empty cell it goes as far as there is no other. matrix (3, 4) takes points to where the grid's box is
-    the unit cube; apart[first:] is how many cells each of its cells is from the nearest with matter."""
+def matter_at(o, d, end, matrix, apart, first, nx, ny, nz):
+    """Where along a ray o + t d, from t = 0 to the end, the first cell with matter of a grid begins, or
+    NOWHERE: from an empty cell it goes as far as there is no other. matrix (3, 4) takes points to where the
+    grid's box is the unit cube; apart[first:] is how many cells each of its cells is from the nearest with
+    matter."""
     x, y, z = o
     dx, dy, dz = d
     m = matrix
@@ -30,8 +33,9 @@ def matter_at(o, d, matrix, apart, first, nx, ny, nz):
         ny * (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz),
         nz * (m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz),
     )
-    t, end = hit_box(origin, way, (0.0, 0.0, 0.0), (float(nx), float(ny), float(nz)))
-    start, u, length = along(origin, way, t), 0.0, end - t  # so that steps are seen however far away t is
+    t, leaves = hit_box(origin, way, (0.0, 0.0, 0.0), (float(nx), float(ny), float(nz)))
+    # From where the ray enters, so that steps are seen however far away that is.
+    start, u, length = along(origin, way, t), 0.0, min(end, leaves) - t
     least = FACE_TOLERANCE / max(abs(way[0]), max(abs(way[1]), abs(way[2])))
     while u < length:
         x, y, z = along(start, way, u)
@@ -48,6 +52,16 @@ def matter_at(o, d, matrix, apart, first, nx, ny, nz):
 
 
 @body
+def matter_from_core(o, d, matrix, apart, first, nx, ny, nz):
+    """`matter_at` of a grid over all of space, of whose cells only those in the core are told apart: beyond,
+    its matter is everywhere."""
+    t, end = hit_box(o, d, (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    if t > 0.0 or end <= 0.0:
+        return 0.0
+    return min(end, matter_at(o, d, end, matrix, apart, first, nx, ny, nz))
+
+
+@body
 def comes_near(o, d, ball, end):
     """Whether a ray o + t d comes into a ball (centre and radius) with 0 <= t < end."""
     x, y, z = ball[0] - o[0], ball[1] - o[1], ball[2] - o[2]
@@ -56,37 +70,90 @@ def comes_near(o, d, ball, end):
     return x * x + y * y + z * z <= ball[3] * ball[3] and t + ball[3] >= 0 and t - ball[3] < end
 
 
-@task
-def first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, low, high, first, second):
-    """`first_two` for rays low..high."""
+@body
+def bundle_of(rays_o, rays_d, low, high):
+    """A cone that holds the unit directions of rays low..high, and a ball that holds their origins: centre,
+    radius, axis and half angle."""
+    x, y, z = rays_o[low, 0], rays_o[low, 1], rays_o[low, 2]
+    dx, dy, dz, wide = 0.0, 0.0, 0.0, 0.0
     for i in range(low, high):
-        o, d = (rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]), (rays_d[i, 0], rays_d[i, 1], rays_d[i, 2])
-        nearest, next_nearest, which = NOWHERE, NOWHERE, -1
-        for b in range(to_unit.shape[0]):
-            at = -1.0
-            if balls[b, 3] < NOWHERE:
-                if not comes_near(o, d, balls[b], next_nearest):
+        dx, dy, dz = dx + rays_d[i, 0], dy + rays_d[i, 1], dz + rays_d[i, 2]
+        ox, oy, oz = rays_o[i, 0] - x, rays_o[i, 1] - y, rays_o[i, 2] - z
+        wide = max(wide, ox * ox + oy * oy + oz * oz)
+    length, least = math.sqrt(dx * dx + dy * dy + dz * dz), 1.0
+    if length <= 0.0:
+        return (x, y, z), math.sqrt(wide), (1.0, 0.0, 0.0), math.pi
+    dx, dy, dz = dx / length, dy / length, dz / length
+    for i in range(low, high):
+        least = min(least, rays_d[i, 0] * dx + rays_d[i, 1] * dy + rays_d[i, 2] * dz)
+    return (x, y, z), math.sqrt(wide), (dx, dy, dz), math.acos(max(least, -1.0))
+
+
+@body
+def may_come_near(bundle, ball):
+    """Whether a ray of a bundle, see `bundle_of`, may come into a ball (centre and radius)."""
+    centre, wide, axis, angle = bundle
+    x, y, z = ball[0] - centre[0], ball[1] - centre[1], ball[2] - centre[2]
+    far, radius = math.sqrt(x * x + y * y + z * z), ball[3] + wide
+    if far * (1 - ROUNDING) <= radius:
+        return True
+    off = math.acos(min(max((x * axis[0] + y * axis[1] + z * axis[2]) / far, -1.0), 1.0))
+    return off - math.asin(radius / far) <= angle + ROUNDING
+
+
+@body
+def balls_before(rays_o, rays_d, balls, low, high):
+    """The bits of the balls, of which there are at most 64, that one of rays low..high may come into: most of
+    a picture's tiles come to few."""
+    bundle, bits = bundle_of(rays_o, rays_d, low, high), np.uint64(0)
+    for b in range(balls.shape[0]):
+        if balls[b, 3] >= NOWHERE or may_come_near(bundle, balls[b]):
+            bits |= np.uint64(1) << np.uint64(b)
+    return bits
+
+
+@task
+def first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, everywhere, low, high, first, second):
+    """`first_two` for rays low..high."""
+    for begin in range(low, high, RAYS_OF_TILE):
+        end = min(high, begin + RAYS_OF_TILE)
+        bits = balls_before(rays_o, rays_d, balls, begin, end)
+        for i in range(begin, end):
+            o, d = (rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]), (rays_d[i, 0], rays_d[i, 1], rays_d[i, 2])
+            nearest, next_nearest, which, left, b = NOWHERE, NOWHERE, -1, bits, -1
+            while left != np.uint64(0):
+                b += 1
+                asked = left & np.uint64(1)
+                left >>= np.uint64(1)
+                if asked == np.uint64(0):
                     continue
-                nx, ny, nz = apart_at[b, 1], apart_at[b, 2], apart_at[b, 3]
-                at = matter_at(o, d, to_unit[b], apart, apart_at[b, 0], nx, ny, nz)
-            if at < nearest:
-                which, nearest, next_nearest = b, at, nearest
-            elif at < next_nearest:
-                next_nearest = at
-        first[i], second[i] = which, next_nearest
+                endless, nx, ny, nz = balls[b, 3] >= NOWHERE, apart_at[b, 1], apart_at[b, 2], apart_at[b, 3]
+                if endless and everywhere:
+                    at = -1.0
+                elif endless:
+                    at = matter_from_core(o, d, to_unit[b], apart, apart_at[b, 0], nx, ny, nz)
+                elif comes_near(o, d, balls[b], next_nearest):
+                    at = matter_at(o, d, NOWHERE, to_unit[b], apart, apart_at[b, 0], nx, ny, nz)
+                else:
+                    continue
+                if at < nearest:
+                    which, nearest, next_nearest = b, at, nearest
+                elif at < next_nearest:
+                    next_nearest = at
+            first[i], second[i] = which, next_nearest
 
 
 @loop
-def first_two(rays_o, rays_d, to_unit, apart, apart_at, balls, threads, first, second):
-    """For every ray (N, 3) the first of several placed grids in which it comes to a cell with matter, or -1,
-    into first (N,) int16, and how far along it such cells of a second one begin, or NOWHERE, into second
+def first_two(rays_o, rays_d, to_unit, apart, apart_at, balls, everywhere, threads, first, second):
+    """For every ray (N, 3) the first of at most 64 placed grids in which it comes to a cell with matter, or
+    -1, into first (N,) int16, and how far along it such cells of a second one begin, or NOWHERE, into second
     (N,).
 
     to_unit (B, 3, 4) takes points to where the box of a grid is the unit cube; apart is how many cells each
     cell is from the nearest with matter, flat, of all grids, and apart_at (B, 4) where in it that of a grid
     begins, and its cells per axis; balls (B, 4) is where a ball around its matter has its centre, and its
-    radius: of a grid without end it is infinite, and its matter is everywhere. Tasks are dealt to so many
-    threads as in `each` of loops.py.
+    radius: of a grid without end it is infinite, and its matter is `everywhere`, or in the core where its
+    cells have some. Tasks are dealt to so many threads as in `each` of loops.py.
     """
     n = rays_o.shape[0]
     tasks = (n + RAYS_PER_TASK - 1) // RAYS_PER_TASK
@@ -94,7 +161,49 @@ def first_two(rays_o, rays_d, to_unit, apart, apart_at, balls, threads, first, s
     for turn in prange(each_has * threads):
         part = turn % each_has * threads + turn // each_has
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
-        first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, low, high, first, second)
+        first_two_task(
+            rays_o, rays_d, to_unit, apart, apart_at, balls, everywhere, low, high, first, second
+        )
+
+
+@task
+def handed_on_task(rays_o, rays_d, reach, first, second, own_step, low, high, until):
+    """`handed_on` for rays low..high."""
+    for i in range(low, high):
+        near, at, b = reach[i, 0], second[i], first[i]
+        step = own_step[b] if b >= 0 else 0.0
+        if step < 0.0:
+            until[i] = near
+        elif at >= NOWHERE:
+            until[i] = NOWHERE
+        elif step == 0.0:
+            until[i] = max(near, at)
+        else:
+            o, d = (rays_o[i, 0], rays_o[i, 1], rays_o[i, 2]), (rays_d[i, 0], rays_d[i, 1], rays_d[i, 2])
+            enters, leaves = hit_box(o, d, (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+            begin, end = max(near, enters), max(near, at)
+            if begin >= leaves or end < begin:
+                until[i] = near
+            elif end < leaves:
+                until[i] = begin + math.floor((end - begin) / step) * step
+            else:
+                until[i] = leaves
+
+
+@loop
+def handed_on(rays_o, rays_d, reach, first, second, own_step, until):
+    """For every ray (N, 3), which comes to grids as `first_two` says, how far along it only the first one
+    needs to be asked, into until (N,): its beginning, reach[:, 0], where that is nowhere so, NOWHERE where it
+    is so to its end.
+
+    own_step (B,) is 0 for a grid that ends. One without end hands a ray on between two of its samples: in the
+    core, where they are own_step apart, or where the core ends and samples begin anew, or at its beginning;
+    where own_step is negative, it hands all of a ray on.
+    """
+    n = rays_o.shape[0]
+    for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
+        low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
+        handed_on_task(rays_o, rays_d, reach, first, second, own_step, low, high, until)
 
 
 @task

@@ -12,7 +12,7 @@ from numba import get_num_threads
 
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.kernels.loops import Rays
-from fusedrf_cli.engine.kernels.routing import NOWHERE, first_two, put_behind, taken
+from fusedrf_cli.engine.kernels.routing import NOWHERE, first_two, handed_on, put_behind, taken
 from fusedrf_cli.engine.kinds.vm.field import VMField
 
 Shown = Callable[[Rays, np.ndarray], None]
@@ -22,19 +22,60 @@ Shown = Callable[[Rays, np.ndarray], None]
 def show_by_routes(field: VMField, together: Shown, rays: Rays, out: np.ndarray) -> None:
     """Fill out (N, 5) as ComputedField.show does; `together` is that of all blocks.
 
-    A ray is followed through its first block up to where it comes to cells with matter of a second one, and
-    from there, if light is left, through all of them.
+    A ray is followed through its first block up to where it comes to cells with matter of a second one; if
+    light is left, through that one as far as there is matter of no other; and from there through all of them.
     """
     first, second = met_blocks(field, rays)
     near, far = np.ascontiguousarray(rays.reach.T)
     steps = own_steps(field, rays.step)
     until = alone_until(field, rays, first, second, steps)
-    out[:], end = 0, np.minimum(far, until)
-    for b, chosen in by_number(np.where(until > near, first, -1)):
+    end = np.minimum(far, until)
+    numbers = np.where(until > near, first, np.int16(-1))
+    if numbers.size and numbers.min() == numbers.max() and lies_in(field, numbers[0]):
+        own = rays._replace(reach=np.stack([near, end], 1), step=steps[numbers[0]])
+        field.alone[numbers[0]].show(own, out)  # as most of a picture's rays in a place: without copies
+    else:
+        out[:] = 0
+        for b, chosen in by_number(numbers):
+            own = rays._replace(step=steps[b])
+            show_behind(field.alone[b].show, own, chosen, near, end, field.blocks[b].object_to_field, out)
+    show_second(field, rays, lit(rays, until, far, out), until, far, steps, out)
+    show_behind(together, rays, lit(rays, until, far, out), until, far, np.eye(4), out)
+
+
+def lit(rays: Rays, until: np.ndarray, far: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """(M,) those rays that go on from `until` (N,), by what they have shown so far."""
+    return np.flatnonzero((until < np.minimum(far, NOWHERE)) & (out[:, 3] < 1 - rays.early_stop))
+
+
+def show_second(
+    field: VMField,
+    rays: Rays,
+    left: np.ndarray,
+    until: np.ndarray,
+    far: np.ndarray,
+    steps: list[float],
+    out: np.ndarray,
+) -> None:
+    """Follow the rays left (M,) from until (N,) on through the bounded block whose matter comes next, up to
+    where that of another one does, and move `until` there. A ray that comes to matter of a place next stays
+    where it is: the place is asked together with all others there."""
+    endless = np.isinf(field.balls[:, 3])
+    if not len(left) or np.asarray(field.crossings)[endless].any():
+        return
+    beyond = rays.rays_o[left] + until[left, None] * rays.rays_d[left]
+    found, further = met_blocks(field, rays._replace(rays_o=beyond, rays_d=rays.rays_d[left]), False)
+    found[np.append(endless, False)[found]] = -2
+    begin, until[left] = until.copy(), np.where(found != -2, until[left] + further, until[left])
+    end = np.minimum(far, until)
+    for b, chosen in by_number(np.maximum(found, -1)):
         own = rays._replace(step=steps[b])
-        show_behind(field.alone[b].show, own, chosen, near, end, field.blocks[b].object_to_field, out)
-    left = np.flatnonzero((until < np.minimum(far, NOWHERE)) & (out[:, 3] < 1 - rays.early_stop))
-    show_behind(together, rays, left, until, far, np.eye(4), out)
+        show_behind(field.alone[b].show, own, left[chosen], begin, end, field.blocks[b].object_to_field, out)
+
+
+def lies_in(field: VMField, b: int) -> bool:
+    """Whether the frame of block b, -1 for none, is the field's own."""
+    return b >= 0 and np.array_equal(field.blocks[b].object_to_field, np.eye(4))
 
 
 def own_steps(field: VMField, step: float) -> list[float]:
@@ -49,20 +90,12 @@ def alone_until(
     its beginning where that is not so from there on, NOWHERE where it meets no second one.
 
     A background is the first of every ray, and has detail finer than its step: the ray is handed on between
-    two of its samples, in the core, where they are evenly apart, and nowhere else.
+    two of its samples, in the core, where they are evenly apart, or where the core ends.
     """
-    near = rays.reach[:, 0]
-    until = np.where(second < NOWHERE, np.maximum(near, second), NOWHERE)
-    for b in np.flatnonzero(np.isinf(field.balls[:, 3])).tolist():
-        his = first == b
-        if field.crossings[b] != 0:
-            until[his] = near[his]
-            continue
-        his &= second < NOWHERE
-        o, d, begin, end = rays.rays_o[his], rays.rays_d[his], near[his, None], until[his, None]
-        in_core = (abs(o + begin * d) <= 1).all(1) & (abs(o + end * d) <= 1).all(1)
-        cut = begin + np.floor((end - begin) / steps[b]) * steps[b]
-        until[his] = np.where(in_core, cut[:, 0], near[his])
+    own_step = np.where(np.isinf(field.balls[:, 3]), steps, 0.0)
+    own_step[(own_step > 0) & (np.asarray(field.crossings) != 0)] = -1
+    until = np.empty(len(first))
+    handed_on(rays.rays_o, rays.rays_d, np.ascontiguousarray(rays.reach), first, second, own_step, until)
     return until
 
 
@@ -75,14 +108,14 @@ def by_number(numbers: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
             yield number, order[low:high]
 
 
-def met_blocks(field: VMField, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+def met_blocks(field: VMField, rays: Rays, everywhere: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """(N,) the first block that each of the rays comes to, or -1, and (N,) where it comes to a second one, or
-    NOWHERE."""
+    NOWHERE; a place is met everywhere, or only where it has matter."""
     first, second = np.empty(len(rays.rays_o), np.int16), np.empty(len(rays.rays_o))
     apart, apart_at = field.apart
     at = apart_at[[block.tensor for block in field.blocks]]
     placed = field.to_unit, apart, at, field.balls
-    first_two(rays.rays_o, rays.rays_d, *placed, get_num_threads(), first, second)
+    first_two(rays.rays_o, rays.rays_d, *placed, everywhere, get_num_threads(), first, second)
     return first, second
 
 
