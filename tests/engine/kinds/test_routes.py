@@ -25,6 +25,7 @@ from fusedrf_cli.engine.kinds.vm.routes import (
     own_steps,
     show_behind,
     show_second,
+    twin,
 )
 from fusedrf_cli.engine.rendering.cameras import framing_camera, tile_order
 from fusedrf_cli.engine.rendering.volume import render_rays, seen_from
@@ -150,12 +151,12 @@ def test_tiles_ask_all_balls_that_a_ray_comes_into():
         assert 0.1 < (first >= 0).mean() < 0.99 and len(set(first.tolist())) > 10
 
 
-@pytest.mark.parametrize("matrix", [STRETCHED, np.eye(4)], ids=["stretched", "as it is"])
-def test_some_rays_are_shown_in_another_frame_and_put_behind_what_there_is(matrix):
+def test_some_rays_are_shown_in_other_frames_and_put_behind_what_there_is():
     rng = np.random.default_rng(4)
     rays_o, rays_d = rays_at(np.array([-1, -1, -1, 1, 1, 1.0]), 5000, 2)
     begin, end = rng.random(5000), 2 + rng.random(5000)
     chosen = rng.permutation(5000)[:4321]
+    parts = [(STRETCHED, chosen[:3000]), (np.eye(4), chosen[3000:4000]), (shift(0.5), chosen[4000:])]
     before = rng.random((5000, 5)).astype(np.float32)
     behind = rng.random((4321, 5)).astype(np.float32)
     seen = []
@@ -165,17 +166,38 @@ def test_some_rays_are_shown_in_another_frame_and_put_behind_what_there_is(matri
         found[:] = behind
 
     out = before.copy()
-    show_behind(show, Rays(rays_o, rays_d, None, 0.1, 0.0), chosen, begin, end, matrix, out)
-    own_o, own_d, lengths = seen_from(matrix, rays_o[chosen], rays_d[chosen])
-    lengths = np.broadcast_to(lengths, 4321)
-    np.testing.assert_allclose(seen[0].rays_o, own_o, atol=1e-12)
-    np.testing.assert_allclose(seen[0].rays_d, own_d, atol=1e-12)
+    show_behind(show, Rays(rays_o, rays_d, None, 0.1, 0.0), parts, begin, end, out)
+    own = [seen_from(matrix, rays_o[some], rays_d[some]) for matrix, some in parts]
+    lengths = np.concatenate([np.broadcast_to(found[2], len(found[0])) for found in own])
+    np.testing.assert_allclose(seen[0].rays_o, np.concatenate([found[0] for found in own]), atol=1e-12)
+    np.testing.assert_allclose(seen[0].rays_d, np.concatenate([found[1] for found in own]), atol=1e-12)
     reach = np.stack([begin[chosen] * lengths, end[chosen] * lengths], 1)
     np.testing.assert_allclose(seen[0].reach, reach, atol=1e-12)
     behind[:, 4] /= lengths
     wanted = before.copy()
     wanted[chosen] += (1 - before[chosen, 3:4]) * behind
     np.testing.assert_allclose(out, wanted, atol=1e-6)
+
+
+def test_only_copies_of_one_object_in_one_colour_are_twins():
+    """A row of the same ball, of which two are tinted, is seen as each of them is alone."""
+    kind = registry.kind("vm")
+    red, blue = kind.tinted(ball(), (1.0, 0.3, 0.2)), kind.tinted(ball(), (0.2, 0.3, 1.0))
+    row = [ball(), red, ball(), blue, red]
+    field = blocks_of([Placed(str(i), one, shift(2.5 * (i - 2))) for i, one in enumerate(row)])
+    kinds = [twin(field, b) for b in range(5)]
+    shown = field.for_pictures(WORTH_TELLING)
+    colours = []
+    for i, b in enumerate(kinds):
+        rays_o = np.array([[2.5 * (i - 2), 0.0, -4.0]]) + np.linspace(-0.3, 0.3, 50)[:, None]
+        rays_d = np.tile([0.0, 0, 1], (50, 1))
+        together, found = (render_rays(one, rays_o, rays_d) for one in (field, shown))
+        assert abs(found - together)[:, :4].max() < 0.02
+        colours.append(found[:, :3].mean(0))
+        alone = kinds.index(b)
+        np.testing.assert_allclose(colours[i], colours[alone], atol=2e-3)
+    assert kinds[0] == kinds[2] == 0 and kinds[1] == kinds[4] and len(set(kinds)) == 3
+    assert min(abs(colours[0] - colours[1]).max(), abs(colours[1] - colours[3]).max()) > 0.1
 
 
 def test_places_are_told_by_the_number_there():

@@ -5,7 +5,7 @@ matter of one block alone, or end in a first one before they come to that of a s
 answers alone, as a field of one tensor does.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from numba import get_num_threads
@@ -36,11 +36,9 @@ def show_by_routes(field: VMField, together: Shown, rays: Rays, out: np.ndarray)
         field.alone[numbers[0]].show(own, out)  # as most of a picture's rays in a place: without copies
     else:
         out[:] = 0
-        for b, chosen in by_number(numbers):
-            own = rays._replace(step=steps[b])
-            show_behind(field.alone[b].show, own, chosen, near, end, field.blocks[b].object_to_field, out)
+        show_alone(field, rays, by_number(numbers), near, end, steps, out)
     show_second(field, rays, lit(rays, until, far, out), until, far, steps, out)
-    show_behind(together, rays, lit(rays, until, far, out), until, far, np.eye(4), out)
+    show_behind(together, rays, [(np.eye(4), lit(rays, until, far, out))], until, far, out)
 
 
 def lit(rays: Rays, until: np.ndarray, far: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -68,9 +66,33 @@ def show_second(
     found[np.append(endless, False)[found]] = -2
     begin, until[left] = until.copy(), np.where(found != -2, until[left] + further, until[left])
     end = np.minimum(far, until)
-    for b, chosen in by_number(np.maximum(found, -1)):
-        own = rays._replace(step=steps[b])
-        show_behind(field.alone[b].show, own, left[chosen], begin, end, field.blocks[b].object_to_field, out)
+    met = ((b, left[chosen]) for b, chosen in by_number(np.maximum(found, -1)))
+    show_alone(field, rays, met, begin, end, steps, out)
+
+
+def show_alone(
+    field: VMField,
+    rays: Rays,
+    met: Iterable[tuple[int, np.ndarray]],
+    begin: np.ndarray,
+    end: np.ndarray,
+    steps: list[float],
+    out: np.ndarray,
+) -> None:
+    """Composite behind what out (N, 5) has what blocks show alone from and to distances begin and end (N,):
+    of each block by its number rays (M,). Copies of one object are asked at once, since work in small pieces
+    leaves cores idle."""
+    placed: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for b, chosen in met:
+        placed.setdefault(twin(field, b), []).append((field.blocks[b].object_to_field, chosen))
+    for b, parts in placed.items():
+        show_behind(field.alone[b].show, rays._replace(step=steps[b]), parts, begin, end, out)
+
+
+def twin(field: VMField, b: int) -> int:
+    """The first block that shows in its object's frame what block b shows in its own."""
+    tensor, tint = field.blocks[b].tensor, field.blocks[b].tint
+    return next(i for i, o in enumerate(field.blocks) if o.tensor == tensor and np.array_equal(o.tint, tint))
 
 
 def lies_in(field: VMField, b: int) -> bool:
@@ -122,18 +144,20 @@ def met_blocks(field: VMField, rays: Rays, everywhere: bool = True) -> tuple[np.
 def show_behind(
     show: Shown,
     rays: Rays,
-    chosen: np.ndarray,
+    parts: list[tuple[np.ndarray, np.ndarray]],
     begin: np.ndarray,
     end: np.ndarray,
-    matrix: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Composite behind what out (N, 5) has what rays chosen (M,) show, from and to distances begin and end
-    (N,), in a frame that lies at matrix (4, 4) of theirs; the step is that frame's."""
-    count, turn = len(chosen), matrix[:3, :3]
+    """Composite behind what out (N, 5) has what some rays show from and to distances begin and end (N,): in
+    each part rays chosen (M,) in a frame that lies at a matrix (4, 4) of theirs; the step is that frame's."""
+    ends = np.cumsum([0, *(len(chosen) for _, chosen in parts)])
+    count = ends[-1]
     own_o, own_d, reach = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2))
     lengths, found = np.empty(count), np.zeros((count, 5), out.dtype)
-    placing = np.linalg.inv(turn), matrix[:3, 3].copy(), not np.array_equal(turn, np.eye(3))
-    taken(rays.rays_o, rays.rays_d, begin, end, chosen, placing, own_o, own_d, reach, lengths)
+    for (matrix, chosen), low, high in zip(parts, ends[:-1], ends[1:], strict=True):
+        turn, own = matrix[:3, :3], (own_o[low:high], own_d[low:high], reach[low:high], lengths[low:high])
+        placing = np.linalg.inv(turn), matrix[:3, 3].copy(), not np.array_equal(turn, np.eye(3))
+        taken(rays.rays_o, rays.rays_d, begin, end, chosen, placing, *own)
     show(rays._replace(rays_o=own_o, rays_d=own_d, reach=reach), found)
-    put_behind(found, lengths, chosen, out)
+    put_behind(found, lengths, np.concatenate([chosen for _, chosen in parts]), out)
