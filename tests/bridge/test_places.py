@@ -217,6 +217,15 @@ def test_a_place_takes_the_dearest_precision_that_leaves_room():
     assert type(kind.student(summed, StudentRequest(sizes, 10**7))) is Student
 
 
+def test_bricks_of_a_place_hold_its_colours_from_all_sides():
+    """Fitted by fewer harmonics, those of sides that no photo shows would change those that some do."""
+    room = ComposedField([Placed("room", reshaped(fine_walls(), VMShape(16, 16, 2)), LIES)])
+    thing = ComposedField([Placed("thing", random_vm(dtype=torch.float32, cells=4), np.eye(4))])
+    for scene, asked, degree in ((room, None, 2), (thing, None, 1), (room, 1, 1), (thing, 2, 2)):
+        request = StudentRequest(BundleSizes(), 10**7, sh_degree=asked)
+        assert registry.kind("sparse").student(scene, request).plain().sh_degree == degree
+
+
 @pytest.mark.slow
 def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report):
     """What stands around stays as it was, and the object comes in, where there are texels for it."""
