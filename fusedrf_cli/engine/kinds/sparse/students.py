@@ -43,7 +43,7 @@ PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squar
 BYTES_PER_BRICK = 10  # masks and nodes
 DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0
 # Places are photographed from few sides, and what they say to others is anything: fitted by a lower degree,
-# it changes what photos do show: a park's surfaces stay at 22 dB to what they were.
+# it changes what photos do show. A park in 50 MB, before rays: 24.2 dB by degree 1, 30.0 by 2.
 DEGREE_IN_PLACE = 2
 DEGREES = (0, 1, 2)
 TRIES, SMALLER = 3, 0.97  # where a file is larger than was reckoned: by that factor under what would do

@@ -63,10 +63,10 @@ def show_second(
         return
     beyond = rays.rays_o[left] + until[left, None] * rays.rays_d[left]
     found, further = met_blocks(field, rays._replace(rays_o=beyond, rays_d=rays.rays_d[left]), False)
-    found[np.append(endless, False)[found]] = -2
-    begin, until[left] = until.copy(), np.where(found != -2, until[left] + further, until[left])
+    alone = ~np.append(endless, False)[found]  # the last stands for -1, where nothing comes any more
+    begin, until[left] = until.copy(), until[left] + np.where(alone, further, 0)
     end = np.minimum(far, until)
-    met = ((b, left[chosen]) for b, chosen in by_number(np.maximum(found, -1)))
+    met = ((b, left[chosen]) for b, chosen in by_number(np.where(alone, found, np.int16(-1))))
     show_alone(field, rays, met, begin, end, steps, out)
 
 
