@@ -45,5 +45,11 @@ def with_tints(arrays: NamedTuple, tints: np.ndarray) -> NamedTuple:
 
 @cache
 def tinted_arrays(plain: type) -> type:
-    """The type of a kind's Arrays with tints: one for each, since compiled code is kept by type."""
-    return NamedTuple(f"Tinted{plain.__name__}", [*plain.__annotations__.items(), ("tint", object)])
+    """The type of a kind's Arrays with tints: one for each, since compiled code is kept by type. It is found
+    in this module by its name, without which another process would take it for another type and compile all
+    loops over it again."""
+    name = f"{plain.__module__}.{plain.__qualname__}".replace(".", "_") + "_tinted"
+    made = NamedTuple(name, [*plain.__annotations__.items(), ("tint", object)])
+    made.__module__ = __name__
+    globals()[name] = made
+    return made

@@ -19,7 +19,8 @@ SCRIPT = """
 import numpy as np, sys, torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.kernels.loops import Answers, Points
-from fusedrf_cli.engine.kernels.specialise import Loops
+from fusedrf_cli.engine.kernels.specialise import TINTED, Loops
+from fusedrf_cli.engine.kernels.tinting import with_tints
 from fusedrf_cli.engine.spaces import bounded
 sys.path.insert(0, {folder!r})
 import toy
@@ -30,8 +31,10 @@ with kernels.telling_of_compilation(lambda: told.append(1)):
     for rank in map(int, sys.argv[1:]):
         found = Answers(np.zeros(1), np.zeros((1, 3)))
         asked = Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
-        loops = Loops(toy, {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}, bounded)
-        loops.each("query_point", field, grid, asked, 1, found)
+        sizes, arrays = {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}, field
+        if {tinted}:
+            sizes[TINTED], arrays = 1, with_tints(field, np.full((1, 3), 0.4))
+        Loops(toy, sizes, bounded).each("query_point", arrays, grid, asked, 1, found)
         print(found.sigma[0], found.rgb[0, 0])
 print(len(told))
 """
@@ -56,10 +59,13 @@ def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memo
 def ask(tmp_path):
     """What a process of its own answers for fields of some sizes, and whether it compiled anything."""
     (tmp_path / "toy.py").write_text(TOY)
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    # one thread: its loops take less long to compile, in a cache that is the engine's own choice
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
+    environment.pop("NUMBA_CACHE_DIR", None)
 
-    def run(*ranks: int) -> list[str]:
-        command = [sys.executable, "-c", SCRIPT.format(folder=str(tmp_path)), *map(str, ranks)]
+    def run(*ranks: int, tinted: bool = False) -> list[str]:
+        script = SCRIPT.format(folder=str(tmp_path), tinted=tinted)
+        command = [sys.executable, "-c", script, *map(str, ranks)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return done.stdout.split("\n")[:-1]
@@ -72,6 +78,12 @@ def test_sizes_have_code_of_their_own_and_a_second_process_compiles_nothing(ask)
     """Two sizes of one kind, in one cache: without a name of its own one would load the other's code."""
     assert ask(8, 16) == ["8.0 0.25", "16.0 0.25", "1"]
     assert ask(16, 8) == ["16.0 0.25", "8.0 0.25", "0"]
+
+
+def test_a_second_process_compiles_nothing_of_a_field_with_tints(ask):
+    """Its arrays are of a type made while running, which is to be found again by its name."""
+    assert ask(8, tinted=True) == ["8.0 0.1", "1"]
+    assert ask(8, tinted=True) == ["8.0 0.1", "0"]
 
 
 def test_a_changed_file_of_a_plug_in_is_compiled_anew(ask):
