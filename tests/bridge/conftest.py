@@ -5,7 +5,7 @@ import importlib
 import json
 import shutil
 import signal
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,9 @@ from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.distillation import distill, finish, fit
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.blocks import students as blocks
+from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistillSettings, Student
 from fusedrf_cli.engine.kinds.vm import editing, students
 from fusedrf_cli.engine.kinds.vm import field as vm
@@ -101,11 +103,15 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(part("looks"), "WHOLE", 2)
     patch.setattr(part("looks"), "MOST_OBJECTS", 0)
     patch.setattr(Student, "lesson", TinySettings())
+    patch.setattr(part("making"), "DistillSettings", TinySettings)  # for students that are not taught
+    for made in (SparseStudent, AskedStudent):
+        patch.setattr(made, "lesson", replace(made.lesson, views=2, view_size=32))
     patch.setattr(students, "SHAPE", SHAPE)
     patch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     patch.setattr(part("making"), "VIEWS_TO_CHOOSE_BY", 2)
     patch.setattr(finish, "RAYS_PER_STEP", 500)
     patch.setattr(finish, "STEPS", 30)
+    patch.setattr(finish.RayLesson.__init__, "__defaults__", (15_000,))  # as many as those steps take
     patch.setattr(part("editing"), "REGION_SETTINGS", TinySettings())
     patch.setattr(editing, "NUMBERS", SHAPE.size((20, 20, 20)))
     draft = FitSettings(longest=24, steps=60, samples=1 << 13)

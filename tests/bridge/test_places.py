@@ -19,7 +19,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import Student, StudentRequest, Way
+from fusedrf_cli.engine.kinds.student import Student, StudentRequest
 from fusedrf_cli.engine.kinds.vm.blocks import reshaped
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.places import PlaceStudent, turn_of
@@ -28,7 +28,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.spaces import bounded, unbounded
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.python import open_scene
-from tests.analytic.export import vm_field
+from tests.analytic.export import SHAPE, vm_field, way_of
 from tests.analytic.fields import Gaussian, Tint
 from tests.analytic.rays import unit
 from tests.bridge.conftest import done
@@ -41,7 +41,7 @@ LIES = np.array([[2.0, 0, 0, 0.1], [0, 2, 0, 0], [0, 0, 2, -0.2], [0, 0, 0, 1]])
 def walls(seed: int = 0) -> VMField:
     """A closed room of mottled walls far around the core, with a hashed detail, and nothing in it."""
     kind, generator = registry.kind("vm"), torch.Generator().manual_seed(seed)
-    way = Way(ranks=(8, 8), sh_degree=0, hashed=Hashed((1.0, 0.5), 256))
+    way = replace(way_of(SHAPE), hashed=Hashed((1.0, 0.5), 256))
     field = kind.create(kind.plan_at(WHOLE, (17,) * 3, way), generator)
     field.sections(0)["detail"].normal_(0, 0.1, generator=generator)
     middles = OccupancyGrid.full(WHOLE, 32, unbounded)
@@ -95,7 +95,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
     """To the bit in its numbers, over the cells of the scene; and not where more lies outside of it, where it
     is not the scene's frame, or where its numbers are too many."""
     room, thing = walls(), random_vm(dtype=torch.float32, cells=4)
-    kind, way = registry.kind("vm"), Way(ranks=(8, 8), sh_degree=0)
+    kind, way = registry.kind("vm"), way_of(SHAPE)
     small = Placed("thing", thing, LIES @ np.diag([0.3, 0.3, 0.3, 1]))
     scene = ComposedField([Placed("room", room, LIES), small])
 
@@ -104,7 +104,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
         return place_of(room, plan, scene)
 
     student = taken(scene.placed[0], scene)
-    assert student.shape == VMShape(8, 8, 0) and torch.equal(student.params, room.params)
+    assert student.shape == SHAPE and torch.equal(student.params, room.params)
     at = 12 * unit(np.random.default_rng(0).normal(size=(2000, 3)))
     points, dirs = torch.from_numpy(at * np.array([60, 1, 1])), torch.from_numpy(unit(at))
     (sigma, rgb), (wanted, colour) = student.query(points, dirs), room.query(points, dirs)

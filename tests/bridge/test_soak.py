@@ -16,7 +16,7 @@ def descriptors() -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="counts open files in /proc")
-@pytest.mark.parametrize("cycles", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cycles", [5, pytest.param(200, marks=pytest.mark.slow)])
 def test_cycles_of_add_and_delete_leave_nothing_behind(folder, cycles):
     """Memory within 5 %, open files and the folder's files as they were, the bundle no larger but for its
     history, its numbers those of the first."""

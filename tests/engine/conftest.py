@@ -33,7 +33,7 @@ __all__ = [
 
 
 def random_vm(
-    shape: VMShape = SIXTY_FOUR,
+    shape: VMShape | None = None,
     resolution=(5, 8, 7),
     dtype=torch.float64,
     seed: int = 0,
@@ -45,7 +45,8 @@ def random_vm(
     hashed: Hashed | None = None,
 ) -> VMField:
     """A one-block VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so
-    many cells."""
+    many cells. Its shape, where none is given, is what loops of its type are compiled for."""
+    shape = shape or (SIXTY_FOUR if dtype == torch.float64 else THIRTY_TWO)
     generator = torch.Generator().manual_seed(seed)
     grid = OccupancyGrid.full(aabb, cells or 1)
     if cells is not None:

@@ -28,7 +28,7 @@ def test_a_writer_killed_at_random_leaves_whole_packs(tmp_path):
     """P2: without commands around it, many times over."""
     path, rng, seen = tmp_path / "out", random.Random(0), set()
     write_generation(path, 1)
-    for _ in range(24):
+    for _ in range(12):
         writer = subprocess.Popen([sys.executable, "-m", "tests.promises.packs", "write", path], cwd=ROOT)
         before, deadline = path.stat().st_ino, time.monotonic() + 60
         while path.stat().st_ino == before and time.monotonic() < deadline:

@@ -80,7 +80,7 @@ def test_in_eight_bits_too_an_edit_touches_only_what_is_near():
     def coded(field: SparseField) -> SparseField:
         return field.stored(lambda array, name, runs: as_stored(array, "int8", name, runs))
 
-    first = coded(resampled(ball(voxel=0.02), SparseShape(1), 10**6))
+    first = coded(resampled(ball(voxel=0.03), SparseShape(1), 10**6))
     low, top = first.aabb[0], first.tree.top[0]
     small, far = (placed(ball(voxel=0.03, tint=BLUE), 0.1, (x, 0.1, 0)) for x in (0.9, low - 5.9 * top))
     fields = [first, coded(added(first, small))]

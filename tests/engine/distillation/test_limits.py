@@ -7,6 +7,9 @@ from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import orbit
+from tests.analytic.export import way_of
+
+from ..conftest import THIRTY_TWO
 
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
 
@@ -46,7 +49,7 @@ def test_a_fit_stays_inside():
     pixels[:, :3] = 90
     rays = [camera.rays() for camera in cameras]
     away = np.concatenate([np.linalg.norm(np.cross(o, d), axis=1) for o, d in rays])
-    settings = FitSettings(longest=24, steps=60, samples=1 << 12)
+    settings = FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=60, samples=1 << 12)
     limits = ball(32)
     field = FitRun.start(cameras, Pictures(pixels, away > 0.5), BOX, settings, limits=limits).finish()
     middles = field.occupancy.centres()

@@ -8,14 +8,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[3]
 SCRIPT = """
-import numba, numpy as np, torch
+import sys, numba, numpy as np, torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.rendering.volume import reach_of
-from tests.engine.conftest import points_in, random_vm, rays_at, unit
-field, rng = random_vm(cells=4), np.random.default_rng(1)
+from tests.engine.conftest import points_in, rays_at, unit
+from tests.engine.kinds.cases import KINDS
+field, rng = KINDS[sys.argv[1]](), np.random.default_rng(1)
 points, dirs = points_in(field.aabb, 20_000), unit(rng.normal(size=(20_000, 3)))
 points, dirs = torch.from_numpy(points), torch.from_numpy(dirs)
 d_sigma, d_rgb = torch.from_numpy(rng.random(20_000)), torch.from_numpy(rng.random((20_000, 3)))
@@ -35,10 +38,11 @@ for threads in (1, 2, 4):
 """
 
 
-def test_any_number_of_threads_gives_the_same_bytes():
+@pytest.mark.parametrize("kind", ["dense", pytest.param("vm", marks=pytest.mark.slow)])
+def test_any_number_of_threads_gives_the_same_bytes(kind):
+    """The loops over items are those of every kind; those of a grid are compiled soonest."""
     environment = os.environ | {"NUMBA_NUM_THREADS": "4"}
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], cwd=ROOT, env=environment, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", SCRIPT, kind]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n")[:-1] == ["1 True True", "2 True True", "4 True True"]

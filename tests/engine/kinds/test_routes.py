@@ -232,7 +232,7 @@ def scenes() -> dict[str, VMField]:
         "into each other": blocks_of(
             [Placed("one", one, STRETCHED), Placed("two", red, shift(0.5)), Placed("three", one, TURNED)]
         ),
-        "in a place": blocks_of([Placed("place", place(), np.eye(4)), Placed("one", one, small @ TURNED)]),
+        "in a place": blocks_of([Placed("place", place(), np.eye(4)), Placed("red", red, small @ TURNED)]),
         "in an airy place": blocks_of(
             [
                 Placed("place", airy(), np.eye(4)),
@@ -310,7 +310,7 @@ def test_a_place_is_asked_by_its_own_step_before_an_object_too(monkeypatch):
     """Where an object's cells are, but no matter of it, the place shows what it shows alone: a sample of its
     own is held for all of the object's, which are many times as dense."""
     monkeypatch.setattr(vm_field, "OWNERSHIP_CELLS", 8)  # no smaller than the place's voxels
-    noisy, clear = place(), ball()
+    noisy, clear = place(), registry.kind("vm").tinted(ball(), (1.0, 0.3, 0.2))  # as compiled for others
     for name, plane in noisy.sections(0).items():
         plane *= 100 if name.startswith("density_plane") else 1
     clear.tensors = (replace(clear.tensors[0], shift=-80.0),)

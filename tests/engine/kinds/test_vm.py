@@ -138,7 +138,7 @@ def assembled(*places: float, dtype=torch.float64) -> VMField:
     fields = [random_vm(seed=i, cells=4, dtype=dtype) for i in range(len(places))]
     blocks = tuple(Block(i, placed(x), f"block {i}") for i, x in enumerate(places))
     tensors, params = tuple(f.tensors[0] for f in fields), torch.cat([f.params for f in fields])
-    return VMField.assembled(SIXTY_FOUR, tensors, blocks, params)
+    return VMField.assembled(fields[0].shape, tensors, blocks, params)
 
 
 def test_several_blocks_need_owners():

@@ -11,6 +11,7 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.kinds.vm.blocks import reshaped
 from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
 from fusedrf_cli.engine.kinds.vm.reference import vm_products
 from fusedrf_cli.engine.kinds.vm_mlp import bodies
@@ -20,7 +21,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.analytic.export import way_of
 
-from ..conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
+from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
 from .cases import random_vm_mlp as random_field
 
 
@@ -61,7 +62,7 @@ def test_query_equals_a_slow_loop(matrix):
         unit(points_in(np.array([-1.0] * 3 + [1.0] * 3), 20, seed=5)),
     )
     sigma, rgb = field.query(torch.from_numpy(points), torch.from_numpy(dirs))
-    alone = field.factors.query(torch.from_numpy(points), torch.from_numpy(dirs))[0]
+    alone = reshaped(field.factors, SIXTY_FOUR).query(torch.from_numpy(points), torch.from_numpy(dirs))[0]
     torch.testing.assert_close(sigma, alone, rtol=1e-12, atol=0)
     for i in range(20):
         expected = slow_colour(field, points[i], dirs[i]) if sigma[i] > 0 else np.zeros(3)
@@ -200,9 +201,9 @@ def test_gradients_of_answers_are_finite_differences():
     )
 
 
-def test_what_fills_a_layer_up_stays_zero():
+def test_what_fills_a_layer_up_stays_zero(every_sample):
     """A width that is no multiple of 8: training moves the weights and nothing beside them."""
-    field = random_field(torch.float32, width=5)
+    field = random_field(width=5)
     views = list(field.weights.values())
     inside = torch.zeros_like(field.params)
     other = field.with_params(inside)
@@ -227,8 +228,8 @@ def test_the_network_learns_at_a_rate_of_its_own():
     assert network.high == field.params.numel() and network.low % 16 == network.high % 16 == 0
 
 
-def test_rays_that_meet_nothing_teach_nothing():
-    field = random_field(torch.float32)
+def test_rays_that_meet_nothing_teach_nothing(every_sample):
+    field = random_field()
     batch = batch_at(field)._replace(rays_d=-batch_at(field).rays_d)
     gradient, sums = trained(field, batch)
     assert np.isfinite(sums).all() and sums[2] == 0 and not gradient.any()

@@ -20,7 +20,7 @@ from fusedrf_cli.engine.rendering.differentiable import (
 from tests.analytic.rays import affine, turn
 
 from ..conftest import Gaussian, random_vm, rays_at
-from ..kinds.cases import KINDS, coarse_ownership  # noqa: F401  (a fixture)
+from ..kinds.cases import KINDS, SLOW_TO_COMPILE, coarse_ownership  # noqa: F401  (a fixture)
 
 STEP = 0.04
 CHECK = {"fast_mode": True, "eps": 1e-7, "atol": 1e-6, "rtol": 1e-6}
@@ -32,7 +32,10 @@ def coarse_occupancy(monkeypatch):
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
 
 
-@pytest.fixture(params=KINDS)
+TRIED = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW_TO_COMPILE else name for name in KINDS]
+
+
+@pytest.fixture(params=TRIED)
 def field(request):
     return KINDS[request.param]()
 

@@ -25,11 +25,13 @@ from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_ray
 from fusedrf_cli.engine.spaces import space_named, unbounded
 from fusedrf_cli.engine.spaces.unbounded import FAR, PIECES, WHOLE
 from tests.analytic.export import vm_field as exported
+from tests.analytic.export import way_of
 from tests.analytic.fields import Gaussian
 from tests.analytic.rays import affine, turn, unit
 
-from ..conftest import random_vm
+from ..conftest import SIXTY_FOUR, random_vm
 
+WAY = way_of(SIXTY_FOUR)  # of places too, so that blocks of them and of objects need no loops of their own
 GRID = OccupancyGrid.full(WHOLE, space=unbounded)
 SPACE = specialised(None, {}, unbounded)[1]
 
@@ -132,7 +134,7 @@ def test_the_map_has_an_inverse_in_every_form(radius):
 
 def even(sigma: float, resolution: int = 64) -> VMField:
     """A field whose numbers say one density everywhere, in float64, grey: sigma / n² per length."""
-    plan = registry.kind("vm").plan_at(WHOLE, (resolution,) * 3, Way(ranks=(8, 8)))
+    plan = registry.kind("vm").plan_at(WHOLE, (resolution,) * 3, WAY)
     field = registry.kind("vm").create(plan, torch.Generator().manual_seed(0)).with_occupancy(GRID)
     tensor = field.tensors[0]
     object.__setattr__(tensor, "shift", float(np.log(np.expm1(sigma / tensor.scale))))
@@ -164,7 +166,7 @@ def random_field(seed: int = 0, box: np.ndarray = WHOLE) -> VMField:
     of the cells is empty."""
     generator = torch.Generator().manual_seed(seed)
     kind = registry.kind("vm")
-    field = kind.create(kind.plan_at(box, (9, 9, 9), Way(ranks=(8, 8))), generator)
+    field = kind.create(kind.plan_at(box, (9, 9, 9), WAY), generator)
     occupied = np.random.default_rng(seed).random((8, 8, 8)) < 0.7
     numbers = torch.randn(len(field.params), generator=generator, dtype=torch.float64)
     field = field.with_occupancy(OccupancyGrid(box, occupied, unbounded)).with_params(0.5 * numbers)
@@ -174,6 +176,7 @@ def random_field(seed: int = 0, box: np.ndarray = WHOLE) -> VMField:
 
 def test_waves_and_the_one_pass_show_the_same():
     field = random_field()
+    field.sections(0)["colour_basis"].mul_(0.5)  # for colours as far apart as those of trained fields
     o = np.array([o for o, _ in rays(200)])
     d = np.array([d for _, d in rays(200)])
     out = np.zeros((len(o), 5), np.float32)
@@ -462,7 +465,8 @@ def test_a_place_is_sampled_alike_whatever_stands_in_it(monkeypatch):
 def test_no_sample_of_a_coarse_place_steps_over_a_fine_object(scale):
     """In thin fog with voxels of fifteen cells: a picture is the one with a sample at every step."""
     fog = even(0.002, 12)
-    ball = exported(Gaussian(60.0, (0, 0, 0), aabb=0.9 * np.array([-1.0, -1, -1, 1, 1, 1])))
+    gaussian = Gaussian(60.0, (0, 0, 0), aabb=0.9 * np.array([-1.0, -1, -1, 1, 1, 1]))
+    ball = exported(gaussian, shape=SIXTY_FOUR, dtype=torch.float64)
     matrix = affine(scale, (0.31, 0.17, 0.05))
     scene = ComposedField([Placed("fog", fog, np.eye(4)), Placed("ball", ball, matrix)])
     rng = np.random.default_rng(0)
