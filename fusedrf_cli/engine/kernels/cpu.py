@@ -1,10 +1,10 @@
 """Loops on the CPU, and how a field's numbers come to them."""
 
-from fusedrf_cli.engine.kernels.plain import adam, adam_lines, pinhole_rays, sums_of_rows, unbent
+from fusedrf_cli.engine.kernels.plain import adam, adam_lines, lens_rays, sums_of_rows, unbent
 from fusedrf_cli.engine.kernels.specialise import Loops, loops_for
 
 __all__ = [
-    "Loops", "adam", "adam_lines", "loops_for", "on_device", "pinhole_rays", "shared",
+    "Loops", "adam", "adam_lines", "lens_rays", "loops_for", "on_device", "shared",
     "sums_of_rows", "unbent",
 ]  # fmt: skip
 

@@ -418,19 +418,6 @@ def adam_line(params, grads, moment1, moment2, rate, start, beta1, beta2, eps, c
         grads[0, start + i] = zero
 
 
-@body
-def pinhole_ray(pose, fl_x, fl_y, cx, cy, width, top, order, i, rays_o, rays_d):
-    """The ray of pixel order[i]; see `pinhole_rays` in plain.py."""
-    row, column = order[i] // width, order[i] % width
-    x, y = (column + 0.5 - cx) / fl_x, -(top + row + 0.5 - cy) / fl_y
-    dx = pose[0, 0] * x + pose[0, 1] * y - pose[0, 2]
-    dy = pose[1, 0] * x + pose[1, 1] * y - pose[1, 2]
-    dz = pose[2, 0] * x + pose[2, 1] * y - pose[2, 2]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    rays_d[i, 0], rays_d[i, 1], rays_d[i, 2] = dx / length, dy / length, dz / length
-    rays_o[i, 0], rays_o[i, 1], rays_o[i, 2] = pose[0, 3], pose[1, 3], pose[2, 3]
-
-
 @careful
 def bend(u, v, distortion):
     """OpenCV's distortion of a lens: ideal normalised image coordinates (y down) to distorted ones (x, y),
@@ -480,6 +467,22 @@ def unbend(x, y, distortion):
         else:
             share = 0.5 * share
     return u, v
+
+
+@body
+def lens_ray(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, i, rays_o, rays_d):
+    """The ray of pixel order[i]; see `lens_rays` in plain.py."""
+    row, column = order[i] // width, order[i] % width
+    x, y = (column + 0.5 - cx) / fl_x, (top + row + 0.5 - cy) / fl_y
+    if bent:
+        x, y = unbend(x, y, distortion)
+    y = -y
+    dx = pose[0, 0] * x + pose[0, 1] * y - pose[0, 2]
+    dy = pose[1, 0] * x + pose[1, 1] * y - pose[1, 2]
+    dz = pose[2, 0] * x + pose[2, 1] * y - pose[2, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    rays_d[i, 0], rays_d[i, 1], rays_d[i, 2] = dx / length, dy / length, dz / length
+    rays_o[i, 0], rays_o[i, 1], rays_o[i, 2] = pose[0, 3], pose[1, 3], pose[2, 3]
 
 
 @body

@@ -13,7 +13,7 @@ from fusedrf_cli.engine.kernels.parts import (
     adam_line,
     bit_of,
     body,
-    pinhole_ray,
+    lens_ray,
     sum_of_rows,
     touched,
     unbend,
@@ -102,20 +102,21 @@ def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, 
 
 
 @task
-def pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d):
-    """`pinhole_rays` for rays low..high."""
+def lens_task(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, low, high, rays_o, rays_d):
+    """`lens_rays` for rays low..high."""
     for i in range(low, high):
-        pinhole_ray(pose, fl_x, fl_y, cx, cy, width, top, order, i, rays_o, rays_d)
+        lens_ray(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, i, rays_o, rays_d)
 
 
 @loop
-def pinhole_rays(pose, fl_x, fl_y, cx, cy, width, top, order, rays_o, rays_d):
-    """Rays (N, 3) of an undistorted camera at pose (4, 4), camera to world, OpenGL axes: ray i is that of
-    pixel order[i] (N,), counted row by row of `width` pixels from row `top` on."""
+def lens_rays(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, rays_o, rays_d):
+    """Rays (N, 3) of a camera at pose (4, 4), camera to world, OpenGL axes: ray i is that of pixel order[i]
+    (N,), counted row by row of `width` pixels from row `top` on. The lens is a pinhole or, where it is
+    `bent`, has a `distortion`, a tuple of nine (`parts.bend`)."""
     n = order.shape[0]
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
-        pinhole_task(pose, fl_x, fl_y, cx, cy, width, top, order, low, high, rays_o, rays_d)
+        lens_task(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, low, high, rays_o, rays_d)
 
 
 @task

@@ -42,15 +42,12 @@ class Camera:
         inner = (self.fl_x, self.fl_y, self.cx, self.cy, self.width, self.height)
         return (*inner, self.fisheye, *self.distortion)
 
-    @property
-    def bent(self) -> bool:
-        """Whether rays are other than a pinhole's."""
-        return self.fisheye or any(self.distortion)
-
     def seen_from(self, origin: np.ndarray) -> "Camera":
         """The same camera in a frame that lies at `origin` (4, 4), turned and scaled alike along all axes."""
-        pose = np.linalg.inv(origin) @ self.camera_to_world
+        inverse, pose = np.linalg.inv(origin[:3, :3]), np.eye(4)
+        pose[:3, :3] = inverse @ self.camera_to_world[:3, :3]
         pose[:3, :3] /= np.linalg.norm(pose[:3, 0])
+        pose[:3, 3] = inverse @ (self.camera_to_world[:3, 3] - origin[:3, 3])  # exact, however far away
         return replace(self, camera_to_world=pose)
 
     def local_directions(self, rows: slice = slice(None)) -> np.ndarray:
@@ -75,13 +72,14 @@ class Camera:
             order = np.arange((bottom - top) * self.width)
         rays_o, rays_d = np.empty((len(order), 3)), np.empty((len(order), 3))
         pose = np.ascontiguousarray(self.camera_to_world, np.float64)
-        if self.bent:
+        if self.fisheye:
             rays_d[:] = self.local_directions(rows).reshape(-1, 3)[order] @ pose[:3, :3].T
             rays_d /= np.linalg.norm(rays_d, axis=1, keepdims=True)
             rays_o[:] = pose[:3, 3]
         else:
-            inner = self.fl_x, self.fl_y, self.cx, self.cy
-            cpu.pinhole_rays(pose, *map(float, inner), self.width, top, order, rays_o, rays_d)
+            inner = map(float, (self.fl_x, self.fl_y, self.cx, self.cy))
+            lens = of_nine(self.distortion), any(self.distortion)
+            cpu.lens_rays(pose, *inner, *lens, self.width, top, order, rays_o, rays_d)
         return rays_o, rays_d
 
 

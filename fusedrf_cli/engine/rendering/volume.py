@@ -217,8 +217,7 @@ def render_bands(
     rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
     for top in range(0, camera.height, rows):
         order = tile_order(camera.width, min(rows, camera.height - top))
-        rays_o, rays_d = camera.rays(slice(top, top + rows), order)
-        rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
+        rays_o, rays_d, per_length = rays_from(origin, camera, slice(top, top + rows), order)
         reach = {"near": near * per_length, "far": far * per_length}
         found = render_rays(field, rays_o, rays_d, **reach, step=step, early_stop=early_stop)
         found[:, 4] /= per_length
@@ -229,6 +228,18 @@ def render_bands(
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(opacity > 1e-3, pixels[..., 4] / opacity, np.inf).astype(np.float32)
         yield RenderedImage(pixels[..., :3], opacity, depth)
+
+
+def rays_from(
+    origin: np.ndarray | None, camera: Camera, rows: slice, order: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
+    """`seen_from` of a camera's rays. A frame that is turned and scaled alike along all axes, as a place's
+    is, has a camera of its own: that is one pass over the rays less."""
+    if origin is not None and origin.shape == (4, 4):
+        squares = origin[:3, :3].T @ origin[:3, :3]
+        if np.allclose(squares, squares[0, 0] * np.eye(3), rtol=0, atol=1e-12 * squares[0, 0]):
+            return *camera.seen_from(origin).rays(rows, order), 1 / np.sqrt(squares[0, 0])
+    return seen_from(origin, *camera.rays(rows, order))
 
 
 def seen_from(

@@ -40,7 +40,7 @@ from fusedrf_cli.engine.kernels import cpu
 told = []
 with kernels.telling_of_compilation(lambda: told.append(1)):
     rays = np.zeros((1, 3)), np.ones((1, 3))
-    cpu.pinhole_rays(np.eye(4), 1.0, 1.0, 0.5, 0.5, 1, 0, np.zeros(1, np.int64), *rays)
+    cpu.lens_rays(np.eye(4), 1.0, 1.0, 0.5, 0.5, (0.0,) * 9, False, 1, 0, np.zeros(1, np.int64), *rays)
 sys.exit(len(told))
 """
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}

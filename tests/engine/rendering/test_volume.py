@@ -1,5 +1,7 @@
 """Rendering of any field: closed forms, the fast and the general path, early stop, pictures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import framing_camera
-from fusedrf_cli.engine.rendering.volume import render_image, render_rays, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import rays_from, render_image, render_rays, weights_from_depths
 from tests.engine.conftest import (
     BOX,
     DIRECTIONS_26,
@@ -153,6 +155,27 @@ def test_depth_and_background():
     np.testing.assert_allclose(
         white - picture.over((0, 0, 0)), 1 - picture.opacity[..., None].repeat(3, -1), atol=1e-6
     )
+
+
+@pytest.mark.parametrize("stretch", [(1, 1, 1), (2.5, 2.5, 2.5), (2.5, 2.5, -2.5), (1, 1, 1.01)], ids=str)
+@pytest.mark.parametrize("distance", [1.0, 1e6])
+def test_rays_in_a_frame_are_the_rays_of_the_world_seen_from_it(stretch, distance):
+    """Whether the frame has a camera of its own or is stretched, points along its rays are those of the
+    world's: o + t d there is at t over the length of a unit here."""
+    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+    origin = np.eye(4)
+    origin[:3, :3], origin[:3, 3] = turn * np.array(stretch), distance * np.array([1, -2, 3])
+    camera = framing_camera(BOX, 0.7, 0.4, 9, 7)
+    camera = replace(camera, distortion=(-0.12, 0.05, -0.01, 0.003, -0.002))
+    camera.camera_to_world[:3, 3] += origin[:3, 3]
+    order = np.random.default_rng(5).permutation(4 * 9)
+    world_o, world_d = camera.rays(slice(2, 6), order)
+    rays_o, rays_d, per_length = rays_from(origin, camera, slice(2, 6), order)
+    np.testing.assert_allclose(np.linalg.norm(rays_d, axis=1), 1, rtol=1e-12)
+    for t in (0.0, 3.0):
+        here = rays_o + (t * per_length * rays_d.T).T
+        there = np.linalg.inv(origin[:3, :3]) @ (world_o - origin[:3, 3] + t * world_d).T
+        np.testing.assert_allclose(here, there.T, atol=1e-12)
 
 
 def test_a_scene_far_from_the_origin_looks_the_same():
