@@ -44,10 +44,10 @@ class Camera:
 
     def seen_from(self, origin: np.ndarray) -> "Camera":
         """The same camera in a frame that lies at `origin` (4, 4), turned and scaled alike along all axes."""
-        inverse, pose = np.linalg.inv(origin[:3, :3]), np.eye(4)
-        pose[:3, :3] = inverse @ self.camera_to_world[:3, :3]
+        inverse, pose = np.linalg.inv(origin[:3, :3]), np.array(self.camera_to_world, np.float64)
+        pose[:3, 3] -= origin[:3, 3]  # first, so that it is exact however far away both are
+        pose[:3] = inverse @ pose[:3]
         pose[:3, :3] /= np.linalg.norm(pose[:3, 0])
-        pose[:3, 3] = inverse @ (self.camera_to_world[:3, 3] - origin[:3, 3])  # exact, however far away
         return replace(self, camera_to_world=pose)
 
     def local_directions(self, rows: slice = slice(None)) -> np.ndarray:
