@@ -77,6 +77,12 @@ OCCUPANCY_AT = (0.03, 0.06, 0.13, 0.24, 0.38, 0.6)
 # numbers say of empty cells is believed: of a ball half was cut off three steps after a change of resolution.
 CALM_AFTER = 8
 RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothing is tried again
+# What a step takes away of numbers that fade, at the first rate: this over the square of the photos' pixels
+# for each such number, and at most so much. Few photos do not say enough of a hashed detail, which learns by
+# heart then: a fox's 43 photos (0.44 pixels for each number) were shown 3.2 dB better than photos held out,
+# and 2.7 dB with it, which lost nothing. Of a park's 84 larger ones (1.75) 0.23 dB would be lost by as much.
+FADE, MOST_FADED = 9e-5, 5e-4
+FADED_EACH = 16  # steps, each for all of them: going through the numbers takes as long as a small step
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
 # Rays of a step: at least so many, and at most so many for each sample it is to take. Where few meet anything
 # there would be ever more of them.
@@ -281,6 +287,12 @@ class FitRun:
         """Running PSNR of the training rays, dB."""
         return float(-10 * np.log10(max(self.mse or 1.0, 1e-10)))
 
+    @property
+    def faded(self) -> float:
+        """The share of the numbers that fade which a step at the first rate takes away."""
+        fading = sum(group.high - group.low for group in self.field.groups() if group.fades)
+        return min(MOST_FADED, FADE * (fading / self.pool.epochs.count) ** 2)
+
     def share(self) -> float:
         """How much of the run is done, in [0, 1]."""
         if self.settings.time_budget is not None:
@@ -429,6 +441,8 @@ class FitRun:
         if self.settings.smooth:
             strip = int(torch.randint(STRIPS, (), generator=self.generator))
             add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)
+        if self.steps % FADED_EACH == 0:
+            self.optimiser.fade(FADED_EACH * decay * self.faded)
         self.optimiser.step(RATE * decay)
         mse = sums[0] / rays
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse

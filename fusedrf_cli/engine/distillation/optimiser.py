@@ -68,6 +68,13 @@ class Adam:
                 self.field.device_loops.adam_lines(*moved, own, group.lines, *rest)
         self.field.settle()
 
+    def fade(self, share: float) -> None:
+        """Take a share of the numbers of groups that fade away, whatever their gradients are: weight decay
+        beside Adam (Loshchilov and Hutter 2019, "Decoupled weight decay regularization", algorithm 2)."""
+        for group in self.field.groups():
+            if group.fades:
+                self.field.params[group.low : group.high].mul_(1 - share)
+
     def sound(self) -> bool:
         """Whether the gradients are finite, judged by those of the slowest groups, some thousand numbers that
         all samples share, or by all where a field has none; those of which a step looks at few lines only are

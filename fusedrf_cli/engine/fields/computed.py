@@ -66,6 +66,8 @@ class Group:
     """Relative to the optimiser's."""
     lines: np.ndarray | None = None
     """(L,) int64, where the cache lines begin in which a sample can reach any number; None: all of them."""
+    fades: bool = False
+    """Whether its numbers go back towards 0 where little speaks for them (Adam.fade)."""
 
 
 class ComputedField:

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.fit import (
+    FADE,
     FALL,
     FALLS_FROM,
     FINE_SAMPLES,
+    MOST_FADED,
     UNBOUNDED_SAMPLES,
     FitRun,
     FitSettings,
@@ -18,6 +20,7 @@ from fusedrf_cli.engine.distillation.fit import (
     occupancy_of,
 )
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
+from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -79,6 +82,21 @@ def test_steps_take_more_samples_at_full_resolution_of_a_box(capture, unbounded,
     assert coarse == pytest.approx((1 << 14) / 8 * (UNBOUNDED_SAMPLES if unbounded else 1), rel=0.01)
     run.stages.clear()
     assert steered() == pytest.approx(factor * coarse, rel=0.01)
+
+
+def test_a_detail_fades_where_photos_say_little_of_it(capture, monkeypatch):
+    """By the square of its numbers for each pixel, up to a most; a field without one by nothing, ever."""
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.DETAIL_FROM", 2)
+    cameras, images = capture
+
+    def faded(count: int, rows: int) -> float:
+        way = replace(SETTINGS.way, hashed=Hashed((0.1,), rows) if rows else None)
+        settings = replace(SETTINGS, way=way, unbounded=True)
+        return FitRun.start(cameras[:count], images[:count], BOX, settings).faded
+
+    assert faded(8, 1 << 10) == pytest.approx(FADE * (4 * 1024 / (8 * 24 * 24)) ** 2)
+    assert faded(4, 1 << 10) == pytest.approx(4 * faded(8, 1 << 10))
+    assert faded(1, 1 << 16) == MOST_FADED and faded(1, 0) == 0
 
 
 def test_the_same_seed_gives_the_same_bits(capture):

@@ -7,6 +7,7 @@ import torch
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
 from tests.engine.conftest import THIRTY_TWO, random_vm
+from tests.engine.kinds.cases import random_detail
 
 
 def test_groups_cover_all_and_part_at_the_bases():
@@ -49,3 +50,17 @@ def test_rest_without_gradients():
     before = field.params.clone()
     Adam(field, 2).step(0.5)
     assert torch.equal(before, field.params)
+
+
+def test_only_a_hashed_detail_fades(monkeypatch):
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.DETAIL_FROM", 2)
+    field = random_detail(dtype=torch.float32)
+    assert len(fading := [group for group in field.groups() if group.fades]) == 1
+    before, optimiser = field.params.clone(), Adam.of(field)
+    optimiser.fade(0.25)
+    optimiser.fade(0.25)
+    detail = field.sections(0)["detail"]
+    assert fading[0].high - fading[0].low >= detail.numel() and detail.any()
+    expected = before.clone()
+    expected[fading[0].low : fading[0].high] *= 0.75**2
+    torch.testing.assert_close(field.params, expected, rtol=1e-6, atol=0)

@@ -460,7 +460,7 @@ class VMField(ComputedField):
         for tensor, row, end in zip(self.tensors, self.layout.tolist(), ends, strict=True):
             groups += [Group(row[0], row[12]), Group(row[12], row[13], BASIS_RATE)]
             if tensor.hashed and max(tensor.resolution) >= DETAIL_FROM:
-                groups.append(Group(row[13], int(end), DETAIL_RATE))
+                groups.append(Group(row[13], int(end), DETAIL_RATE, fades=True))
         return groups
 
     # -- storing ---------------------------------------------------------------------------------------------
