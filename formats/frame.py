@@ -23,6 +23,9 @@ OUTLIERS = 0.001
 """Share of a view's points that may lie nearer than its `near`, and farther than its `far`."""
 MARGIN = 1.25
 """Factor on the extent of the sparse points, since other parts of the scene may reach farther."""
+SIDEWAYS, TELLING = 0.25, 0.05
+"""Cameras were held sideways whose y axes lie so much nearer to one plane than their x axes, in mean squares,
+and so much nearer than they spread along it, where these are so large at least."""
 OBJECT_MARGIN = 1.05
 """Factor on the extent of an object that masks cut out."""
 
@@ -39,6 +42,30 @@ class SceneFrame:
     """The median of the cameras' distances from the focus."""
     spread: float
     """Radians from the mean direction within which 95 % of the cameras look."""
+
+
+def upward(poses: np.ndarray) -> np.ndarray:
+    """(3,) unit vector: which way is up where cameras of (N, 4, 4) poses stand. It is the mean of their +y
+    axes, or +z where these cancel out.
+
+    Photos that were taken with the camera turned by a quarter, and are stored as they left it, lie on their
+    side: then the +y axes are level, and up is at right angles to them, on the side from which the cameras
+    look down.
+    """
+    across = np.linalg.eigvalsh(scatter(poses[:, :3, 0]))
+    along, directions = np.linalg.eigh(scatter(poses[:, :3, 1]))
+    spread = min(across[0], along[1])
+    if spread > TELLING and along[0] < SIDEWAYS * spread:
+        found = directions[:, 0]
+        return found if found @ poses[:, :3, 2].mean(0) >= 0 else -found
+    mean = poses[:, :3, 1].mean(0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+
+
+def scatter(directions: np.ndarray) -> np.ndarray:
+    """(3, 3) the mean of the outer products of (N, 3) directions with themselves."""
+    return directions.T @ directions / len(directions)
 
 
 def scene_frame(poses: np.ndarray, depth: float | None = None) -> SceneFrame:

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from formats.errors import BadSchema
-from formats.frame import scene_frame
+from formats.frame import scene_frame, upward
 from formats.images import MAX_SIDE
 from formats.rotations import matrices, quaternions
 from formats.views import NO_DISTORTION, Capture, View
@@ -82,10 +82,8 @@ class Rig:
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) unit vector: the mean of the cameras' upward directions, or +z where they cancel out."""
-        mean = self.poses[:, :3, 1].mean(0)
-        length = float(np.linalg.norm(mean))
-        return mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+        """(3,) unit vector: see `upward`."""
+        return upward(self.poses)
 
     def height(self, up: np.ndarray) -> float:
         """The median of the cameras' heights above the focus, along a unit vector (3,)."""

@@ -156,6 +156,22 @@ def test_up_height_and_distance_of_a_ring():
     assert (rig.height(rig.up), rig.distance) == (pytest.approx(4.0), pytest.approx(5.0))
 
 
+@pytest.mark.parametrize("quarters", [1, 3])
+def test_up_of_photos_that_lie_on_their_side(quarters):
+    """A ring of cameras that look down, each turned about its axis by a quarter."""
+    c, s = {1: (0, 1), 3: (0, -1)}[quarters]
+    turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    ring = inward(12, radius=3.0, height=4.0)
+    sideways = [replace(view, camera_to_world=view.camera_to_world @ turn) for view in ring]
+    np.testing.assert_allclose(rig_of(sideways).up, [0, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("elevation", [5, 45, 85])
+def test_up_of_a_ring_from_the_side_and_from_above(elevation):
+    height, radius = 3 * np.sin(np.radians(elevation)), 3 * np.cos(np.radians(elevation))
+    np.testing.assert_allclose(rig_of(inward(12, radius=radius, height=height)).up, [0, 0, 1], atol=1e-9)
+
+
 def test_ups_that_cancel_out():
     up, down = inward(2, height=0.0)
     flipped = down.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])

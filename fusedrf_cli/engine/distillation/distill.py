@@ -183,7 +183,7 @@ class DistillRun:
                 self.student.params.copy_(self.before)
             clock.lap("pictures")
         with uninterrupted():
-            self._leave_haze_out(rays_o[:RAYS_THAT_JUDGE], rays_d[:RAYS_THAT_JUDGE])
+            self._leave_haze_out(pool)
         report.numeric = self.guard.figures()
         return self.student, report
 
@@ -212,10 +212,13 @@ class DistillRun:
         """Whether the student learnt where there is nothing; only one on one grid over its own box did."""
         return self.student.resolution is not None and self.settings.steps > 0
 
-    def _leave_haze_out(self, rays_o: np.ndarray, rays_d: np.ndarray) -> None:
-        """Leave out the room that cells had for matter to grow into, as `without_haze` does."""
+    def _leave_haze_out(self, pool: TeacherPool) -> None:
+        """Leave out the room that cells had for matter to grow into, as `without_haze` does; what it shows is
+        held against the teacher's pictures."""
         if self._has_cells_to_give() and not self.report.found_nothing:
-            self.student = self.student.with_occupancy(without_haze(self.student, rays_o, rays_d))
+            rays = pool.rays_o[:RAYS_THAT_JUDGE], pool.rays_d[:RAYS_THAT_JUDGE]
+            truth = pool.pixels[:RAYS_THAT_JUDGE].numpy()
+            self.student = self.student.with_occupancy(without_haze(self.student, *rays, truth=truth))
 
     def _prune(self) -> None:
         """Leave out the cells that turned out empty, unless that would be all of them."""

@@ -10,7 +10,10 @@ EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
 # Where in a cell haze is looked for: about as close together as the texels of a fine field.
 CLOSE_PROBES = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="ij"), -1).reshape(-1, 3)
 RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
-TRIES = 4  # at leaving haze out, a quarter as thick each time
+# How thick haze is, across a cell, that is left out first where it is known what rays should show: haze of a
+# student is mostly what it failed to learn.
+THICK_HAZE = 16 * EMPTY_BELOW
+THIN_HAZE = EMPTY_BELOW / 64  # that is left out at least, where rays show all that is thicker
 SAME = 1e-6  # mean square by which pictures differ that show the same: 60 dB
 
 
@@ -45,21 +48,29 @@ def depths_across(field: StoredField, probes: np.ndarray) -> np.ndarray:
 
 
 def without_haze(
-    field: StoredField, rays_o: np.ndarray, rays_d: np.ndarray, near: float = 0.0
+    field: StoredField,
+    rays_o: np.ndarray,
+    rays_d: np.ndarray,
+    near: float = 0.0,
+    truth: np.ndarray | None = None,
 ) -> OccupancyGrid:
     """The field's occupancy but for cells in which the optical depth across the cell passes EMPTY_BELOW
-    nowhere; where rays (N, 3) from `near` on show it by more than SAME, but for those of thinner haze, and at
-    last with all of them.
+    nowhere; where rays (N, 3) from `near` on show it by more than SAME, but for those of haze a quarter as
+    thick, and so on, and at last with all of them. Where it is known what rays should show, premultiplied rgb
+    and opacity `truth` (N, 4), it begins with THICK_HAZE, and rays must not be further from that by more.
 
     Cells found while a field learns are grown by one, for matter to grow into; that room would be sampled in
     every picture.
     """
     grid, depth = field.occupancy, depths_across(field, CLOSE_PROBES)
-    whole = render_rays(field, rays_o, rays_d, near=near)
-    for most in EMPTY_BELOW * 0.25 ** np.arange(TRIES):
+    whole = render_rays(field, rays_o, rays_d, near=near)[:, :4]
+    expected, most = (whole, EMPTY_BELOW) if truth is None else (truth, THICK_HAZE)
+    allowed = np.square(whole - expected).mean() + SAME
+    while most >= THIN_HAZE:
         fewer = grid.marked(grid.occupied & (depth > most))
         if fewer.occupied.any():
-            found = render_rays(field.with_occupancy(fewer), rays_o, rays_d, near=near)
-            if np.square(found - whole)[:, :4].mean() <= SAME:
+            found = render_rays(field.with_occupancy(fewer), rays_o, rays_d, near=near)[:, :4]
+            if np.square(found - expected).mean() <= allowed:
                 return fewer
+        most /= 4
     return grid

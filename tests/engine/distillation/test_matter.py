@@ -46,6 +46,24 @@ def test_fog_that_rays_show_stays():
     assert without_haze(field, *rays).occupied.all()
 
 
+def test_thick_haze_goes_where_rays_should_not_show_it_and_stays_where_they_should():
+    """Fog of 0.03 across each cell, three times what counts as empty, beside matter a hundred times as
+    dense: as what a student failed to learn, and as what its teacher shows."""
+    field, dense = fog(3 * EMPTY_BELOW), fog(300 * EMPTY_BELOW)
+    plane, solid = (f.sections(0)["density_plane_0"] for f in (field, dense))
+    plane[: len(plane) // 2] = solid[: len(plane) // 2]
+    rays, grid = rays_at(BOX, 3000, 7), field.occupancy
+    matter = grid.marked(deepest(field, np.argwhere(grid.occupied)).reshape(grid.occupied.shape) > 1)
+    shown, alone = (render_rays(f, *rays)[:, :4] for f in (field, field.with_occupancy(matter)))
+    assert 0.4 < matter.occupied.mean() < 0.6 and np.square(shown - alone).mean() > 1e-3
+    assert without_haze(field, *rays).occupied.all()
+    assert without_haze(field, *rays, truth=shown).occupied.all()
+    kept = without_haze(field, *rays, truth=alone)
+    assert 0.4 < kept.occupied.mean() < 0.6
+    found = render_rays(field.with_occupancy(kept), *rays)[:, :4]
+    assert np.square(found - alone).mean() < 1e-4
+
+
 def test_where_all_is_haze_nothing_goes():
     field, rays = fog(1e-6), rays_at(BOX, 300, 5)
     assert without_haze(field, *rays).occupied.all()
