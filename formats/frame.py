@@ -46,21 +46,31 @@ class SceneFrame:
 
 def upward(poses: np.ndarray) -> np.ndarray:
     """(3,) unit vector: which way is up where cameras of (N, 4, 4) poses stand. It is the mean of their +y
-    axes, or +z where these cancel out.
-
-    Photos that were taken with the camera turned by a quarter, and are stored as they left it, lie on their
-    side: then the +y axes are level, and up is at right angles to them, on the side from which the cameras
-    look down.
-    """
-    across = np.linalg.eigvalsh(scatter(poses[:, :3, 0]))
-    along, directions = np.linalg.eigh(scatter(poses[:, :3, 1]))
-    spread = min(across[0], along[1])
-    if spread > TELLING and along[0] < SIDEWAYS * spread:
-        found = directions[:, 0]
-        return found if found @ poses[:, :3, 2].mean(0) >= 0 else -found
-    mean = poses[:, :3, 1].mean(0)
+    axes, or +z where these cancel out; of photos that lie on their side see `up_of_sideways`."""
+    rights, ups, backs = np.moveaxis(poses[:, :3, :3], 2, 0)
+    found = up_of_sideways(rights, ups, backs)
+    if found is not None:
+        return found
+    mean = ups.mean(0)
     length = float(np.linalg.norm(mean))
     return mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+
+
+def up_of_sideways(rights: np.ndarray, ups: np.ndarray, backs: np.ndarray) -> np.ndarray | None:
+    """(3,) unit vector: which way is up where cameras were turned by a quarter about their axes, and the
+    photos are stored as they left them; None where these were not, or it cannot be told.
+
+    rights, ups and backs (N, 3) are the cameras' axes in the world. People hold the x axis level, even where
+    they look down; here it is the y axis. Up is at right angles to it, on the side from which the cameras
+    look down.
+    """
+    across = np.linalg.eigvalsh(scatter(rights))
+    along, directions = np.linalg.eigh(scatter(ups))
+    spread = min(across[0], along[1])
+    if spread <= TELLING or along[0] >= SIDEWAYS * spread:
+        return None
+    found = directions[:, 0]
+    return found if found @ backs.mean(0) >= 0 else -found
 
 
 def scatter(directions: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from formats import colmap
 from formats.atomic import atomic_folder
 from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
-from formats.frame import scene_frame
+from formats.frame import scene_frame, up_of_sideways
 from formats.images import Header, read_focal, read_image_header, write_smaller
 from formats.mapper import MAX_SIDE
 from formats.photos import copies, natural, pictures
@@ -251,7 +251,9 @@ def _level(poses: np.ndarray, orientations: Sequence[int]) -> np.ndarray:
     """(4, 4) rotation that makes the cameras' vertical +z, and the first's look +y as far as it is level."""
     sides = np.array([UPS.get(orientation, (0, 1)) for orientation in orientations], float)
     ups = np.einsum("nij,nj->ni", poses[:, :3, :2], sides)
-    up = _vertical(ups, np.cross(ups, poses[:, :3, 2]))
+    rights, backs = np.cross(ups, poses[:, :3, 2]), poses[:, :3, 2]
+    up = up_of_sideways(rights, ups, backs)
+    up = _vertical(ups, rights) if up is None else up
     look = -poses[0, :3, 2]
     if np.linalg.norm(np.cross(look, up)) < 0.1:  # straight up or down: then what is up in it, lies ahead
         look = ups[0]

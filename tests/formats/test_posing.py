@@ -185,16 +185,31 @@ def test_cameras_that_look_down_from_one_side_are_stood_upright():
     )
 
 
+def turned_about(axis: int, angle: float) -> np.ndarray:
+    """(4, 4) a turn about x (0) or z (2)."""
+    found, (i, j) = np.eye(4), [(1, 2), (2, 0), (0, 1)][axis]
+    found[i, i] = found[j, j] = np.cos(angle)
+    found[i, j], found[j, i] = -np.sin(angle), np.sin(angle)
+    return found
+
+
 @pytest.mark.parametrize("orientation, quarter", [(1, 0), (6, 1), (3, 2), (8, 3)])
 def test_photos_that_are_stored_sideways(orientation, quarter):
     """The stored picture of a camera that was turned has its up at a side."""
     poses = np.array(ring(9, 5, np.zeros(3)))
-    angle = -np.pi / 2 * quarter
-    roll = np.eye(4)
-    roll[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    roll = turned_about(2, -np.pi / 2 * quarter)
     views, _ = upright(*anyhow(poses @ roll)[:2], [orientation] * 9)
     upright_poses = np.array([view.camera_to_world for view in views]) @ np.linalg.inv(roll)
     assert upright_poses[:, :3, 1] == pytest.approx(np.tile([0, 0, 1], (9, 1)), abs=1e-9)
+
+
+@pytest.mark.parametrize("quarter", [1, 3])
+def test_photos_that_are_stored_sideways_and_do_not_say_so(quarter):
+    """Their cameras look down by 30 degrees."""
+    down, roll = turned_about(0, -np.pi / 6), turned_about(2, -np.pi / 2 * quarter)
+    views, _ = upright(*anyhow(np.array(ring(9, 5, np.zeros(3))) @ down @ roll)[:2], [1] * 9)
+    held = np.array([view.camera_to_world for view in views]) @ np.linalg.inv(down @ roll)
+    assert held[:, :3, 1] == pytest.approx(np.tile([0, 0, 1], (9, 1)), abs=1e-9)
 
 
 def test_a_camera_that_looks_straight_down():
