@@ -80,7 +80,8 @@ RETRY_AFTER = 0.03  # share of the run after which an occupancy that found nothi
 # What a step takes away of numbers that fade, at the first rate: this over the square of the photos' pixels
 # for each such number, and at most so much. Few photos do not say enough of a hashed detail, which learns by
 # heart then: a fox's 43 photos (0.44 pixels for each number) were shown 3.2 dB better than photos held out,
-# and 2.5 to 3.0 dB with it, which lost nothing. Of a park's 84 larger ones (1.75) 0.23 dB would be lost by as much.
+# and 2.5 to 3.0 dB with it, which lost nothing. Of a park's 84 larger ones (1.75) 0.23 dB would be lost by as
+# much.
 FADE, MOST_FADED = 1.4e-4, 9e-4
 FADED_EACH = 16  # steps, each for all of them: going through the numbers takes as long as a small step
 TARGET_MARGIN = 1.0  # dB that training rays are ahead of unseen views, about
