@@ -13,7 +13,7 @@ RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
 # How thick haze is, across a cell, that is left out first where it is known what rays should show: haze of a
 # student is mostly what it failed to learn.
 THICK_HAZE = 16 * EMPTY_BELOW
-THIN_HAZE = EMPTY_BELOW / 64  # that is left out at least, where rays show all that is thicker
+THIN_HAZE = EMPTY_BELOW / 64  # that is tried last, where rays show all that is thicker
 SAME = 1e-6  # mean square by which pictures differ that show the same: 60 dB
 
 
