@@ -54,10 +54,10 @@ def measured(capture: Path, seconds: float, light: float) -> dict:
     taken: dict[str, list[float]] = {}
     learn = fit.FitRun.learn
 
-    def counted(self: fit.FitRun, sums: np.ndarray, rays: int, decay: float) -> None:
+    def counted(self: fit.FitRun, sums: np.ndarray, rays: int, *more) -> None:
         taken.setdefault("rays", []).append(rays)
         taken.setdefault("samples per ray", []).append(sums[2] / rays)
-        learn(self, sums, rays, decay)
+        learn(self, sums, rays, *more)
 
     tell(f"{capture.name}: {light:g}")
     with (

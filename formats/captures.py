@@ -45,7 +45,6 @@ from formats.transforms import (
     read_splits,
     sparse_points,
     stated_aabb,
-    with_depths,
 )
 from formats.views import Capture, View, hold_out
 
@@ -144,9 +143,9 @@ def _read_blender(
 
 def _read_transforms(path: Path, downscale: int | None) -> Capture:
     document, train, test = read_splits(path, downscale)
-    points, notes = sparse_points(path, document, train.views + test.views)
-    train, test = (replace(part, views=with_depths(part.views, points)) for part in (train, test))
-    return _capture(path, "transforms", train, test, stated_aabb(path, document), points, notes)
+    sparse = sparse_points(path, document, train.views + test.views)
+    train, test = (replace(part, views=sparse.told(path, part.views)) for part in (train, test))
+    return _capture(path, "transforms", train, test, stated_aabb(path, document), sparse.points, sparse.notes)
 
 
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
@@ -319,6 +318,7 @@ def write_cameras(path: Path, views: Sequence[View], files: Sequence[str], **mor
             "file_path": file,
             **{key: value for key, value in _intrinsics(view, higher).items() if value != shared[key]},
             "transform_matrix": view.camera_to_world.tolist(),
+            **({} if view.seen is None else {"sparse_points": view.seen.tolist()}),
         }
         for view, file in zip(views, files, strict=True)
     ]

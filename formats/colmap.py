@@ -6,9 +6,10 @@ with x right, y down, z forward. Files `rigs` and `frames` of newer versions are
 
 import math
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -16,13 +17,16 @@ from formats.cameras import checked_size
 from formats.errors import BadIntrinsics, BadModel, BadPose, LimitExceeded, UnsupportedCamera
 from formats.frame import depth_range
 from formats.inputs import read_input
-from formats.points import MAX_POINTS, Points, finite
+from formats.points import MAX_POINTS, Points
 from formats.rotations import matrices
 from formats.views import View
 
 MAX_CAMERAS_BYTES = 64 * 2**20
 MAX_BYTES = 2**31
 MAX_NAME = 4096
+MOST_ERROR = 1.5
+"""Pixels of the photos that were compared. A point that lies farther, on average, from where photos show it is
+none that anything is known of."""
 MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
@@ -77,6 +81,26 @@ class Model:
     points: Points | None
 
 
+@dataclass(frozen=True, eq=False)
+class Listed:
+    """The points of a model as its files name them."""
+
+    ids: np.ndarray
+    """(N,) uint64, rising."""
+    points: Points
+    errors: np.ndarray
+    """(N,) float64, pixels."""
+
+    def found(self, seen: np.ndarray) -> np.ndarray:
+        """(M,) int64, rising: where the points of some ids are among these, without those that are not."""
+        at = np.minimum(np.searchsorted(self.ids, seen), max(len(self.ids) - 1, 0))
+        return np.unique(at[self.ids[at] == seen]) if len(self.ids) else np.empty(0, np.int64)
+
+    def sure(self, found: np.ndarray) -> np.ndarray:
+        """Those of `found` that lie where photos show them."""
+        return found[self.errors[found] <= MOST_ERROR]
+
+
 def model_folder(path: Path) -> Path | None:
     """The folder of a model at `path`, or below it where COLMAP and nerfstudio store it; None without one."""
     places = [path / part for part in ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")]
@@ -107,7 +131,7 @@ def read_model(folder: Path) -> Model:
     listed = list(_read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES))
     if not listed:
         raise BadModel(f"{folder}: its images file is empty; export the model again")
-    ids, points = _points(folder)
+    known = _points(folder)
     images = []
     for where, name, quaternion, translation, camera, seen in listed:
         if camera not in cameras:
@@ -115,20 +139,30 @@ def read_model(folder: Path) -> Model:
                 f"{where}: is of camera {camera}, which the cameras file does not list; export again"
             )
         pose = _pose(quaternion, translation, where)
-        near, far = _depths(pose, ids, points, seen)
-        view = replace(cameras[camera], camera_to_world=pose, near=near, far=far)
+        view = replace(cameras[camera], camera_to_world=pose)
+        if known is not None:
+            found = known.found(seen)
+            near, far = depth_range(pose, known.points.positions[found])
+            view = replace(view, near=near, far=far, seen=known.sure(found))
         images.append(Image(name, where, view))
-    return Model(folder, tuple(images), points)
+    return Model(folder, tuple(images), known and known.points)
 
 
-def read_points(folder: Path) -> Points | None:
-    """The points alone; None where the model has none."""
-    return _points(folder)[1]
+def read_points(folder: Path) -> tuple[Points | None, dict[str, np.ndarray]]:
+    """The points alone, None where the model has none; and, by the stem of each photo's file, which of them
+    were found in it (View.seen). Photos that share a stem are left out."""
+    known = _points(folder)
+    if known is None:
+        return None, {}
+    listed = _read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES)
+    stems = Counter(PurePosixPath(name).stem for _, name, *_ in listed)
+    seen = {PurePosixPath(name).stem: known.sure(known.found(ids)) for _, name, *_, ids in listed}
+    return known.points, {stem: found for stem, found in seen.items() if stems[stem] == 1}
 
 
-def _points(folder: Path) -> tuple[np.ndarray, Points | None]:
+def _points(folder: Path) -> Listed | None:
     if not _has(folder, "points3D"):
-        return np.empty(0, np.uint64), None
+        return None
     return _read(folder, "points3D", {"bin": _binary_points, "txt": _text_points}, MAX_BYTES)
 
 
@@ -157,15 +191,6 @@ def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.nda
     pose[:3, :3] = rotation.T * [1, -1, -1]
     pose[:3, 3] = -rotation.T @ numbers[4:]
     return pose
-
-
-def _depths(pose: np.ndarray, ids: np.ndarray, points: Points | None, seen: np.ndarray) -> tuple:
-    """Nearest and farthest depth of the points that an image saw, outliers left out; None where unknown."""
-    if points is None or not len(ids) or not len(seen):
-        return None, None
-    at = np.minimum(np.searchsorted(ids, seen), len(ids) - 1)
-    found = points.positions[at[ids[at] == seen]]
-    return depth_range(pose, found)
 
 
 # --- cameras ------------------------------------------------------------------------------------------------
@@ -282,8 +307,7 @@ def _text_images(path: Path, data: bytes) -> list[tuple]:
 # --- points -------------------------------------------------------------------------------------------------
 
 
-def _binary_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
-    """Ids (N,) uint64 in rising order, and their points."""
+def _binary_points(path: Path, data: bytes) -> Listed:
     (count,) = struct.unpack_from("<Q", data)
     _check_count(path, count, len(data), 51)
     if count > MAX_POINTS:
@@ -296,11 +320,11 @@ def _binary_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
         if row[-1] > (len(data) - at) // 8:
             raise BadModel(f"{path}: the file is truncated in point {row[0]}; copy or export it again")
         at += 8 * row[-1]
-        rows.append(row[:7])
+        rows.append(row[:8])
     return _sorted_points(rows)
 
 
-def _text_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
+def _text_points(path: Path, data: bytes) -> Listed:
     rows = []
     for line, words in _lines(path, data):
         if not words:
@@ -311,17 +335,19 @@ def _text_points(path: Path, data: bytes) -> tuple[np.ndarray, Points]:
             raise LimitExceeded(f"{path}: more than {MAX_POINTS:,} points; thin them out")
         position = [_number(path, line, word, float) for word in words[1:4]]
         whole = [_number(path, line, word, int) for word in (words[0], *words[4:7])]
-        rows.append((whole[0], *position, *whole[1:]))
+        error = _number(path, line, words[7], float) if len(words) > 7 else 0.0
+        rows.append((whole[0], *position, *whole[1:], error))
     return _sorted_points(rows)
 
 
-def _sorted_points(rows: list[tuple]) -> tuple[np.ndarray, Points]:
+def _sorted_points(rows: list[tuple]) -> Listed:
     ids = np.array([row[0] % 2**64 for row in rows], np.uint64)
     positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
     colours = np.clip(np.array([row[4:7] for row in rows], np.float64).reshape(-1, 3), 0, 255)
     order = np.argsort(ids)
     order = order[(np.abs(positions[order]) < 1e30).all(1)]
-    return ids[order], finite(positions[order], colours[order].astype(np.uint8))
+    errors = np.array([row[7] for row in rows], np.float64)[order]
+    return Listed(ids[order], Points(positions[order], colours[order].astype(np.uint8)), errors)
 
 
 # --- parsing ------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Captures whose cameras stand in `transforms*.json`: Blender's, instant-ngp's and nerfstudio's."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -17,17 +17,19 @@ from formats.cameras import (
     read_frames,
     written_path,
 )
-from formats.errors import BadSchema, MissingFile
+from formats.errors import BadSchema, FormatError, MissingFile
 from formats.frame import depth_range
 from formats.images import read_image_header
 from formats.photos import Folder, copies, find_photo, is_file, natural, on_photo, photo_folder
-from formats.points import Points, read_ply_points
+from formats.points import MAX_POINTS, Points, read_ply_points
 from formats.views import View
 
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 MAX_PROJECTED = 20_000
 """At most so many points are projected into each view."""
+AGREEING = 0.95
+"""Share of a model's observations that lie in the pictures that they are of, if it is of this capture."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,22 @@ def _views(path: Path, document: dict, frames: list[tuple[int, dict]], downscale
         view = frame_view(where, document, frame, name, header[:2])
         reduction = folders[_rooted(frame_file(frame))[0]].reduction(header, downscale)
         mask = _mask(path, folders, frame, where)
+        view = replace(view, seen=_stated_points(where, frame))
         views.append(on_photo(view, photo, header, where, mask, reduction))
         alpha |= header.alpha
     missing = [frame_file(f) for (_, f), photo in zip(frames, photos, strict=True) if not photo]
     return Part(tuple(views), alpha, tuple(missing), tuple(_notes(path, folders)))
+
+
+def _stated_points(where: str, frame: dict) -> np.ndarray | None:
+    """Which points `sparse_points` lists, as `fusedrf pose` writes them (View.seen); None without it."""
+    listed = frame.get("sparse_points")
+    if listed is None:
+        return None
+    whole = isinstance(listed, list) and all(type(i) is int and 0 <= i < MAX_POINTS for i in listed)
+    if not whole:
+        raise BadSchema(f"{where}: expected sparse_points to be a list of whole numbers, one for each point")
+    return np.unique(np.array(listed, np.int64))
 
 
 def _rooted(file: str) -> tuple[str, str]:
@@ -162,24 +176,72 @@ def stated_aabb(path: Path, document: dict) -> np.ndarray | None:
     return np.concatenate([centre - half, centre + half])
 
 
-def sparse_points(
-    path: Path, document: dict, views: tuple[View, ...]
-) -> tuple[Points | None, tuple[str, ...]]:
-    """The points that `ply_file_path` names, or else those of the COLMAP model that the capture was made
-    from, in the frame of the poses; and a note where they were to be there but are not."""
+@dataclass(frozen=True)
+class Sparse:
+    """What is known of a capture's sparse points."""
+
+    points: Points | None = None
+    """In the frame of the poses."""
+    seen: Mapping[str, np.ndarray] | None = None
+    """View.seen by the stem of each photo's file, where a model says it; None where the frames may."""
+    notes: tuple[str, ...] = ()
+
+    def told(self, path: Path, views: tuple[View, ...]) -> tuple[View, ...]:
+        """Views with the depths between which they show the points, and with those found in their photos."""
+        if self.points is None:
+            return tuple(replace(view, seen=None) for view in views)
+        few, told = _sample(self.points), []
+        for view in views:
+            near, far = depth_range(view.camera_to_world, few[_seen(view, few)])
+            seen = view.seen if self.seen is None else self.seen.get(view.image_path.stem)
+            if seen is not None and seen.max(initial=-1) >= len(self.points.positions):
+                raise BadSchema(
+                    f"{path}: {view.name} shows sparse point {seen.max()}, but there are "
+                    f"{len(self.points.positions):,} of them; estimate the poses again"
+                )
+            told.append(replace(view, near=near, far=far, seen=seen))
+        return tuple(told)
+
+
+def sparse_points(path: Path, document: dict, views: tuple[View, ...]) -> Sparse:
+    """The points of the COLMAP model that the capture was made from, where it lies beside and is of the same
+    photos, or else those that `ply_file_path` names; and a note where they were to be there but are not."""
     written = written_path(document, "ply_file_path")
-    if written and is_file(path.parent / written):
-        points = read_ply_points(path.parent / written)
-    elif (model := colmap.model_folder(path.parent)) is not None and "applied_transform" in document:
-        points = colmap.read_points(model)
-    else:
-        note = f"{path}: its sparse points {written} do not exist and are not used"
-        return None, (note,) if written else ()
+    ply, model = bool(written) and is_file(path.parent / written), Sparse()
+    if "applied_transform" in document and (folder := colmap.model_folder(path.parent)) is not None:
+        try:
+            points, seen = colmap.read_points(folder)
+        except FormatError as error:
+            if not ply:
+                raise
+            model = Sparse(notes=(f"{error}; {path} is read without that model",))
+        else:
+            model = _agreeing(Sparse(_placed(path, document, points, views), seen), views)
+    if model.seen is None and ply:
+        points = _placed(path, document, read_ply_points(path.parent / written), views)
+        return Sparse(points, None, model.notes)
+    if model.points is None and written:
+        return Sparse(notes=(f"{path}: its sparse points {written} do not exist and are not used",))
+    return model
+
+
+def _placed(path: Path, document: dict, points: Points | None, views: tuple[View, ...]) -> Points | None:
+    """Points in the frame of the poses; None where there are none. Depending on the version of nerfstudio the
+    file holds points before or after the transform."""
     if points is None or not len(points.positions) or not views:
-        return None, ()
-    # Depending on the version of nerfstudio the file holds points before or after the transform.
+        return None
     candidates = [points, *(points.moved(matrix) for matrix in _applied(path, document))]
-    return max(candidates, key=lambda moved: _seen_share(moved, views)), ()
+    return max(candidates, key=lambda moved: _seen_share(moved, views))
+
+
+def _agreeing(sparse: Sparse, views: tuple[View, ...]) -> Sparse:
+    """Points without what a model says of photos that do not show them so: it is of others, or posed anew."""
+    found = [(view, sparse.seen.get(view.image_path.stem)) for view in views]
+    found = [(view, seen) for view, seen in found if seen is not None and len(seen)]
+    if sparse.points is None or not found:
+        return replace(sparse, seen=None)
+    shown = np.concatenate([_seen(view, sparse.points.positions[seen]) for view, seen in found])
+    return sparse if shown.mean() > AGREEING else replace(sparse, seen=None)
 
 
 def _applied(path: Path, document: dict) -> list[np.ndarray]:
@@ -211,14 +273,3 @@ def _seen(view: View, positions: np.ndarray) -> np.ndarray:
 def _seen_share(points: Points, views: tuple[View, ...]) -> float:
     few = _sample(points)[::10]
     return float(np.mean([_seen(view, few).mean() for view in views[:: max(1, len(views) // 20)]]))
-
-
-def with_depths(views: tuple[View, ...], points: Points | None) -> tuple[View, ...]:
-    """The views with the depths between which they show the points."""
-    if points is None:
-        return views
-    few, told = _sample(points), []
-    for view in views:
-        near, far = depth_range(view.camera_to_world, few[_seen(view, few)])
-        told.append(replace(view, near=near, far=far))
-    return tuple(told)

@@ -52,6 +52,9 @@ class View:
     far: float | None = None
     """Depths (along -z, world units) between which lie the sparse points that it sees, except for one in a
     thousand on each side."""
+    seen: np.ndarray | None = None
+    """(N,) int64: which of the capture's sparse points were found in its photo, each once; None where nothing
+    says so."""
     pixels: np.ndarray | None = None
     """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
 

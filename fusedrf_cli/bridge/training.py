@@ -12,6 +12,7 @@ from formats.captures import hold_out, is_mesh, load_photos
 from formats.meshes import mesh_capture
 from formats.views import Capture, check_parallax
 from fusedrf_cli.bridge.extent import Extent, extent_of
+from fusedrf_cli.bridge.depths import known_points
 from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
@@ -103,8 +104,9 @@ def train(request: TrainRequest, progress) -> dict:
         )
         cameras = [extent.camera(camera_of(v)) for v in capture.train]
         pictures = pictures_of(request, capture)
+        known = known_points(capture, extent)
         name = Path(request.source).resolve().stem
-        run = FitRun.start(cameras, pictures, extent.box, settings, name, extent.cells)
+        run = FitRun.start(cameras, pictures, extent.box, settings, name, extent.cells, known)
         if saved:
             if saved[1].get("kind") != kind.name:
                 raise checkpoint_mismatch(request.output)

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from itertools import cycle
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,9 +54,9 @@ def test_the_quaternion_of_these_tests():
 
 
 def binary_model(
-    folder: Path, names=NAMES, model=1, params=(80, 80, 50, 40), size=SIZE, points=POINTS, apart=0.0
+    folder: Path, names=NAMES, model=1, params=(80, 80, 50, 40), size=SIZE, points=POINTS, apart=0.0, errors=(0.5,)
 ) -> None:
-    """All cameras at one place, or `apart` from each other."""
+    """All cameras at one place, or `apart` from each other; the errors of points are told in turn."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIiQQ", 1, 5, model, *size) + struct.pack(f"<{len(params)}d", *params)
@@ -68,8 +69,8 @@ def binary_model(
         images += struct.pack("<Q", len(seen)) + b"".join(struct.pack("<ddQ", 1.5, 2.5, p) for p in seen)
     (folder / "images.bin").write_bytes(images)
     cloud = struct.pack("<Q", len(points))
-    for i, p in points.items():
-        cloud += struct.pack("<Q3d3BdQ", i, *p, i % 256, 20, 30, 0.5, 2) + struct.pack("<4I", 1, 0, 11, 0)
+    for (i, p), error in zip(points.items(), cycle(errors), strict=False):
+        cloud += struct.pack("<Q3d3BdQ", i, *p, i % 256, 20, 30, error, 2) + struct.pack("<4I", 1, 0, 11, 0)
     (folder / "points3D.bin").write_bytes(cloud)
 
 
@@ -116,8 +117,16 @@ def test_colmap_points(tmp_path, write_model):
     # Seen from x = 4 along -x, they lie 3, 4 and 100 deep.
     view = capture.train[0]
     assert (view.near, view.far) == pytest.approx((3.002, 99.808))
+    assert view.seen.tolist() == [0, 1, 2]
     if write_model is text_model:  # an image without observations, whose second line is empty
-        assert capture.train[2].near is None
+        assert capture.train[2].near is None and not len(capture.train[2].seen)
+
+
+def test_points_that_photos_show_elsewhere_are_not_what_they_show(tmp_path):
+    binary_model(tmp_path / "sparse/0", errors=(0.5, 3.0, np.nan))  # of points 7, 3 and 900
+    photos(tmp_path / "images")
+    capture = read_capture(tmp_path)
+    assert len(capture.points.positions) == 3 and capture.train[0].seen.tolist() == [1]
 
 
 MODELS = {
@@ -595,9 +604,39 @@ def test_points_of_the_model_that_a_capture_came_from(tmp_path):
     points = {i: tuple((np.array(p) / scale - matrix[:, 3]) @ matrix[:, :3]) for i, p in POINTS.items()}
     binary_model(tmp_path / "colmap/sparse/0", points=points)
     write(tmp_path, fl_x=80, applied_transform=MOVED, applied_scale=scale)
+    cloud(tmp_path / "p.ply")
+    for more in ({}, {"ply_file_path": "p.ply"}):
+        write(tmp_path, fl_x=80, applied_transform=MOVED, applied_scale=scale, **more)
+        capture = read_capture(tmp_path)
+        assert capture.kind == "transforms" and capture.notes == ()
+        assert capture.points.positions == pytest.approx(np.array([POINTS[i] for i in (3, 7, 900)]))
+        assert capture.train[0].seen.tolist() == [0, 1, 2]
+
+
+def test_a_model_beside_a_capture_that_is_not_its_own(tmp_path):
+    """Its photo would show points that lie behind it; or it is cut off."""
+    photo(tmp_path / "a.png")
+    cloud(tmp_path / "p.ply")
+    write(tmp_path, fl_x=80, ply_file_path="p.ply", applied_transform=np.eye(4)[:3].tolist())
+    binary_model(tmp_path / "sparse/0", points={i: (9.0, 1.0, 2.0) for i in range(9)})
     capture = read_capture(tmp_path)
-    assert capture.kind == "transforms"
-    assert capture.points.positions == pytest.approx(np.array([POINTS[i] for i in (3, 7, 900)]))
+    assert len(capture.points.positions) == 3 and capture.train[0].seen is None and capture.notes == ()
+    file = tmp_path / "sparse/0/points3D.bin"
+    file.write_bytes(file.read_bytes()[:-9])
+    capture = read_capture(tmp_path)
+    assert len(capture.points.positions) == 3 and capture.train[0].seen is None
+    assert "points3D.bin" in capture.notes[0] and "is read without that model" in capture.notes[0]
+
+
+@pytest.mark.parametrize("listed", ["1", [0.5], [-1], [True], {}, [10**12], [3]])
+def test_points_that_a_frame_cannot_show(tmp_path, listed):
+    photo(tmp_path / "a.png")
+    cloud(tmp_path / "p.ply")
+    write(tmp_path, fl_x=80, frames=[frame("a.png", sparse_points=[2, 0, 2])], ply_file_path="p.ply")
+    assert read_capture(tmp_path).train[0].seen.tolist() == [0, 2]
+    write(tmp_path, fl_x=80, frames=[frame("a.png", sparse_points=listed)], ply_file_path="p.ply")
+    with pytest.raises(BadSchema, match="sparse.point"):
+        read_capture(tmp_path)
 
 
 def test_points_that_are_not_there(tmp_path):

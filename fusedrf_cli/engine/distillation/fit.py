@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.distillation import keypoints
 from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
+from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
 from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
@@ -163,11 +165,13 @@ class FitRun:
         settings: FitSettings,
         generator: torch.Generator,
         limits: OccupancyGrid | None = None,
+        known: KeyPoints | None = None,
     ):
         """limits: cells over the field's box that alone may hold matter, where something besides the pictures
         says so: wherever no ray tells that there is nothing, cells found anew would grow by one each time."""
         self.limits = limits
         self.field, self.pool, self.settings, self.generator = field, pool, settings, generator
+        self.keypoints = known
         self.optimiser = self.fresh_optimiser()
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(settings.stages[1:]), [*OCCUPANCY_AT, 1.0]
@@ -186,8 +190,10 @@ class FitRun:
         settings: FitSettings,
         name: str = "",
         limits: OccupancyGrid | None = None,
+        known: Known | None = None,
     ) -> "FitRun":
-        """A fit before its first step; the arguments are those of `fit` and of FitRun."""
+        """A fit before its first step; the arguments are those of `fit` and of FitRun, and what points its
+        pictures are known to show."""
         generator = torch.Generator().manual_seed(settings.seed)
         pool = RayPool(cameras, images, generator)
         coarse = max(LEAST_TEXELS, round(settings.longest * settings.stages[0][1]))
@@ -195,7 +201,8 @@ class FitRun:
         field = kind.create(kind.untrained(aabb, coarse, settings.way), generator, name).to(settings.device)
         if limits is not None:
             field = field.with_occupancy(limits)
-        return cls(field, pool, settings, generator, limits)
+        shown = KeyPoints(cameras, known, pool.ignored, generator) if known is not None else None
+        return cls(field, pool, settings, generator, limits, shown if shown is not None and len(shown.points) else None)
 
     def finish(
         self,
@@ -245,6 +252,9 @@ class FitRun:
         }
         order, drawn = self.pool.epochs.state()
         arrays |= order
+        if self.keypoints is not None:
+            order, drawn_points = self.keypoints.epochs.state()
+            arrays |= {f"keypoints.{name}": keys for name, keys in order.items()}
         state = {
             "command": "train",
             "kind": self.field.kind,
@@ -261,6 +271,7 @@ class FitRun:
             "rays": self.rays,
             "guard": self.guard.state(),
             **drawn,
+            "keypoints": None if self.keypoints is None else drawn_points,
         }
         return arrays, state
 
@@ -281,6 +292,8 @@ class FitRun:
         self.started = working_time() - state["elapsed"]
         self.guard.restore(state["guard"])
         self.pool.epochs.restore(arrays, state)
+        if self.keypoints is not None:
+            self.keypoints.epochs.restore(part_of(arrays, "keypoints."), state["keypoints"])
         self.generator.set_state(torch.from_numpy(arrays["random"]))
 
     @property
@@ -402,7 +415,7 @@ class FitRun:
         """One batch of rays and one optimiser step."""
         settings, field = self.settings, self.field
         self.guard.keep()
-        rays_o, rays_d, pixels = self.pool.draw(self.rays)
+        rays_o, rays_d, pixels, depths = self.draw(share)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         background = np.ones((len(rays_o), 3), np.float32)
         if settings.unbounded:  # haze before any one colour would be wrong before the others
@@ -421,13 +434,25 @@ class FitRun:
             UNBOUNDED_EARLY_STOP if settings.unbounded else EARLY_STOP,
             min(1.0, share / SETTLED) * DISTORTION if settings.unbounded else 0.0,
             LIGHT if share > SETTLED else 0.0,
+            keypoints.WEIGHT,
+            depths,
         )
         loss = np.zeros((self.optimiser.parts, 3))
         field.train_rays(batch, self.optimiser.grads, loss)
         sums = loss.sum(0)
         if self.guard.accepts(sums, self.optimiser):
-            self.learn(sums, len(rays_o), decay(share) * self.guard.rate)
+            self.learn(sums, len(rays_o), decay(share) * self.guard.rate, len(depths))
         self.steps += 1
+
+    def draw(self, share: float) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray]:
+        """Rays of a step and their pixels (RayPool.draw), and the depths (m,) that are known of the first m."""
+        if self.keypoints is None or share > keypoints.UNTIL:
+            return *self.pool.draw(self.rays), np.empty(0)
+        chosen, points = self.keypoints.draw(round(keypoints.SHARE * self.rays))
+        known, others = self.pool.of(chosen), self.pool.draw(self.rays - len(chosen))
+        depths = np.linalg.norm(points - known[0], axis=1)
+        rays_o, rays_d = (np.concatenate(both) for both in zip(known[:2], others[:2], strict=True))
+        return rays_o, rays_d, torch.cat([known[2], others[2]]), depths
 
     def near(self, share: float) -> float:
         """The distance from a camera before which nothing is learnt, which shrinks while the scene takes
@@ -436,16 +461,16 @@ class FitRun:
         early = max(0.0, 1 - share / SETTLED) if settings.unbounded else 0.0
         return settings.near * (1 + (EARLY_NEAR - 1) * early)
 
-    def learn(self, sums: np.ndarray, rays: int, decay: float) -> None:
-        """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
-        of the next."""
+    def learn(self, sums: np.ndarray, rays: int, decay: float, known: int = 0) -> None:
+        """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size of
+        the next; of `known` of the rays depths are known, so that their colours are not in the sums."""
         if self.settings.smooth:
             strip = int(torch.randint(STRIPS, (), generator=self.generator))
             add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)
         if self.steps % FADED_EACH == 0:
             self.optimiser.fade(FADED_EACH * decay * self.faded)
         self.optimiser.step(RATE * decay)
-        mse = sums[0] / rays
+        mse = sums[0] / (rays - known)
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
         per_ray = max(sums[2] / rays, 1.0)
         in_a_box = 1 if self.stages else FINE_SAMPLES

@@ -37,6 +37,9 @@ def runs_of(name: str) -> str:
     return f"{name}.runs"
 
 
+NONE_KNOWN = np.empty(0)
+
+
 class Batch(NamedTuple):
     """Rays, what they should show, and how they are sampled."""
 
@@ -51,6 +54,8 @@ class Batch(NamedTuple):
     early_stop: float
     distortion: float = 0.0  # weight of the loss by which a ray's matter draws together
     light: float = 0.0  # weight under which a sample is followed back by chance alone; 0: every one is
+    depth_weight: float = 0.0  # weight of the loss by which matter comes to known depths
+    depths: np.ndarray = NONE_KNOWN  # (m,) float64, how far away what the first m rays show is, if known
 
 
 WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
@@ -335,16 +340,19 @@ class ComputedField:
 
         The loss of a batch is the mean over its rays of mean_c (C_c + (1 - A) background_c - target_c)² +
         opacity_weight (A - target_3)² + distortion (Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i), with A the
-        opacity, w the weights, s = t / (1 + t) and δ the lengths of the samples in s (Mip-NeRF 360, eq. 15).
-        loss (parts, 3) gains the sums over rays of the
-        colour term, of the opacity term and of the samples taken. With batch.light above 0 the gradient is an
-        estimate, whose mean over jitters is that of the loss (loops.py, `followed`).
+        opacity, w the weights, s = t / (1 + t) and δ the lengths of the samples in s (Mip-NeRF 360, eq. 15);
+        and of rays i that show something at a known depth D_i + depth_weight (Σ_j w_j a(t_j) + 1 - A), where
+        a rises from 0 at |t / D_i - 1| = DEPTH_TOLERANCE to 1 at twice that: light that ends elsewhere (a
+        bounded form of the line-of-sight losses of Urban Radiance Fields, Rematas et al. 2022, eq. 14-16).
+        loss (parts, 3) gains the sums over rays of the colour term, where no depth is known, of the opacity
+        term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose mean over
+        jitters is that of the loss (loops.py, `followed`).
         """
         count = len(batch.rays_o)
         most = self.space.most_samples(self.aabb, batch.step)
         batch = Batch(
             exact(batch.rays_o), exact(batch.rays_d), exact(batch.jitter), as_array(batch.target, self.real),
-            as_array(batch.background, self.real), *map(float, batch[5:]),
+            as_array(batch.background, self.real), *map(float, batch[5:-1]), exact(batch.depths),
         )  # fmt: skip
         self.loops.sweep("train_ray", self.arrays, self.grid, batch, count, most, grads, loss)
         self.collect(grads)

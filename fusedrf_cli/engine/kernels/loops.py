@@ -49,6 +49,7 @@ LEARN_FROM = COLOUR_FROM  # the same in training
 LENT_FROM = 2e-3  # the same in pictures, behind a ray's first colour
 REST_FROM = 0.0  # transmittance from which, in pictures that may stop early, all that is left shows a sample
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
+DEPTH_TOLERANCE = 0.01  # share of a known depth that matter may lie from it
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 POINTS_PER_TASK = 2048
 RAYS_PER_TASK = 256
@@ -213,6 +214,13 @@ def triple(values, i):
 def share_along(t):
     """From 0 at a ray's origin to 1 at infinity, 1/2 at one unit."""
     return t / (1.0 + t)
+
+
+def astray(along, depth):
+    """How far what lies at `along` of a ray (share_along) is from a depth that is known: 0 within
+    DEPTH_TOLERANCE of it, 1 from twice that on."""
+    away = abs(along / (max(1.0 - along, 1e-12) * depth) - 1.0)
+    return min(1.0, max(0.0, away / DEPTH_TOLERANCE - 1.0))
 
 
 def between(k, many):
@@ -399,7 +407,7 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                 kept.k[count], kept.many[count], kept.steps[count] = between(k, many), many, steps
                 kept.piece[count], kept.held[count] = number, held
                 kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
-                if batch.distortion > 0.0:
+                if batch.distortion > 0.0 or i < batch.depths.shape[0]:
                     kept.along[count] = share_along(distance(course, u))
                 waiting += weight
                 if waiting > LEARN_FROM:
@@ -440,10 +448,12 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
     last = kept.memory.shape[0] - KEPT
     overwritten = shaded * KEPT > kept.memory.shape[0]
-    behind = trans * d_trans
+    depth, far = 0.0, 0.0
+    if i < batch.depths.shape[0]:
+        depth, far = batch.depths[i], batch.depth_weight / batch.target.shape[0]
+    behind = trans * (d_trans + far)
     after = trans
     own = 0.0
-    spread = 0.0
     before, beyond = (0.0, 0.0), (0.0, 0.0)
     if batch.distortion > 0.0:
         for q in range(count):
@@ -470,12 +480,13 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
             carried = kept.carried[q]
             d_rgb = d_colour[0] * carried, d_colour[1] * carried, d_colour[2] * carried
         length = optical_length(course, p, u, kept.many[q], kept.steps[q], step)
+        spread = far * astray(kept.along[q], depth) if far > 0.0 else 0.0
         if batch.distortion > 0.0:
             here = kept.along[q]
             before = before[0] - weight, before[1] - weight * here
-            spread = here * (before[0] - beyond[0]) - (before[1] - beyond[1])
-            spread += weight * length / rate(p) * (1.0 - here) * (1.0 - here) / 3.0
-            spread *= 2.0 * batch.distortion / batch.target.shape[0]
+            apart = here * (before[0] - beyond[0]) - (before[1] - beyond[1])
+            apart += weight * length / rate(p) * (1.0 - here) * (1.0 - here) / 3.0
+            spread += 2.0 * batch.distortion / batch.target.shape[0] * apart
             beyond = beyond[0] + weight, beyond[1] + weight * here
         d_sigma = length * (after * (own + spread) - behind)
         behind += weight * (own + spread)

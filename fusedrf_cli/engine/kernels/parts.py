@@ -225,7 +225,8 @@ def raise_to(out, i, value):
 @body
 def compared(batch, i, colour, trans, work, loss):
     """Gradients of the loss of a batch of rays (ComputedField.train_rays) in ray i's colour and in the
-    transmittance behind it; its colour error, opacity error and work are added to `loss`.
+    transmittance behind it; its colour error, unless its depth is known, opacity error and work are added to
+    `loss`.
     """
     target, background = batch.target, batch.background
     red, green, blue = colour
@@ -233,7 +234,8 @@ def compared(batch, i, colour, trans, work, loss):
     e_g = green + trans * background[i, 1] - target[i, 1]
     e_b = blue + trans * background[i, 2] - target[i, 2]
     e_a = (1.0 - trans) - target[i, 3]
-    accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
+    if i >= batch.depths.shape[0]:
+        accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
     accumulate(loss, 1, e_a * e_a)
     accumulate(loss, 2, work)
     n = target.shape[0]

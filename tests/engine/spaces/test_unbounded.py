@@ -14,6 +14,7 @@ from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
 from fusedrf_cli.engine.kernels.specialise import specialised
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
@@ -215,56 +216,91 @@ def test_gradients_reach_numbers_far_out():
         assert grads[0, at] == pytest.approx(slope, rel=2e-2, abs=1e-6)
 
 
-def distortion(field: VMField, o: np.ndarray, d: np.ndarray, jitter: np.ndarray, step: float) -> float:
-    """The mean over rays of Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i, as it is written (Mip-NeRF 360, eq.
-    15)."""
+def weights_along(field: VMField, o: np.ndarray, d: np.ndarray, jitter: np.ndarray, step: float):
+    """(t, weights, lengths) of all samples of each ray, by the rule of volume rendering as it is written."""
     ts, spans, counts = *np.zeros((2, len(o), 4000)), np.zeros(len(o), np.int64)
     start, alive = np.zeros(len(o), np.int64), np.ones(len(o), bool)
-    SPACE["march"](
-        field.occupancy.arrays,
-        o,
-        d,
-        reach_of(len(o), 0, np.inf),
-        jitter,
-        step,
-        start,
-        alive,
-        ts,
-        spans,
-        counts,
-    )
+    reach = reach_of(len(o), 0, np.inf)
+    SPACE["march"](field.occupancy.arrays, o, d, reach, jitter, step, start, alive, ts, spans, counts)
     assert (start < 0).all()
-    total = 0.0
     for i in range(len(o)):
         t, lengths = ts[i, : counts[i]], spans[i, : counts[i]]
         points = torch.from_numpy(o[i] + t[:, None] * d[i])
         sigma, _ = field.query(points, torch.from_numpy(np.tile(d[i], (len(t), 1))), False)
         depth = sigma.numpy() * lengths
-        weights = np.exp(-(np.cumsum(depth) - depth)) * -np.expm1(-depth)
-        s = t / (1 + t)
-        total += (weights[:, None] * weights * abs(s[:, None] - s)).sum()
-        total += (weights**2 * lengths * (1 - s) ** 2).sum() / 3
-    return total / len(o)
+        yield t, np.exp(-(np.cumsum(depth) - depth)) * -np.expm1(-depth), lengths
 
 
-def test_the_distortion_loss_sends_back_its_own_gradient():
-    field = random_field(4)
-    rng = np.random.default_rng(5)
-    d = rng.normal(size=(6, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    o, jitter = rng.normal(size=(6, 3)), rng.random(6)
+def distortion(field: VMField, *rays) -> float:
+    """The mean over rays of Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i, as it is written (Mip-NeRF 360, eq.
+    15)."""
     found = []
-    for weight in (0.0, 0.7):
-        batch = Batch(o, d, jitter, np.zeros((6, 4)), np.zeros((6, 3)), 0.0, 0.0, 0.05, -1.0, weight)
+    for t, weights, lengths in weights_along(field, *rays):
+        s = t / (1 + t)
+        own = (weights**2 * lengths * (1 - s) ** 2).sum() / 3
+        found.append((weights[:, None] * weights * abs(s[:, None] - s)).sum() + own)
+    return np.mean(found)
+
+
+def astray(field: VMField, depths: np.ndarray, *rays) -> float:
+    """The sum over the first rays, whose depths are known, of the light that ends elsewhere or nowhere, over
+    the number of all rays."""
+    found = 0.0
+    for depth, (t, weights, _) in zip(depths, weights_along(field, *rays), strict=False):
+        away = abs(t / depth - 1)
+        far = np.interp(away, [0, DEPTH_TOLERANCE, 2 * DEPTH_TOLERANCE], [0, 0, 1])
+        found += (weights * far).sum() + 1 - weights.sum()
+    return found / len(rays[0])
+
+
+def some_rays(count: int, seed: int) -> tuple:
+    """Origins, directions and jitter of rays all over the core, and the length of a step."""
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=(count, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return rng.normal(size=(count, 3)), d, rng.random(count), 0.05
+
+
+@pytest.mark.parametrize("term", ["distortion", "depths"])
+def test_a_loss_of_weights_sends_back_its_own_gradient(term):
+    field, rays = random_field(4), some_rays(6, 5)
+    o, d, jitter, step = rays
+    # where light ends anyway, and where it does not; the last two rays show what nobody knows
+    depths = np.array([(t * w).sum() / w.sum() for t, w, _ in weights_along(field, *rays)])[:4] * [1, 1.3, 1, 0.5]
+    weight = 0.7
+    with_it = (weight,) if term == "distortion" else (0.0, 0.0, weight, depths)
+    gradients = []
+    for extra in ((), with_it):
+        batch = Batch(o, d, jitter, np.zeros((6, 4)), np.zeros((6, 3)), 0.0, 0.0, step, -1.0, *extra)
         grads = np.zeros((1, len(field.params)))
         field.train_rays(batch, grads, np.zeros((1, 3)))
-        found.append(grads[0])
-    found = (found[1] - found[0]) / 0.7
+        gradients.append(grads[0])
+    found = (gradients[1] - gradients[0]) / weight
+
+    def wanted(params: torch.Tensor) -> float:
+        moved = field.with_params(params)
+        return distortion(moved, *rays) if term == "distortion" else astray(moved, depths, *rays)
+
     for at in np.argsort(-abs(found))[:40:8]:
-        step = torch.zeros_like(field.params)
-        step[at] = 1e-5
-        both = [distortion(field.with_params(field.params + s), o, d, jitter, 0.05) for s in (step, -step)]
-        assert found[at] == pytest.approx((both[0] - both[1]) / 2e-5, rel=1e-5, abs=1e-10)
+        change = torch.zeros_like(field.params)
+        change[at] = 1e-5
+        slope = (wanted(field.params + change) - wanted(field.params - change)) / 2e-5
+        assert found[at] == pytest.approx(slope, rel=1e-5, abs=1e-10)
+
+
+def test_rays_of_known_depth_do_not_count_for_the_error_of_colours():
+    field, (o, d, jitter, step) = random_field(4), some_rays(6, 5)
+    target = np.random.default_rng(1).random((6, 4))
+
+    def error(part: slice, *extra) -> np.ndarray:
+        loss = np.zeros((1, 3))
+        batch = Batch(o[part], d[part], jitter[part], target[part], np.zeros((6, 3))[part], 0.1, 0.0, step, -1.0, *extra)
+        field.train_rays(batch, np.zeros((1, len(field.params))), loss)
+        return loss[0]
+
+    known = error(slice(0, 6), 0.0, 0.0, 0.05, np.ones(2))
+    assert known[0] == pytest.approx(error(slice(2, 6))[0])
+    assert known[1:] == pytest.approx(error(slice(0, 6))[1:])
 
 
 def test_the_largest_weight_of_each_cell():

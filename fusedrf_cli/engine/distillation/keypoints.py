@@ -1,0 +1,48 @@
+"""Pixels of pictures that are known to show a point: what structure from motion found in them."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.distillation.epochs import Epochs
+from fusedrf_cli.engine.rendering.cameras import Camera, projected
+
+UNTIL = 0.5  # share of the run after which depths are not held to any more
+SHARE = 1 / 16  # of the rays of a step
+WEIGHT = 0.05
+
+
+class Known(NamedTuple):
+    """Which points pictures are known to show."""
+
+    points: np.ndarray
+    """(N, 3) float64, in the field's frame."""
+    picture: np.ndarray
+    """(N,) int64, the picture that shows each; a point may come again with another."""
+
+
+class KeyPoints:
+    """Pixels with a point that they show, in random order."""
+
+    def __init__(self, cameras: list[Camera], known: Known, ignored: np.ndarray | None, generator: torch.Generator):
+        """ignored (P,) bool: pixels, counted picture after picture, that must not be drawn."""
+        first = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
+        pixels = np.full(len(known.points), -1)
+        for i, camera in enumerate(cameras):
+            own = np.flatnonzero(known.picture == i)
+            at, _, inside = projected(camera, known.points[own])
+            column, row = at[inside].astype(np.int64).T
+            pixels[own[inside]] = first[i] + row * camera.width + column
+        used = pixels >= 0
+        if ignored is not None:
+            used &= ~ignored[pixels]
+        self.pixels = torch.from_numpy(pixels[used])
+        self.points = known.points[used]
+        self.epochs = Epochs(len(self.points), generator)
+
+    def draw(self, count: int) -> tuple[torch.Tensor, np.ndarray]:
+        """Pixels (count,) int64, counted picture after picture, and the points (count, 3) that they show; or
+        as many as there are."""
+        chosen = self.epochs.draw(count)
+        return self.pixels[chosen], self.points[chosen.numpy()]
