@@ -25,8 +25,8 @@ MAX_CAMERAS_BYTES = 64 * 2**20
 MAX_BYTES = 2**31
 MAX_NAME = 4096
 MOST_ERROR = 1.5
-"""Pixels of the photos that were compared. A point that lies farther, on average, from where photos show it is
-none that anything is known of."""
+"""Pixels of the photos that were compared. A point that lies farther, on average, from where photos show it
+says nothing of them."""
 MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",

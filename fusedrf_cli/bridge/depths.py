@@ -28,7 +28,9 @@ def known_points(capture: Capture, extent: Extent) -> Known | None:
     return Known(points, picture[sure])
 
 
-def certain(positions: np.ndarray, views: tuple[View, ...], point: np.ndarray, picture: np.ndarray) -> np.ndarray:
+def certain(
+    positions: np.ndarray, views: tuple[View, ...], point: np.ndarray, picture: np.ndarray
+) -> np.ndarray:
     """(P,) bool: which of the positions (P, 3) enough of the views show from directions so far apart that
     their distance follows. `point` and `picture` (N,) tell who shows what.
 

@@ -11,8 +11,8 @@ from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_photos
 from formats.meshes import mesh_capture
 from formats.views import Capture, check_parallax
-from fusedrf_cli.bridge.extent import Extent, extent_of
 from fusedrf_cli.bridge.depths import known_points
+from fusedrf_cli.bridge.extent import Extent, extent_of
 from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
@@ -146,6 +146,7 @@ def train(request: TrainRequest, progress) -> dict:
         "seconds": {"training": seconds},
         "training_psnr": run.psnr,
         "holdout": measured,
+        "depths_of_points": run.keypoints and len(run.keypoints.points),
         "exposure": exposure(run),
         "poses": moved(run, cameras, extent) if settings.poses else None,
         "memory": memory.report(),

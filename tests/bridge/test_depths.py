@@ -41,7 +41,9 @@ def off(eyes: np.ndarray, point: np.ndarray, rng) -> float:
 def test_a_point_is_certain_where_lines_of_sight_that_are_a_little_off_meet_near_it(count):
     rng = np.random.default_rng(0)
     for apart in (0.02, 0.05, 0.3, 0.6):
-        eyes = np.stack([np.linspace(-apart, apart, count), np.full(count, -4.0), rng.normal(size=count) * apart], 1)
+        eyes = np.stack(
+            [np.linspace(-apart, apart, count), np.full(count, -4.0), rng.normal(size=count) * apart], 1
+        )
         everyone = np.arange(count)
         sure = certain(np.zeros((1, 3)), views(eyes), np.zeros(count, int), everyone)[0]
         error = off(eyes, np.zeros(3), rng)

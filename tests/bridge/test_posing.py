@@ -38,8 +38,8 @@ def holiday(folder, monkeypatch):
         calls.append(threads)
         poses = np.array([looking_at(eye, np.zeros(3)) for eye in eyes(5)])
         views = [
-            View(photo.stem, pose, 12, 12, 8, 6, 16, 12, image_path=photo)
-            for photo, pose in zip(photos, poses, strict=False)
+            View(photo.stem, pose, 12, 12, 8, 6, 16, 12, image_path=photo, seen=np.arange(i, 99, 2))
+            for i, (photo, pose) in enumerate(zip(photos, poses, strict=False))
         ]
         points = Points(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
         return Posed(tuple(views), points, ("p5.png",), ("p5.png",), (5,), 0.5)
@@ -60,6 +60,8 @@ def test_a_capture_is_written_beside_the_photos(report, holiday, folder):
     assert "1 of 6 photos found no place and were left out: p5.png; p5.png are blurred or plain" in warning
     document = json.loads((folder / "garden/transforms.json").read_text())
     assert [frame["file_path"] for frame in document["frames"]] == [f"../holiday/p{i}.png" for i in range(5)]
+    seen = [view.seen.tolist() for view in read_capture(folder / "garden").train]
+    assert seen == [[*range(i, 99, 2)] for i in range(5)]
     assert report("train", "garden", "-o", "out.rfpack", *DRAFT)["views"] == 5
     assert len(holiday) == 1
 

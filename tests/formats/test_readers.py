@@ -2,8 +2,8 @@
 
 import json
 import struct
-from itertools import cycle
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +54,14 @@ def test_the_quaternion_of_these_tests():
 
 
 def binary_model(
-    folder: Path, names=NAMES, model=1, params=(80, 80, 50, 40), size=SIZE, points=POINTS, apart=0.0, errors=(0.5,)
+    folder: Path,
+    names=NAMES,
+    model=1,
+    params=(80, 80, 50, 40),
+    size=SIZE,
+    points=POINTS,
+    apart=0.0,
+    errors=(0.5,),
 ) -> None:
     """All cameras at one place, or `apart` from each other; the errors of points are told in turn."""
     folder.mkdir(parents=True, exist_ok=True)

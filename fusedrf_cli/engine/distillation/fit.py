@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.distillation import keypoints
 from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
 from fusedrf_cli.engine.distillation.guard import Guard
-from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
+from fusedrf_cli.engine.distillation.keypoints import DEPTH_WEIGHT, KeyPoints, Known
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
 from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
@@ -26,7 +25,7 @@ from fusedrf_cli.engine.distillation.poses import (
 )
 from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.computed import Batch
+from fusedrf_cli.engine.fields.computed import NONE_KNOWN, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
@@ -192,7 +191,7 @@ class FitRun:
         limits: OccupancyGrid | None = None,
         known: Known | None = None,
     ) -> "FitRun":
-        """A fit before its first step; the arguments are those of `fit` and of FitRun, and what points its
+        """A fit before its first step; the arguments are those of `fit` and of FitRun, and which points its
         pictures are known to show."""
         generator = torch.Generator().manual_seed(settings.seed)
         pool = RayPool(cameras, images, generator)
@@ -201,8 +200,9 @@ class FitRun:
         field = kind.create(kind.untrained(aabb, coarse, settings.way), generator, name).to(settings.device)
         if limits is not None:
             field = field.with_occupancy(limits)
-        shown = KeyPoints(cameras, known, pool.ignored, generator) if known is not None else None
-        return cls(field, pool, settings, generator, limits, shown if shown is not None and len(shown.points) else None)
+        ignored = None if pool.ignored is None else pool.ignored.numpy()
+        shown = None if known is None else KeyPoints(cameras, known, ignored, generator)
+        return cls(field, pool, settings, generator, limits, shown)
 
     def finish(
         self,
@@ -434,7 +434,7 @@ class FitRun:
             UNBOUNDED_EARLY_STOP if settings.unbounded else EARLY_STOP,
             min(1.0, share / SETTLED) * DISTORTION if settings.unbounded else 0.0,
             LIGHT if share > SETTLED else 0.0,
-            keypoints.WEIGHT,
+            DEPTH_WEIGHT,
             depths,
         )
         loss = np.zeros((self.optimiser.parts, 3))
@@ -445,10 +445,12 @@ class FitRun:
         self.steps += 1
 
     def draw(self, share: float) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray]:
-        """Rays of a step and their pixels (RayPool.draw), and the depths (m,) that are known of the first m."""
-        if self.keypoints is None or share > keypoints.UNTIL:
-            return *self.pool.draw(self.rays), np.empty(0)
-        chosen, points = self.keypoints.draw(round(keypoints.SHARE * self.rays))
+        """Rays of a step with their pixels, as RayPool.draw gives them, and the depths (m,) of the first m,
+        which are known."""
+        wanted = 0 if self.keypoints is None else self.keypoints.wanted(self.rays, share)
+        if not wanted:
+            return *self.pool.draw(self.rays), NONE_KNOWN
+        chosen, points = self.keypoints.draw(wanted)
         known, others = self.pool.of(chosen), self.pool.draw(self.rays - len(chosen))
         depths = np.linalg.norm(points - known[0], axis=1)
         rays_o, rays_d = (np.concatenate(both) for both in zip(known[:2], others[:2], strict=True))
@@ -462,8 +464,8 @@ class FitRun:
         return settings.near * (1 + (EARLY_NEAR - 1) * early)
 
     def learn(self, sums: np.ndarray, rays: int, decay: float, known: int = 0) -> None:
-        """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size of
-        the next; of `known` of the rays depths are known, so that their colours are not in the sums."""
+        """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
+        of the next. Of `known` of them depths are known, and their colour errors are not in the sums."""
         if self.settings.smooth:
             strip = int(torch.randint(STRIPS, (), generator=self.generator))
             add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)

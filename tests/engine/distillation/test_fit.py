@@ -1,5 +1,6 @@
 """Fitting a field to pictures of a ball: quality, sameness, and the parts of the loop."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -19,12 +20,13 @@ from fusedrf_cli.engine.distillation.fit import (
     fit,
     occupancy_of,
 )
+from fusedrf_cli.engine.distillation.keypoints import Known
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, random_vm
 
@@ -60,6 +62,64 @@ def test_a_ball_is_learnt(capture):
     assert 0.02 < field.occupancy.occupied.mean() < 0.9
     shares, quality = zip(*told, strict=True)
     assert list(shares) == sorted(shares) and quality[-1] > quality[0] + 5
+
+
+def known_of(cameras: list[Camera], each: int = 30) -> Known:
+    """Points of the ball's front, as each camera sees them."""
+    points, rng = [], np.random.default_rng(0)
+    for camera in cameras:
+        aside = rng.normal(size=(each, 3))
+        front = camera.camera_to_world[:3, 3] / np.linalg.norm(camera.camera_to_world[:3, 3]) + 0.3 * aside
+        points.append(0.7 * front / np.linalg.norm(front, axis=1, keepdims=True))
+    return Known(np.concatenate(points), np.repeat(np.arange(len(cameras)), each))
+
+
+def test_known_points_bring_matter_to_where_it_is():
+    """Four pictures from nearly one place hardly tell how far away a ball is: along rays that nothing was
+    told of, the light of most ends half as far from where it should."""
+    cameras = orbit(BOX, 60, 24, 24)[:4]
+    images, off = pictures(cameras), []
+    rays_o, rays_d = orbit(BOX, 60, 24, 24)[5].rays()
+    true = render_rays(Ball(density=40.0, radius=0.7), rays_o, rays_d, step=0.02)
+    met = true[:, 3] > 0.9
+    for known in (None, known_of(cameras, 600)):
+        field = FitRun.start(cameras, images, BOX, SETTINGS, known=known).finish()
+        seen = render_rays(field, rays_o, rays_d, step=0.02)
+        off.append(np.median(np.abs(seen[met, 4] / seen[met, 3] - true[met, 4] / true[met, 3])))
+    assert off[1] < 0.6 * off[0]
+
+
+def test_a_run_that_knows_points_goes_on_as_if_nothing_had_happened(capture):
+    cameras, images = capture
+    settings = replace(SETTINGS, steps=30)
+
+    def begun() -> FitRun:
+        return FitRun.start(cameras, images, BOX, settings, known=known_of(cameras))
+
+    def taken(run: FitRun, steps: int) -> FitRun:
+        for _ in range(steps):
+            run.step(run.share())
+        return run
+
+    whole, half = taken(begun(), 8), taken(begun(), 4)
+    arrays, state = half.checkpoint()
+    again = begun()
+    again.restore({name: array.copy() for name, array in arrays.items()}, json.loads(json.dumps(state)))
+    assert torch.equal(taken(again, 4).field.params, whole.field.params)
+
+
+def test_points_are_known_of_a_part_of_the_rays_in_the_first_half(capture):
+    cameras, images = capture
+    run = FitRun.start(cameras, images, BOX, SETTINGS, known=known_of(cameras, 400))
+    run.rays = 1600
+    rays_o, rays_d, pixels, depths = run.draw(0.2)
+    assert len(rays_o) == len(rays_d) == len(pixels) == 1600 and len(depths) == 100
+    surface = rays_o[:100] + depths[:, None] * rays_d[:100]
+    assert np.linalg.norm(surface, axis=1) == pytest.approx(np.full(100, 0.7), abs=0.15)  # 1.5 pixels
+    assert len(run.draw(0.6)[3]) == 0
+    few = FitRun.start(cameras, images, BOX, SETTINGS, known=known_of(cameras, 40))
+    few.rays = 1600
+    assert len(few.draw(0.2)[3]) == 10  # 320 of them, each once in 32 steps
 
 
 def test_the_rate_holds_and_then_falls_by_equal_factors():

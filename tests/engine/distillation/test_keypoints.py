@@ -17,7 +17,9 @@ def cameras() -> list[Camera]:
     eyes = np.array([[4.0, 0, 1], [0, 4, 1], [-3, -3, 0]])
     lenses = [(40, 30, (0.0,) * 5, False), (24, 36, BENT, False), (32, 32, (0.05, 0, 0, 0), True)]
     return [
-        Camera(look_at(eye, np.zeros(3), UP), 40, 40, width / 2, height / 2, width, height, bends, str(i), fish)
+        Camera(
+            look_at(eye, np.zeros(3), UP), 40, 40, width / 2, height / 2, width, height, bends, str(i), fish
+        )
         for i, (eye, (width, height, bends, fish)) in enumerate(zip(eyes, lenses, strict=True))
     ]
 

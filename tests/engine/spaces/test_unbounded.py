@@ -266,7 +266,8 @@ def test_a_loss_of_weights_sends_back_its_own_gradient(term):
     field, rays = random_field(4), some_rays(6, 5)
     o, d, jitter, step = rays
     # where light ends anyway, and where it does not; the last two rays show what nobody knows
-    depths = np.array([(t * w).sum() / w.sum() for t, w, _ in weights_along(field, *rays)])[:4] * [1, 1.3, 1, 0.5]
+    ends = [(t * weights).sum() / weights.sum() for t, weights, _ in weights_along(field, *rays)]
+    depths = np.array(ends[:4]) * [1, 1.3, 1, 0.5]
     weight = 0.7
     with_it = (weight,) if term == "distortion" else (0.0, 0.0, weight, depths)
     gradients = []
@@ -294,7 +295,8 @@ def test_rays_of_known_depth_do_not_count_for_the_error_of_colours():
 
     def error(part: slice, *extra) -> np.ndarray:
         loss = np.zeros((1, 3))
-        batch = Batch(o[part], d[part], jitter[part], target[part], np.zeros((6, 3))[part], 0.1, 0.0, step, -1.0, *extra)
+        asked = o[part], d[part], jitter[part], target[part], np.zeros((6, 3))[part]
+        batch = Batch(*asked, 0.1, 0.0, step, -1.0, *extra)
         field.train_rays(batch, np.zeros((1, len(field.params))), loss)
         return loss[0]
 
