@@ -219,7 +219,7 @@ def share_along(t):
 def astray(along, depth):
     """How far what lies at `along` of a ray (share_along) is from a depth that is known: 0 within
     DEPTH_TOLERANCE of it, 1 from twice that on."""
-    away = abs(along / (max(1.0 - along, 1e-12) * depth) - 1.0)
+    away = abs(along / max((1.0 - along) * depth, 1e-12) - 1.0)
     return min(1.0, max(0.0, away / DEPTH_TOLERANCE - 1.0))
 
 
