@@ -138,13 +138,16 @@ def test_pictures_under_a_grid_that_knows_the_insides_of_cells():
 
 
 def trained(rays_o, rays_d, step):
-    """Work for `twice`: gradient, losses and samples of rays with random targets."""
+    """Work for `twice`: gradient, losses and samples of rays with random targets, of the first of which the
+    depth is known."""
     n, rng = len(rays_o), np.random.default_rng(2)
     jitter, target, background = rng.random(n), rng.random((n, 4)), rng.random((n, 3))
+    losses = {"opacity_weight": 0.3, "distortion": 0.1, "depth_weight": 0.5, "depths": rng.random(1) + 1}
+    batch = Batch(rays_o, rays_d, jitter, target, background, near=0.0, step=step, early_stop=1e-3, **losses)
 
     def gradient(field):
         grads, loss = np.zeros((1, field.params.numel()), field.real), np.zeros((1, 3))
-        field.train_rays(Batch(rays_o, rays_d, jitter, target, background, 0.3, 0.0, step, 1e-3), grads, loss)
+        field.train_rays(batch, grads, loss)
         return grads, loss
 
     return gradient
