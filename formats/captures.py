@@ -305,6 +305,7 @@ def write_capture(
     for view, picture in zip(views, pixels, strict=True):
         write_png(folder / split / f"{view.name}.png", picture)
     files = [f"./{split}/{view.name}" for view in views]
+    views = [replace(view, seen=None) for view in views]  # of points that are not written
     write_cameras(folder / f"transforms_{split}.json", views, files)
 
 

@@ -340,10 +340,10 @@ class ComputedField:
 
         The loss of a batch is the mean over its rays of mean_c (C_c + (1 - A) background_c - target_c)² +
         opacity_weight (A - target_3)² + distortion (Σ_ij w_i w_j |s_i - s_j| + ⅓ Σ_i w_i² δ_i), with A the
-        opacity, w the weights, s = t / (1 + t) and δ the lengths of the samples in s (Mip-NeRF 360, eq. 15);
-        and of rays i that show something at a known depth D_i + depth_weight (Σ_j w_j a(t_j) + 1 - A), where
-        a rises from 0 at |t / D_i - 1| = DEPTH_TOLERANCE to 1 at twice that: light that ends elsewhere (a
-        bounded form of the line-of-sight losses of Urban Radiance Fields, Rematas et al. 2022, eq. 14-16).
+        opacity, w the weights, s = t / (1 + t) and δ the lengths of the samples in s (Mip-NeRF 360, eq. 15).
+        A ray of known depth D has a term more, depth_weight (Σ_i w_i a(t_i) + 1 - A), the light that ends
+        elsewhere or nowhere: a is 0 where |t / D - 1| is up to DEPTH_TOLERANCE and 1 from twice that on. It
+        is ours, after the losses along lidar's lines of sight of Urban Radiance Fields (Rematas et al. 2022).
         loss (parts, 3) gains the sums over rays of the colour term, where no depth is known, of the opacity
         term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose mean over
         jitters is that of the loss (loops.py, `followed`).
