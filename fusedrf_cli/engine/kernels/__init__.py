@@ -17,6 +17,7 @@ from types import ModuleType
 import numba
 from numba.core import event
 
+from fusedrf_cli.engine.kernels import locator
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
 
@@ -65,6 +66,7 @@ def is_ours(folder: Path, others: int) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & others
 
 
+locator.install()
 if "NUMBA_CACHE_DIR" not in os.environ:
     numba.config.CACHE_DIR = str(kernel_cache())
 # The gradient scatter adds short runs of floats; only superword vectorisation turns those into vector

@@ -1,6 +1,7 @@
 """Where compiled kernels are kept."""
 
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -31,20 +32,39 @@ def test_cache_is_the_users_and_named_for_what_is_inlined(tmp_path, monkeypatch)
     assert len(folders) == len(changed) + 1
 
 
-def test_compilation_is_told_once_and_what_is_kept_is_not_compiled(tmp_path):
-    """Two functions, then the same again in a second process: one call of `tell`, then none."""
-    script = """
-import numpy as np, sys
+SCRIPT = """
+import sys
+import numpy as np
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.kernels import cpu
 told = []
 with kernels.telling_of_compilation(lambda: told.append(1)):
     rays = np.zeros((1, 3)), np.ones((1, 3))
     cpu.lens_rays(np.eye(4), 1.0, 1.0, 0.5, 0.5, (0.0,) * 9, False, 1, 0, np.zeros(1, np.int64), *rays)
+print(cpu.__file__)
 sys.exit(len(told))
 """
+"""Compiles two functions, or loads them; its exit code is how often it was told of compilation."""
+
+
+def test_compilation_is_told_once_and_what_is_kept_is_not_compiled(tmp_path):
+    """Two functions, then the same again in a second process: one call of `tell`, then none."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    runs = [subprocess.run([sys.executable, "-c", script], env=environment).returncode for _ in range(2)]
+    runs = [subprocess.run([sys.executable, "-c", SCRIPT], env=environment).returncode for _ in range(2)]
+    assert runs == [1, 0]
+
+
+def test_another_copy_of_the_code_compiles_nothing(tmp_path):
+    """Clones and worktrees share what one of them has compiled."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "PYTHONPATH")}
+    runs = []
+    for name in ("one", "other"):
+        shutil.copytree(Path(kernels.__file__).parents[2], tmp_path / name / "fusedrf_cli")
+        paths = {"PYTHONPATH": str(tmp_path / name), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+        command = [sys.executable, "-c", SCRIPT]
+        run = subprocess.run(command, env=environment | paths, cwd=tmp_path, capture_output=True, text=True)
+        assert run.stdout.startswith(str(tmp_path / name)), run.stderr
+        runs.append(run.returncode)
     assert runs == [1, 0]
 
 
