@@ -1,5 +1,5 @@
-"""Where numba keeps compiled code: by where a file lies in the package, not on the disk, so that another clone
-or worktree of the same code finds what one has compiled. The cache's folder is named for what the code says."""
+"""Where numba keeps compiled code: by where a file lies in the package, not on the disk, so that another
+clone or worktree of the same code finds what one has compiled. The cache's folder is named for the code."""
 
 from pathlib import Path
 
