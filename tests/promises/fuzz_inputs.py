@@ -1,10 +1,10 @@
 """Damaged captures, meshes, scenes and checkpoints: `python -m tests.promises.fuzz_inputs --seed 0`.
 
-`--readers N` mutates N inputs and has the readers read them in this process. `--commands N` has whole commands
-work on N of them, each in a child forked from one warm process, under limits of memory and time; one in five
-is told to end (SIGTERM) meanwhile. An input is wrong if it ended in anything but an error of the program's own,
-took too long, took too much memory, did not end when told to, or left a temporary. Every input follows
-from (seed, index).
+`--readers N` mutates N inputs and has the readers read them in this process. `--commands N` has whole
+commands work on N of them, each in a child forked from one warm process, under limits of memory and time; one
+in five is told to end (SIGTERM) meanwhile. An input is wrong if it ended in anything but an error of the
+program's own, took too long, took too much memory, did not end when told to, or left a temporary. Every input
+follows from (seed, index).
 """
 
 import argparse
