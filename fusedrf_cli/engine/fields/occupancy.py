@@ -23,6 +23,9 @@ ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
 NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
+ORDINARY = (2.0**-4, 2.0**10)
+"""Longest sides of a box between which densities, per unit of length, fit the floats that they are stored as;
+they are learnt as well at any."""
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 
@@ -389,6 +392,18 @@ def placement(origin: np.ndarray) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, 3] = origin
     return matrix
+
+
+def frame_around(box: np.ndarray) -> np.ndarray:
+    """Where a frame for what lies in a box (6,) of the world has its origin, the middle: a position (3,), or,
+    where the box is of no ordinary size, a placement (4, 4). Its unit is then a power of two, by which
+    scaling is exact."""
+    middle, side = (box[:3] + box[3:]) / 2, float((box[3:] - box[:3]).max())
+    if side == 0 or ORDINARY[0] <= side <= ORDINARY[1]:
+        return middle
+    frame = placement(middle)
+    frame[:3, :3] *= 2.0 ** np.floor(np.log2(side))
+    return frame
 
 
 def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
