@@ -406,6 +406,24 @@ def frame_around(box: np.ndarray) -> np.ndarray:
     return frame
 
 
+def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(4, 4) of an object seen from a frame that lies at `origin`: a position (3,), or a placement (4, 4)."""
+    frame, matrix = placement(origin), object_to_world.copy()
+    matrix[:3, 3] -= frame[:3, 3]  # first, so that it is exact however far away both are
+    if origin.shape == (4, 4):
+        matrix[:3] = np.linalg.inv(frame[:3, :3]) @ matrix[:3]
+    return matrix
+
+
+def seen_change(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(4, 4) that does in a frame, which lies at `origin` (4, 4), what a `matrix` (4, 4) does in the world."""
+    linear, inverse = origin[:3, :3], np.linalg.inv(origin[:3, :3])
+    change = np.eye(4)
+    change[:3, :3] = inverse @ matrix[:3, :3] @ linear
+    change[:3, 3] = inverse @ ((matrix[:3, :3] - np.eye(3)) @ origin[:3, 3] + matrix[:3, 3])
+    return change
+
+
 def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(6,) world box around a box (6,) of a frame that lies at `origin`: a position (3,), or a placement (4,
     4)."""
@@ -414,7 +432,11 @@ def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 def seen_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(6,) box of a frame that lies at `origin` around a world box (6,)."""
-    return box - np.tile(origin, 2) if origin.shape == (3,) else transformed_aabb(box, np.linalg.inv(origin))
+    if origin.shape == (3,):
+        return box - np.tile(origin, 2)
+    turned = origin.copy()
+    turned[:3, 3] = 0
+    return transformed_aabb(box - np.tile(origin[:3, 3], 2), np.linalg.inv(turned))
 
 
 def box_corners(aabb: np.ndarray) -> np.ndarray:
