@@ -60,7 +60,7 @@ def boxed(box: tuple) -> TrainRequest:
     return replace(request(), unbounded=None, aabb=box)
 
 
-@pytest.mark.parametrize("box", [(-1.5,) * 3 + (1.5,) * 3, (60, 0, 0, 61, 1, 0.5), (0, 0, 0, 0.1, 0.1, 0.1)])
+@pytest.mark.parametrize("box", [(-1.5,) * 3 + (1.5,) * 3, (60, 0, 0, 61, 1, 0.5), (0, 0, 0, 0.002, 0.002, 0.002)])
 def test_a_box_of_ordinary_size_near_the_origin_is_learnt_in_the_frame_of_the_world(box):
     capture = photos([(4, 0, 0), (0, 4, 0), (0, 0, 4)])
     extent = extent_of(boxed(box), capture, False)

@@ -23,7 +23,7 @@ ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
 NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
-ORDINARY = (2.0**-4, 2.0**10)
+ORDINARY = (2.0**-10, 2.0**12)
 """Longest sides of a box between which densities, per unit of length, fit the floats that they are stored as;
 they are learnt as well at any."""
 # where in a cell its density is probed
