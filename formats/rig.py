@@ -22,7 +22,7 @@ from formats.views import NO_DISTORTION, Capture, View
 MAX_CAMERAS = 10_000
 MAX_NAME_BYTES = 200
 """A picture is written under the name of its camera, with an ending."""
-FARTHEST = 1e12
+FARTHEST = 1e13
 LARGEST = 1e9
 """Of a lens's numbers, in pixels."""
 DIGITS = 8
@@ -74,6 +74,13 @@ class Rig:
     def views(self) -> tuple[View, ...]:
         """All cameras."""
         return self.train + self.test
+
+    @property
+    def reach(self) -> float:
+        """The largest number of the cameras' positions, of the focus and of their distance, or of 1 over
+        that."""
+        most = max(np.abs(self.poses[:, :3, 3]).max(), np.abs(self.focus).max())
+        return float(max(most, self.distance, 1 / self.distance))
 
     @property
     def poses(self) -> np.ndarray:

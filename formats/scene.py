@@ -41,16 +41,21 @@ from formats.rig import FARTHEST, RigSchema, read_rig
 from formats.rotations import matrices
 
 FORMAT = "rfpack"
-VERSION = "1.2"
+VERSION = "1.3"
+SHOWING_VERSION = "1.2"  # of scenes that show a node otherwise than it is
 FRAMED_VERSION = "1.1"  # of scenes with cameras or a framing
 PLAIN_VERSION = "1.0"  # of scenes that have neither
+FAR = "far"
+"""The feature that scenes beyond NEAR_TRANSLATION, NEAR_SINGULAR_VALUES and NEAR_CAMERAS require (1.3): readers
+before it refuse those with a sentence, whatever else they read."""
 MEMBER = r"fields/[0-9a-f]{16}\.safetensors"
 MAX_SCENE_BYTES = 4 << 20
 MAX_NODES = 10_000
 MAX_DEPTH = 64
 MAX_NAME_BYTES = 255
-MAX_TRANSLATION = 1e6
-SINGULAR_VALUES = (1e-4, 1e4)
+MAX_TRANSLATION, NEAR_TRANSLATION = 1e13, 1e6
+SINGULAR_VALUES, NEAR_SINGULAR_VALUES = (1e-12, 1e12), (1e-4, 1e4)
+NEAR_CAMERAS = 1e12
 MAX_CONDITION = 1e6
 WARN_CONDITION = 1e3
 # A unit quaternion typed with two decimals is off by at most this.
@@ -96,7 +101,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
     generator: str = ""
     composition: Literal["max", "add"] = "max"
     history: list[dict] = []
-    requires: Annotated[list[str], msgspec.Meta(max_length=0)] = []
+    requires: Annotated[list[Literal["far"]], msgspec.Meta(max_length=1)] = []
     framing: Box | msgspec.UnsetType = msgspec.UNSET
     cameras: RigSchema | msgspec.UnsetType = msgspec.UNSET
 
@@ -104,7 +109,9 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
 NODE_KEYS = NodeSchema.__struct_fields__
 PLACEMENT_KEYS = ("translation", "rotation", "scale", "matrix")
 SHOWING_KEYS = ("visible", "crop", "opacity", "tint")
-SCENE_KEYS = ("format", "version", "generator", "composition", "nodes", "history", "framing", "cameras")
+SCENE_KEYS = (
+    "format", "version", "requires", "generator", "composition", "nodes", "history", "framing", "cameras",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -127,7 +134,7 @@ class Node:
         if self.field is not None and self.source is not None:
             raise BadSchema(f"node {self.name!r}: has both a field and a source, expected one of them")
         matrix = _placement_matrix(self.placement, self.name)
-        _check_affine(matrix, f"node {self.name!r}")
+        check_affine(matrix, f"node {self.name!r}")
         matrix.flags.writeable = False
         _check_showing(self.showing, self.name)
         object.__setattr__(self, "node_to_parent", matrix)
@@ -226,7 +233,7 @@ class SceneGraph:
                 raise LimitExceeded(f"more than {MAX_NODES:,} nodes")
             seen.add(name)
             if depth > 1:
-                _check_affine(object_to_world, f"node {node.name!r} in the world")
+                check_affine(object_to_world, f"node {node.name!r} in the world")
 
     def walk(self) -> Iterator[tuple[Node, int, np.ndarray]]:
         """Every node in document order with its depth (roots 1) and `object_to_world` (4, 4)."""
@@ -257,6 +264,17 @@ class SceneGraph:
                 shown = visible, opacity, tint, own
                 stack.append((child, object_to_world @ child.node_to_parent, *shown))
         return found
+
+    @property
+    def far(self) -> bool:
+        """Whether a node, a camera or the framing lies, or a node scales, beyond what readers before FAR
+        take."""
+        if max(map(abs, self.framing or (0.0,))) >= NEAR_CAMERAS:
+            return True
+        if self.cameras is not None and read_rig(self.cameras).reach >= NEAR_CAMERAS:
+            return True
+        placed = (matrix for node, _, world in self.walk() for matrix in (node.node_to_parent, world))
+        return not all(_within(matrix, NEAR_TRANSLATION, NEAR_SINGULAR_VALUES) for matrix in placed)
 
 
 def make_node(
@@ -328,12 +346,13 @@ def dump_scene(scene: SceneGraph) -> bytes:
     """
     shown = {"framing": scene.framing and list(scene.framing), "cameras": scene.cameras}
     shown = {key: value for key, value in shown.items() if value is not None}
-    least = FRAMED_VERSION if shown else PLAIN_VERSION
-    if any(node.showing for node, _, _ in scene.walk()):
-        least = VERSION
+    least, far = FRAMED_VERSION if shown else PLAIN_VERSION, scene.far
+    if far or any(node.showing for node, _, _ in scene.walk()):
+        least = VERSION if far else SHOWING_VERSION
     content = {
         "format": FORMAT,
         "version": max(scene.version, least, key=_numbered),
+        **({"requires": [FAR]} if far else {}),
         "generator": scene.generator,
         "composition": scene.composition,
         "nodes": [_node_content(node) for node in scene.nodes],
@@ -533,8 +552,9 @@ def _unit(quaternion: np.ndarray, name: str) -> np.ndarray:
     return quaternion / norm
 
 
-def _check_affine(matrix: np.ndarray, who: str) -> None:
-    """Refuse what cannot be inverted to float64 accuracy; warn where an object is stretched extremely."""
+def check_affine(matrix: np.ndarray, who: str) -> None:
+    """Refuse what cannot be inverted to float64 accuracy, or is beyond what the format holds; warn where an
+    object is stretched extremely. Raises BadSchema, LimitExceeded, SingularTransform."""
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise BadSchema(f"{who}: last row {matrix[3].tolist()}, expected [0, 0, 0, 1]; columns act on points")
     if np.abs(matrix[:3, 3]).max() > MAX_TRANSLATION:
@@ -542,9 +562,8 @@ def _check_affine(matrix: np.ndarray, who: str) -> None:
             f"{who}: translation {matrix[:3, 3].tolist()} is beyond {MAX_TRANSLATION:g} units"
         )
     high, _, low = np.linalg.svd(matrix[:3, :3], compute_uv=False)
-    smallest, largest = SINGULAR_VALUES
-    # The slack lets a scale of exactly the limit through the rounding of the decomposition.
-    if not (low >= smallest * (1 - 1e-9) and high <= largest * (1 + 1e-9) and high / low <= MAX_CONDITION):
+    if not _within(matrix, MAX_TRANSLATION, SINGULAR_VALUES) or not high / low <= MAX_CONDITION:
+        smallest, largest = SINGULAR_VALUES
         raise SingularTransform(
             f"{who}: scales by {low:.3g} to {high:.3g}, expected {smallest:g} to {largest:g} "
             f"with a ratio of at most {MAX_CONDITION:g}"
@@ -552,6 +571,14 @@ def _check_affine(matrix: np.ndarray, who: str) -> None:
     if high / low > WARN_CONDITION:
         text = f"{who}: stretched {high / low:.0f} times more along one axis than along another"
         warnings.warn(text, FormatWarning, 2)
+
+
+def _within(matrix: np.ndarray, farthest: float, sizes: tuple[float, float]) -> bool:
+    """Whether an affine (4, 4) moves no farther and scales by no other than these."""
+    high, _, low = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    # The slack lets a scale of exactly the limit through the rounding of the decomposition.
+    scales = low >= sizes[0] * (1 - 1e-9) and high <= sizes[1] * (1 + 1e-9)
+    return bool(scales and np.abs(matrix[:3, 3]).max() <= farthest)
 
 
 def _check_version(content: object, where: str) -> bool:
@@ -565,9 +592,10 @@ def _check_version(content: object, where: str) -> bool:
     major, minor = _numbered(VERSION)
     if int(match[1]) != major:
         raise NewerVersion(f"{where}: version {found}, but this fusedrf reads {major}.x; update fusedrf")
-    if content.get("requires"):
+    required = content.get("requires", [])
+    if not isinstance(required, list) or any(word != FAR for word in required):
         raise NewerVersion(
-            f"{where}: requires {content['requires']!r}, which this version does not know; update fusedrf"
+            f"{where}: requires {required!r}, which this version does not know; update fusedrf"
         )
     newer = int(match[2]) > minor
     if newer:

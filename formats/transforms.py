@@ -253,7 +253,7 @@ def _applied(path: Path, document: dict) -> list[np.ndarray]:
         scale = float(document.get("applied_scale", 1.0))
     except (TypeError, ValueError, OverflowError):
         matrix, scale = np.empty(0), 1.0
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 0 < scale < 1e9:
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 0 < scale < 1e12:
         raise BadSchema(f"{path}: expected applied_transform to be a 3x4 matrix, and applied_scale positive")
     return [matrix * scale]
 

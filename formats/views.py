@@ -17,7 +17,7 @@ from formats.points import Points
 
 LEAST_VIEWS = 3
 """Depth does not follow from fewer photos."""
-APART = 1e-9
+APART = 1e-13
 """Cameras nearer to each other than this share of their distance from the origin stand at one point."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 ORTHONORMAL_TOLERANCE = 1e-3

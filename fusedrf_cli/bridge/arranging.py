@@ -11,7 +11,7 @@ from fusedrf_cli.bridge.editing import Fused, edit_report, placed_note, read_fus
 from fusedrf_cli.bridge.history import graph_nodes
 from fusedrf_cli.bridge.memory import Memory, ownership
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.engine.fields.occupancy import placed_box, placement
+from fusedrf_cli.engine.fields.occupancy import placed_box, placement, seen_change
 from fusedrf_cli.engine.kinds.editing import Edited, Part, enclosing
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import ArrangeRequest
@@ -63,7 +63,7 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
         change = Change(event, request.new_name or request.name, event == "duplicated", matrix)
         progress.phase(event, None)
         origin = placement(fused.origin)
-        arranged = becoming(request.name, change, np.linalg.inv(origin) @ matrix @ origin)
+        arranged = becoming(request.name, change, seen_change(matrix, origin))
         try:
             field = fused.kind.arranged(fused.field, arranged)
         except ValueError as error:

@@ -31,7 +31,7 @@ from fusedrf_cli.bridge.scene import (
     write_field,
 )
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composed import ComposedField, largest
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge, RegionJudge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
@@ -140,12 +140,13 @@ def add(request: AddRequest, progress) -> dict:
         memory.expect(*addition_memory(fused.field, new), advice="add a smaller object")
         placed = [placed_at(p, opened(p.field), request) for p in new.placed]
         objects = [p.moved(fused.origin) for p in placed]
-        truth = ComposedField([Placed("", fused.field.to(place), np.eye(4)), *objects])
-        if truth.origin.shape == (4, 4) and not np.array_equal(truth.origin, np.eye(4)):
+        parts = [Placed("", fused.field.to(place), np.eye(4)), *objects]
+        if any(p.unbounded for p in objects) and largest(parts) is not parts[0]:
             raise InvalidInput(
                 f"{request.source}: it fills all of space, around more than {request.fused} does; place both "
                 "in a scene.json and fuse that"
             )
+        truth = ComposedField(parts, origin=np.eye(4))
         progress.phase("adding", 1.0)
         try:
             teach = Teacher(request, request.rgb, place, progress, len(objects))
@@ -153,17 +154,14 @@ def add(request: AddRequest, progress) -> dict:
         except ValueError as error:
             raise InvalidInput(f"{request.fused}: {error}") from error
         progress.phase("measuring", None)
-        origin = placement(fused.origin) @ placement(truth.origin)
+        origin = placement(fused.origin)
         size = LOCAL_VIEW if edited.local else REGION_SETTINGS.view_size
         cameras = cameras_of(request, fused, new, placed, truth, origin, size)
         if edited.local:  # what the region hides is all that can differ
             judge = RegionJudge(truth, cameras, origin, placed_box(edited.box, fused.origin))
         else:
             judge = Judge(truth, cameras, origin)
-        as_read = stored(edited.field, precision)
-        if truth.origin.shape == (3,):
-            as_read = as_read.moved(truth.origin)
-        reached = judge(as_read.to(place))
+        reached = judge(stored(edited.field, precision).to(place))
         nodes = history_nodes(new, request.output, {})
         entry = {
             "event": "added",
@@ -223,9 +221,10 @@ def read_fused(path: str, memory: Memory, turned: bool = False) -> Fused:
         )
     memory.expect(sources([held_size(headers[leaf.field])], copies=READING), advice="edit a smaller field")
     field = make_field(read_field(path, leaf.field), path)
-    only_moved = np.array_equal(leaf.object_to_world[:3, :3], np.eye(3))
-    if not only_moved and not turned and field.occupancy.space is bounded:
-        raise InvalidInput(f"{path}: its field is turned or scaled, and cannot be edited; fuse it first")
+    linear = leaf.object_to_world[:3, :3]
+    upright = linear[0, 0] > 0 and np.array_equal(linear, linear[0, 0] * np.eye(3))
+    if not upright and not turned and field.occupancy.space is bounded:
+        raise InvalidInput(f"{path}: its field is turned or stretched, and cannot be edited; fuse it first")
     others = [member for member in headers if member != leaf.field]
     return Fused(path, scene, others, leaf, field, registry.kind(field.kind), headers[leaf.field].precision)
 

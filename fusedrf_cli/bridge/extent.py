@@ -10,7 +10,13 @@ from formats.views import Capture, View
 from fusedrf_cli.bridge.hull import visual_hull
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.engine.distillation.visibility import shown_cells
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import (
+    OccupancyGrid,
+    frame_around,
+    placed_box,
+    placement,
+    seen_box,
+)
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
@@ -30,6 +36,8 @@ NEAR = 0.1
 NEAR_OF_POINTS = 0.6
 """Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer is
 empty, for all other cameras too."""
+FAR_AWAY = 64.0
+"""Times its longest side from the world's origin a box has a frame of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +55,13 @@ class Extent:
     """Over the box: where there can be anything to learn, an object that masks cut out or what photos of a
     place show; None: anywhere."""
 
+    def view(self, view: View) -> View:
+        """A view of the world in the field's frame."""
+        return replace(view, camera_to_world=self.camera(camera_of(view)).camera_to_world)
+
     def camera(self, camera: Camera) -> Camera:
         """A camera of the world in the field's frame."""
-        return camera.seen_from(self.origin) if self.unbounded else camera
+        return camera if np.array_equal(self.origin, np.eye(4)) else camera.seen_from(self.origin)
 
     @property
     def centre(self) -> np.ndarray:
@@ -65,7 +77,7 @@ class Extent:
         """What was chosen, in world units."""
         if self.unbounded:
             return {"space": "unbounded", "centre": self.centre.tolist(), "radius": self.unit}
-        return {"space": "bounded", "aabb": self.box.tolist()}
+        return {"space": "bounded", "aabb": placed_box(self.box, self.origin).tolist()}
 
 
 def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
@@ -79,18 +91,24 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     boxed = request.aabb is not None or request.unbounded is False or cut_out or capture.frame is None
     if not boxed or asked:
         return _unbounded(request, capture)
-    if capture.object_aabb is not None:
-        return _around_object(request, capture)
-    box = capture.aabb if request.aabb is None else request.aabb
-    return Extent(np.asarray(box, np.float64))
+    box = capture.aabb if capture.object_aabb is None else capture.object_aabb
+    box = np.asarray(box if request.aabb is None else request.aabb, np.float64)
+    extent = in_own_frame(box)
+    if capture.object_aabb is None:
+        return extent
+    # Rays through pixels of an object alone do not tell what is empty around it: only its visual hull can hold
+    # anything.
+    hull = visual_hull([extent.view(view) for view in capture.train], extent.box)
+    return replace(extent, box=hull.aabb, cells=hull)
 
 
-def _around_object(request: TrainRequest, capture: Capture) -> Extent:
-    """The visual hull of what the masks of the training photos keep, in the box of the object or the one that
-    is asked for. Rays through pixels of the object alone do not tell what is empty around it."""
-    box = capture.object_aabb if request.aabb is None else np.asarray(request.aabb, np.float64)
-    hull = visual_hull(capture.train, box)
-    return Extent(hull.aabb, cells=hull)
+def in_own_frame(box: np.ndarray) -> Extent:
+    """The extent of a box (6,) of the world: in the world's frame, or, where it lies far away for its size or is
+    of no ordinary size, in one of its own, so that its numbers have the digits that they have anywhere."""
+    frame = placement(frame_around(box))
+    if np.array_equal(frame[:3, :3], np.eye(3)) and np.abs(box).max() <= FAR_AWAY * (box[3:] - box[:3]).max():
+        return Extent(box)
+    return Extent(seen_box(box, frame), frame)
 
 
 def _unbounded(request: TrainRequest, capture: Capture) -> Extent:

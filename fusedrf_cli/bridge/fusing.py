@@ -14,6 +14,7 @@ from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
 from fusedrf_cli.bridge.running import Saved, checkpoint_path, engine, load_checkpoint
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
+    check_graph,
     history_nodes,
     refuse_options,
     unusable_kind,
@@ -31,6 +32,7 @@ from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
 
 DEFAULT_MAX_SIZE = 25_000_000  # and what the places among the sources take
+FUSED = "fused"  # the node of the field
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -53,6 +55,8 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
         kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
         nodes = history_nodes(loaded, request.output, kept)
         cameras = kept_cameras(loaded, progress)
+        framing = kept_framing(loaded, scene.composed, cameras)
+        check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
         asked = student_request(request, scene, graph_bytes(nodes, cameras))
         try:
             student = kind.student(scene.composed, asked)
@@ -84,13 +88,13 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
         size = write_field(
             request.output,
             found.field,
-            "fused",
+            FUSED,
             precision=found.tried.way.precision,
             overwrite=request.overwrite,
             origin=scene.composed.origin,
             history=(entry,),
             kept=kept,
-            framing=kept_framing(loaded, scene.composed, cameras),
+            framing=framing,
             cameras=cameras,
         )
         checkpoint_path(request.output).unlink(missing_ok=True)

@@ -150,7 +150,7 @@ def views_of_place(scene: LoadedScene, composed: ComposedField) -> tuple[Camera,
     """Cameras of SMALL pixels a side in the frame of a scene: those of the photos of its place, and more from
     between them; none where the scene keeps no cameras of a place."""
     rig = rig_of(scene)
-    if rig is None or not rig.surroundings or composed.origin.shape == (3,):
+    if rig is None or not rig.surroundings or composed.occupancy.space is not unbounded:
         return ()
     rng = np.random.default_rng(VIEWS_SEED)
     chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(len(rig.views), OWN_VIEWS)).astype(int))

@@ -21,6 +21,7 @@ def cameras_of_capture(capture: Capture, cut_out: bool, progress) -> dict | None
         return None
     try:
         cameras = capture_rig(capture, capture.frame is not None and not cut_out).content()
+        read_rig(cameras)
         if camera_bytes(cameras) > MAX_CAMERA_BYTES:
             raise LimitExceeded(f"they take more than {MAX_CAMERA_BYTES:,} bytes")
     except FormatError as error:

@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
+from formats.errors import FormatError
 from formats.records import FieldHeader, FieldRecord, as_stored
 from formats.scene import (
     WHITE,
     Leaf,
     SceneGraph,
+    check_affine,
+    dump_scene,
     expand_scene,
     inline_scenes,
     make_node,
@@ -33,6 +36,7 @@ from fusedrf_cli.errors import FusedRFError, InvalidInput, UsageProblem
 from fusedrf_cli.requests import FuseRequest, TrainRequest
 
 STDIN_LIMIT = 4 << 20
+NO_MEMBER = "fields/0000000000000000.safetensors"
 OPTIONS = {"ranks": "--ranks", "sh_degree": "--sh-degree"}
 
 
@@ -241,7 +245,10 @@ class _Loader:
         if key not in self.fields:
             self.fields[key] = StreamedField(lambda: self.shelf.take(key, size, read))
         try:
+            check_affine(leaf.object_to_world, f"node '{leaf.name}' in the world")
             placed = Placed(leaf.name, self.fields[key], leaf.object_to_world)
+        except FormatError as error:
+            raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{path}: {error}; give an invertible placement") from error
         return SourceField(placed, leaf.background, path, member, size, leaf.whole)
@@ -324,19 +331,39 @@ def write_field(
         writer.copy_field(path, member)
     arrays, metadata = field.state()
     member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
-    node = make_node(name, field=member, **placement_of(origin))
-    generator = f"fusedrf {__version__}"
-    framing = None if framing is None else tuple(float(number) for number in framing)
-    graph = SceneGraph(
-        nodes=(node,),
-        history=history,
-        generator=generator,
-        extras=extras or {},
-        framing=framing,
-        cameras=cameras,
-    )
+    graph = replace(graph_of(member, name, origin, framing, cameras), history=history, extras=extras or {})
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
+
+
+def graph_of(
+    member: str,
+    name: str,
+    origin: np.ndarray | None,
+    framing: Sequence[float] | None,
+    cameras: dict | None,
+) -> SceneGraph:
+    """The scene of a bundle of one field; see `write_field`."""
+    return SceneGraph(
+        nodes=(make_node(name, field=member, **placement_of(origin)),),
+        generator=f"fusedrf {__version__}",
+        framing=None if framing is None else tuple(float(number) for number in framing),
+        cameras=cameras,
+    )
+
+
+def check_graph(
+    output: str,
+    name: str,
+    origin: np.ndarray | None,
+    framing: Sequence[float] | None,
+    cameras: dict | None,
+) -> None:
+    """Before a field is learnt: raise whatever `write_field` would of where it lies and what is kept with it."""
+    try:
+        dump_scene(graph_of(NO_MEMBER, name, origin, framing, cameras))
+    except FormatError as error:
+        raise error.within(output) from error
 
 
 def short_origin(object_to_world: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ from fusedrf_cli.bridge.running import (
     load_checkpoint,
     resumable,
 )
-from fusedrf_cli.bridge.scene import refuse_options, stored, unusable_kind, write_field
+from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.engine.distillation.pixels import Pictures
@@ -95,6 +95,7 @@ def train(request: TrainRequest, progress) -> dict:
         suits = PLACE_PRECISION if extent.unbounded else "float16"
         request = replace(request, precision=request.precision or suits)
         kept = cameras_of_capture(capture, cut_out, progress)
+        check_graph(request.output, Path(request.output).stem, extent.origin, None, kept)
         settings = fit_settings(request, kind, capture, extent, place, camera_bytes(kept))
         plan = kind.untrained(extent.box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))

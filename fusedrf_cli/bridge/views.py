@@ -18,7 +18,7 @@ from fusedrf_cli.requests import RenderRequest
 DEFAULT_SIZE = (800, 800)
 LEANING = 0.7  # cosine: photos held within 45 degrees of +z leave +z upright
 ONE_SIDED = np.radians(120)  # without any camera: photos taken from one side
-LEAST_APART = 1e-9  # of a target's distance from the world's origin
+LEAST_APART = 1e-13  # of a target's distance from the world's origin
 
 
 def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.ndarray) -> list[Camera]:

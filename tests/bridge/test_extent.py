@@ -15,7 +15,7 @@ from fusedrf_cli.bridge.refined import with_poses
 from fusedrf_cli.bridge.training import fit_settings, quality_of, texels_of_place
 from fusedrf_cli.engine.distillation.fit import FitSettings
 from fusedrf_cli.engine.distillation.poses import poses_of
-from fusedrf_cli.engine.fields.occupancy import placed_box
+from fusedrf_cli.engine.fields.occupancy import ORDINARY, placed_box
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import look_at
 from fusedrf_cli.engine.spaces.unbounded import SUBJECT, WHOLE, contracted
@@ -54,6 +54,39 @@ def test_photos_that_look_one_way_fill_the_box_that_they_are_learnt_in():
         away = extent.near * 10 ** rng.uniform(0.02, 4, (500, 1))
         at = contracted(torch.from_numpy(camera.camera_to_world[:3, 3] + away * rays)).numpy()
         assert ((at >= extent.box[:3] - 1e-9) & (at <= extent.box[3:] + 1e-9)).all()
+
+
+def boxed(box: tuple) -> TrainRequest:
+    return replace(request(), unbounded=None, aabb=box)
+
+
+@pytest.mark.parametrize("box", [(-1.5,) * 3 + (1.5,) * 3, (60, 0, 0, 61, 1, 0.5), (0, 0, 0, 0.002, 0.002, 0.002)])
+def test_a_box_of_ordinary_size_near_the_origin_is_learnt_in_the_frame_of_the_world(box):
+    capture = photos([(4, 0, 0), (0, 4, 0), (0, 0, 4)])
+    extent = extent_of(boxed(box), capture, False)
+    assert extent.box.tolist() == list(box) and np.array_equal(extent.origin, np.eye(4))
+    assert extent.camera(camera_of(capture.train[0])).camera_to_world is capture.train[0].camera_to_world
+
+
+@pytest.mark.parametrize(
+    ("unit", "at"), [(1.0, (432100, 5411200, 310)), (1e9, (0, 0, 0)), (1e-9, (0, 1, 0)), (1e3, (1e12, 0, -1e12))]
+)
+def test_a_box_far_away_or_of_another_size_has_a_frame_of_its_own(unit, at):
+    """With numbers as near the origin; what cameras see there is what they see in the world."""
+    at = np.array(at, float)
+    eyes = [at + unit * np.array(eye, float) for eye in ((4, 0, 0), (0, 4, 0), (0, 1, 4))]
+    capture = photos(eyes, at)
+    box = np.concatenate([at - unit, at + 1.5 * unit])
+    extent = extent_of(boxed(tuple(box)), capture, False)
+    side = (extent.box[3:] - extent.box[:3]).max()
+    assert ORDINARY[0] <= side <= ORDINARY[1] and np.abs(extent.box).max() < side and not extent.unbounded
+    np.testing.assert_allclose(placed_box(extent.box, extent.origin), box, rtol=1e-12)
+    np.testing.assert_allclose(extent.report()["aabb"], box, rtol=1e-12)
+    for view in capture.train:
+        camera = extent.camera(camera_of(view))
+        np.testing.assert_allclose(camera.camera_to_world[:3, :3], view.camera_to_world[:3, :3], atol=1e-9)
+        eye = extent.origin[:3, :3] @ camera.camera_to_world[:3, 3] + extent.centre
+        np.testing.assert_allclose(eye, view.camera_to_world[:3, 3], rtol=1e-12)
 
 
 def test_pixels_of_photos_that_look_one_way_are_as_wide_near_as_far():

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from formats.images import write_png
-from formats.views import View
+from formats.views import Capture, View
 from fusedrf_cli.bridge import hull
+from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.hull import cropped, projected, visual_hull
 from fusedrf_cli.bridge.pictures import camera_of
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_box
+from fusedrf_cli.requests import TrainRequest
 from tests.formats.test_captures import looking_at
 
 CENTRE, RADIUS = np.array([0.2, -0.1, 0.3]), 0.5
@@ -123,3 +125,22 @@ def test_cropping_keeps_the_cells_where_they_are():
     assert small.occupied.sum() == grid.occupied.sum() and small.occupied.size < grid.occupied.size / 2
     np.testing.assert_allclose(small.centres(), grid.centres())
     np.testing.assert_allclose(small.cell, grid.cell)
+
+
+def test_the_hull_of_an_object_far_away_is_that_of_the_same_at_the_origin(tmp_path):
+    """Its cells lie in a frame of their own, and in the world where they lay before it was moved."""
+    views, unit, at = views_of(tmp_path), 2.0**20, np.array([2.0**42, -(2.0**40), 0.0])
+    moved = [replace(view, camera_to_world=view.camera_to_world.copy()) for view in views]
+    for view in moved:
+        view.camera_to_world[:3, 3] = unit * view.camera_to_world[:3, 3] + at
+    words = {name: None for name in TrainRequest.__dataclass_fields__}
+    found = []
+    for chosen, box in ((views, BOX), (moved, unit * BOX + np.tile(at, 2))):
+        capture = Capture(tmp_path, "transforms", tuple(chosen), (), box, True, object_aabb=box)
+        found.append(extent_of(TrainRequest(**words), capture, True))
+    here, there = found
+    assert np.array_equal(here.origin, np.eye(4)) and holds_the_ball(here.cells)
+    assert np.array_equal(here.cells.occupied, there.cells.occupied)
+    box = placed_box(there.box, there.origin)
+    np.testing.assert_allclose((box - np.tile(at, 2)) / unit, here.box, atol=1e-9)
+    assert np.abs(there.box).max() < 2

@@ -218,12 +218,12 @@ REFUSED = {
     "quaternion length": (node(rotation=[0, 0, 0.5, 0.5]), errors.BadSchema),
     "quaternion zero": (node(rotation=[0, 0, 0, 0]), errors.BadSchema),
     "flat": (node(scale=[1, 1, 0]), errors.SingularTransform),
-    "tiny": (node(scale=[1e-5] * 3), errors.SingularTransform),
+    "tiny": (node(scale=[1e-13] * 3), errors.SingularTransform),
     "huge": (node(scale=[1e300] * 3), errors.SingularTransform),
     "condition": (node(scale=[1e-3, 1, 2e3]), errors.SingularTransform),
     "far": (node(translation=[1e300, 0, 0]), errors.LimitExceeded),
     "product": (
-        node(scale=[1e-3] * 3, children=[{"name": "c", "scale": [1e-3] * 3}]),
+        node(scale=[1e-7] * 3, children=[{"name": "c", "scale": [1e-7] * 3}]),
         errors.SingularTransform,
     ),
     "same name": (node(children=[{"name": "n"}]), errors.DuplicateName),
@@ -251,9 +251,45 @@ def test_limits_themselves_are_accepted_at_once():
         len(parse_scene(scene_json(*[{"name": str(i)} for i in range(MAX_NODES)]), "here").nodes) == MAX_NODES
     )
     assert time.perf_counter() - began < 5
-    for scale in (1e-4, 1e4):
+    for scale in (1e-12, 1e12):
         placed(scale=[scale] * 3)
-    placed(translation=[1e6, 0, 0])
+    placed(translation=[1e13, 0, 0])
+
+
+NEAR = [{"scale": [1e-4] * 3}, {"scale": [1e4] * 3}, {"translation": [0, -1e6, 0]}]
+FAR = [{"scale": [0.99e-4] * 3}, {"scale": [1.01e4] * 3}, {"translation": [0, -1.01e6, 0]}]
+
+
+@pytest.mark.parametrize("words", NEAR)
+def test_a_scene_that_any_reader_takes_requires_nothing(words):
+    content = json.loads(dump_scene(SceneGraph((make_node("n", **words),))))
+    assert content["version"] == "1.0" and "requires" not in content
+
+
+@pytest.mark.parametrize("words", FAR)
+def test_a_far_scene_requires_a_reader_that_knows_of_such(words):
+    """Those before version 1.3 refuse whatever `requires` names; what is near again requires it no more."""
+    data = dump_scene(SceneGraph((make_node("n", **words),)))
+    content = json.loads(data)
+    assert content["version"] == "1.3" and content["requires"] == ["far"]
+    scene = parse_scene(data, "here")
+    assert dump_scene(scene) == data and not scene.extras
+    assert "requires" not in json.loads(dump_scene(replace(scene, nodes=(make_node("n"),))))
+
+
+def test_far_groups_and_framings_require_it_too():
+    half = {"scale": [1e-3] * 3, "children": (make_node("c", scale=[1e-3] * 3),)}
+    for scene in (
+        SceneGraph((make_node("n", **half),)),
+        SceneGraph((), framing=(1e12, 0.0, 0.0, 2e12, 1.0, 1.0)),
+    ):
+        assert json.loads(dump_scene(scene))["requires"] == ["far"]
+
+
+@pytest.mark.parametrize("required", [["far", "time"], ["time"], "far", {"far": 1}, 1, [["far"]]])
+def test_what_else_is_required_is_refused(required):
+    with pytest.raises(errors.NewerVersion, match="here: requires"):
+        parse_scene(scene_json(requires=required), "here")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

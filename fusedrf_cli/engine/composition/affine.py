@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import transformed_aabb
+from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.spaces import unbounded
 
@@ -91,12 +91,7 @@ class Placed:
     def moved(self, origin: np.ndarray) -> "Placed":
         """The same placement seen from a frame that lies at `origin`: a position (3,), or a placement (4,
         4)."""
-        if origin.shape == (3,):
-            matrix = self.object_to_world.copy()
-            matrix[:3, 3] -= origin
-        else:
-            matrix = np.linalg.inv(origin) @ self.object_to_world
-        return Placed(self.name, self.field, matrix)
+        return Placed(self.name, self.field, seen_placement(self.object_to_world, origin))
 
 
 def rigid_motion(twist: torch.Tensor) -> torch.Tensor:

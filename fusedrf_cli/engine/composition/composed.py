@@ -14,6 +14,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     SCENE_CELLS,
     OccupancyGrid,
     Pace,
+    frame_around,
     placed_box,
     placed_cells,
     unbounded_cells,
@@ -34,23 +35,26 @@ class ComposedField:
     c = Σσ_i c_i / Σσ_i. The frame's origin is the scene's centre, `origin` in the world, so that a scene far
     from the world's
     origin loses no digits: world points and ray origins have `origin` subtracted in float64 before they come
-    here. Where a field fills all of space, the frame is that field's, of the largest core where there are
+    here. Where a scene is of no ordinary size, `origin` is a placement (4, 4) with a unit (`frame_around`).
+    Where a field fills all of space, the frame is that field's, of the largest core where there are
     several, and `origin` its placement (4, 4).
     """
 
     kind = "composed"
 
-    def __init__(self, placed: list[Placed], rule: str = "max"):
-        """Raises ValueError when there is nothing to compose or the rule is unknown."""
+    def __init__(self, placed: list[Placed], rule: str = "max", origin: np.ndarray | None = None):
+        """origin: where its frame lies, where that is settled. Raises ValueError when there is nothing to compose or the rule is unknown."""
         if not placed:
             raise ValueError("a composed scene needs at least one field")
         if rule not in RULES:
             raise ValueError(f"composition should be one of {', '.join(RULES)}, found '{rule}'")
-        if any(p.unbounded for p in placed):
+        if origin is not None:
+            self.origin = origin
+        elif any(p.unbounded for p in placed):
             self.origin = largest(placed).object_to_world
         else:
             boxes = np.stack([p.aabb for p in placed])
-            self.origin = (boxes[:, :3].min(0) + boxes[:, 3:].max(0)) / 2
+            self.origin = frame_around(np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)]))
         self.placed, self.rule = [p.moved(self.origin) for p in placed], rule
 
     def posed(self, poses: Mapping[str, np.ndarray]) -> "ComposedField":

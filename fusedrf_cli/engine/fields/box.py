@@ -13,7 +13,7 @@ from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
-MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
+MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
 

@@ -23,6 +23,9 @@ ROUNDED = 1e-9  # cells: faces that lie so close are the same
 OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
 NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
 POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
+ORDINARY = (2.0**-10, 2.0**12)
+"""Longest sides of a box between which densities, per unit of length, fit the floats that they are stored as;
+they are learnt as well at any."""
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 
@@ -391,6 +394,36 @@ def placement(origin: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def frame_around(box: np.ndarray) -> np.ndarray:
+    """Where a frame for what lies in a box (6,) of the world has its origin, the middle: a position (3,), or,
+    where the box is of no ordinary size, a placement (4, 4). Its unit is then a power of two, by which
+    scaling is exact."""
+    middle, side = (box[:3] + box[3:]) / 2, float((box[3:] - box[:3]).max())
+    if side == 0 or ORDINARY[0] <= side <= ORDINARY[1]:
+        return middle
+    frame = placement(middle)
+    frame[:3, :3] *= 2.0 ** np.floor(np.log2(side))
+    return frame
+
+
+def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(4, 4) of an object seen from a frame that lies at `origin`: a position (3,), or a placement (4, 4)."""
+    frame, matrix = placement(origin), object_to_world.copy()
+    matrix[:3, 3] -= frame[:3, 3]  # first, so that it is exact however far away both are
+    if origin.shape == (4, 4):
+        matrix[:3] = np.linalg.inv(frame[:3, :3]) @ matrix[:3]
+    return matrix
+
+
+def seen_change(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """(4, 4) that does in a frame, which lies at `origin` (4, 4), what a `matrix` (4, 4) does in the world."""
+    linear, inverse = origin[:3, :3], np.linalg.inv(origin[:3, :3])
+    change = np.eye(4)
+    change[:3, :3] = inverse @ matrix[:3, :3] @ linear
+    change[:3, 3] = inverse @ ((matrix[:3, :3] - np.eye(3)) @ origin[:3, 3] + matrix[:3, 3])
+    return change
+
+
 def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(6,) world box around a box (6,) of a frame that lies at `origin`: a position (3,), or a placement (4,
     4)."""
@@ -399,7 +432,11 @@ def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 def seen_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(6,) box of a frame that lies at `origin` around a world box (6,)."""
-    return box - np.tile(origin, 2) if origin.shape == (3,) else transformed_aabb(box, np.linalg.inv(origin))
+    if origin.shape == (3,):
+        return box - np.tile(origin, 2)
+    turned = origin.copy()
+    turned[:3, 3] = 0
+    return transformed_aabb(box - np.tile(origin[:3, 3], 2), np.linalg.inv(turned))
 
 
 def box_corners(aabb: np.ndarray) -> np.ndarray:

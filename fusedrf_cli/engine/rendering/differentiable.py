@@ -71,6 +71,9 @@ def render_rays(
         poses, origin = shifted(poses, field.origin), field.origin
     rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
     known, device = structure(field, poses), device_of(field)
+    if per_length is not None and isinstance(field, ComposedField) and known.occupancy.space is bounded:
+        unit = float(np.linalg.norm(field.origin[:3, 0]))
+        near, step = near / unit, step and step / unit
     step = step or sampling_step(known)
     host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]
     if not needs_gradient(field, rays_o, rays_d, *(poses or {}).values()):

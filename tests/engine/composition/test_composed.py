@@ -8,6 +8,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.occupancy import seen_box, seen_change
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
@@ -134,6 +135,43 @@ def test_a_scene_far_away_gives_the_same_picture(shift):
     here = picture((0, 0, 0))
     assert here.std() > 0.05
     assert psnr(picture(shift), here) >= 60
+
+
+@pytest.mark.parametrize("rule", ["max", "add"])
+@pytest.mark.parametrize(("size", "offset"), [(1e-9, (0, 1e-7, 0)), (1e9, (-1e10, 0, 3e12)), (1e4, (5e5, 0, 0))])
+def test_a_scene_in_any_unit_gives_the_same_picture(size, offset, rule):
+    """After a similarity of the world densities are 1/size of what they were, and distances are `size` times."""
+
+    def picture(size, offset):
+        world = affine(size, offset)
+        fields = [
+            Placed("a", Gaussian(density=20.0), world @ affine(turn(30))),
+            Placed("b", Ball(radius=0.3).occupy(8), world @ affine(0.5, (1, 0, 0))),
+        ]
+        composed = ComposedField(fields, rule)
+        near = framing_camera(np.array([-1.0, -1, -1, 1.5, 1, 1]), 0.4, 0.3, 24, 24)
+        pose = near.camera_to_world.copy()
+        pose[:3, 3] = (world @ pose)[:3, 3]
+        camera = Camera(pose, near.fl_x, near.fl_y, near.cx, near.cy, 24, 24)
+        shot = render_image(composed, camera, origin=composed.origin)
+        return shot.over((1, 1, 1)), shot.depth / size, composed.aabb
+
+    here, deep, box = picture(1.0, (0, 0, 0))
+    there, as_deep, box_there = picture(size, offset)
+    assert here.std() > 0.05 and psnr(there, here) >= 60
+    seen = np.isfinite(deep) & np.isfinite(as_deep)
+    np.testing.assert_allclose(as_deep[seen], deep[seen], rtol=1e-2)
+    assert 1 <= (box_there[3:] - box_there[:3]).max() < 2.5  # numbers of an ordinary size
+
+
+def test_a_placement_seen_from_a_frame_far_away_keeps_its_digits():
+    frame = affine(2.0**-20, (1e12, -5e11, 310.0))
+    found = Placed("a", RED, frame @ affine(turn(20), (0, 0, 0))).moved(frame).object_to_world
+    np.testing.assert_allclose(found, affine(turn(20), (0, 0, 0)), atol=1e-12)
+    step = affine(np.eye(3), (3 * 2.0**-20, 0, 0))  # a move by three units of the frame
+    np.testing.assert_array_equal(seen_change(step, frame), affine(np.eye(3), (3, 0, 0)))
+    box = np.array([1e12, -5e11, 310.0, 1e12 + 1, -5e11 + 2, 311.0])
+    np.testing.assert_array_equal(seen_box(box, frame), np.array([0, 0, 0, 1, 2, 1]) * 2.0**20)
 
 
 def test_what_cannot_be_composed_is_refused():

@@ -25,7 +25,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, Br
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
-MAX_ANSWER = 1e30  # of a density or a logit: finite in float32 also after a placement's largest stretch
+MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
 OCCUPANCY_CELLS = 192  # along the longest axis, at most, unless there are more top cells
 """Bits of a mask: voxel (i, j, k) is bit (i * 4 + j) * 4 + k."""
