@@ -18,6 +18,8 @@ MAX_STEM_BYTES = 200
 # Where a file system cannot reserve space, writing finds out whether there is enough.
 NO_RESERVING = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS, errno.ENODEV)
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # <fcntl.h>, <linux/fs.h>
+_unfinished: set[Path] = set()
+"""Temporaries that this process is writing now."""
 CAUSES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
     errno.EDQUOT: "the disk quota is used up; free some space or choose another folder",
@@ -41,6 +43,7 @@ def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> It
     """
     target = Path(os.path.realpath(path))
     temporary = _sibling(target)
+    _unfinished.add(temporary)
     try:
         with open(temporary, mode.replace("w", "x"), encoding=None if "b" in mode else "utf-8") as file:
             if reserve:
@@ -55,6 +58,8 @@ def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> It
             temporary.unlink()
         _explain(error, path, temporary, target)
         raise
+    finally:
+        _unfinished.discard(temporary)
     _sync_folder(target.parent)
 
 
@@ -68,6 +73,7 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
     check_writable(path, overwrite, folders=True)
     target = Path(os.path.realpath(path))
     temporary = _sibling(target)
+    _unfinished.add(temporary)
     try:
         temporary.mkdir()
         yield temporary
@@ -78,6 +84,8 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
         shutil.rmtree(temporary, ignore_errors=True)
         _explain(error, path, temporary, target)
         raise
+    finally:
+        _unfinished.discard(temporary)
     _sync_folder(target.parent)
 
 
@@ -112,6 +120,13 @@ def check_space(path: Path | str, needed: int) -> None:
 def hidden_sibling(target: Path, ending: str) -> Path:
     """`.name.ending` beside `target`, for any name that a file can have."""
     return target.with_name(f"{_hidden_stem(target)}.{ending}")
+
+
+def remove_unfinished() -> None:
+    """Remove the temporaries that this process is writing: it ends without going on."""
+    for place in list(_unfinished):
+        with contextlib.suppress(OSError):
+            _remove(place)
 
 
 def remove_leftovers(path: Path | str) -> None:

@@ -502,7 +502,8 @@ def writing(what: str, *, folders: bool = False, edits: str | None = None) -> Ca
 
 
 def _tell(sentence: str) -> None:
-    click.echo(printable(sentence), err=True)
+    with contextlib.suppress(OSError):
+        click.echo(printable(sentence), err=True)
 
 
 def reporting(
