@@ -14,8 +14,8 @@ _LONGEST_LIST = 12
 
 
 def emit(report: dict, *, as_json: bool, quiet: bool = False) -> None:
-    """Print `report` on stdout. With `quiet`, or where stdout is closed, text about an output that was written
-    is left out."""
+    """Print `report` on stdout. With `quiet`, and where stdout is closed, text about an output that was
+    written is left out."""
     if as_json:
         click.echo(_escaped(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False)))
     elif not ("output" in report and (quiet or streams.nowhere())):

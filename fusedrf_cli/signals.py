@@ -16,7 +16,7 @@ from fusedrf_cli.errors import Interrupted
 PATIENCE = 4.0
 """Seconds that a process may take to end by itself."""
 ECHO = 0.3
-"""Seconds in which a second signal is the same one: `timeout` sends one to the process and one to its group."""
+"""Seconds in which a second signal is the same one: `timeout` sends to a process and then to its group."""
 
 _obeying = False
 _first: float | None = None

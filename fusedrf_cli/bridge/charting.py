@@ -7,12 +7,11 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
 
-from formats.atomic import atomic_folder, hidden_sibling
+from formats.atomic import atomic_folder, temporary_sibling
 from formats.errors import ResourceError
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.anew import as_it_is
@@ -208,8 +207,8 @@ def scratch(output: str) -> Iterator[Iterator[Path]]:
     target, made = Path(os.path.realpath(output)), []
 
     def names() -> Iterator[Path]:
-        for number in count():
-            made.append(hidden_sibling(target, f"{number}.rfpack"))
+        while True:
+            made.append(temporary_sibling(target))
             yield made[-1]
 
     try:

@@ -49,8 +49,8 @@ Load = Callable[[FuseRequest, Memory, str, object], LoadedScene]
 def fuse(
     request: FuseRequest, progress, load: Load = load_to_fuse, somewhere: Callable = written_somewhere
 ) -> dict:
-    """Turn a composed scene into one field and write it, `somewhere` where its place is full, with the scene's
-    history."""
+    """Turn a composed scene into one field and write it with the scene's history; `somewhere` writes, as
+    `written_somewhere` does."""
     with engine(request.device, request.threads, progress) as place:
         progress.phase("reading", None)
         check_checkpoint(request.output, request.resume, request.overwrite)

@@ -123,7 +123,9 @@ class Uninterrupted:
 
 
 @contextlib.contextmanager
-def resumable(output: str, checkpoint, progress, learnt: Callable[[], bool] = bool) -> Iterator[Uninterrupted]:
+def resumable(
+    output: str, checkpoint, progress, learnt: Callable[[], bool] = bool
+) -> Iterator[Uninterrupted]:
     """Run steps inside the `Uninterrupted` that this gives; an interrupt leaves `checkpoint()` beside the
     output and goes on its way, saying so, and every few minutes one is left there unasked. So is one at the
     end, where `learnt()`: what comes then may be interrupted, too."""
@@ -144,7 +146,7 @@ def held_back(output: str) -> Iterator[None]:
     is there."""
     with signals.unhurried(), Uninterrupted(lambda: None, lambda sentence: None):
         yield
-        signals.remains = f"interrupted; {output} is written whole, but was not measured"
+        signals.remains = f"interrupted, but {output} is written whole"
 
 
 def saved_somewhere(output: str, arrays: dict[str, np.ndarray], state: dict) -> str:
@@ -204,10 +206,11 @@ def check_checkpoint(output: str, resume: bool, overwrite: bool) -> None:
     path = checkpoint_path(output)
     if not resume and not overwrite and os.path.lexists(path):
         raise OutputExists(
-            f"{path}: an interrupted run left it; go on from it with --resume, or give -w/--overwrite to begin "
-            "anew"
+            f"{path}: an interrupted run left it; go on from it with --resume, or give -w/--overwrite to "
+            "begin anew"
         )
-    check_writable(path, overwrite=True)
+    if os.path.lexists(path):
+        check_writable(path, overwrite=True)
 
 
 def save_checkpoint(output: str, arrays: dict[str, np.ndarray], state: dict) -> Path:

@@ -252,7 +252,9 @@ def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, code
     assert len([text for text in said["warnings"] if "learning goes on" in text]) == 1
 
 
-def test_an_interrupt_on_a_full_disk_saves_elsewhere(report, run, folder, interrupted_in_step, straight, monkeypatch):
+def test_an_interrupt_on_a_full_disk_saves_elsewhere(
+    report, run, folder, interrupted_in_step, straight, monkeypatch
+):
     write, room = part("running").write_checkpoint, folder.parent / "room"
     room.mkdir()
 

@@ -9,7 +9,11 @@ import pytest
 from formats.checkpoints import MAGIC, read_checkpoint, write_checkpoint
 from formats.errors import BadHeader, FormatError, MissingFile, NewerVersion, NotAFile, OlderVersion
 
-ARRAYS = {"params": np.arange(6, dtype=np.float32).reshape(2, 3), "seen": np.array([True, False]), "none": np.zeros((0, 2))}
+ARRAYS = {
+    "params": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "seen": np.array([True, False]),
+    "none": np.zeros((0, 2)),
+}
 STATE = {"command": "train", "mse": float("inf"), "name": "Süd"}
 
 
@@ -28,7 +32,9 @@ def test_what_was_written_comes_back(path):
 
 def test_every_flipped_bit_and_every_length_is_noticed(path):
     data = path.read_bytes()
-    damaged = [data[:i] + bytes([data[i] ^ 1 << bit]) + data[i + 1 :] for i in range(len(data)) for bit in range(8)]
+    damaged = [
+        data[:i] + bytes([data[i] ^ 1 << bit]) + data[i + 1 :] for i in range(len(data)) for bit in range(8)
+    ]
     damaged += [data[:i] for i in range(len(data))] + [data + b"\0", data * 2]
     for content in damaged:
         path.write_bytes(content)
@@ -53,7 +59,7 @@ def of(*arrays, **words) -> bytes:
     [
         *(sealed({}), sealed([]), sealed(b"{"), sealed(b"[" * 100_000), sealed({}, length=1 << 62)),
         *(of(state=3), of(arrays=3), of(3), of(["a", "<f4"]), of([1, "<f4", []]), of(["a", 7, [1]])),
-        *(of(["a", "<f4", [1 << 62]]), of(["a", "<f4", [-1]]), of(["a", "|O8", [1]]), of(["a", "<f4", [1.0]])),
+        *(of(["a", "<f4", [1 << 62]]), of(["a", "<f4", [-1]]), of(["a", "|O8", [1]]), of(["a", "<f4", [1.5]])),
         *(of(["a", "<f4", [0] * 64]), of(["a", "<f4", 3]), of(["a", "<f4", [True]]), sealed({}, b"more")),
     ],
 )  # fmt: skip
