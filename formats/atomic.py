@@ -28,6 +28,8 @@ CAUSES = {
     errno.EFBIG: "the file is larger than the disk's format allows",
     errno.EIO: "the disk reports an error; use another disk",
 }
+unfinished: set[Path] = set()
+"""Temporary files and folders of this process, which are worth nothing once it ends."""
 
 
 @contextlib.contextmanager
@@ -40,7 +42,8 @@ def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> It
     read-only, no permission.
     """
     target = Path(os.path.realpath(path))
-    temporary = _sibling(target)
+    temporary = temporary_sibling(target)
+    unfinished.add(temporary)
     try:
         with open(temporary, mode.replace("w", "x"), encoding=None if "b" in mode else "utf-8") as file:
             if reserve:
@@ -55,7 +58,9 @@ def atomic_writer(path: Path | str, *, mode: str = "wb", reserve: int = 0) -> It
             temporary.unlink()
         _explain(error, path, temporary, target)
         raise
-    _sync_folder(target.parent)
+    finally:
+        unfinished.discard(temporary)
+    sync_folder(target.parent)
 
 
 @contextlib.contextmanager
@@ -67,7 +72,8 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
     """
     check_writable(path, overwrite, folders=True)
     target = Path(os.path.realpath(path))
-    temporary = _sibling(target)
+    temporary = temporary_sibling(target)
+    unfinished.add(temporary)
     try:
         temporary.mkdir()
         yield temporary
@@ -78,7 +84,9 @@ def atomic_folder(path: Path | str, *, overwrite: bool = False) -> Iterator[Path
         shutil.rmtree(temporary, ignore_errors=True)
         _explain(error, path, temporary, target)
         raise
-    _sync_folder(target.parent)
+    finally:
+        unfinished.discard(temporary)
+    sync_folder(target.parent)
 
 
 def check_writable(path: Path | str, overwrite: bool, *, folders: bool = False) -> None:
@@ -114,12 +122,21 @@ def hidden_sibling(target: Path, ending: str) -> Path:
     return target.with_name(f"{_hidden_stem(target)}.{ending}")
 
 
+def remove_unfinished() -> None:
+    """Remove the temporaries of this process, which ends without going on."""
+    for place in list(unfinished):
+        with contextlib.suppress(OSError):
+            _remove(place)
+
+
 def remove_leftovers(path: Path | str) -> None:
-    """Remove the temporaries that killed writers of `path` left. The caller must hold its lock."""
+    """Remove the temporaries that killed writers of `path` left, of its checkpoint too, and what was written
+    under a temporary's name. The caller must hold its lock."""
     target = Path(os.path.realpath(path))
     # A folder that was moved aside may be the only copy: it is removed only when the new one is in place.
-    endings = "tmp|old" if target.exists() else "tmp"
-    leftover = re.compile(re.escape(_hidden_stem(target)) + rf"\.[0-9a-f]{{12}}\.({endings})")
+    ending = r"\.[0-9a-f]{12}\." + ("(tmp|old)" if target.exists() else "tmp")
+    more = r"(\.checkpoint)?"
+    leftover = re.compile(rf"\.?{re.escape(_hidden_stem(target))}{more}{ending}{more}({ending})?")
     for place in target.parent.iterdir():
         if leftover.fullmatch(place.name):
             with contextlib.suppress(OSError):
@@ -133,7 +150,8 @@ def _hidden_stem(target: Path) -> str:
     return f".{name}"
 
 
-def _sibling(target: Path, ending: str = "tmp") -> Path:
+def temporary_sibling(target: Path, ending: str = "tmp") -> Path:
+    """A new name beside `target` that the next writer of it removes."""
     return hidden_sibling(target, f"{secrets.token_hex(6)}.{ending}")
 
 
@@ -168,7 +186,7 @@ def _swap_in(temporary: Path, target: Path) -> None:
     if _exchange(temporary, target):
         _remove(temporary)
         return
-    aside = _sibling(target, "old")
+    aside = temporary_sibling(target, "old")
     os.replace(target, aside)
     try:
         os.replace(temporary, target)
@@ -208,19 +226,20 @@ def _sync_tree(folder: Path) -> None:
     """Flush every file in `folder`, and then the names."""
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
-            descriptor = os.open(os.path.join(place, name), os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        _sync_folder(Path(place))
+            sync_file(os.path.join(place, name))
+        sync_folder(Path(place))
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_file(path: Path | str) -> None:
+    """Flush a file that somebody else wrote."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_folder(folder: Path) -> None:
     """Make the rename itself survive a power loss; where this is not possible, the file is still complete."""
     with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        sync_file(folder)

@@ -98,6 +98,12 @@ class NewerVersion(FormatError):
     exit_code = 4
 
 
+class OlderVersion(FormatError):
+    """The file was written by an earlier version, whose files of this kind are not read any more."""
+
+    exit_code = 4
+
+
 # --- fields -------------------------------------------------------------------------------------------------
 
 

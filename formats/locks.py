@@ -1,13 +1,17 @@
-"""One writer per output: a lock file beside it, held from reading to writing, which ends with its process."""
+"""One writer per output: a lock file beside it, held from reading to writing, which ends with its process;
+and temporary folders that are locked as long as their process lives."""
 
 import contextlib
 import errno
 import os
+import shutil
+import stat
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from formats.atomic import hidden_sibling, remove_leftovers
+from formats.atomic import hidden_sibling, remove_leftovers, unfinished
 from formats.errors import FormatWarning, ResourceError
 
 ENDING = "fusedrf-lock"
@@ -64,3 +68,50 @@ def _acquire(lock, waiting: Callable[[str], None] | None, path: Path | str) -> N
             raise
         waiting(f"{path}: waiting for another fusedrf that is writing it")
         lock.acquire()
+
+
+@contextlib.contextmanager
+def temporary_folder(prefix: str) -> Iterator[Path]:
+    """A new folder for temporary files, which ends with the block. Those of this prefix that this user's
+    killed processes left are removed."""
+    for place in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
+        if _abandoned(place):
+            shutil.rmtree(place, ignore_errors=True)
+    new = Path(tempfile.mkdtemp(prefix="fusedrf-new-"))
+    folder = new.with_name(new.name.replace("fusedrf-new-", prefix))
+    unfinished.add(folder)
+    with _locked(new):
+        try:
+            yield new.rename(folder)  # only now, locked, it has a name that others look for
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            unfinished.discard(folder)
+
+
+def _abandoned(folder: Path) -> bool:
+    """Whether a temporary folder is this user's, and no process holds it."""
+    try:
+        status = folder.lstat()
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
+            return False
+        with _locked(folder) as held:
+            return held
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[bool]:
+    """Lock a folder for this block; whether nobody else had locked it."""
+    import fcntl
+
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        held = True
+    except OSError:
+        held = False
+    try:
+        yield held
+    finally:
+        os.close(descriptor)

@@ -2,15 +2,14 @@
 had. An edit that keeps its input says its SHA-256 as `before` in the entry of history that it adds.
 """
 
-import contextlib
 import os
 import re
 import shutil
 from pathlib import Path
 
-from formats.atomic import atomic_writer
+from formats.atomic import atomic_writer, check_space, check_writable, sync_file, sync_folder
 from formats.bundle import is_bundle, read_headers, sha256_of
-from formats.errors import BadSchema, MissingFile
+from formats.errors import BadSchema, FormatError, MissingFile, ResourceError
 from formats.scene import SceneGraph
 
 KEPT = 64
@@ -23,39 +22,96 @@ def past_of(bundle: Path | str) -> Path:
     return Path(f"{bundle}.history")
 
 
+def check_past(bundle: Path | str, output: Path | str) -> None:
+    """Before any work: a bundle and its earlier ones can be kept as what an output will have been. Raises
+    ResourceError."""
+    folder = past_of(output)
+    if not os.path.lexists(folder):
+        check_writable(folder, overwrite=False)
+    elif not folder.is_dir():
+        raise ResourceError(f"{folder}: no folder, and in the way; move it, or leave --keep-history out")
+    elif not os.access(folder, os.W_OK | os.X_OK):
+        raise ResourceError(f"{folder}: cannot write in it; make it writable, or leave --keep-history out")
+    place = folder if folder.is_dir() else folder.parent
+    if os.path.isfile(bundle) and os.stat(bundle).st_dev != os.stat(place).st_dev:  # no link will do
+        check_space(folder, os.path.getsize(bundle))
+
+
 def keep(bundle: Path | str, output: Path | str) -> str:
-    """Keep a bundle and its own earlier ones as what an output will have been; its SHA-256.
+    """Keep a bundle and its own earlier ones as what an output will have been; its SHA-256. Of those in the
+    folder at most KEPT stay, the output's own before all.
 
     Where the file system can, the bytes are shared with the bundle that is there. Raises ResourceError."""
     checksum = sha256_of(bundle)
-    share(past_of(bundle), past_of(output))
-    folder = past_of(output)
-    folder.mkdir(exist_ok=True)
-    link(Path(bundle), folder / f"{checksum}.rfpack")
-    held = sorted(folder.glob("*.rfpack"), key=lambda path: path.stat().st_mtime)
-    for old in held[: max(0, len(held) - KEPT)]:
-        old.unlink(missing_ok=True)
+    share(bundle, bundle, output)
+    folder = made(past_of(output))
+    link(Path(bundle), folder / f"{checksum}.rfpack", checksum)
+    prune(folder, [checksum, *chain(folder, bundle)])
+    sync_folder(folder)
     return checksum
 
 
-def share(own: Path, other: Path) -> None:
-    """Have the bundles of one folder in another one too."""
-    if not own.is_dir() or os.path.realpath(own) == os.path.realpath(other):
-        return
-    other.mkdir(exist_ok=True)
-    for path in own.glob("*.rfpack"):
-        link(path, other / path.name)
+def made(folder: Path) -> Path:
+    """A folder that is there, and on the disk."""
+    if not folder.is_dir():
+        folder.mkdir()
+        sync_folder(folder.parent)
+    return folder
 
 
-def link(path: Path, target: Path) -> None:
-    """The same bytes at another path, where there is nothing yet."""
-    with contextlib.suppress(FileExistsError):
+def chain(folder: Path, bundle: Path | str) -> list[str]:
+    """The checksums of the bundles before one, the latest first, as far as they are in the folder."""
+    found, path = [], Path(bundle)
+    while len(found) < KEPT:
         try:
-            os.link(path, target)
-        except FileExistsError:
-            raise
-        except OSError:  # another disk, or one without links
-            copy(path, target)
+            checksum = before(read_headers(path)[0])
+        except FormatError:
+            if not found:
+                raise
+            break  # it was damaged since it was kept
+        path = folder / f"{checksum}.rfpack"
+        if checksum is None or not path.is_file():
+            break
+        found.append(checksum)
+    return found
+
+
+def prune(folder: Path, own: list[str]) -> None:
+    """Remove bundles until at most KEPT are there: first those that are none of an output's `own`, which come
+    the latest first, and then its earliest. What this module did not put there is left alone: whatever is not
+    named by the checksum that it has."""
+    held = {path.stem for path in folder.glob("*.rfpack") if CHECKSUM.fullmatch(path.stem)}
+    paths = {checksum: folder / f"{checksum}.rfpack" for checksum in held}
+    others = sorted(held - set(own), key=lambda checksum: paths[checksum].lstat().st_mtime)
+    for checksum in [*others, *reversed([c for c in own if c in held])][: max(0, len(held) - KEPT)]:
+        path = paths[checksum]
+        if path.is_file() and sha256_of(path) == checksum:
+            path.unlink(missing_ok=True)
+
+
+def share(bundle: Path | str, held: Path | str, output: Path | str) -> None:
+    """Have the bundles before one, which were kept as what `held` was, as what an output was, too."""
+    own, other = past_of(held), past_of(output)
+    earlier = chain(own, bundle)
+    if not earlier or os.path.realpath(own) == os.path.realpath(other):
+        return
+    check_past(held, output)
+    for checksum in earlier:
+        link(own / f"{checksum}.rfpack", made(other) / f"{checksum}.rfpack", checksum)
+
+
+def link(path: Path, target: Path, checksum: str) -> None:
+    """The same bytes at another path, and on the disk. Raises ResourceError where others are there."""
+    if os.path.lexists(target):
+        if target.is_file() and sha256_of(target) == checksum:
+            return
+        raise ResourceError(f"{target}: holds something else than its name says; move it away")
+    try:
+        os.link(path, target)
+    except OSError:  # another disk, or one without links
+        copy(path, target)
+    else:
+        sync_file(target)
 
 
 def copy(path: Path, target: Path | str) -> int:
@@ -93,7 +149,7 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
             f"{past_of(bundle).name} beside the bundle"
         )
     last = scene.history[-1]
-    share(past_of(bundle), past_of(output))
+    share(path, bundle, output)
     size = copy(path, output)
     return {
         "output": str(output),
@@ -106,14 +162,7 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
 
 def depth(folder: Path, bundle: Path | str) -> int:
     """How many edits of a bundle can be undone, one after the other."""
-    found, path = 0, Path(bundle)
-    while found < KEPT:
-        checksum = before(read_headers(path)[0])
-        path = folder / f"{checksum}.rfpack"
-        if checksum is None or not path.is_file():
-            break
-        found += 1
-    return found
+    return len(chain(folder, bundle))
 
 
 def names_of(entry: dict) -> list[str]:

@@ -9,7 +9,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
 from formats.frame import scene_frame, up_of_sideways
 from formats.images import Header, read_focal, read_image_header, write_smaller
+from formats.locks import temporary_folder
 from formats.mapper import MAX_SIDE
 from formats.photos import copies, natural, pictures
 from formats.points import Points, write_ply_points
@@ -40,6 +40,8 @@ UPS = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where up is in the stored picture (right, up), by EXIF orientation; (0, 1) of the others."""
 CAMERAS = "transforms.json"
 POINTS = "points.ply"
+TEMPORARY = "fusedrf-poses-"
+"""What the names of temporary folders begin with."""
 UNREAD = (".heic", ".heif", ".HEIC", ".HEIF")
 """Photos of phones that cannot be decoded here."""
 
@@ -99,8 +101,7 @@ def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress)
     LimitExceeded, MissingExtra, NoPoses, PosingFailed.
     """
     check_extra(folder)
-    with tempfile.TemporaryDirectory(prefix="fusedrf-poses-") as work:
-        work = Path(work)
+    with temporary_folder(TEMPORARY) as work:
         headers = _prepare(work, photos, threads, progress)
         told = _run(folder, work, threads, progress)
         counts = dict(zip(photos, told["features"], strict=True))

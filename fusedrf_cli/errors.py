@@ -60,7 +60,7 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, signal_number: int = 2):
         super().__init__(signal_number)
         self.exit_code = 128 + signal_number
-        self.sentence = "interrupted"
+        self.sentence: str | None = None
 
     def __str__(self) -> str:
-        return self.sentence
+        return self.sentence or "interrupted"

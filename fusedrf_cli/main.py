@@ -1,5 +1,6 @@
 """The `fusedrf` command: finds the subcommand, and turns every failure into one line and an exit code."""
 
+import contextlib
 import importlib
 import os
 import signal
@@ -11,8 +12,8 @@ from click.exceptions import Exit, NoArgsIsHelpError
 from click.shell_completion import shell_complete
 
 from formats.errors import FormatError, printable
-from fusedrf_cli import __version__, options
-from fusedrf_cli.errors import FusedRFError, Interrupted
+from fusedrf_cli import __version__, options, signals, streams
+from fusedrf_cli.errors import FusedRFError
 
 COMMANDS = (
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
@@ -64,16 +65,20 @@ def _report_error(error: BaseException) -> int:
     if isinstance(error, BrokenPipeError):  # the reader (`head`, for example) has closed the pipe
         return 128 + signal.SIGPIPE  # as a shell reports a process that this signal ended
     sentence, code = _sentence(error)
-    click.echo(f"Error: {printable(sentence)}", err=True)
+    if isinstance(error, KeyboardInterrupt):
+        signals.said()
+    with contextlib.suppress(OSError):  # stderr may be full, or nobody may read it
+        click.echo(f"Error: {printable(sentence)}", err=True)
     return code
 
 
 def _sentence(error: BaseException) -> tuple[str, int]:
     match error:
-        case FusedRFError() | FormatError() | Interrupted():
+        case FusedRFError() | FormatError():
             return str(error), error.exit_code
         case KeyboardInterrupt() | click.Abort():
-            return str(Interrupted()), 130
+            said = getattr(error, "sentence", None) or signals.remains or "interrupted"
+            return said, getattr(error, "exit_code", 130)
         case click.UsageError(ctx=click.Context() as ctx):
             return f"{error.format_message().rstrip('.')}; try '{ctx.command_path} --help'", error.exit_code
         case click.ClickException():
@@ -119,24 +124,10 @@ def cli() -> None:
 
 def main() -> None:
     """The entry point of the process."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
-            signal.signal(number, _interrupt)
+    streams.hold()
+    signals.obey()
     try:
         cli.main()
     finally:
-        _seal_stdout()
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise Interrupted(number)
-
-
-def _seal_stdout() -> None:
-    """Keep the interpreter's last flush from failing again, which would print an error and exit with 120."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (AttributeError, ValueError):
-        pass  # there is no stdout, or it was closed
+        signals.leave()
+        streams.seal()

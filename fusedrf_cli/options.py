@@ -475,25 +475,46 @@ running = _stack(_RUNNING)
 seeded = _stack((*_RUNNING, _seed))
 
 
-def writing(what: str, *, folders: bool = False, edits: str | None = None) -> Callable:
-    """-o/--output (`what` it is, a folder too with `folders`) and -w.
+def writing(
+    what: str,
+    *,
+    folders: bool = False,
+    stdout: bool = False,
+    edits: str | None = None,
+    beside: Callable[[str, dict], dict[str, bool]] = lambda output, words: {},
+) -> Callable:
+    """-o/--output (`what` it is, a folder too with `folders`, with `stdout` a - as well) and -w.
 
-    Before any work an output that is in the way, cannot be written, or is being written is refused. A command
+    Before any work an output that is in the way, cannot be written, or is being written is refused, and so
+    are the other ones that a command line has: `beside(output, words)`, which of them are folders. A command
     whose argument `edits` is its output waits instead, and reads it only then: no edit is lost.
     """
 
     def decorate(command: Callable) -> Callable:
         @functools.wraps(command)
         def checked(*, output: str, overwrite: bool, **words):
-            if output == STDIO:
+            if stdout and output == STDIO:
                 return command(output=output, overwrite=overwrite, **words)
             from formats.atomic import check_writable
             from formats.locks import output_lock
 
-            check_writable(output, overwrite, folders=folders)
+            others = beside(output, words)
+            outputs = {output: folders} | others
+            if len({os.path.realpath(path) for path in outputs}) <= len(others):
+                raise UsageProblem(f"{output}: two outputs go there; give them different names")
             in_place = edits is not None and os.path.realpath(words[edits]) == os.path.realpath(output)
-            with output_lock(output, _tell if in_place else None):
-                check_writable(output, overwrite, folders=folders)  # it may have come while we waited
+            with contextlib.ExitStack() as locks:
+                for path, folder in outputs.items():
+                    check_writable(path, overwrite, folders=folder)
+                for path in outputs:
+                    waiting = _tell if in_place and path == output else None
+                    locks.enter_context(output_lock(path, waiting))
+                for path, folder in outputs.items():  # it may have come while we waited
+                    check_writable(path, overwrite, folders=folder)
+                if words.get("keep_history"):
+                    from formats.past import check_past
+
+                    check_past(words[edits], output)
                 return command(output=output, overwrite=overwrite, **words)
 
         return click.option("-o", "--output", required=True, type=click.Path(), help=what)(overwrite(checked))
@@ -502,7 +523,8 @@ def writing(what: str, *, folders: bool = False, edits: str | None = None) -> Ca
 
 
 def _tell(sentence: str) -> None:
-    click.echo(printable(sentence), err=True)
+    with contextlib.suppress(OSError):
+        click.echo(printable(sentence), err=True)
 
 
 def reporting(

@@ -1,5 +1,6 @@
 """A command's progress on stderr: a live line on a terminal, one final line anywhere else."""
 
+import contextlib
 import sys
 import time
 
@@ -87,7 +88,8 @@ class Progress(NullProgress):
         if self._bar is not None:
             self._bar.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
         else:
-            click.echo(printable(text), err=True)
+            with contextlib.suppress(OSError):  # a full or closed stderr is no reason to lose the work
+                click.echo(printable(text), err=True)
 
     def _summary(self) -> str:
         names, starts = zip(*self._started, strict=True)

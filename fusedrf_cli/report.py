@@ -7,16 +7,18 @@ from collections.abc import Iterator
 import click
 
 from formats.errors import printable
+from fusedrf_cli import streams
 
 _UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 _LONGEST_LIST = 12
 
 
 def emit(report: dict, *, as_json: bool, quiet: bool = False) -> None:
-    """Print `report` on stdout. With `quiet`, text about an output that was written is left out."""
+    """Print `report` on stdout. With `quiet`, and where stdout is closed, text about an output that was
+    written is left out."""
     if as_json:
         click.echo(_escaped(json.dumps(_plain(report), ensure_ascii=False, allow_nan=False)))
-    elif not (quiet and "output" in report):
+    elif not ("output" in report and (quiet or streams.nowhere())):
         for line in lines(report):
             click.echo(printable(line))
 

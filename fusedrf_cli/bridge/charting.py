@@ -7,12 +7,12 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
 
-from formats.atomic import atomic_folder, hidden_sibling
+from formats.atomic import atomic_folder, temporary_sibling
+from formats.errors import ResourceError
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
@@ -171,9 +171,10 @@ def chart(request: ChartRequest, progress) -> dict:
             waiting = {kind: ladders(kind, request.least_psnr) for kind in request.kinds}
         except ValueError as error:
             raise unusable_kind(error) from error
-        left = run.climb(waiting, budget)
-        progress.phase("frames", 1 + ROUNDS)
-        composed_ms, *ms = benchmark.frame_times(run.bundles, progress.advance)
+        with run.kept():
+            left = run.climb(waiting, budget)
+            progress.phase("frames", 1 + ROUNDS)
+            composed_ms, *ms = benchmark.frame_times(run.bundles, progress.advance)
     for point, value in zip(run.points, ms, strict=True):
         point.ms = value
     mark_frontiers(run.points)
@@ -206,15 +207,12 @@ def scratch(output: str) -> Iterator[Iterator[Path]]:
     target, made = Path(os.path.realpath(output)), []
 
     def names() -> Iterator[Path]:
-        for number in count():
-            made.append(hidden_sibling(target, f"{number}.rfpack"))
+        while True:
+            made.append(temporary_sibling(target))
             yield made[-1]
 
     try:
         yield names()
-    except Interrupted as interrupt:
-        interrupt.sentence = "interrupted; nothing was written"  # and no checkpoint is left to go on from
-        raise
     finally:
         for path in made:
             path.unlink(missing_ok=True)
@@ -255,6 +253,26 @@ class Charting:
         self.bundles: list[Path] = []
         self.refused: dict[str, FusedRFError] = {}
         self.warm: set[tuple[str, str]] = set()
+
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[None]:
+        """Where this block is interrupted, or a disk is full, the points that were found are left as a
+        table."""
+        try:
+            yield
+        except (Interrupted, OSError, ResourceError) as error:
+            said = "nothing was written"
+            if self.points:
+                output = self.request.output
+                composed = {"ms": float("nan"), "bytes": self.benchmark.source_bytes}
+                with atomic_folder(output, overwrite=self.request.overwrite) as folder:
+                    write_csv(folder / "chart.csv", self.points, composed)
+                said = f"the {len(self.points)} points found so far are in {Path(output) / 'chart.csv'}"
+            if isinstance(error, Interrupted):
+                error.sentence = f"interrupted; {said}"  # and no checkpoint is left to go on from
+            else:
+                self.progress.warn(said)
+            raise
 
     def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
         """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
@@ -332,7 +350,7 @@ class Charting:
             device=own.device,
             threads=own.threads,
         )
-        return fuse(wanted, heard, load=as_it_is), heard.warnings
+        return fuse(wanted, heard, as_it_is, lambda output, write: write(output)), heard.warnings
 
 
 def mark_frontiers(points: list[Point]) -> None:

@@ -19,7 +19,7 @@ from fusedrf_cli.bridge.looks import Subject, looks
 from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.rigs import rig_of
-from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
     held_size,
@@ -161,14 +161,19 @@ def add(request: AddRequest, progress) -> dict:
             judge = RegionJudge(truth, cameras, origin, placed_box(edited.box, fused.origin))
         else:
             judge = Judge(truth, cameras, origin)
-        reached = judge(stored(edited.field, precision).to(place))
         nodes = history_nodes(new, request.output, {})
         entry = {
             "event": "added",
             "nodes": [placed_note(n, request.object_to_world, request.name) for n in nodes],
-            "psnr": reached,
         }
-        size = write_edited(request, fused, edited.field, precision, entry)
+        try:
+            reached = judge(stored(edited.field, precision).to(place))
+        except KeyboardInterrupt:
+            if not edited.local:  # it was learnt
+                with held_back(request.output):
+                    write_edited(request, fused, edited.field, precision, entry)
+            raise
+        size = write_edited(request, fused, edited.field, precision, entry | {"psnr": reached})
     figures = {**edited.figures, "psnr": {"before_rgb": reached}, "memory": memory.report()}
     return edit_report(request, size, request.name, fused, edited, figures, started)
 
@@ -177,19 +182,24 @@ def write_edited(request: EditRequest, fused: Fused, field: StoredField, precisi
     """Write the edited field with one more entry of history; the bytes written."""
     if request.keep_history:
         entry = entry | {"before": keep(fused.path, request.output)}
-    return write_field(
-        request.output,
-        field,
-        fused.node.name,
-        precision=precision,
-        overwrite=request.overwrite,
-        origin=fused.origin,
-        history=summed_up((*fused.scene.history, entry)),
-        kept=dict.fromkeys(fused.others, fused.path),
-        extras=fused.scene.extras,
-        framing=fused.framing,
-        cameras=fused.scene.cameras,
-    )
+
+    def write(output: str) -> int:
+        return write_field(
+            output,
+            field,
+            fused.node.name,
+            precision=precision,
+            overwrite=request.overwrite,
+            origin=fused.origin,
+            history=summed_up((*fused.scene.history, entry)),
+            kept=dict.fromkeys(fused.others, fused.path),
+            extras=fused.scene.extras,
+            framing=fused.framing,
+            cameras=fused.scene.cameras,
+        )
+
+    learnt = isinstance(request, Learning)
+    return written_somewhere(request.output, write) if learnt else write(request.output)
 
 
 def addition_memory(field: StoredField, new: LoadedScene) -> list[dict[str, float]]:
@@ -318,4 +328,3 @@ def edit_report(
         **figures,
         "total_seconds": time.monotonic() - started,
     }
-

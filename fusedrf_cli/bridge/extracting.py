@@ -11,6 +11,7 @@ import numpy as np
 from formats.atomic import atomic_folder, check_writable
 from formats.captures import read_cameras
 from formats.errors import BadMask, FormatError, OutputExists
+from formats.filenames import distinct
 from formats.hulls import Hull
 from formats.images import read_mask, write_png
 from formats.photos import pictures
@@ -23,7 +24,7 @@ from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.mending import mended
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import to_pixels
-from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement
@@ -132,8 +133,11 @@ def extract(request: ExtractRequest, progress) -> dict:
         if request.invert:
             wanted, figures["hole"] = mended(request, fused, wanted, found, memory, place, progress)
             parts = found, wanted
+        with held_back(request.output):
+            size = written_somewhere(
+                request.output, lambda output: write(request, output, fused, wanted, found)
+            )
         files = previews(request, fused, rig, parts, progress) if request.preview else []
-        size = write(request, fused, rig, wanted, found)
         box = placed_box(found.occupancy.subject, fused.origin)
     return {
         "output": request.output,
@@ -423,20 +427,18 @@ def cut(
 # -- writing -------------------------------------------------------------------------------------------------
 
 
-def write(
-    request: ExtractRequest, fused: Fused, rig: dict[str, View], wanted: StoredField, found: StoredField
-) -> int:
+def write(request: ExtractRequest, output: str, fused: Fused, wanted: StoredField, found: StoredField) -> int:
     """Write one of the two fields as a bundle; the bytes written."""
     if request.invert:
         history = summed_up((*fused.scene.history, {"event": "extracted", "names": [], "nodes": []}))
         return write_field(
-            request.output, wanted, fused.node.name, precision=request.precision or fused.precision,
+            output, wanted, fused.node.name, precision=request.precision or fused.precision,
             overwrite=request.overwrite, origin=fused.origin, history=history,
             kept=dict.fromkeys(fused.others, fused.path), extras=fused.scene.extras, framing=fused.framing,
             cameras=fused.scene.cameras,
         )  # fmt: skip
     return write_field(
-        request.output, found, request.name or "object", precision=request.precision or "float16",
+        output, found, request.name or "object", precision=request.precision or "float16",
         overwrite=request.overwrite, origin=fused.origin,
         framing=placed_box(found.occupancy.subject, fused.origin),
         cameras=own_cameras(fused, found),
@@ -465,10 +467,11 @@ def previews(
     cameras = [camera_of(view) for view in views] or [framed(fused, parts[0])]
     progress.phase("previews", len(cameras))
     files, folder = [], Path(request.preview)
+    names = distinct([camera.name or "view" for camera in cameras], ("_object", "_marked", "_rest"))
     with atomic_folder(folder, overwrite=request.overwrite) as temporary:
-        for number, camera in enumerate(cameras):
+        for number, (camera, stem) in enumerate(zip(cameras, names, strict=True)):
             for what, pixels in pictures_of(fused, parts, camera).items():
-                name = f"{camera.name or 'view'}_{what}.png"
+                name = f"{stem}_{what}.png"
                 write_png(temporary / name, pixels)
                 files.append(str(folder / name))
             progress.advance(number + 1)

@@ -11,7 +11,15 @@ from fusedrf_cli.bridge.making import Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
-from fusedrf_cli.bridge.running import Saved, checkpoint_path, engine, load_checkpoint
+from fusedrf_cli.bridge.running import (
+    Saved,
+    check_checkpoint,
+    checkpoint_path,
+    engine,
+    held_back,
+    load_checkpoint,
+    written_somewhere,
+)
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
     check_graph,
@@ -40,10 +48,14 @@ Load = Callable[[FuseRequest, Memory, str, object], LoadedScene]
 """What is to be fused, within a memory, on a device, with a progress that is told of what goes on."""
 
 
-def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
-    """Turn a composed scene into one field and write it with the scene's history."""
+def fuse(
+    request: FuseRequest, progress, load: Load = load_to_fuse, somewhere: Callable = written_somewhere
+) -> dict:
+    """Turn a composed scene into one field and write it with the scene's history; `somewhere` writes, as
+    `written_somewhere` does."""
     with engine(request.device, request.threads, progress) as place:
         progress.phase("reading", None)
+        check_checkpoint(request.output, request.resume, request.overwrite)
         saved = load_checkpoint(request.output, "fuse") if request.resume else None
         memory = Memory(request.memory)
         loaded = load(request, memory, place, progress)
@@ -69,9 +81,7 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
                 f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
                 f"where {readable_size(asked.limit)} were allowed; give more"
             ) from error
-        details = student.details(found.field)
-        warn_of_detail(details, remedy(kind, loaded, scene.composed), progress)
-        figures = figures_of(found, maker, choosing, seconds)
+        reached = reached_by(found, student)
         entry = {
             "event": "fused",
             "kind": kind.name,
@@ -83,21 +93,28 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
                 "rgb": request.rgb,
                 "from_scratch": request.from_scratch,
             },
-            "psnr": figures["psnr"],
+            "psnr": reached,
         }
-        size = write_field(
-            request.output,
-            found.field,
-            FUSED,
-            precision=found.tried.way.precision,
-            overwrite=request.overwrite,
-            origin=scene.composed.origin,
-            history=(entry,),
-            kept=kept,
-            framing=framing,
-            cameras=cameras,
-        )
-        checkpoint_path(request.output).unlink(missing_ok=True)
+        with held_back(request.output):  # what was made comes before what is found out about it
+            size = somewhere(
+                request.output,
+                lambda output: write_field(
+                    output,
+                    found.field,
+                    FUSED,
+                    precision=found.tried.way.precision,
+                    overwrite=request.overwrite,
+                    origin=scene.composed.origin,
+                    history=(entry,),
+                    kept=kept,
+                    framing=framing,
+                    cameras=cameras,
+                ),
+            )
+            checkpoint_path(request.output).unlink(missing_ok=True)
+        details = student.details(found.field)
+        warn_of_detail(details, remedy(kind, loaded, scene.composed), progress)
+        figures = figures_of(found, maker, choosing, seconds)
     report = {
         "output": request.output,
         "bytes": size,
@@ -214,12 +231,20 @@ def choose(choosing: Choosing, student: Student, request: FuseRequest) -> Tried 
     return found
 
 
+def reached_by(found: Kept, student: Student) -> dict:
+    """The dB that a choice reached on the views that it was chosen by."""
+    tried, did = found.tried, found.did
+    learnt = did is not None and student.learnt
+    after = did.psnr_after_rgb if learnt else tried.psnr if tried.psnr > tried.before else None
+    psnr = {"before_rgb": tried.before, "after_rgb": after}
+    return psnr | ({"rgb_kept": did.rgb_kept} if learnt else {}) | {"stored": tried.psnr}
+
+
 def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str, float]) -> dict:
     """What the report says of a choice."""
     tried, did, student, request = found.tried, found.did, maker.student, maker.request
     kind = student.kind.name
     learnt = did is not None and student.learnt
-    after = did.psnr_after_rgb if learnt else tried.psnr if tried.psnr > tried.before else None
     count = len(choosing.tried)
     started = time.monotonic()
     neighbours = {}
@@ -228,11 +253,8 @@ def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str,
     elif not student.learnt and (count > 1 or request.target_psnr is not None) and not maker.budget.over:
         neighbours = choosing.neighbours(tried)
         seconds["neighbours"] = time.monotonic() - started
-    psnr = {"before_rgb": tried.before, "after_rgb": after}
-    psnr |= {"rgb_kept": did.rgb_kept} if learnt else {}
-    psnr |= {"stored": tried.psnr, **maker.verdict(found)}
     figures = {
-        "psnr": psnr,
+        "psnr": reached_by(found, student) | maker.verdict(found),
         "seconds": seconds | (did.seconds if did is not None else {}),
     }
     if learnt:

@@ -10,7 +10,7 @@ import torch
 from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.choose import FINALISTS, Tried
 from fusedrf_cli.bridge.looks import looks_of, views_of_place
-from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable
+from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable, take_up
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
@@ -28,6 +28,7 @@ from fusedrf_cli.requests import FuseRequest
 
 VIEWS_TO_CHOOSE_BY = 8
 RATE_IN_PLACE = 0.02  # of a student that begins as a place and has only to learn what stands in it: 3 dB
+WORTH_SAVING = 10.0  # seconds of learning, from which on a student is saved before it is measured
 TRIES = 6  # that a search for a target makes, about
 
 
@@ -238,13 +239,16 @@ class Maker:
         if saved is not None:
             if any(saved[1].get(word) != value for word, value in made_with.items()):
                 raise checkpoint_mismatch(request.output)
-            run.restore(*saved)
+            take_up(run, saved, request.output)
 
         def checkpoint() -> tuple[dict, dict]:
             arrays, state = run.checkpoint()
             return arrays, state | made_with
 
-        with resumable(request.output, checkpoint) as uninterrupted:
+        def learnt() -> bool:
+            return run.learnt_seconds > WORTH_SAVING
+
+        with resumable(request.output, checkpoint, self.progress, learnt) as uninterrupted:
             student, did = run.finish(*self.telling(), uninterrupted)
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)

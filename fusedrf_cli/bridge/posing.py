@@ -1,11 +1,10 @@
 """`pose`: where photos were taken; and the same for `train`, which keeps it in the user's cache."""
 
 import atexit
+import contextlib
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,12 +12,13 @@ from importlib.metadata import version
 from pathlib import Path
 
 from formats.captures import read_capture
-from formats.errors import NoPoses
+from formats.errors import NoPoses, ResourceError
+from formats.locks import temporary_folder
 from formats.photos import has_pictures
-from formats.posing import CAMERAS, Posed, check_extra, estimate, photos_to_pose, write_posed
+from formats.posing import CAMERAS, TEMPORARY, Posed, check_extra, estimate, photos_to_pose, write_posed
 from formats.views import Capture
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.running import available_cores
+from fusedrf_cli.bridge.running import available_cores, written_somewhere
 from fusedrf_cli.requests import PoseRequest
 
 WORLD = (
@@ -36,7 +36,9 @@ def pose(request: PoseRequest, progress) -> dict:
     photos = photos_to_pose(request.photos)
     posed = estimate(request.photos, photos, request.threads or available_cores(), progress)
     _warn_of_unposed(request.photos, posed.unposed, posed.plain, len(photos), progress)
-    write_posed(request.output, posed, request.overwrite, relative=True)
+    written_somewhere(
+        request.output, lambda folder: write_posed(folder, posed, request.overwrite, relative=True)
+    )
     view = posed.views[0]
     return {
         "output": request.output,
@@ -94,12 +96,12 @@ def _keep(posed: Posed, folder: Path) -> Path:
     """Write poses to the cache, or where that cannot be written to a folder that ends with the process."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder.parent, os.W_OK):
-            raise PermissionError
-    except OSError:
-        folder = Path(tempfile.mkdtemp(prefix="fusedrf-poses-")) / folder.name
-        atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
-    write_posed(folder, posed, overwrite=True, relative=False)
+        write_posed(folder, posed, overwrite=True, relative=False)
+    except (OSError, ResourceError):
+        lasting = contextlib.ExitStack()
+        folder = lasting.enter_context(temporary_folder(TEMPORARY)) / folder.name
+        atexit.register(lasting.close)
+        write_posed(folder, posed, overwrite=True, relative=False)
     return folder
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.atomic import atomic_folder
+from formats.filenames import DEPTH, depth_of, distinct
 from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
 from fusedrf_cli.bridge.memory import Memory, insides, ownership, picture, sources
@@ -166,8 +167,7 @@ class _Shooting:
         channels = 4 if self.background is None else 3
         with contextlib.ExitStack() as stack:
             add = stack.enter_context(png_writer(path, *size, channels))
-            beside = path.with_name(f"{path.stem}_depth.png")
-            deep = stack.enter_context(depth_png_writer(beside, *size)) if self.depth else None
+            deep = stack.enter_context(depth_png_writer(depth_of(path), *size)) if self.depth else None
             for band in render_bands(self.field, view, **self.how):
                 add(to_pixels(band, self.background))
                 if deep:
@@ -179,10 +179,14 @@ class _Shooting:
 
     def folder(self, folder: Path, views: list[Camera], overwrite: bool) -> list[str]:
         """A folder of one picture per view, named after it."""
+        names = distinct([view.name for view in views], ("", DEPTH) if self.depth else ("",))
+        for view, name in zip(views, names, strict=True):
+            if view.name != name:
+                self.progress.warn(f"{folder}: the view '{view.name}' is in {name}.png; another has its name")
         with atomic_folder(folder, overwrite=overwrite) as temporary:
-            for view in views:
-                self.picture(temporary / f"{view.name}.png", view)
-        return [str(folder / f"{view.name}.png") for view in views]
+            for view, name in zip(views, names, strict=True):
+                self.picture(temporary / f"{name}.png", view)
+        return [str(folder / f"{name}.png") for name in names]
 
     def count(self, started: float) -> None:
         """One view more is done."""

@@ -2,9 +2,9 @@
 
 import contextlib
 import importlib.util
-import json
 import os
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,18 +12,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import safe_open
 
-from formats.atomic import atomic_writer
+from formats.atomic import check_writable
+from formats.checkpoints import Saved, read_checkpoint, write_checkpoint
+from formats.errors import OutputExists, ResourceError
+from fusedrf_cli import signals
 from fusedrf_cli.bridge.memory import available, peak
 from fusedrf_cli.engine.rendering.volume import is_out_of_memory
 from fusedrf_cli.errors import InvalidInput, NumericFailure, ResourceProblem
 from fusedrf_cli.report import readable_size
 
-Saved = tuple[dict[str, np.ndarray], dict]
-"""Arrays and JSON-able state of an interrupted run."""
-SAVED_EVERY = 150.0
-"""Seconds of a run that a kill can lose."""
+SAVED_EVERY = 90.0
+"""Seconds from the end of one saving of a run to the next: with what saving takes, a kill loses less than two
+minutes."""
 FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
 
 
@@ -50,6 +51,7 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
     """
     place = place_for(device)
     count, before = threads or available_cores(), torch.get_num_threads()
+    signals.remains = None
     from fusedrf_cli.engine import kernels
 
     torch.set_num_threads(count)
@@ -75,12 +77,13 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
 class Uninterrupted:
     """A context to go through once per step, in which an interrupt waits for the step's end: what is saved
     then is no half of one. A second interrupt does not wait, and `torn` tells that there is nothing to save.
-    Every SAVED_EVERY seconds it is saved after a step in any case, for runs that are killed.
+    Every SAVED_EVERY seconds it is saved after a step in any case, for runs that are killed; where that
+    fails, it is tried again as much later, and `failed` is called once with a sentence.
     """
 
-    def __init__(self, save: Callable[[], object]):
+    def __init__(self, save: Callable[[], object], failed: Callable[[str], None]):
         self.torn, self.waiting, self.previous = False, None, {}
-        self.save, self.due = save, time.monotonic() + SAVED_EVERY
+        self.save, self.due, self.failed = save, time.monotonic() + SAVED_EVERY, failed
 
     def __call__(self) -> "Uninterrupted":
         return self
@@ -94,6 +97,8 @@ class Uninterrupted:
         return self
 
     def _arrived(self, number: int, frame: object) -> None:
+        if self.waiting is not None and signals.seen_to():
+            return
         self.torn = self.waiting is not None
         self.waiting = number
         if self.torn:
@@ -105,22 +110,81 @@ class Uninterrupted:
         if self.waiting is not None and kind is None:
             self.previous[self.waiting](self.waiting, None)
         if kind is None and time.monotonic() >= self.due:
+            self.meanwhile()
+
+    def meanwhile(self) -> None:
+        """Save the run, which goes on whether that succeeds or not."""
+        try:
             self.save()
-            self.due = time.monotonic() + SAVED_EVERY
+        except (OSError, ResourceError) as error:
+            self.failed(f"{error}; learning goes on, and saving its state is tried again")
+            self.failed = lambda sentence: None
+        self.due = time.monotonic() + SAVED_EVERY
 
 
 @contextlib.contextmanager
-def resumable(output: str, checkpoint) -> Iterator[Uninterrupted]:
+def resumable(
+    output: str, checkpoint, progress, learnt: Callable[[], bool] = bool
+) -> Iterator[Uninterrupted]:
     """Run steps inside the `Uninterrupted` that this gives; an interrupt leaves `checkpoint()` beside the
-    output and goes on its way, saying so, and every few minutes one is left there unasked."""
-    steps = Uninterrupted(lambda: save_checkpoint(output, *checkpoint()))
+    output and goes on its way, saying so, and every few minutes one is left there unasked. So is one at the
+    end, where `learnt()`: what comes then may be interrupted, too."""
+    steps = Uninterrupted(lambda: save_checkpoint(output, *checkpoint()), progress.warn)
     try:
         yield steps
+        if learnt():
+            steps.meanwhile()
     except KeyboardInterrupt as interrupt:
         if not steps.torn:
-            path = save_checkpoint(output, *checkpoint())
-            interrupt.sentence = f"interrupted; go on with --resume, the state is in {path}"
+            interrupt.sentence = saved_somewhere(output, *checkpoint())
         raise
+
+
+@contextlib.contextmanager
+def held_back(output: str) -> Iterator[None]:
+    """A block that writes the output, in which an interrupt waits for its end; later ones say that the output
+    is there."""
+    with signals.unhurried(), Uninterrupted(lambda: None, lambda sentence: None):
+        yield
+        signals.remains = f"interrupted, but {output} is written whole"
+
+
+def saved_somewhere(output: str, arrays: dict[str, np.ndarray], state: dict) -> str:
+    """Save the state of an interrupted run beside its output, or, where that fails, in a folder for temporary
+    files; what to tell of it."""
+    try:
+        return going_on(save_checkpoint(output, arrays, state))
+    except (OSError, ResourceError) as error:
+        why = error
+    try:
+        folder = tempfile.mkdtemp(prefix="fusedrf-saved-")
+        path = save_checkpoint(os.path.join(folder, Path(output).name), arrays, state)
+    except (OSError, ResourceError):
+        return f"interrupted; the state of the run is lost, since {why}"
+    return (
+        f"interrupted; the state is in {path}, since {why}; to go on with --resume move it to "
+        f"{checkpoint_path(output)}"
+    )
+
+
+def going_on(path: Path) -> str:
+    """The sentence of an interrupted run whose state is in a file."""
+    return f"interrupted; go on with --resume, the state is in {path}"
+
+
+def written_somewhere(output: str, write: Callable[[str], int]) -> int:
+    """What `write(path)` gives for the output. Where that cannot be written, it is written to a folder for
+    temporary files, and ResourceProblem says where: what took long to learn is not lost for it."""
+    try:
+        return write(output)
+    except (OSError, ResourceError, OutputExists) as error:
+        why = error
+    try:
+        path = os.path.join(tempfile.mkdtemp(prefix="fusedrf-saved-"), Path(output).name)
+        write(path)
+    except (OSError, ResourceError):
+        raise why from None
+    raise ResourceProblem(f"{why}; what was made is in {path}") from why
 
 
 def available_cores() -> int:
@@ -136,54 +200,49 @@ def checkpoint_path(output: str) -> Path:
     return Path(f"{output}.checkpoint")
 
 
+def check_checkpoint(output: str, resume: bool, overwrite: bool) -> None:
+    """Before any work: no earlier run's checkpoint is overwritten unasked. Raises OutputExists,
+    ResourceError."""
+    path = checkpoint_path(output)
+    if not resume and not overwrite and os.path.lexists(path):
+        raise OutputExists(
+            f"{path}: an interrupted run left it; go on from it with --resume, or give -w/--overwrite to "
+            "begin anew"
+        )
+    if os.path.lexists(path):
+        check_writable(path, overwrite=True)
+
+
 def save_checkpoint(output: str, arrays: dict[str, np.ndarray], state: dict) -> Path:
     """Write a run's state beside its output, whole or not at all."""
     path = checkpoint_path(output)
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    size = sum(array.nbytes for array in arrays.values())
-    with atomic_writer(path, reserve=size) as file:
-        file.write(checkpoint_header(arrays, {"fusedrf": json.dumps(state, sort_keys=True)}))
-        for array in arrays.values():
-            file.write(array.reshape(-1).view(np.uint8).data)
+    with signals.unhurried():
+        write_checkpoint(path, arrays, state)
+    signals.remains = going_on(path)
     return path
 
 
-def checkpoint_header(arrays: dict[str, np.ndarray], metadata: dict[str, str]) -> bytes:
-    """What a safetensors file begins with that holds arrays one after the other. The library would make bytes
-    of all of them first, twice: of a place's field and moments 0.6 GB."""
-    told, end = {"__metadata__": metadata}, 0
-    for name, array in arrays.items():
-        start, end = end, end + array.nbytes
-        dtype = array.dtype.kind.upper() + str(8 * array.dtype.itemsize)
-        told[name] = {"dtype": dtype, "shape": list(array.shape), "data_offsets": [start, end]}
-    text = json.dumps(told).encode()
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text
-
-
-def load_checkpoint(output: str, command: str) -> tuple[dict[str, np.ndarray], dict]:
-    """The state that `save_checkpoint` left for an output; InvalidInput when there is none or it is another
-    command's.
-    """
+def load_checkpoint(output: str, command: str) -> Saved:
+    """The state that `save_checkpoint` left for an output; InvalidInput when it is another command's. Raises
+    as `read_checkpoint`."""
     path = checkpoint_path(output)
-    if not path.exists():
-        raise InvalidInput(f"{path}: no checkpoint to resume from; run without --resume")
-    try:
-        with safe_open(path, "numpy") as file:
-            state = json.loads((file.metadata() or {}).get("fusedrf", "{}"))
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (no mapping)
-        if not isinstance(state, dict):
-            raise ValueError("its state is no object")
-    except Exception as error:
-        raise InvalidInput(
-            f"{path}: not a readable checkpoint ({error}); delete it and run without --resume"
-        ) from error
+    arrays, state = read_checkpoint(path)
     if state.get("command") != command:
         raise InvalidInput(
             f"{path}: a checkpoint of '{state.get('command')}', not of '{command}'; delete it or choose "
             "another output"
         )
     return arrays, state
+
+
+def take_up(run, saved: Saved, output: str) -> None:
+    """Have a run go on from a saved state; InvalidInput where that is not of such a run."""
+    try:
+        run.restore(*saved)
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        if is_out_of_memory(error):
+            raise
+        raise checkpoint_mismatch(output) from error
 
 
 def checkpoint_mismatch(output: str) -> InvalidInput:

@@ -20,11 +20,15 @@ from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.refined import aligned, moved, with_poses
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.running import (
+    check_checkpoint,
     checkpoint_mismatch,
     checkpoint_path,
     engine,
+    held_back,
     load_checkpoint,
     resumable,
+    take_up,
+    written_somewhere,
 )
 from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
@@ -86,6 +90,7 @@ def train(request: TrainRequest, progress) -> dict:
     """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
     with engine(request.device, request.threads, progress) as place:
         memory = Memory(request.memory)
+        check_checkpoint(request.output, request.resume, request.overwrite)
         saved = load_checkpoint(request.output, "train") if request.resume else None
         kind = trained_kind(request)
         progress.phase("reading", None)
@@ -111,11 +116,25 @@ def train(request: TrainRequest, progress) -> dict:
         if saved:
             if saved[1].get("kind") != kind.name:
                 raise checkpoint_mismatch(request.output)
-            run.restore(*saved)
+            take_up(run, saved, request.output)
         field, seconds = _run(run, request.output, progress)
-        if settings.poses:
-            capture = with_poses(capture, extent, run.pool.poses)
-            kept = cameras_of_capture(capture, cut_out, progress)
+        with held_back(request.output):  # what was learnt comes before what is found out about it
+            if settings.poses:
+                capture = with_poses(capture, extent, run.pool.poses)
+                kept = cameras_of_capture(capture, cut_out, progress)
+            size = written_somewhere(
+                request.output,
+                lambda output: write_field(
+                    output,
+                    field,
+                    Path(request.output).stem,
+                    precision=request.precision,
+                    overwrite=request.overwrite,
+                    origin=extent.origin,
+                    cameras=kept,
+                ),
+            )
+            checkpoint_path(request.output).unlink(missing_ok=True)
         progress.phase("measuring", None)
         measured = None
         if request.holdout:
@@ -125,16 +144,6 @@ def train(request: TrainRequest, progress) -> dict:
                 measured["aligned"] = aligned(written, capture, extent, settings.near, request.seed)
             if capture.kind != "mesh":
                 warn_of_holdout(request.output, measured, progress)
-        size = write_field(
-            request.output,
-            field,
-            Path(request.output).stem,
-            precision=request.precision,
-            overwrite=request.overwrite,
-            origin=extent.origin,
-            cameras=kept,
-        )
-        checkpoint_path(request.output).unlink(missing_ok=True)
     report = {
         "output": request.output,
         "bytes": size,
@@ -323,7 +332,7 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     """Train to the end; an interrupt leaves a checkpoint and goes on its way."""
     progress.phase("training", 1.0)
     started = time.monotonic()
-    with resumable(output, run.checkpoint) as uninterrupted:
+    with resumable(output, run.checkpoint, progress) as uninterrupted:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
     run.forget()
     warn_of_numbers(run.guard.figures(), progress)

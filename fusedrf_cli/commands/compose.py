@@ -59,7 +59,7 @@ def _placed_options(command):
 @click.command("compose")
 @click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=options.INPUT)
 @_placed_options
-@options.writing("The scene to write, scene.json, or - for stdout.")
+@options.writing("The scene to write, scene.json, or - for stdout.", stdout=True)
 @click.option(
     "--composition",
     type=click.Choice(["max", "add"]),

@@ -8,7 +8,10 @@ from fusedrf_cli.requests import ExtractRequest
 
 @click.command("extract")
 @click.argument("field", type=options.INPUT)
-@options.writing("The object to write, OUT.rfpack.")
+@options.writing(
+    "The object to write, OUT.rfpack.",
+    beside=lambda output, words: {words["preview"]: True} if words["preview"] else {},
+)
 @click.option(
     "--masks",
     type=options.INPUT,

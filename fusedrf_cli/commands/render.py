@@ -1,6 +1,7 @@
 """`fusedrf render`: pictures and films of a field or scene."""
 
 import math
+from pathlib import Path
 
 import click
 
@@ -9,9 +10,19 @@ from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
 
+def beside(output: str, words: dict) -> dict[str, bool]:
+    """The depth of a single picture, where that is asked for."""
+    from formats.filenames import depth_of
+
+    single = Path(output).suffix.lower() == ".png"
+    return {str(depth_of(Path(output))): False} if words["depth"] and single else {}
+
+
 @click.command("render")
 @click.argument("scene", type=options.SCENE)
-@options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).", folders=True)
+@options.writing(
+    "A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).", folders=True, beside=beside
+)
 @click.option("--cameras", type=options.INPUT, help="Views of a transforms.json.")
 @click.option("--path", type=options.INPUT, help="Views of a nerfstudio camera_path.json.")
 @click.option(

@@ -31,7 +31,8 @@ from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.main import _interrupt, cli
+from fusedrf_cli.main import cli
+from fusedrf_cli.signals import interrupt
 from tests.analytic.export import SHAPE, vm_field
 from tests.analytic.fields import Box, Tint
 
@@ -206,7 +207,7 @@ def interrupted_in_step(monkeypatch):
                     signal.raise_signal(signal.SIGINT)
             step(self, rate)
 
-        previous = signal.signal(signal.SIGINT, _interrupt)  # as the process itself has it
+        previous = signal.signal(signal.SIGINT, interrupt)  # as the process itself has it
         try:
             with monkeypatch.context() as patch:
                 patch.setattr(Adam, "step", interrupted)

@@ -20,10 +20,10 @@ from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor
 from fusedrf_cli.engine.kinds.ladders import shrinking as shrinking_rungs
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
-from fusedrf_cli.main import _interrupt
 from fusedrf_cli.options import BYTES
 from fusedrf_cli.progress import NullProgress
 from fusedrf_cli.requests import ChartRequest
+from fusedrf_cli.signals import interrupt
 from tests.bridge.conftest import done, part, write_scene_of
 
 CHART = ("chart", "scene.json", "-o", "chart", "--size", "24x24")
@@ -114,7 +114,7 @@ def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
     def interrupted(request, progress, load):
         Path(request.output).touch()
         Path(f"{request.output}.checkpoint").touch()
-        _interrupt(signal.SIGINT, None)
+        interrupt(signal.SIGINT, None)
 
     monkeypatch.setattr(part("charting"), "fuse", interrupted)
     result = run(*CHART)

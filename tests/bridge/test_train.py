@@ -1,8 +1,12 @@
 """`train` for real, on eight pictures of 24 x 24."""
 
+import errno
 import json
+import os
 import shutil
+import tempfile
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +15,7 @@ from safetensors.numpy import save
 
 from formats import atomic
 from formats.bundle import read_bundle
+from formats.checkpoints import write_checkpoint
 from formats.rig import read_rig
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.engine.distillation.poses import changed_each, turns
@@ -209,15 +214,89 @@ def test_divergence_is_exit_6(run, folder, monkeypatch):
 
 
 def test_a_checkpoint_of_something_else_is_refused(run, folder):
-    listed = save({}, {"fusedrf": "[1]"})
-    contents = (b"junk", "not a readable"), (listed, "no object"), (None, "no checkpoint")
-    for content, says in contents:
-        path = folder / "out.rfpack.checkpoint"
+    path = folder / "out.rfpack.checkpoint"
+    contents = ((b"junk", 3, "not a readable"), (save({}, {}), 4, "earlier"), (None, 3, "no checkpoint"))
+    for content, code, says in contents:
         path.unlink(missing_ok=True)
         if content:
             path.write_bytes(content)
         result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--resume")
-        assert result.exit_code == 3 and says in result.stderr
+        assert result.exit_code == code and says in result.stderr
+    write_checkpoint(path, {}, {"command": "train", "kind": "vm"})
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--resume")
+    assert result.exit_code == 3 and "other settings" in result.stderr
+
+
+def test_a_checkpoint_in_the_way_is_left_alone(run, folder):
+    """What an earlier run learnt is not overwritten unasked."""
+    path = folder / "out.rfpack.checkpoint"
+    path.write_bytes(b"an hour")
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert result.exit_code == 1 and "--resume" in result.stderr and path.read_bytes() == b"an hour"
+    assert run("train", "photos", "-o", "out.rfpack", *WORDS, "-w").exit_code == 0 and not path.exists()
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
+def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, code):
+    """P5: a folder may have become read-only, too."""
+    tries = []
+
+    def full(path, arrays, state):
+        tries.append(state["steps"])
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(part("running"), "write_checkpoint", full)
+    monkeypatch.setattr(part("running"), "SAVED_EVERY", 0.0)
+    said = train(report)
+    assert len(tries) > 5 and said["steps"] == 60
+    assert len([text for text in said["warnings"] if "learning goes on" in text]) == 1
+
+
+def test_an_interrupt_on_a_full_disk_saves_elsewhere(
+    report, run, folder, interrupted_in_step, straight, monkeypatch
+):
+    write, room = part("running").write_checkpoint, folder.parent / "room"
+    room.mkdir()
+
+    def full(path, *words):
+        if Path(path).parent.resolve() == folder.resolve() or str(path).startswith("out"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, *words)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(part("running"), "write_checkpoint", full)
+        patch.setattr(tempfile, "tempdir", str(room))
+        with interrupted_in_step(30):
+            result = run("train", "photos", "-o", "out.rfpack", *WORDS)
+    (saved,) = room.glob("fusedrf-saved-*/out.rfpack.checkpoint")
+    assert result.exit_code == 130 and str(saved) in result.stderr and "move it to" in result.stderr
+    shutil.move(saved, folder / "out.rfpack.checkpoint")
+    train(report, "out.rfpack", "--resume")
+    assert list(read_bundle(folder / "out.rfpack").fields) == straight
+
+
+def test_an_output_that_cannot_be_written_in_the_end_is_written_elsewhere(run, folder, straight, monkeypatch):
+    """P5: its folder is gone by then."""
+    place, room = folder / "sub", folder.parent / "room"
+    place.mkdir()
+    room.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(room))
+    monkeypatch.setattr(FitRun, "forget", lambda run: shutil.rmtree(place))
+    result = run("train", "photos", "-o", "sub/out.rfpack", *WORDS)
+    (saved,) = room.glob("fusedrf-saved-*/out.rfpack")
+    assert result.exit_code == 5 and str(saved) in result.stderr
+    assert list(read_bundle(saved).fields) == straight
+
+
+def test_an_interrupt_while_measuring_loses_nothing(run, folder, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(part("training"), "measure", stop)
+    result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--holdout", "4")
+    assert result.exit_code == 130 and "out.rfpack is written whole" in result.stderr
+    read_bundle(folder / "out.rfpack")
+    assert not (folder / "out.rfpack.checkpoint").exists()
 
 
 @pytest.mark.parametrize("device, code", [("cuda", 5), ("cpu", 0)])
