@@ -5,17 +5,25 @@ compares these with the file byte by byte. So no data can be hidden between memb
 still list and extract them.
 """
 
+import contextlib
 import mmap
 import os
 import re
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from formats.errors import BadHeader, ChecksumMismatch, LimitExceeded, NotABundle, TruncatedBundle
+from formats.errors import (
+    BadHeader,
+    ChecksumMismatch,
+    LimitExceeded,
+    NotABundle,
+    ResourceError,
+    TruncatedBundle,
+)
 from formats.inputs import open_input
 
 ALIGNMENT = 64
@@ -32,6 +40,7 @@ LOCAL = struct.Struct("<4sHHHHHIIIHH")
 CENTRAL = struct.Struct("<4sHHHHHHIIIHHHHHII")
 END = struct.Struct("<4sHHHHIIH")
 EXTRA = struct.Struct("<HH")
+PIECE = 16 << 20  # bytes of a member that are looked at before their pages are given back
 REWRITTEN = "the file is damaged, or another tool packed it: write it with fusedrf"
 
 
@@ -81,10 +90,12 @@ def write_archive(file: BinaryIO, members: Iterable[tuple[str, bytes]]) -> None:
 
 
 def read_archive(path: Path | str, *, verify: bool = True) -> dict[str, memoryview]:
-    """The members of a bundle, memory-mapped, in order; structure always checked, CRCs with `verify`.
+    """The members of a bundle, memory-mapped, in order; structure always checked, CRCs with `verify`. They
+    stay those of the file that was opened, whatever takes its name later.
 
     Raises MissingFile, NotAFile, NotABundle, TruncatedBundle, BadHeader, ChecksumMismatch, LimitExceeded.
     """
+    allow_files()
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MAGIC))
@@ -92,8 +103,36 @@ def read_archive(path: Path | str, *, verify: bool = True) -> dict[str, memoryvi
             raise NotABundle(f"{path}: begins with {magic!r}, expected an .rfpack bundle ({MAGIC!r})")
         if size > MAX_ARCHIVE:
             raise LimitExceeded(f"{path}: has {size:,} bytes, but a bundle is smaller than 4 GiB")
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except OSError as error:
+            raise ResourceError(f"{path}: cannot be mapped ({error.strerror})") from error
     return parse_archive(memoryview(data), str(path), verify=verify)
+
+
+def pieces(data: bytes | memoryview) -> Iterator[bytes | memoryview]:
+    """Bytes of a member piece by piece, so that no more of a large file is in memory at once."""
+    for start in range(0, len(data), PIECE):
+        yield data[start : start + PIECE]
+        give_back(data)
+
+
+def give_back(data: bytes | memoryview) -> None:
+    """Let go of the pages of the file that members are mapped from: they are read again where they are asked
+    for again."""
+    mapping = data.obj if isinstance(data, memoryview) else None
+    if isinstance(mapping, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        mapping.madvise(mmap.MADV_DONTNEED)
+
+
+def allow_files() -> None:
+    """Allow this process as many open files as the system lets it: every bundle of a scene stays open."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if soft != hard:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def parse_archive(data: memoryview, where: str, *, verify: bool = True) -> dict[str, memoryview]:
@@ -109,7 +148,10 @@ def parse_archive(data: memoryview, where: str, *, verify: bool = True) -> dict[
     views = {_text(member): data[member.start : member.stop] for member in members}
     if verify:
         for member in members:
-            if zlib.crc32(views[_text(member)]) != member.crc:
+            crc = 0
+            for piece in pieces(views[_text(member)]):
+                crc = zlib.crc32(piece, crc)
+            if crc != member.crc:
                 raise ChecksumMismatch(f"{where}: member {_text(member)} is damaged (CRC-32); copy it again")
     return views
 

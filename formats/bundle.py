@@ -5,9 +5,12 @@ import math
 import re
 from collections.abc import Container, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
-from formats.archive import MAGIC, parse_archive, read_archive, write_archive
+import numpy as np
+
+from formats.archive import MAGIC, parse_archive, pieces, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
 from formats.contents import objects_in, world_aabb
 from formats.errors import (
@@ -19,7 +22,14 @@ from formats.errors import (
     UnknownMember,
 )
 from formats.inputs import open_input
-from formats.records import FieldHeader, FieldRecord, decode_field, decode_header, encode_field
+from formats.records import (
+    FieldHeader,
+    FieldRecord,
+    decode_field,
+    decode_header,
+    encode_field,
+    mapped_array,
+)
 from formats.rig import read_rig
 from formats.scene import (
     FORMAT,
@@ -42,6 +52,46 @@ class Bundle:
 
     scene: SceneGraph
     fields: dict[str, FieldRecord]
+
+
+class OpenBundle:
+    """A bundle that was opened and verified once, and is read from that version to the end: whatever takes
+    its name meanwhile is another file."""
+
+    def __init__(self, path: Path | str, *, verify: bool = True):
+        """Every byte is checked, but no array decoded; without `verify` the checksums are not. Raises a
+        FormatError naming the file and the member: see `formats/errors.py`."""
+        self.path = Path(path)
+        views = read_archive(path, verify=verify)
+        self.scene, self.headers = _headers(views, str(path), verify)
+        self._views = views
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return len(self._views[SCENE].obj)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hex SHA-256 of the file's bytes."""
+        return _sha256(memoryview(self._views[SCENE].obj))
+
+    def data(self, member: str) -> memoryview:
+        """A field's bytes. Raises MissingMember."""
+        if member not in self.headers:
+            raise MissingMember(f"{self.path}: holds no member {member!r}")
+        return self._views[member]
+
+    def field(self, member: str) -> FieldRecord:
+        """One field. Raises MissingMember, and as `decode_field`."""
+        record = decode_field(self.data(member), f"{self.path}: {member}")
+        for part, name in shared_members(member, record, self.headers, str(self.path)).items():
+            _take_part(record, part, decode_field(self._views[name], f"{self.path}: {name}"))
+        return record
+
+    def array(self, member: str, name: str) -> np.ndarray:
+        """One array of a field as it is stored, read-only. Raises MissingMember and KeyError."""
+        return mapped_array(self.data(member), self.headers[member].specs[name])
 
 
 class BundleWriter:
@@ -77,15 +127,14 @@ class BundleWriter:
             parts[part] = self.add_field(FieldRecord(PART, own), precision)
         return FieldRecord(record.kind, arrays, record.metadata | {SHARED: parts})
 
-    def copy_field(self, path: Path | str, member: str) -> str:
-        """Take over `member` of the bundle at `path`, and the parts it shares, byte for byte; raises as
-        `read_bundle`."""
-        views = _checked_members(read_archive(path), str(path), verify=True)
-        if member not in views:
-            raise MissingMember(f"{path}: holds no member {member!r}")
-        header = decode_header(views[member], f"{path}: {member}")
-        for name in (member, *shared_members(member, header, views, str(path)).values()):
-            self.members[name] = bytes(views[name])
+    def copy_field(self, bundle: OpenBundle | Path | str, member: str) -> str:
+        """Take over a member of another bundle, and the parts it shares, byte for byte. Raises MissingMember,
+        and of a path as `read_bundle`."""
+        bundle = bundle if isinstance(bundle, OpenBundle) else OpenBundle(bundle)
+        header, members = bundle.headers.get(member), bundle.headers
+        shared = {} if header is None else shared_members(member, header, members, str(bundle.path))
+        for name in (member, *shared.values()):
+            self.members[name] = bytes(bundle.data(name))
         return member
 
     def write(self, path: Path | str, scene: SceneGraph | None = None, *, overwrite: bool = False) -> None:
@@ -125,7 +174,14 @@ def field_member(record: FieldRecord, precision: str = "float16") -> tuple[str, 
 
 def member_name(data: bytes | memoryview) -> str:
     """The name that a field's bytes give it."""
-    return f"fields/{hashlib.sha256(data).hexdigest()[:16]}.safetensors"
+    return f"fields/{_sha256(data)[:16]}.safetensors"
+
+
+def _sha256(data: bytes | memoryview) -> str:
+    digest = hashlib.sha256()
+    for piece in pieces(data):
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
@@ -140,18 +196,8 @@ def read_headers(path: Path | str, *, verify: bool = True) -> tuple[SceneGraph, 
     """The scene of the bundle at `path` and the headers of its fields, by member; no array is decoded, but
     with `verify` every byte is checked. Raises as `read_bundle`.
     """
-    return _headers(read_archive(path, verify=verify), str(path), verify)
-
-
-def read_field(path: Path | str, member: str) -> FieldRecord:
-    """One field of a bundle whose bytes were checked before. Raises MissingMember, and as `read_bundle`."""
-    views = read_archive(path, verify=False)
-    if member not in views:
-        raise MissingMember(f"{path}: no longer holds {member!r}; was the file replaced meanwhile?")
-    record = decode_field(views[member], f"{path}: {member}")
-    for part, name in shared_members(member, record, views, str(path)).items():
-        _take_part(record, part, decode_field(views[name], f"{path}: {name}"))
-    return record
+    bundle = OpenBundle(path, verify=verify)
+    return bundle.scene, bundle.headers
 
 
 def _take_part(record: FieldRecord, part: str, found: FieldRecord) -> None:

@@ -25,6 +25,8 @@ LEVELS = {8: 127, 4: 7}  # the largest code, by bits
 # cutting off the largest number gains nothing. None may be above 1, or no code would reach L.
 FACTORS = {8: (1.0,), 4: (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.65)}
 NUMBERS_AT_ONCE = 1 << 17  # of an array, so that what is made of them stays in the cache
+MOST_AT_ONCE = 8 * NUMBERS_AT_ONCE  # where a row of blocks has more than that
+MADE_AT_ONCE = 20 * MOST_AT_ONCE  # bytes that are made of them on the way
 
 
 def is_coded(shape: tuple[int, ...]) -> bool:
@@ -104,7 +106,7 @@ def dequantised(
     if kept_numbers and not codes.min():
         raise BadArray(f"{where}: has a code 0, expected 1 to {2 * levels + 1}; make the file again")
     array, at = np.zeros(shape, np.float32), 0
-    for rows, blocks, sides in _slabs(shape, runs):
+    for rows, blocks, sides in _pieces(block_sides(shape, runs)):
         if not scales[blocks].any():
             continue  # pages of zeros are never touched
         spread = _spread(scales[blocks], sides)
@@ -126,15 +128,38 @@ def check_scales(
         raise NotFinite(f"{where}: has scales that are NaN or infinite; make the file again")
     if np.signbit(scales).any():
         raise BadArray(f"{where}: has negative scales; make the file again")
-    return _numbers_kept(scales > 0, shape, runs)
+    count = 0
+    for _, blocks, sides in _pieces(block_sides(shape, runs)):
+        kept = (scales[blocks] > 0).astype(np.int64)
+        for axis, lengths in enumerate(sides):
+            kept *= lengths.reshape([-1 if a == axis else 1 for a in range(len(shape))])
+        count += int(kept.sum())
+    return count
 
 
-def _numbers_kept(kept: np.ndarray, shape: tuple[int, ...], runs: np.ndarray | None = None) -> int:
-    """How many numbers lie in the blocks that are kept."""
-    counts = kept.astype(np.int64)
-    for axis, lengths in enumerate(block_sides(shape, runs)):
-        counts *= lengths.reshape([-1 if a == axis else 1 for a in range(len(shape))])
-    return int(counts.sum())
+def _pieces(
+    sides: tuple[np.ndarray, ...],
+) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...], tuple[np.ndarray, ...]]]:
+    """Slices of an array with blocks of these sides, in its own order, and of its scales, and the blocks'
+    lengths in them along each axis: of MOST_AT_ONCE numbers at most, whatever its shape."""
+    first, *rest = sides
+    beside = math.prod(int(side.sum()) for side in rest)
+    whole = tuple(slice(0, int(side.sum())) for side in rest), tuple(slice(0, len(side)) for side in rest)
+    in_a_row = beside * int(first.max(initial=1))
+    if in_a_row <= MOST_AT_ONCE or not rest:
+        at, step = 0, max(1, NUMBERS_AT_ONCE // max(1, in_a_row))
+        for block in range(0, len(first), step):
+            lengths = first[block : block + step]
+            rows = slice(at, at := at + int(lengths.sum()))
+            yield (rows, *whole[0]), (slice(block, block + step), *whole[1]), (lengths, *rest)
+        return
+    row = 0
+    for block, length in enumerate(first.tolist()):
+        for _ in range(length):  # a row of so many numbers, whose codes follow each other
+            for inner, blocks, lengths in _pieces(tuple(rest)):
+                place = (slice(row, row + 1), *inner), (slice(block, block + 1), *blocks)
+                yield *place, (np.ones(1, np.int64), *lengths)
+            row += 1
 
 
 def _slabs(

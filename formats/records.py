@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import safetensors.numpy
 
+from formats.archive import give_back
 from formats.errors import (
     BadArray,
     BadHeader,
@@ -21,6 +22,7 @@ from formats.inputs import parse_json
 from formats.quantised import (
     BLOCKS,
     LEVELS,
+    MADE_AT_ONCE,
     code_bytes,
     dequantised,
     is_coded,
@@ -173,17 +175,19 @@ def decode_field(data: bytes | memoryview, where: str) -> FieldRecord:
     header = decode_header(data, where)
     arrays = {}
     for name in header.plain:
-        array = _mapped(data, header.specs[name])
+        array = mapped_array(data, header.specs[name])
         array = array.astype(np.float32 if array.dtype.kind == "f" else array.dtype.newbyteorder("="))
         _check_finite(name, array, where)
         arrays[name] = array
+        give_back(data)
     for name, spec in header.coded.items():
-        scales, codes = (_mapped(data, header.specs[part]) for part in coded_parts(name))
+        scales, codes = (mapped_array(data, header.specs[part]) for part in coded_parts(name))
         runs = arrays[runs_of(name)] if spec.runs else None
         place = f"{where}: array {name!r}"
         if runs is not None:
             _check_runs(runs, spec.shape[0], scales.shape[0], place)
         arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, place, runs)
+        give_back(data)
     return FieldRecord(header.kind, arrays, header.metadata)
 
 
@@ -213,6 +217,20 @@ def decode_header(data: bytes | memoryview, where: str) -> FieldHeader:
     return found
 
 
+def reading_size(header: FieldHeader) -> int:
+    """Bytes that reading a field takes beside its decoded arrays, at most: of the largest array what lies in
+    the file, and what is made of that on the way."""
+    found = [0]
+    for name in header.plain:
+        spec = header.specs[name]
+        found.append((spec.stop - spec.start) + math.prod(spec.shape))
+    for name, spec in header.coded.items():
+        scales, codes = (header.specs[part] for part in coded_parts(name))
+        widened = codes.stop - codes.start if spec.bits == 8 else 5 * (codes.stop - codes.start)
+        found.append(2 * (scales.stop - scales.start) + widened + MADE_AT_ONCE)
+    return max(found)
+
+
 def coded_parts(name: str) -> tuple[str, str]:
     """The names of the two arrays that a coded one lies in: its scales and its codes."""
     return f"{name}.scales", f"{name}.codes"
@@ -229,7 +247,7 @@ def _plain(value: object) -> object:
     raise TypeError(f"{type(value).__name__} is not a JSON value")
 
 
-def _mapped(data: bytes | memoryview, spec: ArraySpec) -> np.ndarray:
+def mapped_array(data: bytes | memoryview, spec: ArraySpec) -> np.ndarray:
     """An array as it lies in its field's bytes."""
     return np.frombuffer(data, spec.dtype, math.prod(spec.shape), spec.start).reshape(spec.shape)
 

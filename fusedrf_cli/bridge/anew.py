@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import is_bundle, read_headers, sha256_of
+from formats.bundle import OpenBundle, is_bundle, sha256_of
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.editing import check_history
 from fusedrf_cli.bridge.history import nodes_of
@@ -21,13 +21,14 @@ def load_to_fuse(request: FuseRequest, memory: Memory, place: str, progress) -> 
     """The scene that is to be fused: of a fused bundle its objects as they were before, where all of them are
     found; with a warning the fused field itself, where not. Raises InvalidInput where a folder was named that
     lacks one, UsageProblem where there is nothing to be found."""
-    graph = None if request.scene == "-" or not is_bundle(request.scene) else read_headers(request.scene)[0]
+    opened = None if request.scene == "-" or not is_bundle(request.scene) else OpenBundle(request.scene)
+    graph = None if opened is None else opened.scene
     if graph is None or not was_fused(graph):
         if request.sources:
             raise UsageProblem(f"--sources applies to a fused bundle; {request.scene} tells of no sources")
         return load_scene(request.scene, request.allow_outside, memory, place)
     check_history(graph, request.scene)
-    found, missing = sources_of(graph, request)
+    found, missing = sources_of(opened, request)
     if not missing:
         progress.tell(f"{request.scene} is fused anew from its {len(found)} sources")
         composition = graph.history[0].get("composition", "max")
@@ -50,34 +51,44 @@ def was_fused(graph: SceneGraph) -> bool:
     return bool(graph.history) and graph.history[0].get("event") == "fused"
 
 
-def sources_of(graph: SceneGraph, request: FuseRequest) -> tuple[list[FoundField], list[str]]:
+def sources_of(fused: OpenBundle, request: FuseRequest) -> tuple[list[FoundField], list[str]]:
     """The objects that are in a fused bundle now, and the names of those of which no file is found."""
-    path, found, missing = Path(request.scene), [], []
+    found, missing = [], []
     elsewhere = Elsewhere(request.sources)
-    inside = read_headers(path)[1]
-    for node in nodes_of(graph.history).values():
+    for node in nodes_of(fused.scene.history).values():
         member = node["field"]
-        file = path if node.get("kept") and member in inside else source_file(node, path, elsewhere, request)
-        headers = {} if file is None else read_headers(file)[1]
-        if member not in headers:
+        inside = node.get("kept") and member in fused.headers
+        bundle = fused if inside else source_bundle(node, fused.path, elsewhere, request)
+        if bundle is None or member not in bundle.headers:
             missing.append(node["name"])
             continue
         matrix = np.asarray(node["object_to_world"], np.float64)
         leaf = Leaf(node["name"], member, None, matrix, bool(node.get("background")))
-        found.append((leaf, file, member, headers[member]))
+        found.append((leaf, bundle, member))
     return found, missing
 
 
-def source_file(node: dict, path: Path, elsewhere: "Elsewhere", request: FuseRequest) -> Path | None:
-    """The file that a node of a history names by its checksum: where it was, else in the folder given."""
+def source_bundle(
+    node: dict, path: Path, elsewhere: "Elsewhere", request: FuseRequest
+) -> OpenBundle | None:
+    """The bundle that a node of a history names by its checksum: where it was, else in the folder given."""
     if not node.get("sha256"):
         return None
     folder = path.resolve().parent
     named = (folder / node.get("source", "")).resolve()
     may_be_read = request.allow_outside or named.is_relative_to(folder)
-    if may_be_read and named.is_file() and sha256_of(named) == node["sha256"]:
-        return named
-    return elsewhere.find(node["sha256"])
+    if may_be_read and (bundle := unchanged(named, node["sha256"])):
+        return bundle
+    file = elsewhere.find(node["sha256"])
+    return None if file is None else unchanged(file, node["sha256"])
+
+
+def unchanged(path: Path, sha256: str) -> OpenBundle | None:
+    """The bundle at a path, if there is one and it has that checksum."""
+    if not path.is_file() or not is_bundle(path):
+        return None
+    bundle = OpenBundle(path)
+    return bundle if bundle.sha256 == sha256 else None
 
 
 class Elsewhere:

@@ -1,6 +1,6 @@
 """`convert`: a field of any kind to one of any other."""
 
-from formats.bundle import is_bundle, read_headers
+from formats.bundle import OpenBundle, is_bundle
 from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
@@ -65,8 +65,8 @@ def kind_of(path: str) -> str:
     """The kind of the one field that a bundle places; InvalidInput where it is something else."""
     if not is_bundle(path):
         raise InvalidInput(f"{path}: not a bundle; convert takes a .rfpack with one field")
-    scene, headers = read_headers(path)
-    placed = [leaf.field for leaf in scene.leaves() if leaf.field is not None]
+    bundle = OpenBundle(path)
+    placed = [leaf.field for leaf in bundle.scene.leaves() if leaf.field is not None]
     if len(placed) != 1:
         raise InvalidInput(f"{path}: holds {len(placed)} placed fields where one was expected; fuse it first")
-    return headers[placed[0]].kind
+    return bundle.headers[placed[0]].kind

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import read_field, read_headers, sha256_of
 from formats.records import FieldRecord
+from fusedrf_cli.bridge.anew import unchanged
 from fusedrf_cli.bridge.editing import Fused, Teacher, edit_report, read_fused, write_edited
 from fusedrf_cli.bridge.history import graph_nodes
 from fusedrf_cli.bridge.memory import Memory
@@ -145,7 +145,7 @@ def remaining(request: DeleteRequest, fused: Fused, place: str, progress) -> lis
         if name in request.names:
             continue
         if node["field"] in fused.others:
-            record = read_field(path, node["field"])
+            record = fused.bundle.field(node["field"])
         else:
             record = record_from_file(node, path, request.allow_outside)
         if record is None:
@@ -165,7 +165,7 @@ def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord
         "source" not in node
         or not os.path.isfile(source)
         or not (inside or allow_outside)
-        or sha256_of(source) != node["sha256"]
+        or (bundle := unchanged(source, node["sha256"])) is None
     ):
         return None
-    return read_field(source, node["field"]) if node["field"] in read_headers(source)[1] else None
+    return bundle.field(node["field"]) if node["field"] in bundle.headers else None

@@ -9,23 +9,23 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from formats.bundle import is_bundle, read_field, read_headers
+from formats.bundle import OpenBundle, is_bundle
 from formats.past import keep
 from formats.rig import read_rig
 from formats.scene import Leaf, Matrix4, SceneGraph
 from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.history import graph_nodes, summed_up
 from fusedrf_cli.bridge.looks import Subject, looks
-from fusedrf_cli.bridge.memory import FLOAT, READING, RESAMPLING, Memory, ownership, picture, sources
+from fusedrf_cli.bridge.memory import FLOAT, RESAMPLING, Memory, ownership, picture, sources
 from fusedrf_cli.bridge.memory import result as finished
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
 from fusedrf_cli.bridge.scene import (
     LoadedScene,
-    held_size,
     history_nodes,
     load_scene,
     make_field,
+    needs_of,
     short_origin,
     stored,
     write_field,
@@ -71,7 +71,7 @@ class HistoryNode(msgspec.Struct):
 class Fused:
     """A bundle of one field that is to be edited."""
 
-    path: str
+    bundle: OpenBundle
     scene: SceneGraph
     others: list[str]
     """Members besides the field: sources that were kept inside."""
@@ -80,6 +80,11 @@ class Fused:
     kind: Kind
     precision: str
     """Of the field as it is stored."""
+
+    @property
+    def path(self) -> str:
+        """Of the bundle."""
+        return str(self.bundle.path)
 
     @property
     def origin(self) -> np.ndarray:
@@ -192,7 +197,7 @@ def write_edited(request: EditRequest, fused: Fused, field: StoredField, precisi
             overwrite=request.overwrite,
             origin=fused.origin,
             history=summed_up((*fused.scene.history, entry)),
-            kept=dict.fromkeys(fused.others, fused.path),
+            kept=dict.fromkeys(fused.others, fused.bundle),
             extras=fused.scene.extras,
             framing=fused.framing,
             cameras=fused.scene.cameras,
@@ -217,7 +222,8 @@ def read_fused(path: str, memory: Memory, turned: bool = False) -> Fused:
     else."""
     if not is_bundle(path):
         raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
-    scene, headers = read_headers(path)
+    bundle = OpenBundle(path)
+    scene = bundle.scene
     check_history(scene, path)
     leaves = [leaf for leaf in scene.leaves() if leaf.field is not None]
     if len(leaves) != 1:
@@ -229,14 +235,16 @@ def read_fused(path: str, memory: Memory, turned: bool = False) -> Fused:
         raise InvalidInput(
             f"{path}: its field is cropped, thinned or hidden, and cannot be edited; fuse it first"
         )
-    memory.expect(sources([held_size(headers[leaf.field])], copies=READING), advice="edit a smaller field")
-    field = make_field(read_field(path, leaf.field), path)
+    needs = needs_of(bundle, leaf.field)
+    memory.expect({"the field while it is read": needs.held + needs.reading}, advice="edit a smaller field")
+    field = make_field(bundle.field(leaf.field), path)
     linear = leaf.object_to_world[:3, :3]
     upright = linear[0, 0] > 0 and np.array_equal(linear, linear[0, 0] * np.eye(3))
     if not upright and not turned and field.occupancy.space is bounded:
         raise InvalidInput(f"{path}: its field is turned or stretched, and cannot be edited; fuse it first")
-    others = [member for member in headers if member != leaf.field]
-    return Fused(path, scene, others, leaf, field, registry.kind(field.kind), headers[leaf.field].precision)
+    others = [member for member in bundle.headers if member != leaf.field]
+    precision = bundle.headers[leaf.field].precision
+    return Fused(bundle, scene, others, leaf, field, registry.kind(field.kind), precision)
 
 
 def check_history(scene: SceneGraph, path: str) -> None:

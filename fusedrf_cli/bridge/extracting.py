@@ -434,7 +434,7 @@ def write(request: ExtractRequest, output: str, fused: Fused, wanted: StoredFiel
         return write_field(
             output, wanted, fused.node.name, precision=request.precision or fused.precision,
             overwrite=request.overwrite, origin=fused.origin, history=history,
-            kept=dict.fromkeys(fused.others, fused.path), extras=fused.scene.extras, framing=fused.framing,
+            kept=dict.fromkeys(fused.others, fused.bundle), extras=fused.scene.extras, framing=fused.framing,
             cameras=fused.scene.cameras,
         )  # fmt: skip
     return write_field(

@@ -3,8 +3,8 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
-from pathlib import Path
 
+from formats.bundle import OpenBundle
 from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.making import Kept, Maker, Scene
@@ -64,7 +64,7 @@ def fuse(
         kind, suits = choose_kind(request.kind, loaded, scene.composed)
         refuse_options(kind, request)
         started = time.monotonic()
-        kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
+        kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
         nodes = history_nodes(loaded, request.output, kept)
         cameras = kept_cameras(loaded, progress)
         framing = kept_framing(loaded, scene.composed, cameras)
@@ -303,17 +303,17 @@ def check_target(report: dict, target_psnr: float | None, output: str) -> None:
 
 def source_bytes(loaded: LoadedScene) -> int:
     """Bytes of the distinct source files."""
-    return file_bytes(f.path for f in loaded.fields)
+    return file_bytes(f.bundle for f in loaded.fields)
 
 
 def place_bytes(loaded: LoadedScene) -> int:
     """Bytes of the distinct source files of fields that fill all of space."""
-    return file_bytes(f.path for f in loaded.fields if f.placed.unbounded)
+    return file_bytes(f.bundle for f in loaded.fields if f.placed.unbounded)
 
 
-def file_bytes(paths: Iterable[Path | None]) -> int:
-    """Bytes of the distinct files that are there."""
-    return sum(path.stat().st_size for path in set(paths) if path is not None and path.is_file())
+def file_bytes(bundles: Iterable[OpenBundle]) -> int:
+    """Bytes of the distinct files."""
+    return sum(bundle.size for bundle in set(bundles))
 
 
 def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:

@@ -57,16 +57,17 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
     torch.set_num_threads(count)
     kernels.set_threads(count)
     try:
-        with kernels.telling_of_compilation(lambda: progress.tell(FIRST_USE)):
+        with kernels.telling_of_compilation(lambda: progress.tell(FIRST_USE), progress.warn):
             yield place
     except FloatingPointError as error:
         raise NumericFailure(
             f"the optimisation diverged: {error}; try another --seed or a lower resolution"
         ) from error
-    except (MemoryError, RuntimeError) as error:
+    except Exception as error:
         if is_out_of_memory(error):
+            where = " of the GPU" if place == "cuda" and not isinstance(error, MemoryError) else ""
             raise ResourceProblem(
-                f"not enough memory: {error}; {readable_size(peak())} were taken, "
+                f"not enough memory{where}: {error}; {readable_size(peak())} were taken, "
                 f"{readable_size(available())} are free; try a smaller --max-size or --size"
             ) from error
         raise

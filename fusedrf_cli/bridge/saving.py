@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import BundleWriter, is_bundle, read_headers
+from formats.bundle import BundleWriter
 from formats.records import FieldRecord
 from formats.scene import Node, SceneGraph, make_node
 from fusedrf_cli import __version__
@@ -37,11 +37,11 @@ def save_scene(
             members[id(field)] = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
         nodes.append(placed_node(name, members[id(field)], placements[name], source.background))
     history = ()
-    if scene.path is not None and is_bundle(scene.path):
+    if scene.bundle is not None:
         history = scene.graph.history
         shown = {source.member for source in scene.fields}
-        for member in read_headers(scene.path)[1].keys() - shown:
-            writer.copy_field(scene.path, member)
+        for member in scene.bundle.headers.keys() - shown:
+            writer.copy_field(scene.bundle, member)
     graph = SceneGraph(
         tuple(nodes),
         scene.composition,

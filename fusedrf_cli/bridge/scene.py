@@ -4,13 +4,14 @@ import os
 import sys
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import BundleWriter, is_bundle, read_field, read_headers, sha256_of
+from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
-from formats.records import FieldHeader, FieldRecord, as_stored
+from formats.records import FieldRecord, as_stored, reading_size
 from formats.scene import (
     WHITE,
     Leaf,
@@ -24,11 +25,11 @@ from formats.scene import (
     resolve_source,
 )
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.memory import READING, Memory, sources
+from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
@@ -37,6 +38,8 @@ from fusedrf_cli.requests import FuseRequest, TrainRequest
 
 STDIN_LIMIT = 4 << 20
 NO_MEMBER = "fields/0000000000000000.safetensors"
+MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
+"""What reading arrays and metadata that make no field may raise."""
 OPTIONS = {"ranks": "--ranks", "sh_degree": "--sh-degree"}
 
 
@@ -46,17 +49,16 @@ class SourceField:
 
     placed: Placed
     background: bool
-    path: Path | None
-    """The bundle it was read from."""
+    bundle: OpenBundle
+    """That it was read from."""
     member: str
-    size: int
-    """Bytes of its numbers in memory."""
+    needs: FieldNeeds
     whole: bool = True
     """Whether it is shown as the bundle has it."""
 
 
-FoundField = tuple[Leaf, Path, str, FieldHeader]
-"""Where a field lies in a scene, the bundle that it is in, its member and that member's header."""
+FoundField = tuple[Leaf, OpenBundle, str]
+"""Where a field lies in a scene, the bundle that it is in, and its member."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +85,13 @@ class LoadedScene:
     shelf: Shelf
     rigs: tuple[PlacedRig, ...] = ()
     """Of its sources."""
+    bundle: OpenBundle | None = None
+    """That the graph was read from; None: a scene.json."""
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of the distinct fields' numbers."""
-        return list({f.member: f.size for f in self.fields}.values())
+        """Bytes of the distinct fields."""
+        return list({id(f.placed.field): f.needs.held for f in self.fields}.values())
 
     @property
     def placed(self) -> list[Placed]:
@@ -119,7 +123,7 @@ def make_field(record: FieldRecord, where: str) -> StoredField:
         raise InvalidInput(f"{where}: {error}") from error
     try:
         return field.from_state(record.arrays, record.metadata)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except MALFORMED as error:
         raise InvalidInput(
             f"{where}: the '{record.kind}' field is malformed ({error}); make the bundle again"
         ) from error
@@ -137,13 +141,19 @@ def refuse_options(kind: Kind, request: FuseRequest | TrainRequest) -> None:
             raise UsageProblem(f"{option} does not apply to kind '{kind.name}'; leave it out")
 
 
-def held_size(header: FieldHeader) -> int:
-    """Bytes of a field in memory: its arrays, and what follows from them."""
-    shapes = {name: tuple(spec.shape) for name, spec in header.specs.items()}
+def needs_of(bundle: OpenBundle, member: str) -> FieldNeeds:
+    """What a field of a bundle needs of memory, told by its header before it is read. InvalidInput where that
+    makes no field."""
+    header = bundle.headers[member]
+    arrays = partial(bundle.array, member)
     try:
-        return registry.kind(header.kind).held_bytes(header.decoded_size, shapes)
-    except ValueError:  # reading the field says so
-        return header.decoded_size
+        needs = registry.kind(header.kind).field_needs(header.metadata, header.arrays, arrays)
+    except MALFORMED:  # reading the field says what is wrong
+        needs = FieldNeeds(header.decoded_size, 0)
+    shared = shared_members(member, header, bundle.headers, str(bundle.path)).values()
+    parts = [header, *(bundle.headers[name] for name in shared)]
+    decoding = max(map(reading_size, parts)) - needs.held  # before anything is made of the arrays
+    return FieldNeeds(needs.held, sum(part.decoded_size for part in parts) + max(needs.reading, decoding))
 
 
 def load_scene(
@@ -162,8 +172,8 @@ def load_scene(
         )
         return _Loader(where, budget, place).load(graph, allow_outside)
     if is_bundle(path):
-        scene, headers = read_headers(path)
-        return _Loader(Path(path), budget, place).load(scene, allow_outside, headers)
+        bundle = OpenBundle(path)
+        return _Loader(Path(path), budget, place).load(bundle.scene, allow_outside, bundle)
     return _Loader(Path(path), budget, place).load(expand_scene(path, allow_outside), allow_outside)
 
 
@@ -175,40 +185,44 @@ def load_found(
 
 
 class _Loader:
-    """Finds the fields of one scene; every bundle's headers are read once."""
+    """Finds the fields of one scene; every bundle is opened once, and read from that version to the end."""
 
     def __init__(self, path: Path, budget: Memory | None, place: str):
         self.path, self.budget, self.shelf, self.place = path, budget, Shelf(), place
-        self.bundles: dict[Path, tuple[SceneGraph, dict[str, FieldHeader]]] = {}
+        self.bundles: dict[Path, OpenBundle] = {}
         self.fields: dict[str, StreamedField] = {}
         self.rigs: list[PlacedRig] = []
 
-    def load(
-        self, graph: SceneGraph, allow_outside: bool, headers: dict[str, FieldHeader] | None = None
-    ) -> LoadedScene:
+    def load(self, graph: SceneGraph, allow_outside: bool, bundle: OpenBundle | None = None) -> LoadedScene:
         found = []
         leaves = graph.leaves()
         for leaf in leaves:
             if not leaf.visible:
                 continue
             if leaf.field is not None:
-                found.append((leaf, self.path, leaf.field, (headers or {})[leaf.field]))
+                found.append((leaf, bundle, leaf.field))
             elif leaf.source is not None:
                 found += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
         if not found and leaves:
             raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
         if not found:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
-        return self.read(graph, found)
+        return self.read(graph, found, bundle)
 
-    def read(self, graph: SceneGraph, found: Sequence[FoundField]) -> LoadedScene:
+    def read(
+        self, graph: SceneGraph, found: Sequence[FoundField], bundle: OpenBundle | None = None
+    ) -> LoadedScene:
         """A scene of fields, within the budget."""
+        needs = {(bundle, member): needs_of(bundle, member) for _, bundle, member in found}
         if self.budget is not None:
-            sizes = list({member: held_size(header) for *_, member, header in found}.values())
-            self.shelf.resize(self.budget.room({}))
-            self.budget.expect(sources(sizes, self.shelf.room, READING), advice="use smaller sources")
-        fields = tuple(self.source(*where) for where in found)
-        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs))
+            sizes = list({key_of(leaf, member): needs[b, member].held for leaf, b, member in found}.values())
+            reading = {"a source while it is read": max(each.reading for each in needs.values())}
+            self.shelf.resize(self.budget.room(reading))
+            self.budget.expect(sources(sizes, self.shelf.room) | reading, advice="use smaller sources")
+        fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in found)
+        return LoadedScene(
+            fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle
+        )
 
     def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
@@ -218,8 +232,8 @@ class _Loader:
                     f"{self.path}: node '{leaf.name}': its source {leaf.source} is no bundle; train it to a "
                     ".rfpack first"
                 )
-            self.bundles[path] = read_headers(path)
-        scene, headers = self.bundles[path]
+            self.bundles[path] = OpenBundle(path)
+        scene = self.bundles[path].scene
         inner = [node for node in scene.leaves() if node.field is not None and node.visible]
         if not inner:
             raise InvalidInput(
@@ -230,28 +244,32 @@ class _Loader:
             self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
         return [
-            (replace(node.inside(leaf), name=name), path, node.field, headers[node.field])
+            (replace(node.inside(leaf), name=name), self.bundles[path], node.field)
             for name, node in zip(named, inner, strict=True)
         ]
 
-    def source(self, leaf: Leaf, path: Path, member: str, header: FieldHeader) -> SourceField:
+    def source(self, leaf: Leaf, bundle: OpenBundle, member: str, needs: FieldNeeds) -> SourceField:
         """leaf: where the field lies, under which name, and what is shown of it."""
-        size, where = held_size(header), f"{path}: node '{leaf.name}'"
-        key = member if leaf.whole else f"{member} {leaf.opacity} {leaf.tint} {leaf.crops}"
+        where, key = f"{bundle.path}: node '{leaf.name}'", key_of(leaf, member)
 
         def read():
-            return as_shown(make_field(read_field(path, member), where), leaf, where).to(self.place)
+            return as_shown(make_field(bundle.field(member), where), leaf, where).to(self.place)
 
         if key not in self.fields:
-            self.fields[key] = StreamedField(lambda: self.shelf.take(key, size, read))
+            self.fields[key] = StreamedField(lambda: self.shelf.take(key, needs.held, read))
         try:
             check_affine(leaf.object_to_world, f"node '{leaf.name}' in the world")
             placed = Placed(leaf.name, self.fields[key], leaf.object_to_world)
         except FormatError as error:
             raise error.within(str(self.path)) from error
         except ValueError as error:
-            raise InvalidInput(f"{path}: {error}; give an invertible placement") from error
-        return SourceField(placed, leaf.background, path, member, size, leaf.whole)
+            raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
+        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole)
+
+
+def key_of(leaf: Leaf, member: str) -> str:
+    """What tells fields apart: their numbers, and what is shown of them."""
+    return member if leaf.whole else f"{member} {leaf.opacity} {leaf.tint} {leaf.crops}"
 
 
 def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
@@ -284,10 +302,8 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
     """What a history entry says of every source: name, placement, box, path from the output's folder,
     checksum, kept member.
     """
-    folder, hashes, nodes = Path(output).resolve().parent, {}, []
+    folder, nodes = Path(output).resolve().parent, []
     for f in scene.fields:
-        if f.path is not None and f.path not in hashes and f.path.exists():
-            hashes[f.path] = sha256_of(f.path)
         node = {
             "name": f.placed.name,
             "object_to_world": f.placed.object_to_world.tolist(),
@@ -296,8 +312,8 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
             "background": f.background,
             "kept": f.member in kept and f.whole,
         }
-        if f.path in hashes and f.whole:  # an edit reads it again as it is
-            node |= {"source": os.path.relpath(f.path.resolve(), folder), "sha256": hashes[f.path]}
+        if f.whole:  # an edit reads it again as it is
+            node |= {"source": os.path.relpath(f.bundle.path.resolve(), folder), "sha256": f.bundle.sha256}
         nodes.append(node)
     return nodes
 
@@ -316,7 +332,7 @@ def write_field(
     overwrite: bool,
     origin: np.ndarray | None = None,
     history: tuple[dict, ...] = (),
-    kept: dict[str, Path] | None = None,
+    kept: dict[str, OpenBundle] | None = None,
     extras: dict | None = None,
     framing: Sequence[float] | None = None,
     cameras: dict | None = None,
@@ -327,8 +343,8 @@ def write_field(
     show (bridge/rigs.py).
     """
     writer = BundleWriter()
-    for member, path in (kept or {}).items():
-        writer.copy_field(path, member)
+    for member, bundle in (kept or {}).items():
+        writer.copy_field(bundle, member)
     arrays, metadata = field.state()
     member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
     graph = replace(graph_of(member, name, origin, framing, cameras), history=history, extras=extras or {})

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from formats.bundle import read_bundle, read_field, read_headers
+from formats.bundle import OpenBundle, read_bundle, read_headers
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.kinds import registry
@@ -33,7 +33,7 @@ def numbers(folder, bundle: str) -> dict[str, bytes]:
     """The arrays of the one field of a bundle that are no grids over it."""
     _, headers = read_headers(folder / bundle)
     (member,) = headers
-    arrays = read_field(folder / bundle, member).arrays
+    arrays = OpenBundle(folder / bundle).field(member).arrays
     return {name: array.tobytes() for name, array in arrays.items() if "plane" in name or "line" in name}
 
 

@@ -83,7 +83,7 @@ def test_a_checkpoint_is_written_without_a_copy_of_the_run(tmp_path):
 
 
 def test_nothing_is_read_before_the_refusal(folder, monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.bridge.scene.read_field", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr("formats.bundle.OpenBundle.field", lambda *_: pytest.fail("read"))
     with pytest.raises(ResourceProblem):
         load_scene(str(folder / "scene.json"), budget=Memory(1))
 

@@ -17,12 +17,12 @@ from formats.archive import parse_archive, write_archive
 from formats.bundle import (
     Bundle,
     BundleWriter,
+    OpenBundle,
     field_member,
     is_bundle,
     member_name,
     parse_bundle,
     read_bundle,
-    read_field,
     read_headers,
     read_summary,
     sha256_of,
@@ -287,7 +287,7 @@ def test_what_fields_share_lies_in_a_bundle_once_and_comes_back_with_each(tmp_pa
     assert len(writer.members) == 3
     writer.write(tmp_path / "a.rfpack", SceneGraph(tuple(make_node(m[7:11], field=m) for m in members)))
     for seed, member in zip((1, 2), members, strict=True):
-        found = read_field(tmp_path / "a.rfpack", member)
+        found = OpenBundle(tmp_path / "a.rfpack").field(member)
         assert np.array_equal(found.arrays["own"], np.full((2, 3), seed))
         assert np.array_equal(found.arrays["decoder.weight"], np.eye(3))
         assert list(found.metadata["shared"]) == ["decoder"]
@@ -302,7 +302,7 @@ def test_a_field_read_and_written_again_shares_the_same_part(tmp_path):
     writer = BundleWriter()
     member = writer.add_field(sharing(1))
     writer.write(tmp_path / "a.rfpack", SceneGraph((make_node("a", field=member),)))
-    assert BundleWriter().add_field(read_field(tmp_path / "a.rfpack", member)) == member
+    assert BundleWriter().add_field(OpenBundle(tmp_path / "a.rfpack").field(member)) == member
 
 
 @pytest.mark.parametrize(
@@ -313,6 +313,6 @@ def test_a_part_that_is_not_there_is_refused_by_name(tmp_path, shared):
     writer = BundleWriter()
     writer.members[member_name(data)] = data
     writer.write(tmp_path / "a.rfpack", SceneGraph((make_node("a", field=member_name(data)),)))
-    for read in (read_bundle, read_headers, lambda path: read_field(path, member_name(data))):
+    for read in (read_bundle, read_headers, lambda path: OpenBundle(path).field(member_name(data))):
         with pytest.raises(errors.FormatError, match="shared|shares"):
             read(tmp_path / "a.rfpack")

@@ -1,5 +1,6 @@
 """The protocol every radiance field keeps."""
 
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -33,6 +34,17 @@ class RadianceField(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class FieldNeeds:
+    """Bytes of memory that a stored field takes, told by its header: few bytes of a file can say many
+    numbers."""
+
+    held: int
+    """While it is there."""
+    reading: int
+    """More, beside its arrays, while it is made of them."""
+
+
 class StoredField(RadianceField, Protocol):
     """A field kind that bundles can hold."""
 
@@ -51,6 +63,22 @@ def sampling_step(field: RadianceField) -> float:
     how far apart samples may lie in which cells, their smallest distance."""
     grid = field.occupancy
     return grid.unit or grid.space.picture_step(field.voxel_size)
+
+
+MOST_SAMPLES = 1 << 16
+"""Of a ray in a field over one grid: twice as many as one of 8,192 texels a side needs."""
+MOST_OF_SEVERAL = 1 << 20
+"""The same where several are placed in one field, and most samples of a ray meet none of them."""
+
+
+def check_samples(samples: float, what: str, most: int = MOST_SAMPLES) -> None:
+    """Raise ValueError where a ray would take more samples than is bearable: of a box that is far thinner, or
+    has far finer texels, along one axis than along another."""
+    if not samples <= most:
+        raise ValueError(
+            f"a ray through {what} would take up to {samples:,.0f} samples, expected at most {most:,}: it is "
+            "too thin, or its texels too fine, along one axis"
+        )
 
 
 NOTHING = 1e-4  # optical depth through a whole box under which a field shows nothing

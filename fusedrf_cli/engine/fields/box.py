@@ -1,5 +1,7 @@
 """Fields over one box whose numbers lie on texels along its axes."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
@@ -7,10 +9,19 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.computed import ComputedField, Group, unpack_bits
+from fusedrf_cli.engine.fields.base import FieldNeeds, check_samples, sampling_step
+from fusedrf_cli.engine.fields.computed import (
+    PER_CELL,
+    PER_CELL_MADE,
+    ComputedField,
+    Group,
+    Reads,
+    unpack_bits,
+)
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
+PER_VERTEX_FOUND = 7  # bytes of a vertex, or of a cell, while the used ones are found
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
@@ -217,15 +228,26 @@ class BoxField(ComputedField):
         kept = values[torch.from_numpy(self.used)] if part.on_vertices else values
         return kept if part.columns is None else kept[..., : part.columns]
 
-    def unpack(self, part: Part, stored: torch.Tensor) -> torch.Tensor:
-        """Inverse of `pack`; what is not stored is 0."""
-        if part.columns is not None:
-            stored = torch.nn.functional.pad(stored, (0, part.shape[-1] - part.columns))
-        if not part.on_vertices:
-            return stored
-        whole = torch.zeros(part.shape)
-        whole[torch.from_numpy(self.used)] = stored
-        return whole
+    def unpack(self, part: Part, stored: torch.Tensor, values: torch.Tensor) -> None:
+        """Inverse of `pack`, into a part that is 0, as what is not stored stays."""
+        if part.on_vertices:
+            rows, stored = values.view(np.prod(self.resolution), -1), stored.view(len(stored), -1)
+            rows = rows[:, : stored.shape[1]]
+            rows.index_copy_(0, torch.from_numpy(np.flatnonzero(self.used)), stored)
+        else:
+            values[..., : stored.shape[-1]] = stored
+
+    @classmethod
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """See Kind.field_needs."""
+        parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
+        numbers = sum(-(-math.prod(part.shape) // LINE) * LINE for part in parts)
+        counts, texels = metadata["cells"]["counts"], metadata["resolution"]
+        made = PER_CELL_MADE * math.prod(counts)
+        if any(part.on_vertices for part in parts):  # used_vertices axis by axis, and the used ones' places
+            halves = [math.prod([*texels[:n], *counts[n:]]) for n in range(4)]
+            made = max(made, PER_VERTEX_FOUND * max(halves), (1 + 8) * math.prod(texels))
+        return FieldNeeds(4 * numbers + PER_CELL * math.prod(counts), made)
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "BoxField":
@@ -244,6 +266,7 @@ class BoxField(ComputedField):
             space_named(cells.get("space", "bounded")),
         )
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
+        check_samples(grid.space.most_samples(grid.aabb, sampling_step(bare)), "the field")
         for part in bare.parts:  # before `params` takes memory
             found, expected = arrays.get(part.name), bare.stored_shape(part)
             if found is None or found.shape != expected:
@@ -252,7 +275,7 @@ class BoxField(ComputedField):
         field = cls(shape, bare.box, resolution, scale, shift, occupancy=grid)
         for part, view in zip(field.parts, field.sections().values(), strict=True):
             stored = torch.from_numpy(np.ascontiguousarray(arrays[part.name], np.float32))
-            view.copy_(field.unpack(part, stored))
+            field.unpack(part, stored, view)
         field.check_answers()
         return field
 
@@ -266,6 +289,12 @@ class BoxField(ComputedField):
         """Raise ValueError where a colour's logit could be beyond MAX_ANSWER."""
         if not largest <= MAX_ANSWER:
             raise ValueError(f"a colour's logit would reach {largest:.3g}, expected at most {MAX_ANSWER:g}")
+
+
+def largest(values: torch.Tensor, kept: int = 0) -> torch.Tensor:
+    """The largest magnitudes, float64, over all dimensions but the last `kept`; no copy is made."""
+    dims = tuple(range(values.dim() - kept))
+    return torch.maximum(values.amax(dims), -values.amin(dims)).double()
 
 
 def lines_of(rows: np.ndarray, width: int) -> np.ndarray:
@@ -286,7 +315,10 @@ def used_vertices(occupancy: OccupancyGrid, box: np.ndarray, resolution: tuple[i
         spans.append((np.clip(low, 0, cells), np.clip(high + 1, 0, cells)))
     found = occupancy.occupied
     for axis, (low, high) in enumerate(spans):  # the box of cells around a vertex is a product of three runs
-        total = np.concatenate([np.zeros_like(found.take([0], axis), int), np.cumsum(found, axis)], axis)
+        shape = list(found.shape)
+        shape[axis] += 1
+        total = np.zeros(shape, np.int16)  # MAX_TEXELS of them at most
+        np.cumsum(found, axis, out=total[(slice(None),) * axis + (slice(1, None),)])
         found = total.take(high, axis) > total.take(low, axis)
     return found
 

@@ -1,6 +1,7 @@
 """What all kinds of field share whose answers compiled loops compute from one flat vector of numbers."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.fields.base import FieldNeeds
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.loops import (
@@ -27,9 +29,19 @@ from fusedrf_cli.engine.kernels.specialise import TINTED
 from fusedrf_cli.engine.kernels.tinting import with_tints
 
 CELLS_PER_TASK = 256
+CELLS_AT_ONCE = 1 << 18
 StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
 """The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
 the runs of its rows, or None."""
+
+
+Reads = Callable[[str], np.ndarray]
+"""A stored array by its name."""
+PER_CELL = 3
+"""Bytes of a cell of an occupancy grid: whether it is occupied, how far it is from one that is, and that once
+more for fields of several blocks."""
+PER_CELL_MADE = 12
+"""More while those distances are found."""
 
 
 def runs_of(name: str) -> str:
@@ -195,6 +207,11 @@ class ComputedField:
         that changes nothing."""
         return None if self.tint is None else np.array([self.tint])
 
+    @classmethod
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """See Kind.field_needs."""
+        return FieldNeeds(4 * sum(math.prod(shape) for shape in shapes.values()), 0)
+
     @property
     def device_loops(self) -> ModuleType:
         """The module of loops of the device that the numbers lie on."""
@@ -274,9 +291,12 @@ class ComputedField:
     ) -> np.ndarray:
         """(N,) largest σ of one of the field's frames, as if unstretched, over offsets (K, 3) in each of
         `cells` (N, 3) int64 of a grid with corner lo (3,) and cells of size cell (3,)."""
-        asked = Cells(exact(lo), exact(cell), np.ascontiguousarray(cells, np.int64), exact(offsets), frame)
         out = np.zeros(len(cells), self.real)
-        self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(cells), out)
+        for start in range(0, len(cells), CELLS_AT_ONCE):  # between which an interrupt is heard
+            part = slice(start, start + CELLS_AT_ONCE)
+            own = np.ascontiguousarray(cells[part], np.int64)
+            asked = Cells(exact(lo), exact(cell), own, exact(offsets), frame)
+            self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(own), out[part])
         return out
 
     def weights_in_cells(
@@ -378,4 +398,4 @@ def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> n
         raise ValueError(
             f"array '{name}' should have shape {[-(-count // 8)]} for a grid of {shape}, found {have}"
         )
-    return np.unpackbits(packed, count=count).reshape(shape).astype(bool)
+    return np.unpackbits(packed, count=count).reshape(shape).view(bool)

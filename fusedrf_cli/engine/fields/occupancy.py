@@ -82,14 +82,37 @@ class OccupancyGrid:
             return found
         return found._replace(stride=self.stride, unit=self.unit)
 
+    @cached_property
+    def passage(self) -> float:
+        """The longest way of a ray through occupied cells, at most, in lengths that samples may lie apart, as
+        many times a step, or `unit` where there are strides: a ray passes the layers of cells along the axis
+        that it follows most, each in at most √3 times its thickness."""
+        if not self.occupied.any():
+            return 0.0
+        found = []
+        for axis in range(3):
+            others = tuple({0, 1, 2} - {axis})
+            often = self.occupied.any(others)
+            if self.stride is not None:
+                closest = self.stride.min(others, where=self.occupied, initial=MAX_STRIDE)
+                often = often / np.maximum(closest, 1)
+            found.append(often.sum() * self.cell[axis])
+        return float(np.sqrt(3) * max(found))
+
+    def most_samples(self, step: float) -> int:
+        """How many samples a ray can have in occupied cells, at most; step: where there are no strides."""
+        apart = step if self.stride is None else self.unit
+        passed = self.space.PIECES * self.passage / apart + self.space.PIECES
+        return int(min(passed, self.space.most_samples(self.aabb, apart)))
+
     def tight_aabb(self, margin_cells: float = 1.0) -> np.ndarray:
         """(6,) box around the occupied cells plus a margin, inside the grid's own box; that box itself where
         all is empty."""
         if not self.occupied.any():
             return self.aabb
-        index = np.argwhere(self.occupied)
-        lo = self.aabb[:3] + (index.min(0) - margin_cells) * self.cell
-        hi = self.aabb[:3] + (index.max(0) + 1 + margin_cells) * self.cell
+        layers = [np.flatnonzero(self.occupied.any(tuple({0, 1, 2} - {axis}))) for axis in range(3)]
+        lo = self.aabb[:3] + (np.array([held[0] for held in layers]) - margin_cells) * self.cell
+        hi = self.aabb[:3] + (np.array([held[-1] for held in layers]) + 1 + margin_cells) * self.cell
         return np.concatenate([np.maximum(lo, self.aabb[:3]), np.minimum(hi, self.aabb[3:])])
 
     @property

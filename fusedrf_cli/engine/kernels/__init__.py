@@ -9,8 +9,8 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -20,12 +20,15 @@ from numba.core import event
 from fusedrf_cli.engine.kernels import locator
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
+NOWHERE = Path(os.devnull, "kernels")
+
 
 def kernel_cache() -> Path:
     """The folder compiled kernels are kept in: the user's cache, or a temporary one where that cannot be
     written. Kernels are code, so a folder that another user could have filled is neither.
 
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
+    Where no folder can be had, nothing is kept.
     """
     bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined())).hexdigest()[:12]
     bodies += "-one" if ONE_THREAD else ""
@@ -35,9 +38,13 @@ def kernel_cache() -> Path:
         wanted.mkdir(parents=True, exist_ok=True)
         probe = tempfile.TemporaryFile(dir=wanted)
         probe.close()
+        ours = is_ours(wanted, others=stat.S_IWGRP | stat.S_IWOTH)
     except OSError:
-        return temporary_cache(bodies)
-    return wanted if is_ours(wanted, others=stat.S_IWGRP | stat.S_IWOTH) else temporary_cache(bodies)
+        ours = False
+    try:
+        return wanted if ours else temporary_cache(bodies)
+    except OSError:
+        return NOWHERE
 
 
 def inlined() -> list[Path]:
@@ -107,9 +114,18 @@ class _First(event.Listener):
         """Nothing."""
 
 
-def telling_of_compilation(tell: Callable[[], None]) -> AbstractContextManager:
-    """Within it `tell` is called once, before the first kernel that has to be compiled."""
-    return event.install_listener("numba:compile", _First(tell))
+@contextlib.contextmanager
+def telling_of_compilation(
+    tell: Callable[[], None], warn: Callable[[str], None] = warnings.warn
+) -> Iterator[None]:
+    """Within it `tell` is called once, before the first kernel that has to be compiled, and `warn` where
+    compiled kernels cannot be kept."""
+    before, locator.Kept.warn = locator.Kept.warn, staticmethod(warn)
+    try:
+        with event.install_listener("numba:compile", _First(tell)):
+            yield
+    finally:
+        locator.Kept.warn = staticmethod(before)
 
 
 _compiling = event.TimingListener()

@@ -23,11 +23,13 @@ RAYS_IN_FLIGHT = 1 << 14  # rays of a training pass that have scratch memory at 
 POINTS_IN_FLIGHT = 1 << 18
 
 if not SIMULATED:  # whose compiler has settings of its own
-    from numba.cuda.core import config
+    from numba.cuda.core import caching, config
     from numba.cuda.core import event as gpu_event
 
+    from fusedrf_cli.engine.kernels import locator
     from fusedrf_cli.engine.kernels.atomics import add_4
 
+    locator.install(caching)
     config.CACHE_DIR = numba.config.CACHE_DIR
     config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a scene of few rays is no mistake
 
@@ -153,6 +155,8 @@ def each_thread(field, grid, asked, count, out):
     i = cuda.grid(1)
     if i < count:
         scratch, memory = cuda.local.array(SCRATCH_ROOM, REAL), cuda.local.array(MEMORY_ROOM, REAL)
+        for r in range(SCRATCH_ROOM):  # what lies there is another thread's
+            scratch[r] = 0
         item(field, grid, asked, i, scratch, memory, out)
 
 

@@ -13,9 +13,9 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
-from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.base import FieldNeeds, RadianceField, StoredField
 from fusedrf_cli.engine.fields.box import BoxField
-from fusedrf_cli.engine.fields.computed import WHITE
+from fusedrf_cli.engine.fields.computed import WHITE, Reads
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.kinds import refitting, splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
@@ -128,9 +128,10 @@ class Kind:
         """What a field holds of the objects placed in a scene."""
         return details_at_voxel(scene.placed, field.voxel_size)
 
-    def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
-        """Bytes of a field in memory whose arrays, of these shapes, take `decoded` once they are read."""
-        return decoded
+    def field_needs(self, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """What a stored field of these metadata and shapes of arrays needs of memory; array(name) reads one
+        of them. Raises what `from_state` does where they make no field."""
+        return self.field.needs(metadata, shapes, array)
 
     def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
         """The ways to fuse that are worth charting, in groups that take about as long; those that learn least

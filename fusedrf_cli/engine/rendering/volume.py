@@ -14,6 +14,10 @@ from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
 EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
 SEEN_WEIGHT = 1e-6  # samples lighter than this stay black
 RAYS_AT_ONCE = 1 << 14  # of any field: waves through many fields would take more memory than these do
+WORK_AT_ONCE = {"cpu": 1 << 24, "cuda": 1 << 28}
+"""Samples that compiled loops take, at most, before an interrupt is heard: seconds on one core."""
+COLOURS = 500  # of a ray, at most: each stands for a share of the light (LENT_FROM of loops.py)
+CUDA_ERRORS = ("CudaAPIError", "CudaDriverError", "CudaRuntimeError")  # of numba-cuda, which may not be there
 HALVINGS = 6  # of the rays done at once, where memory is short
 SAMPLES_PER_WAVE = 32
 ROWS_AT_ONCE_PIXELS = 1 << 18
@@ -48,9 +52,9 @@ def render_rays(
     """Render rays (N, 3) float64 of the field's frame, from distance `near` to `far`, of all rays or of each
     (N,): (N, 5) float32 premultiplied rgb, opacity, Σ w t.
 
-    A ray's numbers do not depend on which others it is rendered with. Where memory is short, fewer rays are
-    done at once; MemoryError (or torch's own) when even that does not help. Raises ValueError for a direction
-    of no length, along which there is no end, or one that is not finite.
+    A ray's numbers do not depend on which others it is rendered with. So many are done at once as take
+    WORK_AT_ONCE; where memory is short, fewer are. MemoryError (or torch's own) when even that does not help.
+    Raises ValueError for a direction of no length, along which there is no end, or one that is not finite.
     """
     check_directions(rays_d)
     step, reach = step or sampling_step(field), reach_of(len(rays_o), near, far)
@@ -64,10 +68,18 @@ def render_rays(
         else:
             march_rays(field, rays_o[part], rays_d[part], reach[part], step, early_stop, out[part])
 
-    at_once = RAYS_AT_ONCE if fast is None else max(1, len(rays_o))
+    at_once = RAYS_AT_ONCE if fast is None else rays_at_once(field, step)
     for start in range(0, len(rays_o), at_once):
         in_halves(render, start, min(start + at_once, len(rays_o)))
     return out
+
+
+def rays_at_once(field: RadianceField, step: float) -> int:
+    """How many rays of a computed field take WORK_AT_ONCE samples, if none of them ends early."""
+    device = "cpu" if field.device_loops is cpu else "cuda"
+    samples = field.occupancy.most_samples(step)
+    shading = field.loops.names["SHADING_COST"] * min(samples, COLOURS)
+    return max(1, WORK_AT_ONCE[device] // max(samples + shading, 1))
 
 
 def reach_of(rays: int, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
@@ -89,7 +101,7 @@ def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: 
     """render(slice(start, stop)), or its halves one after the other where memory does not suffice."""
     try:
         return render(slice(start, stop))
-    except (MemoryError, RuntimeError) as error:
+    except Exception as error:
         if not is_out_of_memory(error) or not halvings or stop - start < 2:
             raise
     # Only here is the exception gone, and with it the arrays of the attempt that its traceback held.
@@ -99,9 +111,14 @@ def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: 
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory could not be had; torch says so by a RuntimeError."""
+    """Whether an error says that memory could not be had, here or on a GPU; torch says so by a RuntimeError,
+    the GPU's compiler by an error of CUDA's."""
+    said = str(error).lower().replace("_", " ")
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and ("alloc" in str(error) or "out of memory" in str(error))
+        isinstance(error, RuntimeError)
+        and ("alloc" in said or "out of memory" in said)
+        or type(error).__name__ in CUDA_ERRORS
+        and "out of memory" in said
     )
 
 

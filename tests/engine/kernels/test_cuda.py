@@ -43,6 +43,22 @@ def test_the_simulator_agrees():
     run_simulated(__file__)
 
 
+@pytest.fixture(autouse=True)
+def used_memory(monkeypatch):
+    """A thread's own memory holds what another left there; the simulator would clear it."""
+    if SIMULATED:
+        from numba.cuda.simulator.kernelapi import FakeCUDALocal
+
+        clear = FakeCUDALocal.array
+
+        def used(self, shape, dtype):
+            found = clear(self, shape, dtype)
+            found[...] = np.nan
+            return found
+
+        monkeypatch.setattr(FakeCUDALocal, "array", used)
+
+
 def vm(dtype: torch.dtype) -> ComputedField:
     """One tensor under an occupancy grid."""
     return random_vm(dtype=dtype, cells=3)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from fusedrf_cli.engine.fields.box import BoxField, Part
+from fusedrf_cli.engine.fields.box import BoxField, Part, largest
 from fusedrf_cli.engine.kinds.cp import bodies, reference
 
 FACTOR_SPREAD = 0.2  # TensoRF's, of lines
@@ -63,7 +63,7 @@ class CPField(BoxField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        peak = {name: view.abs().flatten(0, -2).amax(0).double() for name, view in self.sections().items()}
+        peak = {name: largest(view, kept=1) for name, view in self.sections().items()}
         density, colour = (
             peak[f"{what}_line_0"] * peak[f"{what}_line_1"] * peak[f"{what}_line_2"]
             for what in ("density", "colour")

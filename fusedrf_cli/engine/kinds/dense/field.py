@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import BoxField, Part
+from fusedrf_cli.engine.fields.box import BoxField, Part, largest
 from fusedrf_cli.engine.kinds.dense import bodies, reference
 
 DENSITY_RATE, COLOUR_RATE = 60.0, 10.0  # a vertex is touched seldom; slower ones leave haze for long
@@ -65,7 +65,7 @@ class DenseField(BoxField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        peak = {name: float(view.abs().amax()) for name, view in self.sections().items()}
+        peak = {name: float(largest(view)) for name, view in self.sections().items()}
         self.check_density(peak["density"])
         self.check_logit(3 * self.shape.coefficients * peak["colour"])
 

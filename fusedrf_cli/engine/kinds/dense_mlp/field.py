@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from fusedrf_cli.engine.fields.box import Part
+from fusedrf_cli.engine.fields.box import Part, largest
 from fusedrf_cli.engine.kinds.dense.field import DenseField
 from fusedrf_cli.engine.kinds.dense_mlp import bodies, reference
 
@@ -88,10 +88,10 @@ class DenseMLPField(DenseField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        peak = {name: view.abs().double() for name, view in self.sections().items()}
-        self.check_density(float(peak["density"].amax()))
-        largest = max(float(peak["colour"].amax()), 1.0)
+        sections = self.sections()
+        self.check_density(float(largest(sections["density"])))
+        most = max(float(largest(sections["colour"])), 1.0)
         for layer in ("hidden", "out"):
-            weight, bias = peak[f"decoder.{layer}.weight"], peak[f"decoder.{layer}.bias"]
-            largest = float((weight.sum(0) * largest + bias).amax())
-        self.check_logit(largest)
+            weight, bias = (sections[f"decoder.{layer}.{part}"].abs().double() for part in ("weight", "bias"))
+            most = float((weight.sum(0) * most + bias).amax())
+        self.check_logit(most)

@@ -379,6 +379,18 @@ class Lattice:
         return total.tocsr()
 
 
+def table_entries(nodes: np.ndarray, top: int) -> int:
+    """How many entries the tables of `top` top cells have, at most, as their nodes' codes tell (`packed`)."""
+    code = np.unpackbits(nodes).reshape(-1, 2)
+    split = (code[:, 0] == 1) & (code[:, 1] == 0)
+    level, start, count, cells = 0, 0, top, 0
+    while count and start < len(split):
+        inner = int(np.count_nonzero(split[start : start + count]))
+        cells = inner if level == 0 else cells
+        start, count, level = start + count, 8 * inner, level + 1
+    return min(top + cells * 8 ** min(level - 1, MAX_LEVEL), MAX_ENTRIES)
+
+
 def sides(top) -> np.ndarray:
     """(3,) float64 of three sides, or of one for all."""
     return np.broadcast_to(np.asarray(top, np.float64), 3).copy()

@@ -6,7 +6,8 @@ lattice of voxels twice as wide. σ = scale softplus(f) and rgb = sigmoid(Σ_k Y
 activation.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,15 +17,34 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.computed import ComputedField, StoredAs, exact, runs_of
+from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples
+from fusedrf_cli.engine.fields.computed import (
+    PER_CELL,
+    PER_CELL_MADE,
+    ComputedField,
+    Reads,
+    StoredAs,
+    exact,
+    runs_of,
+)
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.sparse import bodies, reference, training
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
-from fusedrf_cli.engine.kinds.sparse.bricks import MAX_BRICKS, MAX_TOP_CELLS, BrickTree, Lattice, check_counts
+from fusedrf_cli.engine.kinds.sparse.bricks import (
+    MAX_BRICKS,
+    MAX_TOP_CELLS,
+    BrickTree,
+    Lattice,
+    check_counts,
+    table_entries,
+)
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
+PER_BRICK_MADE = 5000  # more while they are found
+PER_TOP_CELL = 10  # its table's place and depth
+PER_NODE = 60  # of a node while the tree is walked: its code and place, and those of its children
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
 OCCUPANCY_CELLS = 192  # along the longest axis, at most, unless there are more top cells
@@ -278,6 +298,18 @@ class SparseField(ComputedField):
         return arrays, metadata
 
     @classmethod
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """See Kind.field_needs; with the tables that follow from the tree."""
+        (bricks,), counts = shapes["masks"], metadata["counts"]
+        top, bricks = math.prod(counts), bricks // 8
+        entries = table_entries(array("nodes"), top)
+        numbers = sum(math.prod(shapes[name]) for name in ("rows", "bands") if name in shapes)
+        cells = OCCUPANCY_CELLS**3 if max(counts) < OCCUPANCY_CELLS else top
+        held = PER_BRICK * bricks + 4 * (numbers + entries) + PER_TOP_CELL * top + PER_CELL * cells
+        walked = PER_NODE * 4 * shapes["nodes"][0]
+        return FieldNeeds(held, PER_BRICK_MADE * bricks + PER_CELL_MADE * cells + walked)
+
+    @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "SparseField":
         """Inverse of `state`. Every number is checked before it can size an array or index one."""
         tree = stored_tree(arrays, metadata)
@@ -329,6 +361,7 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     tree = replace(tree, phase=tuple(whole(n, "phase", 0, 1) for n in phase))
     if not tree.mask.any():
         raise ValueError("array 'masks' should have an active voxel")
+    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", MOST_OF_SEVERAL)
     tree.tables  # noqa: B018  (made now, so that what is too large is refused here)
     return tree
 

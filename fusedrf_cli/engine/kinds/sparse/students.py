@@ -1,7 +1,7 @@
 """A sparse field as a student: bricks where the scene has matter, filled by asking it, and finished on
 rays."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
@@ -19,7 +19,7 @@ from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, runs_box, with_fringe
-from fusedrf_cli.engine.kinds.sparse.field import PER_BRICK, SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
 from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
@@ -107,10 +107,6 @@ class SparseKind(Kind):
             Detail(p.name, p.condition, opacity_off(p.condition), p.voxel_size, v, extent(p) / v)
             for p, v in zip(scene.placed, held_voxels(scene, field), strict=True)
         ]
-
-    def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
-        """The numbers, and the indices that follow from the bricks."""
-        return decoded + PER_BRICK * prod(shapes.get("masks", (0,))) // 8
 
     def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
         """One ladder."""

@@ -7,7 +7,8 @@ asked (two where they meet; the denser wins), so that a query costs the same how
 edit appends or drops a block and leaves the rest as it is.
 """
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,15 +18,26 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples, sampling_step
 from fusedrf_cli.engine.fields.box import (
     DENSITY_SCALE_PER_EXTENT,
     DENSITY_SHIFT,
     MAX_ANSWER,
     interpolate_axis,
+    largest,
     unit_texels,
     whole_numbers,
 )
-from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, StoredAs, unpack_bits
+from fusedrf_cli.engine.fields.computed import (
+    PER_CELL,
+    PER_CELL_MADE,
+    WHITE,
+    ComputedField,
+    Group,
+    Reads,
+    StoredAs,
+    unpack_bits,
+)
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import (
@@ -48,9 +60,13 @@ from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 ROUNDING = 1e-6  # share of a ball's radius by which it is larger
+PER_OWNED_CELL = 8  # bytes of a cell of several blocks: owners, distances, strides
+PER_OWNED_CELL_MADE = 16  # more while they are found
+PER_PLACED_CELL = 110  # of a tensor's cell while it is placed in the field
 BY_ROUTES = 40  # blocks at most: which of them it meets, each ray is asked for each
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
+MAX_RANK = 1024  # of a stored field
 BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less
 DETAIL_RATE = 0.5  # at 1 smooth things come out grainy: a cup after 100 s SSIM 0.77, with 0.5 0.79
 DETAIL_STEP = 2.0
@@ -138,8 +154,8 @@ class VMShape:
         bands."""
         for name in ("density_rank", "colour_rank"):
             rank = getattr(self, name)
-            if rank < 8 or rank % 8:
-                raise ValueError(f"'{name}' should be a multiple of 8, found {rank}")
+            if type(rank) is not int or not 8 <= rank <= MAX_RANK or rank % 8:
+                raise ValueError(f"'{name}' should be a multiple of 8 up to {MAX_RANK}, found {rank}")
         if self.sh_degree not in range(4):
             raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
 
@@ -504,6 +520,17 @@ class VMField(ComputedField):
         return arrays, metadata
 
     @classmethod
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """See Kind.field_needs; of several blocks with the grids that say which is asked where."""
+        numbers = sum(aligned(math.prod(s)) for name, s in shapes.items() if not name.endswith(".occupancy"))
+        cells = [math.prod(tensor["occupancy"]) for tensor in metadata["tensors"]]
+        held, made = 4 * numbers + PER_CELL * sum(cells), PER_CELL_MADE * max(cells)
+        if len(metadata["blocks"]) > 1:
+            held += PER_OWNED_CELL * OWNERSHIP_CELLS**3
+            made = PER_PLACED_CELL * max(cells) + PER_OWNED_CELL_MADE * OWNERSHIP_CELLS**3
+        return FieldNeeds(held, made)
+
+    @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
         """Inverse of `state`. Every number is checked before it can size an array or index one."""
         shape = VMShape(**metadata["shape"])
@@ -517,7 +544,9 @@ class VMField(ComputedField):
             for name, view in unplaced.sections(t).items():
                 view.copy_(torch.from_numpy(np.ascontiguousarray(arrays[f"tensor_{t}.{name}"], np.float32)))
             check_answers(t, tensors[t], unplaced.sections(t))
-        return cls.assembled(shape, tensors, blocks, params)
+        field = cls.assembled(shape, tensors, blocks, params)
+        check_samples(field.occupancy.most_samples(sampling_step(field)), "its blocks", MOST_OF_SEVERAL)
+        return field
 
 
 def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VMShape) -> VMTensor:
@@ -534,6 +563,7 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
     space = space_named(stored.get("space", "bounded"))
     hashed = hashed_of(i, stored["hashed"], aabb) if "hashed" in stored else None
     tensor = VMTensor(resolution, aabb, scale, shift, occupied, space, hashed)
+    check_samples(space.most_samples(aabb, tensor.step), f"tensor {i}")
     for name, expected in tensor.sections(shape):
         found = arrays.get(f"tensor_{i}.{name}")
         if found is None or found.shape != expected:
@@ -571,7 +601,7 @@ def hashed_of(i: int, stored: dict, aabb: np.ndarray) -> Hashed:
 def check_answers(i: int, tensor: VMTensor, sections: dict[str, torch.Tensor]) -> None:
     """Raise ValueError where finite numbers could multiply to an infinite density or logit, and their
     difference be NaN."""
-    peak = {name: view.abs().flatten(0, -2).amax(0).double() for name, view in sections.items()}
+    peak = {name: largest(view, kept=1) for name, view in sections.items()}
     products = {
         what: torch.stack([peak[f"{what}_plane_{m}"] * peak[f"{what}_line_{m}"] for m in range(3)])
         for what in ("density", "colour")
@@ -582,10 +612,10 @@ def check_answers(i: int, tensor: VMTensor, sections: dict[str, torch.Tensor]) -
     if "detail" in peak:
         density += tensor.scale * len(tensor.hashed.spacings) * float(peak["detail"][0])
         logit += len(tensor.hashed.spacings) * float(peak["detail"][1:].max())
-    for what, largest in (("density", density), ("colour", logit)):
-        if not largest <= MAX_ANSWER:
+    for what, most in (("density", density), ("colour", logit)):
+        if not most <= MAX_ANSWER:
             raise ValueError(
-                f"arrays 'tensor_{i}.{what}_*' multiply to {largest:.3g}, expected at most {MAX_ANSWER:g}"
+                f"arrays 'tensor_{i}.{what}_*' multiply to {most:.3g}, expected at most {MAX_ANSWER:g}"
             )
 
 

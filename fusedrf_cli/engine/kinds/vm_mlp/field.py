@@ -4,18 +4,21 @@ The factors are a `VMField` of one block, used for density, occupancy, resamplin
 basis (3, 9, 3 rank), read as the (27, 3 rank) matrix B, makes the features f = B (P ∘ L); SH is not used.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.computed import ComputedField, Group
+from fusedrf_cli.engine.fields.base import FieldNeeds
+from fusedrf_cli.engine.fields.computed import ComputedField, Group, Reads
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, VMField, VMShape, VMTensor, aligned
 from fusedrf_cli.engine.kinds.vm_mlp import bodies, reference
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
+MAX_WIDTH = 256  # of a stored field
 LAYERS = 3
 NETWORK_RATE = 0.05  # TensoRF: 1e-3 where factors learn at 2e-2
 
@@ -186,12 +189,18 @@ class VMMLPField(ComputedField):
         return arrays | {name: np.ascontiguousarray(w.numpy()) for name, w in weights.items()}, metadata
 
     @classmethod
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """See Kind.field_needs; the factors' numbers are copied once."""
+        factors = VMField.needs(metadata, shapes, array)
+        return FieldNeeds(factors.held, factors.held + factors.reading)
+
+    @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMMLPField":
         """Inverse of `state`; the network's width is that of its first bias."""
         factors = VMField.from_state(arrays, metadata)
         width = arrays.get("network.0.bias")
-        if width is None or width.ndim != 1:
-            raise ValueError("array 'network.0.bias' is missing or not a vector")
+        if width is None or width.ndim != 1 or len(width) > MAX_WIDTH:
+            raise ValueError(f"array 'network.0.bias' is no vector of at most {MAX_WIDTH} numbers")
         weights = {}
         for name, shape in weight_shapes(3 * factors.shape.coefficients, len(width)).items():
             found = arrays.get(f"network.{name}")
