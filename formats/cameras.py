@@ -11,10 +11,11 @@ import re
 from collections import Counter
 from pathlib import Path, PurePosixPath
 
-from formats.errors import BadIntrinsics, BadJson, BadSchema, NoViews, UnsupportedCamera
+from formats.errors import BadIntrinsics, BadJson, BadSchema, LimitExceeded, NoViews, UnsupportedCamera
 from formats.images import MAX_SIDE, read_image_header
-from formats.inputs import read_input
-from formats.photos import EXTENSIONS, find_photo
+from formats.inputs import decoded, read_input
+from formats.names import distinct_names
+from formats.photos import find_photo, split_ending
 from formats.views import View, checked_pose
 
 MAX_JSON = 256 * 2**20
@@ -23,7 +24,12 @@ RATIONAL = "FULL_OPENCV"
 FISHEYE = {"FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
 BENDS = ("k1", "k2", "k3", "p1", "p2")
 RATIONAL_BENDS = ("k4", "k5", "k6")
-JSON_TOKEN = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
+LEAST_PIXELS, MOST_PIXELS = 1e-3, 1e8
+"""Of a focal length; a principal point and distortion are within the latter."""
+MAX_VALUES = 20_000_000
+"""Commas of a file of cameras, which bound the memory that it takes to read."""
+JSON_TOKEN = re.compile(r'"(?:[^"\\]++|\\.)*+(?:"|\\?\Z)|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
+"""A text or a comment. One that does not end takes the rest of the file: nothing is looked at twice."""
 
 
 def read_cameras(path: Path | str, size: tuple[int, int] | None = None) -> tuple[View, ...]:
@@ -49,16 +55,33 @@ def read_cameras(path: Path | str, size: tuple[int, int] | None = None) -> tuple
 
 def read_document(path: Path) -> dict:
     """A JSON object, in which // and /* */ comments are allowed as instant-ngp allows them."""
+    data = read_input(path, MAX_JSON)
+    if data.count(b",") > MAX_VALUES:
+        raise LimitExceeded(f"{path}: JSON of more than {MAX_VALUES:,} values; at most so many are read")
     try:
-        text = read_input(path, MAX_JSON).decode("utf-8-sig")
-        document = json.loads(JSON_TOKEN.sub(lambda m: m[0] if m[0].startswith('"') else " ", text))
+        text = decoded(data)
+        if "//" in text or "/*" in text:
+            text = JSON_TOKEN.sub(_without_comment, text)
+        document = json.loads(text)
     except RecursionError as error:
         raise BadJson(f"{path}: JSON is nested too deep to be read") from error
     except ValueError as error:
-        raise BadJson(f"{path}: not JSON: {error}") from error
+        raise BadJson(f"{path}: not JSON: {error}{_cure(error)}") from error
     if not isinstance(document, dict):
         raise BadSchema(f"{path}: found a JSON {type(document).__name__}, expected an object with frames")
     return document
+
+
+def _without_comment(token: re.Match) -> str:
+    """A text as it is, or the lines that a comment takes, so that errors name the right one."""
+    return token[0] if token[0].startswith('"') else " " + "\n" * token[0].count("\n")
+
+
+def _cure(error: ValueError) -> str:
+    """What to do about a slip that is made by hand; empty for others."""
+    slips = ("Expecting property name", "Illegal trailing comma", "Expecting value")
+    slip = isinstance(error, json.JSONDecodeError) and error.msg.startswith(slips)
+    return "; remove a comma before it, or write what is missing" if slip else ""
 
 
 def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
@@ -88,7 +111,7 @@ def written_path(keys: dict, key: str) -> str:
 def frame_names(frames: list[dict]) -> list[str]:
     """A distinct name per frame: the file stem, or the path joined by _ where two frames share a stem."""
     files = [PurePosixPath(frame_file(frame) or f"{i:05d}") for i, frame in enumerate(frames)]
-    stems = [file.stem if file.suffix in EXTENSIONS else file.name for file in files]
+    stems = [split_ending(file.name)[0] for file in files]
     shared = Counter(stems)
     names = [
         stem
@@ -96,8 +119,7 @@ def frame_names(frames: list[dict]) -> list[str]:
         else "_".join([*(p for p in file.parent.parts if p not in ("/", "..")), stem])
         for file, stem in zip(files, stems, strict=True)
     ]
-    repeated = Counter(names)
-    return [name if repeated[name] == 1 else f"{name}_{i:05d}" for i, name in enumerate(names)]
+    return distinct_names(names)
 
 
 def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[int, int] | None) -> View:
@@ -110,9 +132,10 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
         raise BadIntrinsics(
             f"{where}: no focal length; expected fl_x, x_fov or camera_angle_x here or in the file"
         )
+    pose, repair = checked_pose(frame.get("transform_matrix"), where)
     return View(
         name=name,
-        camera_to_world=checked_pose(frame.get("transform_matrix"), where),
+        camera_to_world=pose,
         fl_x=x or y,
         fl_y=y or x,
         cx=_number(sources, "cx", where, width / 2),
@@ -121,6 +144,7 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
         height=height,
         distortion=distortion,
         fisheye=fisheye,
+        repair=repair,
     )
 
 
@@ -161,7 +185,7 @@ def _focal(sources: tuple[dict, dict], axis: str, side: int, where: str) -> floa
         if (degrees := _number((source,), f"{axis}_fov", where, None)) is not None:
             return fov_focal(math.radians(degrees), side, where)
         if (pixels := _number((source,), f"fl_{axis}", where, None)) is not None:
-            return _positive(pixels, where)
+            return checked_focal(pixels, where)
         if (radians := _number((source,), f"camera_angle_{axis}", where, None)) is not None:
             return fov_focal(radians, side, where)
     return None
@@ -173,12 +197,14 @@ def fov_focal(radians: float, side: int, where: str) -> float:
         raise BadIntrinsics(
             f"{where}: field of view of {math.degrees(radians):g} degrees, expected within 0 to 180"
         )
-    return _positive(0.5 * side / math.tan(0.5 * radians), where)
+    return checked_focal(0.5 * side / math.tan(0.5 * radians), where)
 
 
-def _positive(pixels: float, where: str) -> float:
-    if not pixels > 0:
-        raise BadIntrinsics(f"{where}: focal length of {pixels:g} pixels, expected a positive one")
+def checked_focal(pixels: float, where: str) -> float:
+    """A focal length that cameras have; BadIntrinsics otherwise."""
+    if not LEAST_PIXELS <= pixels <= MOST_PIXELS:
+        what = f"{LEAST_PIXELS:g} to {MOST_PIXELS:g}" if pixels > 0 else "a positive one"
+        raise BadIntrinsics(f"{where}: focal length of {pixels:g} pixels, expected {what}")
     return pixels
 
 
@@ -186,8 +212,12 @@ def _number(sources: tuple[dict, ...], key: str, where: str, default: float | No
     found = next((source[key] for source in sources if source.get(key) is not None), default)
     if found is None:
         return None
-    if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) < 1e30:
-        raise BadIntrinsics(f"{where}: {key} is {str(found)[:40]}, expected a finite number")
+    if isinstance(found, str):
+        raise BadIntrinsics(f"{where}: {key} is the text {found[:40]!r}, expected a number without quotes")
+    if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) <= MOST_PIXELS:
+        raise BadIntrinsics(
+            f"{where}: {key} is {str(found)[:40]}, expected a finite number up to {MOST_PIXELS:g}"
+        )
     return float(found)
 
 
@@ -239,5 +269,5 @@ def _path_view(where: str, frame: dict, name: str, size: tuple[int, int]) -> Vie
     if degrees is None:
         raise BadIntrinsics(f"{where}: no fov; expected the vertical field of view in degrees")
     focal = fov_focal(math.radians(degrees), height, where)
-    pose = checked_pose(frame.get("camera_to_world"), where)
-    return View(name, pose, focal, focal, width / 2, height / 2, width, height)
+    pose, repair = checked_pose(frame.get("camera_to_world"), where)
+    return View(name, pose, focal, focal, width / 2, height / 2, width, height, repair=repair)

@@ -18,7 +18,9 @@ from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews
 from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
+from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
+from formats.matching import instead, match_photos
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
@@ -33,7 +35,6 @@ from formats.photos import (
     natural,
     object_boxes,
     on_photo,
-    photo_folder,
     pictures,
     plain_background,
 )
@@ -46,7 +47,8 @@ from formats.transforms import (
     sparse_points,
     stated_aabb,
 )
-from formats.views import Capture, View, hold_out
+from formats.upright import upward_doubt
+from formats.views import LEAST_VIEWS, Capture, View, hold_out
 
 __all__ = [
     "Capture",
@@ -119,7 +121,12 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
     if test.exists():
         return _read_blender(path, downscale, test=test)
     if (model := colmap.model_folder(path)) is not None:
-        return _read_colmap(path, model, downscale)
+        try:
+            return _read_colmap(path, model, downscale)
+        except MissingFile:
+            # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
+            if not is_file(path / llff.NAME):
+                raise
     if is_file(path / llff.NAME):
         return _read_llff(path / llff.NAME, downscale)
     if (folders := polycam.keyframes(path)) is not None:
@@ -151,49 +158,42 @@ def _read_transforms(path: Path, downscale: int | None) -> Capture:
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     model = colmap.read_model(folder)
     base = colmap.capture_folder(folder) if path == folder else path
+    files = {image.name: image.name.replace("\\", "/") for image in model.images}
+    matched = match_photos(folder, base, files.values(), downscale, ("images", "input", ""))
+    if not matched.photos:
+        raise MissingFile(
+            f"{folder}: names {len(files)} photos such as {min(files, key=natural)}, but none of them is "
+            f"there: {instead(base)}"
+        )
     images = sorted(model.images, key=lambda image: natural(image.name))
-    place, photos, notes = _model_photos(folder, base, [image.name for image in images], downscale)
-    names = frame_names([{"file_path": image.name} for image in images])
-    views, alpha = [], False
-    for image, name, photo in zip(images, names, photos, strict=True):
-        if photo is None:
-            continue
+    images = [image for image in images if files[image.name] in matched.photos]
+    names = dict(zip(images, frame_names([{"file_path": image.name} for image in images]), strict=True))
+    headers = []
+
+    def read(image: colmap.Image) -> View:
+        photo, place = matched.photos[files[image.name]]
         header = read_image_header(photo)
         mask, reduction = _model_mask(base, image.name), place.reduction(header, downscale)
-        views.append(on_photo(replace(image.view, name=name), photo, header, image.where, mask, reduction))
-        alpha |= header.alpha
-    missing = [image.name for image, photo in zip(images, photos, strict=True) if photo is None]
-    part = Part(tuple(views), alpha, tuple(missing), notes)
+        view = replace(image.view, name=names[image])
+        view = on_photo(view, photo, header, image.where, mask, reduction)
+        headers.append(header)
+        return view
+
+    views, broken = read_sound(folder, images, read, lambda image: image.name)
+    notes = (*_other_models(path, folder), *model.notes, *matched.notes, *broken)
+    part = Part(tuple(views), any(header.alpha for header in headers), matched.missing, notes)
     return _capture(path, "colmap", part, Part(), None, model.points)
 
 
-def _model_photos(
-    folder: Path, base: Path, names: list[str], downscale: int | None
-) -> tuple[Folder, list[Path | None], tuple[str, ...]]:
-    """The folder that a model's photos are in, the photo of each name, None where it is missing, and a note
-    on where they are from."""
-    # Beside the capture itself lie other captures, not copies of it.
-    for places in (copies(base / "images"), copies(base / "input"), [Folder(base)]):
-        chosen = photo_folder(places, names, downscale)
-        if chosen is not None:
-            note = f"{folder}: photos are read from {chosen.path.name}"
-            found = [find_photo(chosen.path, name) for name in names]
-            return chosen, found, (note,) if chosen != places[0] else ()
-    # The smaller copies of LLFF's scenes have other names, in the same order as the full-size photos.
-    if (chosen := _counted(base / "images", len(names), downscale)) is not None:
-        ranked = dict(zip(sorted(names), pictures(chosen.path), strict=True))
-        note = f"{folder}: photos of {chosen.path.name} have other names and are matched by order"
-        return chosen, [ranked[name] for name in names], (note,)
-    raise MissingFile(
-        f"{folder}: names {len(names)} photos such as {names[0]}, but {base / 'images'} has none of them; "
-        "put the photos there"
-    )
-
-
-def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
-    """The folder out of `copies` to read photos from whose names say nothing: it has so many."""
-    listed = [(place, pictures(place.path)) for place in copies(images)]
-    return chosen_copy([(place, files[0]) for place, files in listed if len(files) == count > 0], downscale)
+def _other_models(path: Path, folder: Path) -> Iterator[str]:
+    """A sentence about the models beside the one that is read."""
+    others = [other for other in colmap.model_folders(path) if other != folder]
+    if others:
+        named = ", ".join(f"{other.relative_to(path)} of {colmap.image_count(other)}" for other in others[:5])
+        yield (
+            f"{path}: {folder.relative_to(path)}, a model of {colmap.image_count(folder)} photos, is read, "
+            f"and not {named}; give the folder {others[0]} to read that one"
+        )
 
 
 def _model_mask(base: Path, name: str) -> Path | None:
@@ -214,28 +214,53 @@ def _read_llff(path: Path, downscale: int | None) -> Capture:
             f"{path}: has {len(rows)} poses, one per photo by the order of names, but there are {found}; "
             "restore all photos, or estimate the poses again"
         )
-    views, alpha = [], False
-    for i, (row, photo) in enumerate(zip(rows, pictures(place.path), strict=True)):
+    photos = pictures(place.path)
+    sound = [(i, photo) for i, photo in enumerate(photos) if photo.stat().st_size]
+    headers = []
+
+    def read(item: tuple[int, Path]) -> View:
+        i, photo = item
         where, header = f"{path}: row {i} ({photo.name})", read_image_header(photo)
-        view = replace(llff.row_view(where, row), name=photo.stem)
-        views.append(on_photo(view, photo, header, where, reduction=place.reduction(header, downscale)))
-        alpha |= header.alpha
-    notes = () if place.path == images else (f"{path}: photos are read from {place.path.name}",)
-    return _capture(path, "llff", Part(tuple(views), alpha, (), notes), Part(), None)
+        view = replace(llff.row_view(where, rows[i]), name=photo.stem)
+        view = on_photo(view, photo, header, where, reduction=place.reduction(header, downscale))
+        headers.append(header)
+        return view
+
+    views, broken = read_sound(path, sound, read, lambda item: item[1].name)
+    order = (
+        f"{path}: has no names, so its {len(rows)} rows go with the photos of {place.path.name} by the order "
+        f"of their names, {photos[0].name} to {photos[-1].name}"
+    )
+    empty = tuple(photo.name for photo in photos if not photo.stat().st_size)
+    notes = (order, *broken, *repair_notes(path, views))
+    part = Part(tuple(views), any(header.alpha for header in headers), empty, notes)
+    return _capture(path, "llff", part, Part(), None)
+
+
+def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
+    """The folder out of `copies` to read photos from whose names say nothing: it has so many."""
+    listed = [(place, pictures(place.path)) for place in copies(images)]
+    return chosen_copy([(place, files[0]) for place, files in listed if len(files) == count > 0], downscale)
 
 
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
-    views, alpha, missing = [], False, []
-    for file in sorted(cameras.glob("*.json"), key=lambda file: natural(file.name)):
-        view, photo = polycam.read_camera(file), find_photo(images, file.stem)
-        if photo is None:
-            missing.append(file.stem)
-            continue
+    files = {file.stem: file for file in polycam.camera_files(cameras)}
+    matched = match_photos(cameras, images, files, downscale)
+    headers = []
+
+    def read(name: str) -> View:
+        photo, place = matched.photos[name]
         header = read_image_header(photo)
-        reduction = Folder(images).reduction(header, downscale)
-        views.append(on_photo(view, photo, header, str(file), reduction=reduction))
-        alpha |= header.alpha
-    return _capture(path, "polycam", Part(tuple(views), alpha, tuple(missing)), Part(), None)
+        view = polycam.read_camera(files[name], header[:2])
+        reduction = place.reduction(header, downscale)
+        view = on_photo(view, photo, header, str(files[name]), reduction=reduction)
+        headers.append(header)
+        return view
+
+    views, broken = read_sound(cameras, [name for name in files if name in matched.photos], read, str)
+    notes = (*matched.notes, *broken, *repair_notes(cameras, views))
+    part = Part(tuple(views), any(header.alpha for header in headers), matched.missing, notes)
+    return _capture(path, "polycam", part, Part(), None)
 
 
 # --- what they share ----------------------------------------------------------------------------------------
@@ -265,7 +290,9 @@ def _capture(
     if (kept := object_boxes(views)) is not None:
         corners = [view.corners(1.0, bounds) for view, bounds in zip(views, kept, strict=True)]
         cut_out = object_box(poses[:, :3, 3], np.array(corners))
-    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_smaller(path, views))))
+    doubt = upward_doubt(poses) if frame is not None and len(views) >= LEAST_VIEWS else None
+    doubts = [f"{path}: {doubt}"] if doubt else []
+    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_smaller(path, views), *doubts)))
     return Capture(path, kind, train.views, test.views, box, opaque, cut_out, missing, points, frame, notes)
 
 

@@ -5,21 +5,34 @@ with x right, y down, z forward. Files `rigs` and `frames` of newer versions are
 """
 
 import math
+import os
+import re
 import struct
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from formats.cameras import checked_size
-from formats.errors import BadIntrinsics, BadModel, BadPose, LimitExceeded, UnsupportedCamera
+from formats.cameras import MOST_PIXELS, checked_focal, checked_size
+from formats.errors import (
+    BadIntrinsics,
+    BadModel,
+    BadPose,
+    FormatError,
+    ResourceError,
+    UnsupportedCamera,
+)
 from formats.frame import depth_range
-from formats.inputs import read_input
-from formats.points import MAX_POINTS, Points
+from formats.frame_list import once, read_sound
+from formats.inputs import decoded, open_input, read_input
+from formats.matching import stem_key
+from formats.photos import natural
+from formats.points import Points, stride, thinned_notes
 from formats.rotations import matrices
-from formats.views import View
+from formats.views import FARTHEST, View
 
 MAX_CAMERAS_BYTES = 64 * 2**20
 MAX_BYTES = 2**31
@@ -58,6 +71,9 @@ NUMBERS = [
 ]
 """Names of the models by their number in binary files."""
 NO_POINT = 2**64 - 1
+SMALLEST_IMAGE = 73
+"""Bytes of an image without a name or observations."""
+LINE_ENDS = re.compile(r"\r\n?|\n")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +95,8 @@ class Model:
     folder: Path
     images: tuple[Image, ...]
     points: Points | None
+    notes: tuple[str, ...] = ()
+    """What of the model is not used, and why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +120,40 @@ class Listed:
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder of a model at `path`, or below it where COLMAP and nerfstudio store it; None without one."""
-    places = [path / part for part in ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")]
-    found = next((place for place in places if _has(place, "cameras") and _has(place, "images")), None)
-    if found is None and (path / "sparse").is_dir():
-        found = next((p for p in sorted((path / "sparse").iterdir()) if _has(p, "images")), None)
-    return found
+    """The folder of a model at `path`, or of the largest one below it where COLMAP and nerfstudio store it;
+    None without one."""
+    return next(iter(model_folders(path)), None)
+
+
+def model_folders(path: Path) -> list[Path]:
+    """The folder at `path` where that is a model's, or those below it, by how many images they have."""
+    for place in (path, path / "sparse", path / "colmap/sparse"):
+        below = [place]
+        if place != path or path.name == "sparse":
+            below += sorted(_folders(place), key=lambda folder: natural(folder.name))
+        if models := [folder for folder in below if _has(folder, "cameras") and _has(folder, "images")]:
+            return sorted(models, key=image_count, reverse=True)
+    return []
+
+
+def _folders(path: Path) -> list[Path]:
+    try:
+        return [folder for folder in path.iterdir() if folder.is_dir()]
+    except OSError:
+        return []
+
+
+def image_count(folder: Path) -> int:
+    """How many images a model has, as its file states it; 0 where that cannot be read."""
+    try:
+        if (folder / "images.bin").is_file():
+            with open_input(folder / "images.bin") as file:
+                count, size = int.from_bytes(file.read(8), "little"), os.fstat(file.fileno()).st_size
+            return count if count <= size // SMALLEST_IMAGE else 0
+        path = folder / "images.txt"
+        return len(_text_images(path, read_input(path, MAX_BYTES)))
+    except (FormatError, OSError):
+        return 0
 
 
 def capture_folder(model: Path) -> Path:
@@ -128,12 +174,18 @@ def read_model(folder: Path) -> Model:
     Raises BadIntrinsics, BadModel, BadPose, LimitExceeded, MissingFile, ResourceError, UnsupportedCamera.
     """
     cameras = _read(folder, "cameras", {"bin": _binary_cameras, "txt": _text_cameras}, MAX_CAMERAS_BYTES)
-    listed = list(_read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES))
+    listed = _images(folder)
     if not listed:
         raise BadModel(f"{folder}: its images file is empty; export the model again")
-    known = _points(folder)
-    images = []
-    for where, name, quaternion, translation, camera, seen in listed:
+    try:
+        known, notes = _points(folder), []
+    except ResourceError:
+        raise
+    except FormatError as error:
+        known, notes = None, [f"{error}; the model is read without its points"]
+
+    def read(listing: tuple) -> Image:
+        where, name, quaternion, translation, camera, seen = listing
         if camera not in cameras:
             raise BadModel(
                 f"{where}: is of camera {camera}, which the cameras file does not list; export again"
@@ -144,20 +196,31 @@ def read_model(folder: Path) -> Model:
             found = known.found(seen)
             near, far = depth_range(pose, known.points.positions[found])
             view = replace(view, near=near, far=far, seen=known.sure(found))
-        images.append(Image(name, where, view))
-    return Model(folder, tuple(images), known and known.points)
+        return Image(name, where, view)
+
+    listed, repeated = once(folder, listed, _listed_name, lambda item: (*item[2], *item[3]))
+    images, broken = read_sound(folder, listed, read, _listed_name)
+    notes = (*repeated, *broken, *notes, *thinned_notes(folder, known and known.points))
+    return Model(folder, tuple(images), known and known.points, notes)
+
+
+def _listed_name(listing: tuple) -> str:
+    return listing[1]
+
+
+def _images(folder: Path) -> list[tuple]:
+    return _read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES)
 
 
 def read_points(folder: Path) -> tuple[Points | None, dict[str, np.ndarray]]:
-    """The points alone, None where the model has none; and, by the stem of each photo's file, which of them
-    were found in it (View.seen). Photos that share a stem are left out."""
+    """The points alone, None where the model has none; and, by the `stem_key` of each photo's file, which of
+    them were found in it (View.seen). Photos that share a stem are left out."""
     known = _points(folder)
     if known is None:
         return None, {}
-    listed = _read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES)
-    stems = Counter(PurePosixPath(name).stem for _, name, *_ in listed)
-    seen = {PurePosixPath(name).stem: known.sure(known.found(ids)) for _, name, *_, ids in listed}
-    return known.points, {stem: found for stem, found in seen.items() if stems[stem] == 1}
+    named = [(stem_key(PurePosixPath(name).name), ids) for _, name, *_, ids in _images(folder)]
+    stems = Counter(stem for stem, _ in named)
+    return known.points, {stem: known.sure(known.found(ids)) for stem, ids in named if stems[stem] == 1}
 
 
 def _points(folder: Path) -> Listed | None:
@@ -179,11 +242,12 @@ def _read(folder: Path, name: str, parsers: dict, limit: int):
 def _pose(quaternion: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
     """(4, 4) camera-to-world, OpenGL axes, of a world-to-camera rotation and translation."""
     numbers = np.array([*quaternion, *translation], np.float64)
-    usable = np.abs(numbers).max() < 1e15  # False for NaN too
+    usable = np.abs(numbers).max() < FARTHEST  # False for NaN too
     length = float(np.linalg.norm(numbers[:4])) if usable else 0.0
     if not 1e-3 < length < 1e3:
         raise BadPose(
-            f"{where}: its pose is not a rotation with a finite translation; remove the image, or map again"
+            f"{where}: its pose is not a rotation with a translation below {FARTHEST:g}; remove the image, "
+            "or map again"
         )
     w, x, y, z = numbers[:4] / length
     rotation = matrices(np.array([x, y, z, w]))
@@ -203,12 +267,14 @@ def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
         raise BadModel(
             f"{where}: {model} has {len(numbers)} parameters, expected {len(names)}: {MODELS[model]}"
         )
-    if not all(abs(number) < 1e30 for number in numbers):
-        raise BadIntrinsics(f"{where}: a parameter is not a finite number; export the model again")
+    if not all(abs(number) < MOST_PIXELS for number in numbers):
+        raise BadIntrinsics(
+            f"{where}: a parameter is not a number below {MOST_PIXELS:g}; export the model again"
+        )
     said = dict(zip(names, map(float, numbers), strict=True))
     fl_x, fl_y = (said.get(key, said.get("f", 0.0)) for key in ("fx", "fy"))
-    if not min(fl_x, fl_y) > 0:
-        raise BadIntrinsics(f"{where}: focal length of {min(fl_x, fl_y):g} pixels, expected a positive one")
+    for focal in (fl_x, fl_y):
+        checked_focal(focal, where)
     checked_size(width, height, where)
     fisheye = "FISHEYE" in model
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2", "k4", "d1", "d2", "d3")
@@ -245,7 +311,8 @@ def _binary_cameras(path: Path, data: bytes) -> dict[int, View]:
 
 def _text_cameras(path: Path, data: bytes) -> dict[int, View]:
     cameras = {}
-    for line, words in _lines(path, data):
+    for line, text in _lines(path, data):
+        words = text.split()
         if not words:
             continue
         if len(words) < 5:
@@ -253,7 +320,7 @@ def _text_cameras(path: Path, data: bytes) -> dict[int, View]:
         camera, width, height = (_number(path, line, words[i], int) for i in (0, 2, 3))
         where = f"{path}: camera {camera}"
         numbers = [_number(path, line, word, float) for word in words[4:]]
-        cameras[camera] = _camera(where, _known(where, words[1]), width, height, numbers)
+        cameras[camera] = _camera(where, _known(where, words[1].upper()), width, height, numbers)
     return cameras
 
 
@@ -263,7 +330,7 @@ def _text_cameras(path: Path, data: bytes) -> dict[int, View]:
 def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
     """(where, name, quaternion, translation, camera, ids of the points it saw) of each image."""
     (count,) = struct.unpack_from("<Q", data)
-    _check_count(path, count, len(data), 73)
+    _check_count(path, count, len(data), SMALLEST_IMAGE)
     at, found = 8, []
     for _ in range(count):
         image, *numbers, camera = struct.unpack_from("<I7dI", data, at)
@@ -283,71 +350,111 @@ def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
 
 
 def _text_images(path: Path, data: bytes) -> list[tuple]:
-    """As `_binary_images`; the second line of an image, which may be empty, holds x, y and point of each
-    observation."""
-    found, lines = [], _lines(path, data)
-    for line, words in lines:
-        if not words:
+    """As `_binary_images`; the second line of an image holds x, y and point of each observation. It may be
+    empty, or be missing where the poses were not found by COLMAP."""
+    found, lines = [], deque(_lines(path, data))
+    while lines:
+        line, text = lines.popleft()
+        if not text:
             continue
+        words = text.split(None, 9)
         if len(words) < 10:
             raise BadModel(f"{path}: line {line}: expected an id, a pose, a camera and a name")
         image, camera = (_number(path, line, words[i], int) for i in (0, 8))
         numbers = [_number(path, line, word, float) for word in words[1:8]]
-        name = " ".join(words[9:])
-        line, observed = next(lines, (line + 1, []))
-        try:
-            seen = np.array(observed[2::3], np.int64)
-        except (ValueError, OverflowError):
-            raise BadModel(f"{path}: line {line}: expected x, y and a point's id again and again") from None
+        name = words[9]
+        seen = np.empty(0, np.int64)
+        if lines and not _is_image(lines[0][1]):
+            line, text = lines.popleft()
+            observed = text.split()
+            try:
+                seen = np.array(observed[2::3], np.int64)
+                if len(observed) % 3:
+                    raise ValueError
+            except (ValueError, OverflowError):
+                raise BadModel(
+                    f"{path}: line {line}: expected x, y and a point's id again and again"
+                ) from None
         where = f"{path}: image {image} ({name})"
         found.append((where, name, numbers[:4], numbers[4:], camera, seen[seen >= 0].astype(np.uint64)))
     return found
 
 
+def _is_image(text: str) -> bool:
+    """Whether a line is the first of an image: its last words are a name, no numbers, or too few for a
+    point's."""
+    words = text.split(None, 9)
+    if len(words) < 10:
+        return False
+    try:
+        int(words[0]), int(words[8]), [float(word) for word in words[1:8]]
+    except ValueError:
+        return False
+    rest = words[9].split()
+    try:
+        [float(word) for word in rest]
+    except ValueError:
+        return True
+    return len(rest) % 3 != 0
+
+
 # --- points -------------------------------------------------------------------------------------------------
+
+
+HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
+"""A point before its track, each entry of which has 8 bytes."""
+BLOCK = 1 << 16
 
 
 def _binary_points(path: Path, data: bytes) -> Listed:
     (count,) = struct.unpack_from("<Q", data)
-    _check_count(path, count, len(data), 51)
-    if count > MAX_POINTS:
-        raise LimitExceeded(f"{path}: {count:,} points, at most {MAX_POINTS:,} are read; thin them out")
-    head = struct.Struct("<Q3d3BdQ")
-    rows, at = [], 8
-    for _ in range(count):
-        row = head.unpack_from(data, at)
-        at += head.size
-        if row[-1] > (len(data) - at) // 8:
-            raise BadModel(f"{path}: the file is truncated in point {row[0]}; copy or export it again")
-        at += 8 * row[-1]
-        rows.append(row[:8])
-    return _sorted_points(rows)
+    _check_count(path, count, len(data), HEAD.itemsize)
+    step, at, track = stride(count), 8, struct.Struct("<Q").unpack_from
+    heads, kept = np.empty(-(-count // step), HEAD), []
+    for i in range(count):
+        (length,) = track(data, at + 43)
+        if length > (len(data) - at - HEAD.itemsize) // 8:
+            (point,) = track(data, at)
+            raise BadModel(f"{path}: the file is truncated in point {point}; copy or export it again")
+        if i % step == 0:
+            kept.append(at)
+        if len(kept) == BLOCK or kept and i == count - 1:
+            _gather(data, kept, heads[: i // step + 1])
+            kept = []
+        at += HEAD.itemsize + 8 * length
+    return _sorted_points(heads["id"], heads["xyz"], heads["rgb"], heads["error"], step)
+
+
+def _gather(data: bytes, starts: list[int], heads: np.ndarray) -> None:
+    """Fill the last of `heads` from the bytes that begin at `starts`."""
+    rows = np.array(starts)[:, None] + np.arange(HEAD.itemsize)
+    heads[len(heads) - len(starts) :] = np.frombuffer(data, np.uint8)[rows].view(HEAD)[:, 0]
 
 
 def _text_points(path: Path, data: bytes) -> Listed:
-    rows = []
-    for line, words in _lines(path, data):
-        if not words:
-            continue
+    step, rows, ids = stride(data.count(b"\n")), [], []
+    numbered = (item for item in _lines(path, data) if item[1])
+    for line, text in islice(numbered, 0, None, step):
+        words = text.split(None, 8)
         if len(words) < 7:
             raise BadModel(f"{path}: line {line}: expected an id, a position and a colour")
-        if len(rows) == MAX_POINTS:
-            raise LimitExceeded(f"{path}: more than {MAX_POINTS:,} points; thin them out")
+        ids.append(_number(path, line, words[0], int) % 2**64)
         position = [_number(path, line, word, float) for word in words[1:4]]
-        whole = [_number(path, line, word, int) for word in (words[0], *words[4:7])]
+        colour = [_number(path, line, word, int) for word in words[4:7]]
         error = _number(path, line, words[7], float) if len(words) > 7 else 0.0
-        rows.append((whole[0], *position, *whole[1:], error))
-    return _sorted_points(rows)
+        rows.append((*position, *colour, error))
+    table = np.array(rows, np.float64).reshape(-1, 7)
+    return _sorted_points(np.array(ids, np.uint64), table[:, :3], table[:, 3:6], table[:, 6], step)
 
 
-def _sorted_points(rows: list[tuple]) -> Listed:
-    ids = np.array([row[0] % 2**64 for row in rows], np.uint64)
-    positions = np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3)
-    colours = np.clip(np.array([row[4:7] for row in rows], np.float64).reshape(-1, 3), 0, 255)
+def _sorted_points(
+    ids: np.ndarray, positions: np.ndarray, colours: np.ndarray, errors: np.ndarray, step: int
+) -> Listed:
+    """(N,), (N, 3), (N, 3) and (N,) numbers of every `step`-th point of a file."""
     order = np.argsort(ids)
     order = order[(np.abs(positions[order]) < 1e30).all(1)]
-    errors = np.array([row[7] for row in rows], np.float64)[order]
-    return Listed(ids[order], Points(positions[order], colours[order].astype(np.uint8)), errors)
+    colours = np.clip(colours[order], 0, 255).astype(np.uint8)
+    return Listed(ids[order], Points(positions[order], colours, step), errors[order])
 
 
 # --- parsing ------------------------------------------------------------------------------------------------
@@ -358,18 +465,22 @@ def _check_count(path: Path, count: int, length: int, smallest: int) -> None:
         raise BadModel(f"{path}: {count:,} records do not fit into {length:,} bytes; copy or export it again")
 
 
-def _lines(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each line that is not a comment."""
-    for i, line in enumerate(data.decode("utf-8", "replace").split("\n"), 1):
-        if not line.startswith("#"):
-            yield i, line.split()
+def _lines(path: Path, data: bytes) -> Iterator[tuple[int, str]]:
+    """Number and text of each line that is not a comment."""
+    for i, line in enumerate(LINE_ENDS.split(decoded(data, "replace")), 1):
+        text = line.strip()
+        if not text.startswith("#"):
+            yield i, text
 
 
 def _number(path: Path, line: int, word: str, kind: type):
     try:
-        value = kind(word) if len(word) < 40 else math.nan
+        value = float(word) if len(word) < 40 else math.nan
+        value = int(word) if kind is int and word.lstrip("+-").isdecimal() and len(word) < 40 else value
     except ValueError:
         value = math.nan
-    if not abs(value) < 1e30:
-        raise BadModel(f"{path}: line {line}: found {word[:40]!r}, expected a number")
-    return value
+    if not abs(value) < 1e30 or kind is int and value != int(value):
+        points = "; write decimals with a point" if "," in word else ""
+        what = "a whole number" if kind is int else "a number"
+        raise BadModel(f"{path}: line {line}: found {word[:40]!r}, expected {what}{points}")
+    return kind(value)

@@ -23,9 +23,6 @@ OUTLIERS = 0.001
 """Share of a view's points that may lie nearer than its `near`, and farther than its `far`."""
 MARGIN = 1.25
 """Factor on the extent of the sparse points, since other parts of the scene may reach farther."""
-SIDEWAYS, TELLING = 0.25, 0.05
-"""Cameras were held sideways whose y axes lie so much nearer to one plane than their x axes, in mean squares,
-and so much nearer than they spread along it, where these are so large at least."""
 OBJECT_MARGIN = 1.05
 """Factor on the extent of an object that masks cut out."""
 
@@ -42,40 +39,6 @@ class SceneFrame:
     """The median of the cameras' distances from the focus."""
     spread: float
     """Radians from the mean direction within which 95 % of the cameras look."""
-
-
-def upward(poses: np.ndarray) -> np.ndarray:
-    """(3,) unit vector: which way is up where cameras of (N, 4, 4) poses stand. It is the mean of their +y
-    axes, or +z where these cancel out; of photos that lie on their side see `up_of_sideways`."""
-    rights, ups, backs = np.moveaxis(poses[:, :3, :3], 2, 0)
-    found = up_of_sideways(rights, ups, backs)
-    if found is not None:
-        return found
-    mean = ups.mean(0)
-    length = float(np.linalg.norm(mean))
-    return mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-
-
-def up_of_sideways(rights: np.ndarray, ups: np.ndarray, backs: np.ndarray) -> np.ndarray | None:
-    """(3,) unit vector: which way is up where cameras were turned by a quarter about their axes, and the
-    photos are stored as they left them; None where these were not, or it cannot be told.
-
-    rights, ups and backs (N, 3) are the cameras' axes in the world. People hold the x axis level, even where
-    they look down; here it is the y axis. Up is at right angles to it, on the side from which the cameras
-    look down.
-    """
-    across = np.linalg.eigvalsh(scatter(rights))
-    along, directions = np.linalg.eigh(scatter(ups))
-    spread = min(across[0], along[1])
-    if spread <= TELLING or along[0] >= SIDEWAYS * spread:
-        return None
-    found = directions[:, 0]
-    return found if found @ backs.mean(0) >= 0 else -found
-
-
-def scatter(directions: np.ndarray) -> np.ndarray:
-    """(3, 3) the mean of the outer products of (N, 3) directions with themselves."""
-    return directions.T @ directions / len(directions)
 
 
 def scene_frame(poses: np.ndarray, depth: float | None = None) -> SceneFrame:

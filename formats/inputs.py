@@ -52,6 +52,16 @@ def read_input(path: Path | str, limit: int) -> bytes:
         return file.read(limit)
 
 
+def decoded(data: bytes, errors: str = "strict") -> str:
+    """Text of a file: UTF-8, or as the byte-order mark says that it begins with. Raises UnicodeDecodeError
+    unless `errors` are replaced."""
+    if data.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
+        return data.decode("utf-32", errors)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16", errors)
+    return data.decode("utf-8-sig", errors)
+
+
 def parse_json(data: bytes, where: str):
     """Strict JSON: UTF-8, no duplicate keys, finite numbers, integers below 2^63; BadJson otherwise.
 

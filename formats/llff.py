@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.cameras import checked_size
+from formats.cameras import checked_focal, checked_size
 from formats.errors import BadIntrinsics, BadModel, BadPose
 from formats.inputs import read_input
 from formats.views import View, checked_pose
@@ -54,15 +54,14 @@ def row_view(where: str, row: np.ndarray) -> View:
     if not np.isfinite(row).all():
         raise BadPose(f"{where}: holds NaN or infinity; export the poses again")
     height, width, focal = matrix[:, 4]
-    if not focal > 0 or max(height, width, focal) > 1e9:
-        raise BadIntrinsics(f"{where}: focal length of {focal:g} pixels, expected a positive one")
+    focal = checked_focal(float(focal), where)
     if not 0 < near < far:
         raise BadIntrinsics(
             f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth; estimate the "
             "poses again"
         )
-    width, height = checked_size(round(width), round(height), where)
+    width, height = checked_size(*(round(min(float(side), 1e9)) for side in (width, height)), where)
     down, right, back, eye = matrix[:, :4].T
-    pose = checked_pose(np.column_stack([right, -down, back, eye]), where)
-    middle = width / 2, height / 2
-    return View("", pose, focal, focal, *middle, width, height, near=float(near), far=float(far))
+    pose, repair = checked_pose(np.column_stack([right, -down, back, eye]), where)
+    middle, depths = (width / 2, height / 2), {"near": float(near), "far": float(far)}
+    return View("", pose, focal, focal, *middle, width, height, **depths, repair=repair)

@@ -7,7 +7,7 @@ a whole factor: each pixel is the mean of so many a side.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -19,7 +19,13 @@ from formats.errors import BadIntrinsics, BadMask, MissingFile, MixedSizes, NoVi
 from formats.images import Header, oriented, read_image, read_image_header, read_mask
 from formats.views import View
 
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff", ".PNG", ".JPG", ".JPEG")
+EXTENSIONS = (
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".bmp", ".tga", ".tif", ".tiff"),
+    *(".avif", ".heic", ".heif"),
+)
+"""Endings of photos, in letters of any case."""
+UNREAD = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw", ".exr", ".gif")
+"""Endings that poses may name for photos which were converted since."""
 LONGEST = 1080
 """Pixels of a photo's longer side past which a smaller copy is taken where there is one, and otherwise the
 photo is made smaller; unless a factor is asked for."""
@@ -39,7 +45,25 @@ DIGITS = re.compile(r"(\d+)")
 
 def natural(text: str) -> list:
     """Sort key that takes runs of digits as numbers: r_2 before r_10."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in DIGITS.split(text)]
+    parts = [(part.isdecimal(), part.lstrip("0")) for part in DIGITS.split(text)]
+    # A number is compared by its length and digits: there is no limit to how many it has.
+    return [(len(digits), digits) if number else (-1, digits) for number, digits in parts]
+
+
+def split_ending(name: str) -> tuple[str, str]:
+    """A photo's name without its ending, and that; with "" where it has none that photos have."""
+    stem, dot, ending = name.rpartition(".")
+    return (stem, f".{ending}") if stem and f"{dot}{ending}".lower() in (*EXTENSIONS, *UNREAD) else (name, "")
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a file is hidden, as the `._` files beside each photo are that a Mac leaves behind."""
+    return name.startswith(".")
+
+
+def is_picture(name: str) -> bool:
+    """Whether a file is a picture, by its name."""
+    return not is_hidden(name) and Path(name).suffix.lower() in EXTENSIONS
 
 
 @dataclass(frozen=True)
@@ -68,7 +92,7 @@ def pictures(folder: Path) -> list[Path]:
     """The pictures of a folder by name, as LLFF counts them; none where there is no folder."""
     if not folder.is_dir():
         return []
-    return sorted(file for file in folder.iterdir() if file.suffix in EXTENSIONS and is_file(file))
+    return sorted(file for file in folder.iterdir() if is_picture(file.name) and is_file(file))
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
@@ -76,10 +100,11 @@ def find_photo(folder: Path, name: str) -> Path | None:
     if not name:
         return None
     exact = folder / name
-    stem = exact.with_suffix("") if exact.suffix in EXTENSIONS else exact
     if is_file(exact):
         return exact
-    candidates = (stem.with_name(stem.name + ending) for ending in EXTENSIONS)
+    stem = split_ending(exact.name)[0]
+    endings = (form(ending) for ending in EXTENSIONS for form in (str.lower, str.upper))
+    candidates = (exact.with_name(stem + ending) for ending in endings)
     return next((candidate for candidate in candidates if is_file(candidate)), None)
 
 
@@ -104,17 +129,6 @@ def copies(folder: Path) -> list[Folder]:
 
 def _escaped(name: str) -> str:
     return re.sub(r"([*?\[])", r"[\1]", name)
-
-
-def photo_folder(places: Iterable[Folder], names: Iterable[str], downscale: int | None) -> Folder | None:
-    """The folder of `places` (as `copies` gives them) to read the named photos from; None where none of the
-    names is found."""
-    names, firsts = list(names), []
-    for place in places:
-        photo = next((found for name in names if (found := find_photo(place.path, name))), None)
-        if photo is not None:
-            firsts.append((place, photo))
-    return chosen_copy(firsts, downscale)
 
 
 def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:

@@ -1,17 +1,21 @@
 """Sparse points of structure from motion: positions with colours, read from a .ply file."""
 
+import io
 import re
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from formats.atomic import atomic_writer
-from formats.errors import BadModel, LimitExceeded
+from formats.errors import BadModel
 from formats.inputs import read_input
 
 MAX_BYTES = 2**31
 MAX_POINTS = 5_000_000
+"""Of more points every second, third and so on is read."""
 MAX_HEADER = 1 << 16
 TYPES = {
     "char": "i1",
@@ -42,20 +46,32 @@ class Points:
     """(N, 3) float64."""
     colours: np.ndarray
     """(N, 3) uint8 sRGB; white where the file has none."""
+    thinned: int = 1
+    """One out of so many of the file's points is here, from the first on."""
 
     def moved(self, matrix: np.ndarray) -> "Points":
         """The same points behind an affine (3, 4) or (4, 4)."""
-        return Points(self.positions @ matrix[:3, :3].T + matrix[:3, 3], self.colours)
+        return replace(self, positions=self.positions @ matrix[:3, :3].T + matrix[:3, 3])
 
 
-def finite(positions: np.ndarray, colours: np.ndarray) -> Points:
-    """Points without those that are NaN, infinite or beyond 1e30."""
-    sound = (np.abs(positions) < 1e30).all(1)
-    return Points(positions[sound], colours[sound])
+def stride(count: int) -> int:
+    """How many points of a file one is read of, so that there are at most MAX_POINTS."""
+    return max(1, -(-count // MAX_POINTS))
+
+
+def thinned_notes(path: Path | str, points: Points | None) -> list[str]:
+    """A sentence where not all points of a file were read."""
+    if points is None or points.thinned == 1:
+        return []
+    return [
+        f"{path}: of more than {MAX_POINTS:,} sparse points one in {points.thinned} is read, "
+        f"{len(points.positions):,} in all"
+    ]
 
 
 def read_ply_points(path: Path | str) -> Points:
-    """The vertices of a .ply, text or binary; other elements are ignored.
+    """The vertices of a .ply, text or binary, without those that are NaN, infinite or beyond 1e30; of many
+    only some (`thinned`). Other elements are ignored.
 
     Raises BadModel, LimitExceeded (before anything is allocated), MissingFile.
     """
@@ -67,17 +83,19 @@ def read_ply_points(path: Path | str) -> Points:
     names = [name for name, _ in fields]
     if not {"x", "y", "z"} <= set(names):
         raise BadModel(f"{path}: its vertices lack x, y or z; export the points again")
+    step = stride(count)
     if coding == "ascii":
-        table = _text_table(path, data[end.end() :], count, len(fields))
+        table = _text_table(path, data, end.end(), count, len(fields))
         columns = {name: table[:, i] for i, name in enumerate(names)}
     else:
         order = "<" if coding == "binary_little_endian" else ">"
         record = np.dtype([(name, order + kind) for name, kind in fields])
         if count * record.itemsize > len(data) - end.end():
             raise BadModel(f"{path}: ends before the last of {count:,} points; copy or export it again")
-        columns = np.frombuffer(data, record, count, end.end())
+        columns = np.frombuffer(data, record, count, end.end())[::step]
     positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
-    return finite(positions, _colours(columns, dict(fields)))
+    sound = (np.abs(positions) < 1e30).all(1)
+    return Points(positions[sound], _colours(columns, dict(fields))[sound], step)
 
 
 def write_ply_points(path: Path | str, points: Points) -> None:
@@ -125,20 +143,25 @@ def _count(path: Path | str, digits: str) -> int:
     count = int(digits) if digits.isdecimal() and len(digits) < 16 else -1
     if count < 0:
         raise BadModel(f"{path}: the vertex count is {digits[:40]!r}, expected a whole number")
-    if count > MAX_POINTS:
-        raise LimitExceeded(f"{path}: {count:,} points, at most {MAX_POINTS:,} are read; thin them out")
     return count
 
 
-def _text_table(path: Path | str, data: bytes, count: int, width: int) -> np.ndarray:
+def _text_table(path: Path | str, data: bytes, start: int, count: int, width: int) -> np.ndarray:
+    """(N, width) numbers of every `stride`-th of `count` lines from a byte on."""
     if not count:
         return np.empty((0, width))
-    lines = data.split(b"\n", count)[:count]
+    step, lines = stride(count), io.BytesIO(data)
+    lines.seek(start)
+    expected = -(-count // step)
     try:
-        table = np.loadtxt(lines, np.float64, comments=None, ndmin=2) if all(lines) else np.empty((0, 0))
+        if count > len(data) - start:  # a line is a byte at least
+            raise ValueError
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # lines that are all empty
+            table = np.loadtxt(islice(lines, 0, count, step), np.float64, comments=None, ndmin=2)
     except ValueError:
         table = np.empty((0, 0))
-    if table.shape != (count, width):
+    if table.shape != (expected, width):
         raise BadModel(
             f"{path}: expected {count:,} lines of {width} numbers after the header; export it again"
         )

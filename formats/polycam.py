@@ -5,8 +5,9 @@ Its world has y up; rows are cycled so that z is up, as nerfstudio does.
 
 from pathlib import Path
 
-from formats.cameras import checked_size, read_document
+from formats.cameras import MOST_PIXELS, checked_focal, checked_size, read_document
 from formats.errors import BadIntrinsics, BadPose
+from formats.photos import is_hidden, natural
 from formats.views import View, checked_pose
 
 FOLDERS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
@@ -18,26 +19,40 @@ def keyframes(path: Path) -> tuple[Path, Path] | None:
     """The folders of photos and of cameras of an export, or of its `keyframes`; None if it is none."""
     for place in (path / "keyframes", path):
         for photos, cameras in FOLDERS:
-            if (place / photos).is_dir() and any((place / cameras).glob("*.json")):
+            if (place / photos).is_dir() and camera_files(place / cameras):
                 return place / photos, place / cameras
     return None
 
 
-def read_camera(path: Path) -> View:
-    """The camera of one photo. Raises BadIntrinsics, BadJson, BadPose, BadSchema."""
+def camera_files(folder: Path) -> list[Path]:
+    """The cameras of a folder in the natural order of their photos."""
+    files = [file for file in folder.glob("*.json") if not is_hidden(file.name)]
+    return sorted(files, key=lambda file: natural(file.name))
+
+
+def read_camera(path: Path, size: tuple[int, int]) -> View:
+    """The camera of one photo, which has `size` (width, height) where the file does not say.
+
+    Raises BadIntrinsics, BadJson, BadPose, BadSchema.
+    """
     document = read_document(path)
     rows = [[document.get(f"t_{row}{column}") for column in range(4)] for row in ROWS]
     if any(isinstance(number, bool) or not isinstance(number, int | float) for row in rows for number in row):
         raise BadPose(f"{path}: expected its pose as twelve numbers t_00 to t_23; export it again")
+    if document.get("width") is None or document.get("height") is None:
+        document |= dict(zip(("width", "height"), size, strict=True))
     numbers = {}
     for key in ("fx", "fy", "cx", "cy", "width", "height"):
         numbers[key] = document.get(key)
         if isinstance(numbers[key], bool) or not isinstance(numbers[key], int | float):
             raise BadIntrinsics(f"{path}: expected {key} to be a number; export it again")
-        if not abs(numbers[key]) < 1e30:
-            raise BadIntrinsics(f"{path}: {key} is {str(numbers[key])[:40]}, expected a finite number")
-    if not min(numbers["fx"], numbers["fy"]) > 0:
-        raise BadIntrinsics(f"{path}: a focal length that is not positive; export it again")
+        if not abs(numbers[key]) <= MOST_PIXELS:
+            raise BadIntrinsics(
+                f"{path}: {key} is {str(numbers[key])[:40]}, expected a number up to {MOST_PIXELS:g}"
+            )
+    inner = [float(numbers[key]) for key in ("fx", "fy", "cx", "cy")]
+    for focal in inner[:2]:
+        checked_focal(focal, str(path))
     size = checked_size(round(numbers["width"]), round(numbers["height"]), str(path))
-    inner = (float(numbers[key]) for key in ("fx", "fy", "cx", "cy"))
-    return View(path.stem, checked_pose(rows, str(path)), *inner, *size)
+    pose, repair = checked_pose(rows, str(path))
+    return View(path.stem, pose, *inner, *size, repair=repair)

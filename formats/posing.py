@@ -21,12 +21,13 @@ from formats import colmap
 from formats.atomic import atomic_folder
 from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
-from formats.frame import scene_frame, up_of_sideways
+from formats.frame import scene_frame
 from formats.images import Header, read_focal, read_image_header, write_smaller
 from formats.locks import temporary_folder
 from formats.mapper import MAX_SIDE
 from formats.photos import copies, natural, pictures
 from formats.points import Points, write_ply_points
+from formats.upright import vertical
 from formats.views import View
 
 LEAST_PHOTOS = 3
@@ -34,16 +35,12 @@ DISTANCE = 4.0
 """Median distance of the cameras from the origin: about that of the cameras of Blender's captures."""
 FEW_FEATURES = 200
 """A photo of fewer features is blurred, or shows little but plain surfaces."""
-LEVEL = 0.17
-"""Cameras turn about a vertical axis if their x axes spread at least so much in two directions."""
 UPS = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where up is in the stored picture (right, up), by EXIF orientation; (0, 1) of the others."""
 CAMERAS = "transforms.json"
 POINTS = "points.ply"
 TEMPORARY = "fusedrf-poses-"
 """What the names of temporary folders begin with."""
-UNREAD = (".heic", ".heif", ".HEIC", ".HEIF")
-"""Photos of phones that cannot be decoded here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +76,8 @@ def photos_to_pose(folder: Path | str) -> list[Path]:
     places = (folder, *(place.path for place in copies(folder / "images")))
     found = next((files for files in map(pictures, places) if files), [])
     if not found:
-        unread = [file for place in places if place.is_dir() for file in place.iterdir()]
-        if unread := [file for file in unread if file.suffix in UNREAD]:
-            raise NoViews(
-                f"{folder}: its {len(unread)} photos such as {unread[0].name} are HEIC, which is not read; "
-                "convert them to JPEG, or set the phone to its most compatible format"
-            )
         raise MissingFile(f"{folder}: holds no photos; give the folder that they lie in")
+    read_image_header(found[0])  # of a kind that is not read, it is named before any work
     if len(found) < LEAST_PHOTOS:
         raise NoViews(
             f"{folder}: holds {len(found)} photos, but where they were taken follows from {LEAST_PHOTOS} or "
@@ -253,8 +245,7 @@ def _level(poses: np.ndarray, orientations: Sequence[int]) -> np.ndarray:
     sides = np.array([UPS.get(orientation, (0, 1)) for orientation in orientations], float)
     ups = np.einsum("nij,nj->ni", poses[:, :3, :2], sides)
     rights, backs = np.cross(ups, poses[:, :3, 2]), poses[:, :3, 2]
-    up = up_of_sideways(rights, ups, backs)
-    up = _vertical(ups, rights) if up is None else up
+    up, _ = vertical(rights, ups, backs)
     look = -poses[0, :3, 2]
     if np.linalg.norm(np.cross(look, up)) < 0.1:  # straight up or down: then what is up in it, lies ahead
         look = ups[0]
@@ -263,16 +254,3 @@ def _level(poses: np.ndarray, orientations: Sequence[int]) -> np.ndarray:
     turn = np.eye(4)
     turn[:3, :3] = np.cross(ahead, up), ahead, up
     return turn
-
-
-def _vertical(ups: np.ndarray, rights: np.ndarray) -> np.ndarray:
-    """(3,) unit: at right angles to the cameras' x axes (N, 3), which people hold level even where they look
-    down; or the mean of their ups, if those axes do not lie in a plane."""
-    mean = ups.mean(0) / max(np.linalg.norm(ups.mean(0)), 1e-9)
-    _, spread, axes = np.linalg.svd(rights)
-    if spread[1] > LEVEL * np.sqrt(len(rights)):
-        up = axes[2] * np.sign(axes[2] @ mean)
-    else:  # all look one way: only a tilt to the side is known
-        up = mean - (mean @ axes[0]) * axes[0]
-    length = np.linalg.norm(up)
-    return up / length if length > 1e-3 and up @ mean > 0.7 * length else mean

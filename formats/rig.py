@@ -6,7 +6,6 @@ stand in.
 
 import math
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -14,15 +13,14 @@ import msgspec
 import numpy as np
 
 from formats.errors import BadSchema
-from formats.frame import scene_frame, upward
+from formats.frame import scene_frame
 from formats.images import MAX_SIDE
+from formats.names import distinct_names, is_name
 from formats.rotations import matrices, quaternions
-from formats.views import NO_DISTORTION, Capture, View
+from formats.upright import upward
+from formats.views import FARTHEST, NO_DISTORTION, Capture, View
 
 MAX_CAMERAS = 10_000
-MAX_NAME_BYTES = 200
-"""A picture is written under the name of its camera, with an ending."""
-FARTHEST = 1e13
 LARGEST = 1e9
 """Of a lens's numbers, in pixels."""
 DIGITS = 8
@@ -132,7 +130,10 @@ class Rig:
             "distance": float(self.distance),
             "lenses": [list(lens) for lens in lenses],
             **({"lens": [lenses[row] for row in rows]} if len(lenses) > 1 else {}),
-            "names": [*_names(self.train), *_names(self.test)],
+            "names": [
+                *distinct_names(v.name for v in self.train),
+                *distinct_names(v.name for v in self.test),
+            ],
             "poses": [
                 _rounded(eye, decimals) + _rounded(turn, DIGITS)
                 for eye, turn in zip(poses[:, :3, 3], turns, strict=True)
@@ -243,11 +244,6 @@ def _rounded(numbers: np.ndarray, decimals: int) -> list[float]:
 # --- names --------------------------------------------------------------------------------------------------
 
 
-def is_name(name: str) -> bool:
-    """Whether a picture can be written under it everywhere: a camera's name may come from a hostile file."""
-    return name.isprintable() and not set(name) & set("/\\") and 0 < len(name.encode()) <= MAX_NAME_BYTES
-
-
 def _check_names(names: list[str]) -> None:
     """Raises BadSchema for a name that is none, or that two cameras of one part have."""
     wrong = next((name for name in names if not is_name(name)), None)
@@ -256,15 +252,3 @@ def _check_names(names: list[str]) -> None:
     if len(set(names)) < len(names):
         twice = Counter(names).most_common(1)[0][0]
         raise BadSchema(f"cameras: two of them are named {twice!r}, expected a name for each")
-
-
-def _names(views: Iterable[View]) -> list[str]:
-    """The views' names, or ones that are allowed and different where theirs are not."""
-    found: dict[str, None] = {}
-    for number, view in enumerate(views):
-        plain = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in view.name)
-        name = plain if is_name(plain) else f"{plain[:40]}_{number:05d}"
-        while name in found:
-            name = f"{name[:40]}_{number:05d}"
-        found[name] = None
-    return list(found)

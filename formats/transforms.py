@@ -1,7 +1,8 @@
 """Captures whose cameras stand in `transforms*.json`: Blender's, instant-ngp's and nerfstudio's."""
 
+import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -17,11 +18,13 @@ from formats.cameras import (
     read_frames,
     written_path,
 )
-from formats.errors import BadSchema, FormatError, MissingFile
+from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError
 from formats.frame import depth_range
+from formats.frame_list import once, read_sound, repair_notes
 from formats.images import read_image_header
-from formats.photos import Folder, copies, find_photo, is_file, natural, on_photo, photo_folder
-from formats.points import MAX_POINTS, Points, read_ply_points
+from formats.matching import Matched, find_file, instead, match_photos, stem_key
+from formats.photos import natural, on_photo
+from formats.points import MAX_POINTS, Points, read_ply_points, thinned_notes
 from formats.views import View
 
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
@@ -46,39 +49,77 @@ class Part:
 def read_part(path: Path, downscale: int | None) -> Part:
     """All frames of a file."""
     document = read_document(path)
-    return _views(path, document, list(enumerate(read_frames(path, document))), downscale)
+    (part,) = _views(path, document, [_frames(path, document)], downscale)
+    return part
 
 
 def read_splits(path: Path, downscale: int | None) -> tuple[dict, Part, Part]:
     """The document of a nerfstudio or instant-ngp file, and its frames to train on and to test with."""
     document = read_document(path)
-    frames = list(enumerate(read_frames(path, document)))
-    train, test = (_views(path, document, part, downscale) for part in _split(path, document, frames))
-    return document, train, test
+    frames = _frames(path, document)
+    *splits, notes = _split(path, document, frames)
+    train, test = _views(path, document, splits, downscale)
+    return document, replace(train, notes=(*train.notes, *notes)), test
 
 
 # --- frames -------------------------------------------------------------------------------------------------
 
+Numbered = tuple[int, dict]
+"""A frame and its place in the file."""
 
-def _views(path: Path, document: dict, frames: list[tuple[int, dict]], downscale: int | None) -> Part:
-    """Views of the (index, frame) pairs whose photo exists, their cameras scaled to what is read of it."""
-    frames = sorted(frames, key=lambda item: natural(frame_file(item[1])))
-    folders = _folders(path, [frame_file(frame) for _, frame in frames], downscale)
-    photos = [_photo(path, folders, frame_file(frame)) for _, frame in frames]
-    found = [(i, frame, photo) for (i, frame), photo in zip(frames, photos, strict=True) if photo]
-    names = frame_names([frame for _, frame, _ in found])
-    views, alpha = [], False
-    for (i, frame, photo), name in zip(found, names, strict=True):
-        where = frame_where(path, i, frame)
+
+def _frames(path: Path, document: dict) -> list[Numbered]:
+    frames = read_frames(path, document)
+    if not frames:
+        raise NoViews(
+            f'{path}: its list of "frames" is empty, expected one per photo; export the poses again'
+        )
+    return list(enumerate(frames))
+
+
+def _views(
+    path: Path, document: dict, splits: Sequence[list[Numbered]], downscale: int | None
+) -> tuple[Part, ...]:
+    """Views of the frames of each split whose photo exists, their cameras scaled to what is read of it."""
+    splits = [sorted(frames, key=lambda item: natural(_file(item))) for frames in splits]
+    matched = match_photos(path, path.parent, [_file(item) for part in splits for item in part], downscale)
+    if not matched.photos:
+        named = matched.missing[0] if matched.missing else "none"
+        raise NoViews(
+            f"{path}: no view is left, none of its {len(matched.missing)} photos such as {named} is there: "
+            f"{instead(path.parent)}"
+        )
+    parts = [_part(path, document, frames, matched, downscale) for frames in splits]
+    return (replace(parts[0], notes=(*matched.notes, *parts[0].notes)), *parts[1:])
+
+
+def _part(
+    path: Path, document: dict, frames: list[Numbered], matched: Matched, downscale: int | None
+) -> Part:
+    found = [item for item in frames if _file(item) in matched.photos]
+    found, notes = once(path, found, _file, lambda item: json.dumps(item[1].get("transform_matrix")))
+    names = dict(zip((i for i, _ in found), frame_names([frame for _, frame in found]), strict=True))
+    headers = []
+
+    def read(item: Numbered) -> View:
+        (i, frame), where = item, frame_where(path, *item)
+        photo, folder = matched.photos[_file(item)]
         header = read_image_header(photo)
-        view = frame_view(where, document, frame, name, header[:2])
-        reduction = folders[_rooted(frame_file(frame))[0]].reduction(header, downscale)
-        mask = _mask(path, folders, frame, where)
+        view = frame_view(where, document, frame, names[i], header[:2])
+        mask = _mask(path, folder.factor, frame, where)
         view = replace(view, seen=_stated_points(where, frame))
-        views.append(on_photo(view, photo, header, where, mask, reduction))
-        alpha |= header.alpha
-    missing = [frame_file(f) for (_, f), photo in zip(frames, photos, strict=True) if not photo]
-    return Part(tuple(views), alpha, tuple(missing), tuple(_notes(path, folders)))
+        view = on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
+        headers.append(header)
+        return view
+
+    views, broken = read_sound(path, found, read, _file)
+    missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
+    notes = (*notes, *broken, *repair_notes(path, views))
+    return Part(tuple(views), any(header.alpha for header in headers), missing, notes)
+
+
+def _file(item: Numbered) -> str:
+    return frame_file(item[1])
 
 
 def _stated_points(where: str, frame: dict) -> np.ndarray | None:
@@ -92,58 +133,43 @@ def _stated_points(where: str, frame: dict) -> np.ndarray | None:
     return np.unique(np.array(listed, np.int64))
 
 
-def _rooted(file: str) -> tuple[str, str]:
-    """A photo's path split after its last folder `images`, or else before the file name."""
-    parts = PurePosixPath(file).parts
-    folders = parts[:-1]
-    cut = len(folders) - folders[::-1].index("images") if "images" in folders else len(folders)
-    return str(PurePosixPath(*parts[:cut])), str(PurePosixPath(*parts[cut:]))
-
-
-def _folders(path: Path, files: Iterable[str], downscale: int | None) -> dict[str, Folder]:
-    """For each folder of photos in the file, the one that is read: itself or a smaller copy."""
-    named: dict[str, list[str]] = {}
-    for root, name in map(_rooted, filter(None, files)):
-        named.setdefault(root, []).append(name)
-    places = {root: path.parent / root for root in named}
-    # Beside the capture itself lie other captures, not copies of it.
-    among = {root: copies(at) if at != path.parent else [Folder(at)] for root, at in places.items()}
-    chosen = {root: photo_folder(among[root], names, downscale) for root, names in named.items()}
-    return {root: folder for root, folder in chosen.items() if folder}
-
-
-def _photo(path: Path, folders: dict[str, Folder], file: str) -> Path | None:
-    root, name = _rooted(file) if file else ("", "")
-    return find_photo(folders[root].path, name) if root in folders else None
-
-
-def _notes(path: Path, folders: dict[str, Folder]) -> Iterable[str]:
-    for root, folder in folders.items():
-        if folder.factor > 1:
-            yield f"{path}: photos are read from {folder.path.name} instead of {root}"
-
-
-def _mask(path: Path, folders: dict[str, Folder], frame: dict, where: str) -> Path | None:
+def _mask(path: Path, factor: int, frame: dict, where: str) -> Path | None:
     """The frame's mask, from a folder like `masks_4` where the photo is from `images_4` and there is one."""
     written = written_path(frame, "mask_path")
     if not written:
         return None
-    mask, root = path.parent / written, _rooted(frame_file(frame))[0]
-    copy = f"_{folders[root].factor}" if folders[root].factor > 1 else ""
+    mask = PurePosixPath(written)
+    copy = f"_{factor}" if factor > 1 else ""
     reduced = mask.parent.with_name(mask.parent.name + copy) / mask.name if mask.parent.name else mask
-    found = next((file for file in (reduced, mask) if is_file(file)), None)
+    found = find_file(path.parent, str(reduced)) or find_file(path.parent, written)
     if found is None:
-        raise MissingFile(f"{where}: its mask {mask} does not exist; add it, or remove mask_path")
+        raise MissingFile(
+            f"{where}: its mask {path.parent / mask} does not exist; add it, or remove mask_path"
+        )
     return found
 
 
-def _split(path: Path, document: dict, frames: list) -> tuple[list, list]:
-    """Train and test frames by nerfstudio's optional lists of names; without them all are to train on."""
+def _split(
+    path: Path, document: dict, frames: list[Numbered]
+) -> tuple[list[Numbered], list[Numbered], list[str]]:
+    """Train and test frames by nerfstudio's optional lists of names, and notes on what these leave out;
+    without them all are to train on."""
     train = _listed(path, document, "train_filenames")
     test = _listed(path, document, "test_filenames") or _listed(path, document, "val_filenames") or set()
-    is_train = train.__contains__ if train is not None else lambda file: file not in test
-    named = [(frame_file(item[1]), item) for item in frames]
-    return [item for file, item in named if is_train(file)], [item for file, item in named if file in test]
+    files = [_file(item) for item in frames]
+    is_train = [file in train if train is not None else file not in test for file in files]
+    is_test = [file in test for file in files]
+    notes = []
+    if unused := [file for file, *chosen in zip(files, is_train, is_test, strict=True) if not any(chosen)]:
+        notes.append(
+            f"{path}: {len(unused)} frames such as {unused[0]} are in no list of file names that is used"
+        )
+    if both := [file for file, *chosen in zip(files, is_train, is_test, strict=True) if all(chosen)]:
+        notes.append(f"{path}: {len(both)} photos such as {both[0]} are both learnt from and held out")
+    if unknown := sorted(((train or set()) | test) - set(files), key=natural):
+        notes.append(f"{path}: its lists of file names have {len(unknown)} such as {unknown[0]} of no frame")
+    chosen = ([item for item, use in zip(frames, uses, strict=True) if use] for uses in (is_train, is_test))
+    return *chosen, notes
 
 
 def _listed(path: Path, document: dict, key: str) -> set[str] | None:
@@ -183,7 +209,7 @@ class Sparse:
     points: Points | None = None
     """In the frame of the poses."""
     seen: Mapping[str, np.ndarray] | None = None
-    """View.seen by the stem of each photo's file, where a model says it; None where the frames may."""
+    """View.seen by the `stem_key` of each photo's file, where a model says it; None where the frames may."""
     notes: tuple[str, ...] = ()
 
     def told(self, path: Path, views: tuple[View, ...]) -> tuple[View, ...]:
@@ -193,7 +219,9 @@ class Sparse:
         few, told = _sample(self.points), []
         for view in views:
             near, far = depth_range(view.camera_to_world, few[_seen(view, few)])
-            seen = view.seen if self.seen is None else self.seen.get(view.image_path.stem)
+            seen = view.seen if self.seen is None else self.seen.get(_photo_key(view))
+            if seen is not None and self.seen is None and self.points.thinned > 1:
+                seen = seen[seen % self.points.thinned == 0] // self.points.thinned
             if seen is not None and seen.max(initial=-1) >= len(self.points.positions):
                 raise BadSchema(
                     f"{path}: {view.name} shows sparse point {seen.max()}, but there are "
@@ -203,26 +231,37 @@ class Sparse:
         return tuple(told)
 
 
+def _photo_key(view: View) -> str:
+    return stem_key(view.image_path.name)
+
+
 def sparse_points(path: Path, document: dict, views: tuple[View, ...]) -> Sparse:
     """The points of the COLMAP model that the capture was made from, where it lies beside and is of the same
     photos, or else those that `ply_file_path` names; and a note where they were to be there but are not."""
-    written = written_path(document, "ply_file_path")
-    ply, model = bool(written) and is_file(path.parent / written), Sparse()
+    written, sparse = written_path(document, "ply_file_path"), Sparse()
+    ply = find_file(path.parent, written) if written else None
     if "applied_transform" in document and (folder := colmap.model_folder(path.parent)) is not None:
         try:
             points, seen = colmap.read_points(folder)
+        except ResourceError:
+            raise
         except FormatError as error:
-            if not ply:
-                raise
-            model = Sparse(notes=(f"{error}; {path} is read without that model",))
+            sparse = Sparse(notes=(f"{error}; {path} is read without that model",))
         else:
-            model = _agreeing(Sparse(_placed(path, document, points, views), seen), views)
-    if model.seen is None and ply:
-        points = _placed(path, document, read_ply_points(path.parent / written), views)
-        return Sparse(points, None, model.notes)
-    if model.points is None and written:
-        return Sparse(notes=(f"{path}: its sparse points {written} do not exist and are not used",))
-    return model
+            sparse = _agreeing(Sparse(_placed(path, document, points, views), seen), views)
+    if sparse.seen is None and ply:
+        try:
+            points = read_ply_points(ply)
+        except ResourceError:
+            raise
+        except FormatError as error:
+            sparse = replace(sparse, notes=(*sparse.notes, f"{error}; {path} is read without these points"))
+        else:
+            sparse = Sparse(_placed(path, document, points, views), None, sparse.notes)
+    elif sparse.points is None and written:
+        missing = f"{path}: its sparse points {written} do not exist and are not used"
+        sparse = Sparse(notes=(*sparse.notes, missing))
+    return replace(sparse, notes=(*sparse.notes, *thinned_notes(ply or path, sparse.points)))
 
 
 def _placed(path: Path, document: dict, points: Points | None, views: tuple[View, ...]) -> Points | None:
@@ -236,7 +275,7 @@ def _placed(path: Path, document: dict, points: Points | None, views: tuple[View
 
 def _agreeing(sparse: Sparse, views: tuple[View, ...]) -> Sparse:
     """Points without what a model says of photos that do not show them so: it is of others, or posed anew."""
-    found = [(view, sparse.seen.get(view.image_path.stem)) for view in views]
+    found = [(view, sparse.seen.get(_photo_key(view))) for view in views]
     found = [(view, seen) for view, seen in found if seen is not None and len(seen)]
     if sparse.points is None or not found:
         return replace(sparse, seen=None)

@@ -21,6 +21,14 @@ APART = 1e-13
 """Cameras nearer to each other than this share of their distance from the origin stand at one point."""
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 ORTHONORMAL_TOLERANCE = 1e-3
+"""Of the last row of a pose."""
+EXACT, ROUNDED = 1e-4, 2e-2
+"""How far from orthonormal the axes of a pose may be that are taken as they are, as they have from float32 or
+five decimals, and that are taken for the nearest rotation, as they have from two decimals."""
+SCALED = 1e-2
+"""Axes that are so much longer or shorter than 1 were scaled."""
+FARTHEST = 1e13
+"""Cameras stand within this of the world's origin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +65,8 @@ class View:
     says so."""
     pixels: np.ndarray | None = None
     """(height, width, 4) uint8, straight alpha, of a view that was made in memory."""
+    repair: str = ""
+    """What was mended of its pose, as the end of a sentence; empty where nothing was."""
 
     def stretched(self, width: int, height: int) -> "View":
         """The same camera behind a picture resampled to `width` x `height`, each axis by its own factor."""
@@ -161,8 +171,10 @@ def check_parallax(capture: Capture) -> None:
         )
 
 
-def checked_pose(matrix: object, where: str) -> np.ndarray:
-    """A rigid (4,4) float64 pose from 16 or 12 numbers in rows of four; BadPose led by `where` otherwise."""
+def checked_pose(matrix: object, where: str) -> tuple[np.ndarray, str]:
+    """A rigid (4,4) float64 pose from 16 or 12 numbers in rows of four, and what was mended of it (`repair`
+    of a View). Scaled axes are brought to length 1, and axes that are not quite square, as rounding leaves
+    them, to the nearest rotation. Raises BadPose led by `where`."""
     try:
         pose = np.array(matrix, dtype=np.float64).reshape(-1, 4)
     except (TypeError, ValueError, OverflowError):
@@ -176,18 +188,38 @@ def checked_pose(matrix: object, where: str) -> np.ndarray:
             f"{where}: the camera pose holds NaN or infinity; drop this frame or export the poses again"
         )
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > ORTHONORMAL_TOLERANCE:
-        raise BadPose(f"{where}: the camera pose ends in the row {pose[3].tolist()}, expected [0, 0, 0, 1]")
-    _check_rotation(pose[:3, :3], where)
-    return pose
-
-
-def _check_rotation(rotation: np.ndarray, where: str) -> None:
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > ORTHONORMAL_TOLERANCE:
-        lengths = ", ".join(f"{length:.4g}" for length in np.linalg.norm(rotation, axis=0))
+        turned = np.abs(pose[:, 3] - [0, 0, 0, 1]).max() <= ORTHONORMAL_TOLERANCE
+        cure = "; it is transposed: write its columns as rows" if turned else ""
         raise BadPose(
-            f"{where}: the camera pose is no rotation (column lengths {lengths}, {error:.2g} from "
-            "orthonormal); apply the camera's scale before exporting"
+            f"{where}: the camera pose ends in the row {pose[3].tolist()}, expected [0, 0, 0, 1]{cure}"
         )
-    if np.linalg.det(rotation) < 0:
+    if np.abs(pose[:3, 3]).max() >= FARTHEST:
+        raise BadPose(
+            f"{where}: the camera stands {np.abs(pose[:3, 3]).max():.3g} from the world's origin, expected "
+            f"less than {FARTHEST:g}; export the poses in another unit, or around another origin"
+        )
+    pose[:3, :3], repair = _rotation(pose[:3, :3], where)
+    return pose, repair
+
+
+def _rotation(axes: np.ndarray, where: str) -> tuple[np.ndarray, str]:
+    """The rotation (3, 3) that a pose's axes are, and what was mended of them."""
+    lengths = np.linalg.norm(axes, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        unit = axes / lengths
+        error = float(np.abs(unit.T @ unit - np.eye(3)).max())
+    if not error <= ROUNDED:  # also NaN, of an axis without length
+        said = ", ".join(f"{length:.4g}" for length in lengths)
+        raise BadPose(
+            f"{where}: the camera pose is no rotation (column lengths {said}, {error:.2g} from orthonormal); "
+            "drop this frame or export the poses again"
+        )
+    if np.linalg.det(unit) < 0:
         raise BadPose(f"{where}: the camera pose is mirrored (determinant -1); check the exporter's axes")
+    stretch = float(np.abs(lengths - 1).max())
+    if max(error, stretch) <= EXACT:
+        return axes, ""
+    u, _, v = np.linalg.svd(unit)
+    if stretch > SCALED:
+        return u @ v, "have scaled axes, which were brought to length 1"
+    return u @ v, "are rounded, and the nearest rotations were taken"

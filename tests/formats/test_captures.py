@@ -62,6 +62,15 @@ def frame(file: str, **keys) -> dict:
     return {"file_path": file, "transform_matrix": POSE, **keys}
 
 
+def posed(folder: Path, poses, file: str = "a.png", **keys) -> list[dict]:
+    """A frame for each pose, with a photo of its own that is a link to one."""
+    names = [f"{i:02d}{Path(file).suffix}" for i in range(len(poses))]
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+        os.link(folder / file, folder / name)
+    return [frame(name, transform_matrix=pose, **keys) for name, pose in zip(names, poses, strict=True)]
+
+
 def folder_with(folder: Path, **keys) -> Path:
     photo(folder / "a.png")
     write(folder, **{"fl_x": 80, **keys})
@@ -273,15 +282,14 @@ def test_aabb_from_cameras(tmp_path):
     target, random = np.array([3.0, -2, 1]), np.random.default_rng(0)
     eyes = random.normal(size=(5, 3))
     eyes = target + eyes / np.linalg.norm(eyes, axis=1)[:, None] * [[1], [2], [4], [8], [16]]
-    frames = [{"file_path": "a.png", "transform_matrix": looking_at(eye, target)} for eye in eyes]
-    write(tmp_path, frames=frames, fl_x=80)
+    write(tmp_path, frames=posed(tmp_path, [looking_at(eye, target) for eye in eyes]), fl_x=80)
     assert read_capture(tmp_path).aabb == pytest.approx([*(target - 4), *(target + 4)])
 
 
 def test_aabb_of_parallel_cameras_is_finite(tmp_path):
     photo(tmp_path / "a.png")
     moved = np.array(POSE) + np.array([[0, 0, 0, 2]] + [[0] * 4] * 3)
-    write(tmp_path, frames=[frame("a.png"), frame("a.png", transform_matrix=moved.tolist())], fl_x=80)
+    write(tmp_path, frames=posed(tmp_path, [POSE, moved.tolist()]), fl_x=80)
     assert read_capture(tmp_path).aabb == pytest.approx([4, 0, 1, 6, 2, 3])
 
 
@@ -296,7 +304,10 @@ def pose(change) -> list:
 
 BAD_POSES = {
     "NaN": (pose(lambda m: m.__setitem__((0, 3), np.nan)), "NaN"),
-    "scaled": (pose(lambda m: m.__imul__(np.array([[2], [2], [2], [1]]))), "column lengths 2, 2, 2"),
+    "sheared": (pose(lambda m: m.__setitem__((0, 1), 0.1)), "no rotation"),
+    "without an axis": (pose(lambda m: m[:, 0].__imul__(0)), "column lengths 0, 1, 1"),
+    "transposed": (np.transpose(POSE).tolist(), "transposed: write its columns as rows"),
+    "far away": (pose(lambda m: m.__setitem__((0, 3), 1e300)), "1e.300 from the world's origin"),
     "mirrored": (pose(lambda m: m[:, 0].__imul__(-1)), "mirrored"),
     "projective": (pose(lambda m: m.__setitem__((3, 0), 1.0)), "ends in the row"),
     "short": ([[1, 0, 0]], "numbers"),
@@ -308,8 +319,9 @@ BAD_POSES = {
 
 @pytest.mark.parametrize("matrix, said", BAD_POSES.values(), ids=BAD_POSES)
 def test_bad_pose(tmp_path, matrix, said):
-    photo(tmp_path / "a.png")
-    path = write(tmp_path, frames=[frame("a.png"), frame("a.png", transform_matrix=matrix)], fl_x=80)
+    for name in "ab":
+        photo(tmp_path / f"{name}.png")
+    path = write(tmp_path, frames=[frame("b.png"), frame("a.png", transform_matrix=matrix)], fl_x=80)
     with pytest.raises(BadPose, match=said) as caught:
         read_capture(tmp_path)
     assert f"{path}: frame 1 (a.png)" in str(caught.value)
@@ -407,7 +419,7 @@ def test_no_views(tmp_path, frames):
         ("{}", BadSchema),
         ('{"frames": [1]}', BadSchema),
     ]
-    + [("\x80", BadJson), ('{"frames": [], "train_filenames": 3}', BadSchema)],
+    + [("\x80", BadJson), ('{"frames": [{}], "train_filenames": 3}', BadSchema)],
 )
 def test_bad_json(tmp_path, text, error):
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))

@@ -67,7 +67,7 @@ def test_no_photos(tmp_path):
     with pytest.raises(MissingFile, match="holds no photos"):
         photos_to_pose(tmp_path)
     (tmp_path / "IMG_1.HEIC").write_bytes(b"")
-    with pytest.raises(NoViews, match=r"IMG_1\.HEIC.*convert them to JPEG"):
+    with pytest.raises(BadImage, match=r"IMG_1\.HEIC"):
         photos_to_pose(tmp_path)
 
 

@@ -20,7 +20,6 @@ from formats.errors import (
     BadPose,
     BadSchema,
     FormatError,
-    LimitExceeded,
     MissingFile,
     MixedSizes,
     NoPoses,
@@ -29,7 +28,7 @@ from formats.errors import (
 )
 from formats.points import read_ply_points
 from formats.views import check_parallax
-from tests.formats.test_captures import PIXEL, POINT, POSE, SIZE, frame, photo, project, real, write
+from tests.formats.test_captures import PIXEL, POINT, POSE, SIZE, frame, photo, posed, project, real, write
 
 # The same camera as COLMAP says it: x right is world +y, y down is world -z, z forward is world -x.
 TO_CAMERA = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], float)
@@ -198,17 +197,15 @@ def test_colmap_photos_of_another_size_and_ending(tmp_path):
 
 
 def test_colmap_without_the_full_size_photos(tmp_path):
-    """Copies alone, with names of their own, as LLFF's scenes come: they are matched by their order."""
+    """Copies alone, with names of their own, as LLFF's scenes come: which photo is which is not known, unless
+    LLFF's own poses are there, which go by their order."""
     binary_model(tmp_path / "sparse/0", ("IMG_9.JPG", "IMG_10.JPG"))
     photos(tmp_path / "images_2", ("image000.png", "image001.png"), (50, 40))
+    with pytest.raises(MissingFile, match=r"photos such as IMG_9\.JPG.* 2 others, such as images_2/image000"):
+        read_capture(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
     capture = read_capture(tmp_path)
-    # IMG_10 is before IMG_9 by name.
-    assert {view.name: view.image_path.name for view in capture.train} == {
-        "IMG_10": "image000.png",
-        "IMG_9": "image001.png",
-    }
-    assert project(capture.train[0], POINT) == pytest.approx((35, 10))
-    assert "order" in capture.notes[0]
+    assert capture.kind == "llff" and "by the order of their names" in capture.notes[0]
 
 
 def test_colmap_photos_that_are_missing(tmp_path):
@@ -245,6 +242,10 @@ def test_every_cut_of_a_colmap_file_is_refused(tmp_path):
         data = path.read_bytes()
         for kept in range(len(data)):
             path.write_bytes(data[:kept])
+            if name == "points3D":  # which are not needed
+                model = colmap.read_model(folder)
+                assert model.points is None and "points3D.bin" in model.notes[0]
+                continue
             with pytest.raises(FormatError, match=rf"{name}\.bin"):
                 colmap.read_model(folder)
         path.write_bytes(data)
@@ -271,8 +272,12 @@ def test_counts_are_held_against_the_file(tmp_path):
         path = tmp_path / f"{name}.bin"
         data = path.read_bytes()
         path.write_bytes(struct.pack("<Q", 2**62) + data[8:])
-        with pytest.raises(BadModel, match=r"4,611,686,018,427,387,904 records do not fit"):
-            colmap.read_model(tmp_path)
+        said = "4,611,686,018,427,387,904 records do not fit"
+        if name == "points3D":
+            assert said in colmap.read_model(tmp_path).notes[0]
+        else:
+            with pytest.raises(BadModel, match=said):
+                colmap.read_model(tmp_path)
         path.write_bytes(data)
 
 
@@ -292,7 +297,6 @@ BAD_TEXT = {
     "half a line": ("images.txt", "1 1 0 0 0 0 0 0", BadModel, "line 1"),
     "observations of words": ("images.txt", "1 1 0 0 0 0 0 0 5 a.png\n1 1 x", BadModel, "line 2"),
     "no images": ("images.txt", "# none", BadModel, "images file is empty"),
-    "a short point": ("points3D.txt", "1 0 0 0", BadModel, "line 1"),
 }
 
 
@@ -437,7 +441,7 @@ def test_polycam_without_corrections(tmp_path):
     "keys, error",
     [
         ({"t_00": None}, BadPose),
-        ({"t_00": 7}, BadPose),
+        ({"t_01": 7}, BadPose),
         ({"fx": "1"}, BadIntrinsics),
         ({"fx": 0}, BadIntrinsics),
         ({"cx": float("nan")}, BadIntrinsics),
@@ -563,7 +567,7 @@ BAD_CLOUDS = {
     "faces first": (b"ply\nformat ascii 1.0\nelement face 2\nend_header\n", BadModel),
     "list": (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", BadModel),
     "negative": (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", BadModel),
-    "huge": (b"ply\nformat ascii 1.0\nelement vertex 999999999\nend_header\n", LimitExceeded),
+    "huge": (b"ply\nformat ascii 1.0\nelement vertex 999999999\nend_header\n", BadModel),
 }
 
 
@@ -715,7 +719,7 @@ def ring(count: int, radius: float, centre, inward: bool = True) -> list:
 def test_a_box_for_what_is_all_around(tmp_path):
     noisy(tmp_path / "a.png")
     centre = np.array([3.0, -2, 1])
-    frames = [frame("a.png", transform_matrix=pose) for pose in ring(9, 4, centre)]
+    frames = posed(tmp_path, ring(9, 4, centre))
     write(tmp_path, frames=frames, fl_x=80, aabb_scale=4)
     capture = read_capture(tmp_path)
     assert capture.frame.layout == "inward" and capture.frame.distance == pytest.approx(4)
@@ -725,7 +729,7 @@ def test_a_box_for_what_is_all_around(tmp_path):
 
 def test_a_box_as_large_as_the_points_say(tmp_path):
     noisy(tmp_path / "a.png")
-    frames = [frame("a.png", transform_matrix=pose) for pose in ring(9, 4, np.zeros(3))]
+    frames = posed(tmp_path, ring(9, 4, np.zeros(3)))
     directions = np.random.default_rng(0).normal(size=(5000, 3))
     shell = 32 * directions / np.abs(directions).max(1)[:, None]
     for scale, reach in ((1, 1.25 * 32), (0.01, 12), (100, 60)):
@@ -736,7 +740,7 @@ def test_a_box_as_large_as_the_points_say(tmp_path):
 
 def test_plain_pictures_keep_a_tight_box(tmp_path):
     photo(tmp_path / "a.png")
-    write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in ring(9, 4, np.zeros(3))], fl_x=80)
+    write(tmp_path, frames=posed(tmp_path, ring(9, 4, np.zeros(3))), fl_x=80)
     capture = read_capture(tmp_path)
     assert capture.frame is None and capture.aabb == pytest.approx([-4] * 3 + [4] * 3)
 
@@ -744,7 +748,7 @@ def test_plain_pictures_keep_a_tight_box(tmp_path):
 def test_a_room_seen_from_its_middle(tmp_path):
     noisy(tmp_path / "a.png")
     poses = ring(9, 2, np.ones(3), inward=False)
-    write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in poses], fl_x=80)
+    write(tmp_path, frames=posed(tmp_path, poses), fl_x=80)
     capture = read_capture(tmp_path)
     assert capture.frame.layout == "outward"
     assert capture.aabb == pytest.approx([-9] * 3 + [11] * 3)
@@ -755,15 +759,15 @@ def test_poses_without_depth(tmp_path):
     noisy(tmp_path / "a.png")
     turning = ring(9, 0, np.full(3, 7.0), inward=False)
     for poses, error, said in (
-        (turning, BadPose, "all 9 photos, a_00000 to a_00008, stand at one point"),
+        (turning, BadPose, "all 9 photos, 00 to 08, stand at one point"),
         (ring(9, 4, np.zeros(3))[:2], NoViews, "has 2 photos to learn from, but"),
     ):
-        write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in poses], fl_x=80)
+        write(tmp_path, frames=posed(tmp_path, poses), fl_x=80)
         capture = read_capture(tmp_path)
         assert (capture.aabb[3:] > capture.aabb[:3]).all()
         with pytest.raises(error, match=said):
             check_parallax(capture)
-    write(tmp_path, frames=[frame("a.png", transform_matrix=p) for p in ring(9, 1e-3, np.ones(3))], fl_x=80)
+    write(tmp_path, frames=posed(tmp_path, ring(9, 1e-3, np.ones(3))), fl_x=80)
     check_parallax(read_capture(tmp_path))
     with pytest.raises(NoViews, match="has 2 photos to learn from beside 7 that only measure"):
         held = read_capture(tmp_path)
@@ -800,7 +804,7 @@ def test_a_box_around_what_masks_cut_out(tmp_path, border):
         tmp_path / "a.png"
     )
     centre = np.array([3.0, -2, 1])
-    frames = [frame("a.png", mask_path="mask.png", transform_matrix=pose) for pose in ring(9, 4, centre)]
+    frames = posed(tmp_path, ring(9, 4, centre), mask_path="mask.png")
     write(tmp_path, frames=frames, fl_x=80)
     capture = read_capture(tmp_path)
     assert capture.aabb == pytest.approx([*(centre - 20), *(centre + 20)])

@@ -1,0 +1,398 @@
+"""Photos matched to the paths that poses give them, by name and never by order.
+
+Poses come from other computers and programs: their paths may be whole ones of those, name folders that are
+not here, or differ in the case of letters, the ending, percent signs or how Unicode writes an umlaut.
+A photo that lies where its path says goes before one that nearly does; the rest are looked for in the folder
+of the capture and below. A path that two photos would suit gets none, nor does a photo serve two paths.
+"""
+
+import os
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
+
+from formats.images import Header
+from formats.photos import (
+    Folder,
+    chosen_copy,
+    copies,
+    is_file,
+    is_hidden,
+    is_picture,
+    natural,
+    split_ending,
+)
+
+PHOTO_FOLDERS = ("images", "input", "rgb", "photos", "frames")
+"""Folders that photos usually lie in, whatever the poses say."""
+OTHER_FOLDERS = {"masks", "mask", "depth", "depths", "normals", "semantics", "__macosx", "@eadir"}
+"""Folders of pictures that are no photos."""
+HOMES = PHOTO_FOLDERS[:2]
+"""Those that may hold the photos in folders of their own."""
+MAX_LISTED = 200_000
+"""At most so many files are looked at for photos that are not where their paths say."""
+MAX_DEPTH = 8
+NAMED = 5
+"""At most so many photos are named."""
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Photos of paths that were asked for."""
+
+    photos: dict[str, tuple[Path, Folder]]
+    """The photo of each path that has one, and the folder that it was taken from."""
+    missing: tuple[str, ...]
+    """Paths without a photo, in the order asked."""
+    notes: tuple[str, ...]
+
+    def reduction(self, file: str, header: Header, downscale: int | None) -> int:
+        """By how much the photo of a path is to be made smaller (`Folder.reduction`)."""
+        return self.photos[file][1].reduction(header, downscale)
+
+
+def match_photos(
+    where: Path | str,
+    base: Path,
+    files: Iterable[str],
+    downscale: int | None,
+    homes: Sequence[str] = ("",),
+) -> Matched:
+    """The photos of `files`: paths with forward slashes, from a folder of `homes` in `base`, the one that
+    holds the most of them. Notes begin with `where`, which states the paths.
+
+    Folders like `images_4` beside the photos' are used where they lack none of them, as `chosen_copy` says.
+    Beyond `base` and what lies below it only a path that leads there as it is written is followed.
+    """
+    files, listings = list(dict.fromkeys(filter(None, files))), Listings()
+    tries = []
+    for home in homes:
+        paths = {file: str(PurePosixPath(home, file)) for file in files}
+        tries.append((paths, *_as_written(listings, base, paths)))
+        if all(tries[-1][1].values()):
+            break
+    paths, found, ambiguous = max(tries, key=lambda item: sum(map(bool, item[1].values())))
+    moved = {}
+    if lost := [file for file in files if not found[file] and file not in ambiguous]:
+        taken = {photo for several in found.values() for photo in several.values()}
+        moved, unclear = _elsewhere(base, lost, taken)
+        again, more = _as_written(listings, base, moved)
+        found, ambiguous = found | again, ambiguous | unclear | more
+    photos, notes = {}, []
+    for root, group in _groups({file: moved.get(file, paths[file]) for file in files if found[file]}).items():
+        folder, note = _folder(base / root, [found[file] for file in group], downscale)
+        photos |= {file: (found[file][folder.path], folder) for file in group if folder.path in found[file]}
+        notes += [note] if note else []
+    missing = tuple(file for file in files if file not in photos)
+    notes += _how(base, photos, moved, ambiguous)
+    notes += _gone([file for file in missing if file not in ambiguous])
+    return Matched(photos, missing, tuple(f"{where}: {note}" for note in notes))
+
+
+def instead(base: Path) -> str:
+    """What lies in a folder in which no photo was found, as the end of a sentence that says what to do."""
+    held = sorted(("/".join(photo) for photo, _ in _tree(base)), key=natural)
+    there = f"holds {len(held)} others, such as {held[0]}" if held else "holds no photos"
+    return f"{base} {there}; put the photos there under the names that the poses have"
+
+
+def find_file(base: Path, file: str) -> Path | None:
+    """A file that is no photo, by a path from `base`, or where that is another computer's by its end."""
+    parts = PurePosixPath(file).parts
+    tails = (base / file, *(base.joinpath(*parts[i:]) for i in range(1, len(parts))))
+    return next((path for path in tails if is_file(path)), None)
+
+
+def rooted(file: str) -> tuple[str, str]:
+    """A photo's path split after its last folder of HOMES, or else before the file name."""
+    parts = PurePosixPath(file).parts
+    cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i - 1].casefold() in HOMES), len(parts) - 1)
+    return str(PurePosixPath(*parts[:cut])), str(PurePosixPath(*parts[cut:]))
+
+
+def key(name: str) -> str:
+    """A name as it is compared: without percent signs, in one form of Unicode and of letters."""
+    plain = unquote(name) if "%" in name else name
+    return (plain if plain.isascii() else unicodedata.normalize("NFC", plain)).casefold().strip()
+
+
+def stem_key(name: str) -> str:
+    """The same without the ending of a photo."""
+    return key(split_ending(name)[0])
+
+
+class Listings:
+    """The pictures of folders, each of which is listed once."""
+
+    def __init__(self):
+        self._known: dict[Path, dict[str, list[str]]] = {}
+
+    def of(self, folder: Path) -> dict[str, list[str]]:
+        """Names of a folder's pictures by `stem_key`; hidden and empty files are none."""
+        if folder not in self._known:
+            named = defaultdict(list)
+            for entry in _entries(folder):
+                if is_picture(entry.name) and _holds_bytes(entry.path):
+                    named[stem_key(entry.name)].append(entry.name)
+            self._known[folder] = dict(named)
+        return self._known[folder]
+
+    def find(self, folder: Path, name: str) -> list[tuple[int, str]]:
+        """The pictures of a folder that suit a name, with how well, 0 for the name itself; the best alone, or
+        several that are as good. One without an ending is a PNG first, as Blender's are."""
+        beside = self.of(folder)
+        suited = beside.get(stem_key(name)) or beside.get(key(name)) or []
+        if name in suited or not (suited or is_hidden(name)) and _holds_bytes(folder / name):
+            return [(0, name)]
+        bare = not split_ending(name)[1]
+        ranks = [
+            (1 if key(photo) == key(name) or bare and photo == f"{name}.png" else 2, photo)
+            for photo in suited
+        ]
+        best = min(ranks, default=(0, ""))[0]
+        return [item for item in ranks if item[0] == best]
+
+
+def _holds_bytes(path: Path | str) -> bool:
+    """Whether this is a file, and not an empty one; False for names that no file system holds."""
+    try:
+        return os.path.isfile(path) and os.stat(path).st_size > 0
+    except (OSError, ValueError):
+        return False
+
+
+def _entries(folder: Path) -> Iterator[os.DirEntry]:
+    """What lies in a folder, but hidden files; nothing where it is none."""
+    try:
+        with os.scandir(folder) as entries:
+            found = [entry for entry in entries if not is_hidden(entry.name)]
+    except (OSError, ValueError):
+        found = []
+    yield from sorted(found, key=lambda entry: entry.name)
+
+
+# --- where the paths say ------------------------------------------------------------------------------------
+
+
+def _as_written(
+    listings: Listings, base: Path, files: dict[str, str]
+) -> tuple[dict[str, dict[Path, Path]], dict[str, list[Path]]]:
+    """Of paths from `base`, by file: the photo in each folder of copies, by that folder; and files for which
+    photos lie there that suit them equally well."""
+    found, ambiguous = {file: {} for file in files}, {}
+    for root, group in _groups(files).items():
+        home = base / root
+        # Beside the capture itself lie other captures, not copies of it.
+        for place in copies(home) if home != base else [Folder(home)]:
+            suited = {}
+            for file in group:
+                inner = PurePosixPath(rooted(files[file])[1])
+                folder = place.path / inner.parent
+                suited[file] = [(rank, folder / name) for rank, name in listings.find(folder, inner.name)]
+            claims, unclear = _claims(suited)
+            ambiguous |= unclear
+            for file, photo in claims.items():
+                found[file][place.path] = photo
+    return found, {file: photos for file, photos in ambiguous.items() if not found[file]}
+
+
+def _groups(files: dict[str, str]) -> dict[str, list[str]]:
+    """Files by the folder of photos that their paths name."""
+    groups = defaultdict(list)
+    for file, path in files.items():
+        groups[rooted(path)[0]].append(file)
+    return groups
+
+
+def _claims(suited: dict[str, list[tuple]]) -> tuple[dict[str, Path], dict[str, list[Path]]]:
+    """The photo of each file out of those that suit it, (rank, photo), all of one rank; a photo goes to the
+    file of the least rank. And files for which that leaves several, or a photo that others want as much."""
+    least: dict[Path, list] = {}
+    for file, photos in suited.items():
+        for rank, photo in photos:
+            best = least.setdefault(photo, [rank, []])
+            if rank < best[0]:
+                best[:] = rank, []
+            if rank == best[0]:
+                best[1].append(file)
+    claims, unclear = {}, {}
+    for file, photos in suited.items():
+        own = [photo for rank, photo in photos if rank == least[photo][0]]
+        if len(own) == 1 and len(least[own[0]][1]) == 1:
+            claims[file] = own[0]
+        elif own:
+            unclear[file] = own
+    return claims, unclear
+
+
+def _folder(
+    home: Path, found: Sequence[dict[Path, Path]], downscale: int | None
+) -> tuple[Folder, str | None]:
+    """The folder to read photos from, out of `home` and its copies: one that has as many of them as any; and
+    a sentence where it is not `home`, or where a copy lacks some. `found` are the photos by folder."""
+    held = [
+        (place, [photos[place.path] for photos in found if place.path in photos])
+        for place in _places(home, found)
+    ]
+    most = max(len(photos) for _, photos in held)
+    chosen = chosen_copy([(place, photos[0]) for place, photos in held if len(photos) == most], downscale)
+    wanted = chosen_copy([(place, photos[0]) for place, photos in held if photos], downscale)
+    if chosen.factor > 1:
+        return chosen, f"photos are read from {chosen.path.name} instead of {home.name}"
+    if wanted.path != chosen.path:
+        count = next(len(photos) for place, photos in held if place.path == wanted.path)
+        return chosen, (
+            f"{wanted.path.name} has {count} of {most} photos and is not used; they are read from "
+            f"{chosen.path.name}"
+        )
+    return chosen, None
+
+
+def _places(home: Path, found: Sequence[dict[Path, Path]]) -> list[Folder]:
+    """`home` and its copies, those that have any of the photos."""
+    used = {folder for photos in found for folder in photos}
+    return [place for place in (Folder(home), *copies(home)[1:]) if place.path in used]
+
+
+# --- elsewhere ----------------------------------------------------------------------------------------------
+
+
+def _elsewhere(
+    base: Path, files: Sequence[str], taken: set[Path]
+) -> tuple[dict[str, str], dict[str, list[Path]]]:
+    """For files that are not where their paths say, the paths from `base` of photos below it whose names suit
+    them; and those that several suit.
+
+    Folders that the path has and the photo lacks, or the other way round, are passed over, but not both: a
+    photo in `right/` is none of `left/`.
+    """
+    names = defaultdict(list)
+    for photo, folders in _tree(base):
+        if base.joinpath(*photo) not in taken:
+            names[stem_key(photo[-1])].append((photo, folders))
+    suited = {}
+    for file in files:
+        *stated, name = PurePosixPath(file).parts
+        near = names.get(stem_key(name)) or names.get(key(name)) or []
+        ranks = [
+            ((*rank, key(photo[-1]) != key(name)), "/".join((*folders, photo[-1])))
+            for photo, folders in near
+            if (rank := _kinship([key(part) for part in stated], [key(part) for part in folders]))
+        ]
+        best = min(ranks, default=(0, ""))[0]
+        # A photo and its smaller copies are one.
+        suited[file] = [
+            (rank, path)
+            for rank, path in dict((split_ending(p)[0], (r, p)) for r, p in ranks if r == best).values()
+        ]
+    claims, unclear = _claims(suited)
+    return claims, {file: [Path(path) for path in paths] for file, paths in unclear.items()}
+
+
+def _kinship(stated: list[str], folders: list[str]) -> tuple[int, int] | None:
+    """How far the folders of a path are from those that a photo lies in; None where they contradict."""
+    stated, folders = _below(stated), _below(folders)
+    shared = 0
+    while shared < min(len(stated), len(folders)) and stated[-1 - shared] == folders[-1 - shared]:
+        shared += 1
+    if shared == len(folders):
+        return 0, -shared
+    return (1, -shared) if shared == len(stated) else None
+
+
+def _below(folders: list[str]) -> list[str]:
+    """Folders below the one that photos usually lie in."""
+    return folders[1:] if folders and folders[0] in PHOTO_FOLDERS else folders
+
+
+def _tree(base: Path) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """The parts of the path of each picture below `base`, and the folders that it or its full-size original
+    lies in; what is nearer comes first. Links are followed, but into no folder twice."""
+    waiting, entered, count = [((), ())], {os.path.realpath(base)}, 0
+    for path, folders in waiting:
+        inner = [entry for entry in _entries(base.joinpath(*path))]
+        named = {entry.name for entry in inner}
+        for entry in inner:
+            count += 1
+            if count > MAX_LISTED:
+                return
+            if is_picture(entry.name):
+                if _holds_bytes(entry.path):
+                    yield (*path, entry.name), folders
+            elif len(path) < MAX_DEPTH and key(entry.name) not in OTHER_FOLDERS and _is_folder(entry):
+                real = os.path.realpath(entry.path)
+                if real not in entered:
+                    entered.add(real)
+                    waiting.append(((*path, entry.name), (*folders, _original(entry.name, named))))
+
+
+def _is_folder(entry: os.DirEntry) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a link that leads in a circle
+        return False
+
+
+def _original(name: str, beside: set[str]) -> str:
+    """`images` of `images_4`: the folder whose smaller copies a folder holds, or itself."""
+    plain, _, factor = name.rpartition("_")
+    return plain if factor.isdecimal() and (plain in beside or plain == "images") else name
+
+
+# --- what is said -------------------------------------------------------------------------------------------
+
+
+def _how(
+    base: Path,
+    photos: dict[str, tuple[Path, Folder]],
+    moved: dict[str, str],
+    ambiguous: dict[str, list[Path]],
+) -> Iterator[str]:
+    """Sentences about photos that are not quite where their paths say."""
+    other = [file for file in photos if file in moved]
+    if other:
+        yield (
+            f"{_count(other, 'photo is', 'photos are')} not where the file says and taken by name from "
+            f"elsewhere, such as {_local(base, photos[other[0]][0])} for {other[0]}"
+        )
+    renamed = [file for file, (photo, _) in photos.items() if file not in moved and _differs(file, photo)]
+    if renamed:
+        yield (
+            f"{_count(renamed, 'photo has', 'photos have')} another ending or other letters than the file "
+            f"says, such as {photos[renamed[0]][0].name} for {PurePosixPath(renamed[0]).name}"
+        )
+    unclear = [file for file in ambiguous if file not in photos]
+    if unclear:
+        both = " and ".join(_local(base, photo) for photo in ambiguous[unclear[0]][:2])
+        more = "more than one photo suits" if len(ambiguous[unclear[0]]) > 1 else "more than one path suits"
+        yield (
+            f"{_count(unclear, 'photo is', 'photos are')} left out, since {more}: {both} for {unclear[0]}; "
+            "give each photo the name that the file says"
+        )
+
+
+def _gone(missing: Sequence[str]) -> list[str]:
+    if not missing:
+        return []
+    more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+    said = (
+        "photo is not there or empty and is" if len(missing) == 1 else "photos are not there or empty and are"
+    )
+    return [f"{len(missing)} {said} left out: {', '.join(missing[:NAMED])}{more}"]
+
+
+def _differs(file: str, photo: Path) -> bool:
+    """Whether a photo has another name than a path says, other than an ending where that has none."""
+    name = PurePosixPath(file).name
+    return photo.name != name and not (photo.name.startswith(f"{name}.") and not split_ending(name)[1])
+
+
+def _local(base: Path, photo: Path) -> str:
+    return str(photo.relative_to(base) if photo.is_relative_to(base) else photo)
+
+
+def _count(items: Sequence, one: str, several: str) -> str:
+    return f"{len(items)} {one if len(items) == 1 else several}"
