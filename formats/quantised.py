@@ -7,8 +7,9 @@ each, so that what one run holds leaves the others as they are. With L = 127 in 
     value = scale * code / L        scale a float16 >= 0 of its block, code an integer from -L to L
 
 computed in float32, the product first: it is exact, so that code L gives back the scale itself. A block whose
-scale is 0 is all zero and stores no codes. Encoding what was decoded gives the same scales and codes, because
-every other block has a number of code L or -L, from which its scale follows.
+scale is 0 is all zero and stores no codes. Encoding what was decoded gives the same numbers: a block has a
+number of code L or -L, from which its scale follows, or, where that was left out since, a scale that gives
+all that are left (`_regained`).
 """
 
 import math
@@ -202,15 +203,61 @@ def _floored(peaks: np.ndarray) -> np.ndarray:
 def _best_scales(values: np.ndarray, sides: tuple[np.ndarray, ...], bits: int) -> np.ndarray:
     """float16 scales of the blocks of a slab, of the least squared error among those tried."""
     levels, peaks = LEVELS[bits], _by_block(np.maximum, np.abs(values), sides)
-    tried, errors = [_floored(np.float32(factor) * peaks) for factor in FACTORS[bits]], []
-    if len(tried) == 1:
-        return tried[0]
-    for scales in tried:
-        spread = _spread(scales, sides)
-        off = values - spread * _codes(values, spread, levels) / np.float32(levels)
-        errors.append(_by_block(np.add, np.square(off, dtype=np.float64), sides))
-    first = np.argmin(errors, 0)  # of equal ones the largest scale, so that what was coded stays
-    return np.take_along_axis(np.stack(tried), first[None], 0)[0]
+    tried = np.stack([_floored(np.float32(factor) * peaks) for factor in FACTORS[bits]])
+    scales = tried[0]
+    if len(tried) > 1:
+        off = (values - _decoded(values, one, sides, levels) for one in tried)
+        errors = [_by_block(np.add, np.square(o, dtype=np.float64), sides) for o in off]
+        first = np.argmin(errors, 0)  # of equal ones the largest scale, so that what was coded stays
+        scales = np.take_along_axis(tried, first[None], 0)[0]
+    missed = _by_block(np.logical_or, _decoded(values, scales, sides, levels) != values, sides)
+    return _regained(values, sides, levels, peaks, scales, missed) if missed.any() else scales
+
+
+def _decoded(
+    values: np.ndarray, scales: np.ndarray, sides: tuple[np.ndarray, ...], levels: int
+) -> np.ndarray:
+    """What the codes of values give under their blocks' scales."""
+    spread = _spread(scales, sides)
+    return spread * _codes(values, spread, levels) / np.float32(levels)
+
+
+def _regained(
+    values: np.ndarray,
+    sides: tuple[np.ndarray, ...],
+    levels: int,
+    peaks: np.ndarray,
+    scales: np.ndarray,
+    sought: np.ndarray,
+) -> np.ndarray:
+    """The scales, of the blocks that are sought those under which all numbers are codes exactly, where there
+    are such: they were coded by them before the largest was left out."""
+    at, codes = np.argwhere(sought), np.arange(levels - 1, 0, -1, dtype=np.float32)
+    tried = peaks[sought][:, None] * (np.float32(levels) / codes)
+    near = (tried.view(np.int32) + 4 & 0x1FFF) <= 8  # to a rounding or two float16 numbers
+    which, code = np.nonzero(near)
+    with np.errstate(over="ignore"):
+        tried = tried[which, code].astype(np.float16)
+    which, tried = which[np.isfinite(tried)], tried[np.isfinite(tried)]
+    own = _numbers_of(at[which], values, sides)
+    by = tried.astype(np.float32)[:, None]
+    exact = (by * _codes(own, np.broadcast_to(by, own.shape), levels) / np.float32(levels) == own).all(1)
+    found = scales.copy()
+    found[tuple(at[which[exact]][::-1].T)] = tried[exact][::-1]  # of several the smallest scale
+    return found
+
+
+def _numbers_of(blocks: np.ndarray, values: np.ndarray, sides: tuple[np.ndarray, ...]) -> np.ndarray:
+    """(N, K) the numbers of blocks (N, dimensions) of a slab; smaller ones repeat some of theirs."""
+    index = []
+    for axis, lengths in enumerate(sides):
+        own = blocks[:, axis, None]
+        at = (np.cumsum(lengths) - lengths)[own] + np.minimum(np.arange(lengths.max()), lengths[own] - 1)
+        shape = [1] * (1 + len(sides))
+        shape[0], shape[1 + axis] = at.shape
+        index.append(at.reshape(shape))
+    found = values[tuple(index)]
+    return found.reshape(len(blocks), math.prod(found.shape[1:]))
 
 
 def _codes(values: np.ndarray, spread: np.ndarray, levels: int) -> np.ndarray:

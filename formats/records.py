@@ -32,7 +32,7 @@ from formats.quantised import (
 
 KEY = "fusedrf"
 PLAIN, CODED, VERSION = 1, 2, 3  # of fields without coded arrays, with them, and that need what is in NEEDS
-NEEDS = ("hashed", "runs")  # what a field's metadata may say that a reader must know, to show it as it is
+NEEDS = ("hashed", "held", "runs")  # what a field's metadata may say that a reader must know, to show it as it is
 MAX_HEADER = 1 << 20
 MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30

@@ -25,6 +25,7 @@ PER_VERTEX_FOUND = 7  # bytes of a vertex, or of a cell, while the used ones are
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
+ON_TEXEL = 1e-9  # spacings from one, within which a place is that of the texel
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
 
@@ -346,9 +347,11 @@ def unit_texels(box: np.ndarray, old_box: np.ndarray, axis: int, count: int) -> 
 
 def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> torch.Tensor:
     """Linear interpolation of values along one axis at unit coordinates, corners aligned; 0 outside [0,
-    1]."""
+    1]. On a texel, up to a rounding, it is that texel's own to the bit."""
     n = values.shape[axis]
     position = unit * (n - 1)
+    whole = position.round()
+    position = torch.where((position - whole).abs() < ON_TEXEL, whole, position)
     lower = position.floor().clamp(0, n - 2).long()
     fraction = (position - lower).to(values.dtype)
     inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)

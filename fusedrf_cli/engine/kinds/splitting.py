@@ -15,6 +15,8 @@ FINEST = 320
 """Cells along an axis of the grid of a field from which an object is gone, at most, or as many as it had."""
 CUT = 256
 """Cells along the longest side of an object's grid, at most."""
+TOGETHER = 8
+"""Texels along an axis of a plane that files code by one scale."""
 OWN, OTHER = 1, 2
 """Of what is in a cell of a selection."""
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -151,11 +153,13 @@ def placed(points: np.ndarray, space) -> np.ndarray:
 def on_texels(
     wanted: np.ndarray, box: np.ndarray, resolution: tuple[int, int, int]
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
-    """The smallest box (6,) around another whose faces lie on texels of a field over `box` (6,), and how many
-    of them it has per axis: on it resampling takes over the very numbers."""
+    """The smallest box (6,) around another whose faces lie on texels of a field over `box` (6,), the lower
+    ones on those of TOGETHER, and how many of them it has per axis: on it resampling takes over the very
+    numbers, and what files code together stays so."""
     count = np.asarray(resolution) - 1
     spacing = (box[3:] - box[:3]) / count
     first = np.clip(np.floor((wanted[:3] - box[:3]) / spacing + 1e-6), 0, count - 1).astype(int)
+    first -= first % TOGETHER
     last = np.clip(np.ceil((wanted[3:] - box[:3]) / spacing - 1e-6), first + 1, count).astype(int)
     faces = np.concatenate([box[:3] + first * spacing, box[:3] + last * spacing])
     return faces, tuple(int(n) for n in last - first + 1)

@@ -36,9 +36,10 @@ from fusedrf_cli.engine.fields.computed import (
     Group,
     Reads,
     StoredAs,
+    runs_of,
     unpack_bits,
 )
-from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed
+from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed, Held
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
@@ -71,6 +72,7 @@ BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox aft
 DETAIL_RATE = 0.5  # at 1 smooth things come out grainy: a cup after 100 s SSIM 0.77, with 0.5 0.79
 DETAIL_STEP = 2.0
 """Of the finest spacing of its vertices, at which pictures sample a detail."""
+MAX_NUMBERS = 2 << 30  # of a field that is read: of a detail a file may hold few rows
 DETAIL_FROM = 100  # texels from which a detail learns; before, it would learn what is coarse
 
 
@@ -92,6 +94,8 @@ class VMTensor:
     """That the box lies in (engine/spaces)."""
     hashed: Hashed | None = None
     """What is finer than the texels."""
+    held: tuple[int, int] | None = None
+    """How many of its rows are not 0, where few are, and how many blocks of them (`Held`) have any."""
 
     def sections(self, shape: "VMShape") -> list[tuple[str, tuple[int, ...]]]:
         """Names and shapes of its sections, in the order of bodies.py."""
@@ -299,7 +303,13 @@ class VMField(ComputedField):
         for t in range(len(self.tensors)):
             target = back.sections(t)
             for name, view in self.sections(t).items():
-                target[name].copy_(torch.from_numpy(as_stored(view.detach().cpu().numpy(), name, None)))
+                numbers = view.detach().cpu().numpy()
+                held = Held.of(numbers) if name == "detail" else None
+                if held is None:
+                    target[name].copy_(torch.from_numpy(as_stored(numbers, name, None)))
+                else:
+                    rows = torch.from_numpy(held.rows).to(self.params.device)
+                    target[name][rows] = torch.from_numpy(as_stored(numbers[held.rows], name, held.runs)).to(view)
         return back
 
     # -- reading ---------------------------------------------------------------------------------------------
@@ -483,7 +493,7 @@ class VMField(ComputedField):
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and metadata for a bundle; the tensors' occupancies are stored as packed bits, ownership
-        follows from them."""
+        follows from them. Of a detail that few cells can ask the rows other than 0 are stored."""
         arrays = {
             f"tensor_{t}.{name}": view.detach().cpu().numpy()
             for t in range(len(self.tensors))
@@ -491,8 +501,15 @@ class VMField(ComputedField):
         }
         grids = [t.occupancy.occupied for t in self.tensors]
         arrays |= {f"tensor_{t}.occupancy": np.packbits(grid) for t, grid in enumerate(grids)}
-        needs = {"needs": ["hashed"]} if any(t.hashed for t in self.tensors) else {}
-        metadata = needs | {
+        needs = ["hashed"] if any(t.hashed for t in self.tensors) else []
+        for t in range(len(self.tensors)):
+            detail = f"tensor_{t}.detail"
+            held = Held.of(arrays[detail]) if detail in arrays else None
+            if held is not None:
+                needs = ["hashed", "held", "runs"]
+                arrays |= {detail: arrays[detail][held.rows], runs_of(detail): held.runs}
+                arrays |= {f"{detail}_{name}": bits for name, bits in held.state().items()}
+        metadata = ({"needs": needs} if needs else {}) | {
             "aabb": self.aabb.tolist(),
             "shape": {
                 "density_rank": self.shape.density_rank,
@@ -538,11 +555,19 @@ class VMField(ComputedField):
         blocks = tuple(stored_block(i, b, len(tensors)) for i, b in enumerate(metadata["blocks"]))
         if not 1 <= len(blocks) <= NO_BLOCK:
             raise ValueError(f"there should be 1 to {NO_BLOCK} blocks, found {len(blocks)}")
-        params = pages.zeros(sum(t.size(shape) for t in tensors))
+        numbers = sum(t.size(shape) for t in tensors)
+        if numbers > MAX_NUMBERS:
+            raise ValueError(f"its tensors have {numbers:,} numbers, but at most {MAX_NUMBERS:,} are read")
+        params = pages.zeros(numbers)
         unplaced = cls(shape, tensors, blocks, params, tensors[0].occupancy, NO_OWNERS)
         for t in range(len(tensors)):
             for name, view in unplaced.sections(t).items():
-                view.copy_(torch.from_numpy(np.ascontiguousarray(arrays[f"tensor_{t}.{name}"], np.float32)))
+                numbers = torch.from_numpy(np.ascontiguousarray(arrays[f"tensor_{t}.{name}"], np.float32))
+                held = held_of(t, tensors[t], arrays) if name == "detail" else None
+                if held is None:
+                    view.copy_(numbers)
+                else:
+                    view[torch.from_numpy(held.rows)] = numbers
             check_answers(t, tensors[t], unplaced.sections(t))
         field = cls.assembled(shape, tensors, blocks, params)
         check_samples(field.occupancy.most_samples(sampling_step(field)), "its blocks", MOST_OF_SEVERAL)
@@ -564,12 +589,31 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
     hashed = hashed_of(i, stored["hashed"], aabb) if "hashed" in stored else None
     tensor = VMTensor(resolution, aabb, scale, shift, occupied, space, hashed)
     check_samples(space.most_samples(aabb, tensor.step), f"tensor {i}")
+    held = held_of(i, tensor, arrays) if hashed else None
     for name, expected in tensor.sections(shape):
         found = arrays.get(f"tensor_{i}.{name}")
+        if name == "detail" and held is not None:
+            expected = int(held.rows.sum()), expected[1]
         if found is None or found.shape != expected:
             have = "nothing" if found is None else list(found.shape)
             raise ValueError(f"array 'tensor_{i}.{name}' should have shape {list(expected)}, found {have}")
-    return tensor
+    return tensor if held is None else replace(tensor, held=(int(held.rows.sum()), len(held.masks)))
+
+
+def held_of(i: int, tensor: VMTensor, arrays: dict[str, np.ndarray]) -> Held | None:
+    """Which rows of its detail are stored of the i-th tensor; None: all. Raises ValueError naming what does
+    not fit."""
+    blocks, rows = (arrays.get(f"tensor_{i}.detail_{name}") for name in ("blocks", "rows"))
+    if blocks is None or rows is None:
+        return None
+    try:
+        held = Held.from_state(blocks, rows, tensor.hashed.shape[0])
+    except ValueError as error:
+        raise ValueError(f"tensor {i}: {error}") from None
+    runs = arrays.get(f"tensor_{i}.{runs_of('detail')}")
+    if runs is None or not np.array_equal(runs, held.runs):
+        raise ValueError(f"tensor {i}: the runs of its detail are not those of its blocks")
+    return held
 
 
 def stored_hashed(hashed: Hashed) -> dict:

@@ -1,7 +1,7 @@
 """A vm field as a student: one tensor over a scene's box, from the background's numbers where these can be
 taken over."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +9,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.hashed import TOGETHER, WIDTH
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
@@ -102,6 +103,11 @@ class VMKind(Kind):
             "ranks": [field.shape.density_rank, field.shape.colour_rank],
             "sh_degree": field.shape.sh_degree,
         } | ({"detail_rows": rows} if rows else {})
+
+    def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
+        """All rows of details of which few are stored."""
+        bits = sum(8 * shape[0] for name, shape in shapes.items() if name.endswith(".detail_blocks"))
+        return decoded + bits * TOGETHER * WIDTH * 4
 
     def counts(self, field: VMField) -> dict[str, int]:
         """Its blocks."""
@@ -211,5 +217,10 @@ def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Con
         bits += tensor.occupancy.occupied.size + 8  # each is packed by itself
         for name, section in tensor.sections(shape):
             used = read_texels(tensor, int(name[-1])) if "_plane_" in name else None
+            if name == "detail" and tensor.held:
+                rows, blocks = tensor.held
+                section = rows, section[1]
+                sections.append(Section("detail.runs", (blocks, 2 + WIDTH)))  # and the scales of every run
+                bits += tensor.hashed.shape[0] // TOGETHER + blocks * TOGETHER
             sections.append(Section(name, section, used))
     return Contents(sections, bits, len(tensors), blocks)

@@ -1,14 +1,24 @@
-"""Leaving out of a VM field what its pictures do not need: texels that nothing reads, and ranks of little
-energy.
+"""Leaving out of a VM field what its pictures do not need: texels and rows of detail that nothing reads, and
+ranks of little energy.
 """
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Held
 from fusedrf_cli.engine.kinds.vm.field import MODES, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.reference import hashed_row
 
 REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
+ROUNDED = 1e-3
+"""Of a density before activation, and of the spacing of a detail's vertices: what float32 may make of them."""
+MOST_MET = 8.0  # cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked
+VERTICES_AT_ONCE = 1 << 22  # of a detail's lattice: some 100 MB
 
 
 def read_texels(tensor: VMTensor, mode: int) -> np.ndarray:
@@ -46,6 +56,89 @@ def without_unread(field: VMField) -> VMField:
             for what in ("density", "colour"):
                 sections[f"{what}_plane_{mode}"][unread] = 0
     return trimmed
+
+
+def without_unasked(field: VMField) -> VMField:
+    """The same field with 0 in all rows of its details that no occupied cell asks, and in all unread texels:
+    it answers the same there, and a file has the other rows alone."""
+    if field.params.device.type != "cpu":
+        return without_unasked(field.to("cpu")).to(field.params.device)
+    trimmed, tensors = without_unread(field), list(field.tensors)
+    for t, tensor in enumerate(tensors):
+        if tensor.hashed:
+            detail = trimmed.sections(t)["detail"]
+            detail[torch.from_numpy(~asked_rows(field, t))] = 0
+            held = Held.of(detail.numpy())
+            tensors[t] = replace(tensor, held=held and (int(held.rows.sum()), len(held.masks)))
+    params, occupancy = trimmed.params, field.occupancy
+    return VMField(field.shape, tuple(tensors), field.blocks, params, occupancy, field.owners)
+
+
+def asked_rows(field: VMField, t: int) -> np.ndarray:
+    """(R,) bool: the rows of tensor t's detail that some point of an occupied cell asks, where planes and
+    lines say that there may be matter; all of a level of which so many cells are met that most are."""
+    tensor, asked = field.tensors[t], matter_texels(field, t)
+    sides, occupied = tensor.aabb[3:] - tensor.aabb[:3], tensor.occupancy.occupied.mean()
+    found = np.zeros(tensor.hashed.shape[0], bool)
+    for level, spacing in enumerate(tensor.hashed.spacings):
+        own = found[level * tensor.hashed.rows : (level + 1) * tensor.hashed.rows]
+        if occupied * (sides / spacing).prod() > MOST_MET * tensor.hashed.rows:
+            own[:] = True
+            continue
+        for vertices in met_vertices(tensor, asked, spacing):
+            own[hashed_row(tensor.hashed, torch.from_numpy(vertices)).numpy()] = True
+    return found
+
+
+def matter_texels(field: VMField, t: int) -> np.ndarray:
+    """(nx - 1, ny - 1, nz - 1) bool: the cells between tensor t's texels in which planes and lines may say
+    that there is matter. A product of bilinear and linear is trilinear, so it is largest at a corner."""
+    tensor, sections = field.tensors[t], field.sections(t)
+    planes, lines = (
+        [sections[f"density_{what}_{m}"].double() for m in range(3)] for what in ("plane", "line")
+    )
+    cells = []
+    for i in range(tensor.resolution[0]):  # a layer of texels at a time
+        layer = planes[0][i] @ lines[0].T + lines[1] @ planes[1][i].T + (planes[2] @ lines[2][i])
+        high = (layer + tensor.shift > EMPTY_FROM - ROUNDED).numpy()
+        square = high[:-1, :-1] | high[1:, :-1] | high[:-1, 1:] | high[1:, 1:]
+        cells.append(square)
+    return np.stack([one | other for one, other in zip(cells[:-1], cells[1:], strict=True)])
+
+
+def met_vertices(tensor: VMTensor, asked: np.ndarray, spacing: float) -> Iterator[np.ndarray]:
+    """(N, 3) int64, a part after the other: the vertices of a lattice of that spacing around the points of
+    occupied cells that lie in the asked ones (X, Y, Z) bool of the tensor's box."""
+    first = np.floor(tensor.aabb[:3] / spacing - ROUNDED).astype(np.int64)
+    count = np.floor(tensor.aabb[3:] / spacing + ROUNDED).astype(np.int64) + 1 - first
+    layers = max(1, VERTICES_AT_ONCE // int(count[1:].prod()))
+    for start in range(0, count[0], layers):
+        low, sides = first + [start, 0, 0], np.array([min(layers, count[0] - start), *count[1:]])
+        cells = np.ones(sides, bool)
+        for mask in (asked, tensor.occupancy.occupied):
+            cells &= overlapping(mask, tensor.aabb, low, sides, spacing)
+        met = np.zeros(sides + 1, bool)
+        for corner in product((0, 1), repeat=3):
+            met[tuple(slice(c, c + n) for c, n in zip(corner, sides, strict=True))] |= cells
+        yield np.argwhere(met) + low
+
+
+def overlapping(
+    mask: np.ndarray, box: np.ndarray, low: np.ndarray, sides: np.ndarray, spacing: float
+) -> np.ndarray:
+    """(sides) bool: which cells of a lattice of that spacing, from the one at `low` (3,) on, meet one of the
+    marked cells (X, Y, Z) of a box (6,)."""
+    for axis, cells in enumerate(mask.shape):
+        ends = (low[axis] + np.arange(sides[axis] + 1)) * spacing - box[axis]
+        at, off = ends / (box[axis + 3] - box[axis]) * cells, ROUNDED * spacing
+        off *= cells / (box[axis + 3] - box[axis])
+        begin = np.floor(at[:-1] - off).clip(0, cells - 1).astype(np.int64)
+        last = (np.ceil(at[1:] + off) - 1).clip(0, cells - 1).astype(np.int64)
+        met = mask.take(begin, axis)
+        for step in range(1, int((last - begin).max()) + 1):
+            met |= mask.take(np.minimum(begin + step, last), axis)
+        mask = met
+    return mask
 
 
 def smaller_shape(a: VMShape, b: VMShape) -> VMShape:
