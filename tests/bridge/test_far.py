@@ -1,5 +1,5 @@
-"""What stands far from the world's origin, or is counted in tiny or huge units, is learnt, shown and edited as
-the same at the origin: whole commands, before and after a similarity of the world."""
+"""What stands far from the world's origin, or is counted in tiny or huge units, is learnt, shown and edited
+as the same at the origin: whole commands, before and after a similarity of the world."""
 
 import json
 import shutil
