@@ -46,8 +46,8 @@ SHOWING_VERSION = "1.2"  # of scenes that show a node otherwise than it is
 FRAMED_VERSION = "1.1"  # of scenes with cameras or a framing
 PLAIN_VERSION = "1.0"  # of scenes that have neither
 FAR = "far"
-"""The feature that scenes beyond NEAR_TRANSLATION, NEAR_SINGULAR_VALUES and NEAR_CAMERAS require (1.3): readers
-before it refuse those with a sentence, whatever else they read."""
+"""The feature that scenes beyond NEAR_TRANSLATION, NEAR_SINGULAR_VALUES or NEAR_CAMERAS require (1.3);
+readers of earlier versions refuse what they do not know, with a sentence."""
 MEMBER = r"fields/[0-9a-f]{16}\.safetensors"
 MAX_SCENE_BYTES = 4 << 20
 MAX_NODES = 10_000

@@ -105,8 +105,8 @@ class Scene:
 
         near is the distance at which rays begin. step is the distance of samples, None: as fine as what is
         there; samples behind which less light than early_stop is left are not asked. Both are lengths of the
-        world, or of the frame of a field that fills all of space, where there is one. Where nothing needs a gradient this is
-        many times faster.
+        world, or of the frame of a field that fills all of space, where there is one. Where nothing needs a
+        gradient this is many times faster.
         """
         field, origin, poses = self._asked()
         how = {"poses": poses, "origin": origin, "near": near, "step": step, "early_stop": early_stop}

@@ -60,7 +60,7 @@ def _phrase(key: str, value: object) -> str:
     if isinstance(value, list):
         shown = value if len(value) <= _LONGEST_LIST else value[:_LONGEST_LIST]
         rest = f" and {len(value) - len(shown)} more" if len(shown) < len(value) else ""
-        return " ".join(_phrase(key, part) for part in shown) + rest
+        return " ".join(_coordinate(part) or _phrase(key, part) for part in shown) + rest
     if isinstance(value, bool):
         return "yes" if value else "no"
     if key.split(" ")[0] == "bytes" or key.endswith("_bytes"):
@@ -69,6 +69,12 @@ def _phrase(key: str, value: object) -> str:
         unit = " s" if "seconds" in key else " dB" if "psnr" in key and not key.endswith("views") else ""
         return f"{value + 0.0:.4g}{unit}"  # + 0.0: no "-0"
     return str(value)
+
+
+def _coordinate(value: object) -> str | None:
+    """A number of a list with all its digits where it may be a coordinate of a map grid, of which the first
+    four say little."""
+    return f"{value:.10g}" if isinstance(value, float) and 1e4 <= abs(value) < 1e8 else None
 
 
 def readable_size(count: int) -> str:

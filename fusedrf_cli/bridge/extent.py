@@ -96,15 +96,14 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     extent = in_own_frame(box)
     if capture.object_aabb is None:
         return extent
-    # Rays through pixels of an object alone do not tell what is empty around it: only its visual hull can hold
-    # anything.
+    # Rays through pixels of an object alone do not tell what is empty around it; its visual hull does.
     hull = visual_hull([extent.view(view) for view in capture.train], extent.box)
     return replace(extent, box=hull.aabb, cells=hull)
 
 
 def in_own_frame(box: np.ndarray) -> Extent:
-    """The extent of a box (6,) of the world: in the world's frame, or, where it lies far away for its size or is
-    of no ordinary size, in one of its own, so that its numbers have the digits that they have anywhere."""
+    """The extent of a box (6,) of the world: in the world's frame, or, where it lies far away for its size or
+    is of no ordinary size, in one of its own, so that numbers have the digits that they have anywhere."""
     frame = placement(frame_around(box))
     if np.array_equal(frame[:3, :3], np.eye(3)) and np.abs(box).max() <= FAR_AWAY * (box[3:] - box[:3]).max():
         return Extent(box)

@@ -375,7 +375,8 @@ def check_graph(
     framing: Sequence[float] | None,
     cameras: dict | None,
 ) -> None:
-    """Before a field is learnt: raise whatever `write_field` would of where it lies and what is kept with it."""
+    """Before a field is learnt: raise what `write_field` would because of where it lies and what is kept
+    with it."""
     try:
         dump_scene(graph_of(NO_MEMBER, name, origin, framing, cameras))
     except FormatError as error:

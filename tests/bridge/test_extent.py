@@ -60,7 +60,9 @@ def boxed(box: tuple) -> TrainRequest:
     return replace(request(), unbounded=None, aabb=box)
 
 
-@pytest.mark.parametrize("box", [(-1.5,) * 3 + (1.5,) * 3, (60, 0, 0, 61, 1, 0.5), (0, 0, 0, 0.002, 0.002, 0.002)])
+@pytest.mark.parametrize(
+    "box", [(-1.5,) * 3 + (1.5,) * 3, (60, 0, 0, 61, 1, 0.5), (0, 0, 0, 0.002, 0.002, 0.002)]
+)
 def test_a_box_of_ordinary_size_near_the_origin_is_learnt_in_the_frame_of_the_world(box):
     capture = photos([(4, 0, 0), (0, 4, 0), (0, 0, 4)])
     extent = extent_of(boxed(box), capture, False)
@@ -69,7 +71,8 @@ def test_a_box_of_ordinary_size_near_the_origin_is_learnt_in_the_frame_of_the_wo
 
 
 @pytest.mark.parametrize(
-    ("unit", "at"), [(1.0, (432100, 5411200, 310)), (1e9, (0, 0, 0)), (1e-9, (0, 1, 0)), (1e3, (1e12, 0, -1e12))]
+    ("unit", "at"),
+    [(1.0, (432100, 5411200, 310)), (1e9, (0, 0, 0)), (1e-9, (0, 1, 0)), (1e3, (1e12, 0, -1e12))],
 )
 def test_a_box_far_away_or_of_another_size_has_a_frame_of_its_own(unit, at):
     """With numbers as near the origin; what cameras see there is what they see in the world."""

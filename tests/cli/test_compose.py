@@ -110,7 +110,7 @@ def test_a_scene_may_be_composed_again(run):
         ("chair.rfpack -t 1,0,0 -t 2,0,0", 2, "chair.rfpack: --translate is given twice"),
         ("chair.rfpack --background-node --background-node", 2, "--background-node is given twice"),
         ("chair.rfpack -t 1,0", 2, "'1,0' is not three finite numbers"),
-        ("chair.rfpack -s 1e-9", 3, "chair"),
+        ("chair.rfpack -s 1e-13", 3, "chair"),
         ("chair.rfpack --name a table.rfpack --name a", 3, "'a' appears twice"),
         ("README", 3, "README"),
         ("", 2, "Missing argument"),

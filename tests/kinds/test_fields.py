@@ -121,14 +121,6 @@ def test_as_stored_is_as_it_comes_back(field):
             assert torch.equal(found, wanted)
 
 
-def test_a_moved_field_answers_as_before_where_it_is_now(field):
-    points, dirs = asked(field)
-    origin = np.array([0.25, -0.5, 0.125])
-    there = field.moved(origin).query(points - torch.from_numpy(origin), dirs)
-    for found, wanted in zip(there, field.query(points, dirs), strict=True):
-        assert (found - wanted).abs().quantile(0.98) < 1e-9
-
-
 @pytest.mark.parametrize("fault", ["missing", "shape", "infinite", "metadata"])
 def test_a_hostile_state_is_refused_in_a_sentence(field, fault):
     arrays, metadata = field.state()

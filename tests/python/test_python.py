@@ -95,6 +95,32 @@ def test_a_lone_field_and_one_far_away():
     np.testing.assert_allclose(scene.aabb, near.aabb + np.tile(far, 2), atol=1e-6)
 
 
+@pytest.mark.parametrize(("unit", "at"), [(1e-9, (0, 1e-8, 0)), (1e9, (1e12, 0, 5e11))])
+def test_a_scene_in_any_unit_answers_in_it(folder, unit, at):
+    """Densities per unit of length, distances and `near` and `step` are those of the world."""
+    at, names = np.array(at), ("red", "blue")
+    for file, scale, shift in (("here.json", 1.0, 0 * at), ("there.json", unit, at)):
+        nodes = (
+            make_node(
+                n, source=f"{n}.rfpack", scale=[scale] * 3, translation=scale * np.array(PLACES[n]) + shift
+            )
+            for n in names
+        )
+        write_scene(folder / file, SceneGraph(tuple(nodes)))
+    here, there = open_scene("here.json"), open_scene("there.json")
+    g = torch.Generator().manual_seed(0)
+    points = 2 * torch.rand(50, 3, dtype=torch.float64, generator=g) - 1
+    dirs = torch.nn.functional.normalize(torch.rand(50, 3, dtype=torch.float64, generator=g) - 0.5, dim=1)
+    moved = unit * points + torch.from_numpy(at)
+    for one, other, size in zip(there.query(moved, dirs), here.query(points, dirs), (unit, 1.0), strict=True):
+        torch.testing.assert_close(one * size, other, rtol=1e-2, atol=1e-3)
+    found = there.render_rays(moved, dirs, near=0.3 * unit, step=0.01 * unit)
+    wanted = here.render_rays(points, dirs, near=0.3, step=0.01)
+    torch.testing.assert_close(found[:, :4], wanted[:, :4], rtol=0, atol=2e-3)
+    torch.testing.assert_close(found[:, 4] / unit, wanted[:, 4], rtol=1e-2, atol=2e-3)
+    assert wanted[:, 3].max() > 0.5
+
+
 def test_saved_it_is_read_the_same(folder):
     """Placements that were turned too; nodes that show one field keep sharing it."""
     write(folder, "twins.json", {"grey": PLACES["grey"], "red-1": (-0.5, 0, 0), "red-2": (0.5, 0, 0)})

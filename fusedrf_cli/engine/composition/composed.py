@@ -43,7 +43,9 @@ class ComposedField:
     kind = "composed"
 
     def __init__(self, placed: list[Placed], rule: str = "max", origin: np.ndarray | None = None):
-        """origin: where its frame lies, where that is settled. Raises ValueError when there is nothing to compose or the rule is unknown."""
+        """origin: where its frame lies, where that is settled.
+
+        Raises ValueError when there is nothing to compose or the rule is unknown."""
         if not placed:
             raise ValueError("a composed scene needs at least one field")
         if rule not in RULES:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 
 import numpy as np
@@ -122,14 +122,6 @@ class BoxField(ComputedField):
                 old = interpolate_axis(old, dimension, at[axis])
             target.copy_(old)
         return new
-
-    def moved(self, origin: np.ndarray) -> "BoxField":
-        """The same field in a frame whose origin is at `origin` (3,) of its own."""
-        shift = np.tile(origin, 2)
-        grid = replace(self.occupancy, aabb=self.occupancy.aabb - shift)
-        other = self.with_occupancy(grid)
-        other.box = self.box - shift
-        return other
 
     # -- reading -----------------------------------------------------------------------------------------
 

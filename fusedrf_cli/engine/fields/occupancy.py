@@ -439,7 +439,7 @@ def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarra
 
 
 def seen_change(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(4, 4) that does in a frame, which lies at `origin` (4, 4), what a `matrix` (4, 4) does in the world."""
+    """(4, 4) that does in a frame, which lies at `origin` (4, 4), what another (4, 4) does in the world."""
     linear, inverse = origin[:3, :3], np.linalg.inv(origin[:3, :3])
     change = np.eye(4)
     change[:3, :3] = inverse @ matrix[:3, :3] @ linear

@@ -138,9 +138,11 @@ def test_a_scene_far_away_gives_the_same_picture(shift):
 
 
 @pytest.mark.parametrize("rule", ["max", "add"])
-@pytest.mark.parametrize(("size", "offset"), [(1e-9, (0, 1e-7, 0)), (1e9, (-1e10, 0, 3e12)), (1e4, (5e5, 0, 0))])
+@pytest.mark.parametrize(
+    ("size", "offset"), [(1e-9, (0, 1e-7, 0)), (1e9, (-1e10, 0, 3e12)), (1e4, (5e5, 0, 0))]
+)
 def test_a_scene_in_any_unit_gives_the_same_picture(size, offset, rule):
-    """After a similarity of the world densities are 1/size of what they were, and distances are `size` times."""
+    """After a similarity of the world densities are 1/size of what they were, distances `size` times."""
 
     def picture(size, offset):
         world = affine(size, offset)

@@ -5,8 +5,7 @@ wide; it is empty, a brick of 4 x 4 x 4 voxels, or split into eight nodes. Verti
 voxel sides of the finest level, so that neighbours know each other's vertices whatever their levels.
 """
 
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -239,13 +238,6 @@ class Lattice:
         """(V, 3) int64 in units of the tree, free ones first."""
         self.vertices[rank] = vertices
         self.spread = self._spread(keys, rank, hanging, parents)
-
-    def moved(self, origin: np.ndarray) -> "Lattice":
-        """The same lattice in a frame whose origin is at `origin` (3,) of its own."""
-        other = copy(self)
-        other.tree = replace(self.tree, lo=self.tree.lo - origin)
-        other.__dict__.pop("places", None)  # as they were, if they were asked for
-        return other
 
     @property
     def width(self) -> np.ndarray:

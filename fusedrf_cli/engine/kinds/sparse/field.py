@@ -8,7 +8,6 @@ activation.
 
 import math
 from collections.abc import Callable, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -96,13 +95,6 @@ class SparseField(ComputedField):
         self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
         self.coarse = Lattice(fine.tree, COARSE) if shape.sh_degree else None
         self.params = pages.zeros(self.size) if params is None else params
-
-    def moved(self, origin: np.ndarray) -> "SparseField":
-        """The same field in a frame whose origin is at `origin` (3,) of its own."""
-        other = copy(self)._afresh("arrays", "grid", "occupancy")
-        other.fine = self.fine.moved(origin)
-        other.coarse = self.coarse.moved(origin) if self.coarse else None
-        return other
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":
         """The same numbers without the voxels that lie in empty cells alone; itself where that would leave

@@ -287,16 +287,6 @@ class VMField(ComputedField):
             target[name].copy_(old[name])
         return new
 
-    def moved(self, origin: np.ndarray) -> "VMField":
-        """The same field in a frame whose origin is at `origin` (3,) of its own."""
-        shift = np.eye(4)
-        shift[:3, 3] = -np.asarray(origin)
-        blocks = tuple(replace(b, object_to_field=shift @ b.object_to_field) for b in self.blocks)
-        if self.space is not bounded:
-            return VMField.assembled(self.shape, self.tensors, blocks, self.params)
-        grid = replace(self.occupancy, aabb=self.occupancy.aabb - np.tile(origin, 2))
-        return VMField(self.shape, self.tensors, blocks, self.params, grid, self.owners)
-
     def stored(self, as_stored: StoredAs) -> "VMField":
         """See ComputedField; which block is asked where stays as it is, and need not be found again."""
         back = self.with_params(pages.zeros(len(self.params), self.params.dtype, self.params.device))

@@ -84,10 +84,6 @@ class VMMLPField(ComputedField):
         """The field on another box and resolution, with the same network."""
         return VMMLPField(self.factors.resampled(aabb, resolution), self.weights)
 
-    def moved(self, origin: np.ndarray) -> "VMMLPField":
-        """The same field in a frame whose origin is at `origin` (3,) of its own."""
-        return VMMLPField(self.factors.moved(origin), self.weights)
-
     # -- reading ---------------------------------------------------------------------------------------------
 
     @property
