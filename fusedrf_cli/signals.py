@@ -13,7 +13,7 @@ from formats.atomic import remove_unfinished
 from formats.errors import printable
 from fusedrf_cli.errors import Interrupted
 
-PATIENCE = 3.0
+PATIENCE = 2.5
 """Seconds that a process may take to end by itself."""
 ECHO = 0.3
 """Seconds in which a second signal is the same one: `timeout` sends to a process and then to its group."""

@@ -5,9 +5,9 @@ import time
 
 import pytest
 
-# `train` with a bridge that is caught in a call that no signal reaches, as a compiled loop is.
+# `train` with a bridge whose main thread does not heed a signal, as a compiled loop does not.
 CAUGHT = """
-import ctypes, signal, sys, types
+import signal, sys, time, types
 from formats.atomic import atomic_writer
 from fusedrf_cli import signals
 signals.PATIENCE, signals.ECHO = {patience}, {echo}
@@ -16,9 +16,11 @@ def train(request, progress):
         file.write(b"half")
         {doing}
 def caught(seconds):
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])  # another thread gets it
+    signal.signal(signal.SIGTERM, lambda *_: None)  # as if this thread did not come to it
     print("ready", flush=True)
-    ctypes.CDLL(None).usleep(int(seconds * 1e6))
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(0.01)
 import fusedrf_cli
 fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
 from fusedrf_cli.main import main
@@ -64,8 +66,8 @@ def test_a_second_signal_does_not_wait(caught):
 
 
 def test_saving_is_waited_for(caught, folder):
-    saving = "exec('with signals.unhurried():\\n try: caught(1.5)\\n finally: open(\"saved\", \"w\")')"
-    running = caught(saving, patience=0.1)
+    saving = 'exec(\'with signals.unhurried():\\n try: caught(1.5)\\n finally: open("saved", "w")\')'
+    running = caught(f"{saving}; caught(600)", patience=0.1)
     running.communicate(timeout=30)
     assert running.returncode == 143 and (folder / "saved").exists()
 
