@@ -48,10 +48,12 @@ def output_lock(path: Path | str, waiting: Callable[[str], None] | None = None) 
         warnings.warn(text, FormatWarning, 3)
         yield
         return
+    unfinished.add(beside)
     try:
         remove_leftovers(target)
         yield
     finally:
+        unfinished.discard(beside)
         # Before the release: a process waiting for the lock sees that the file is gone, and makes a new one.
         with contextlib.suppress(OSError):
             beside.unlink()

@@ -7,13 +7,13 @@ import select
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from formats.atomic import remove_unfinished
 from formats.errors import printable
 from fusedrf_cli.errors import Interrupted
 
-PATIENCE = 4.0
+PATIENCE = 2.5
 """Seconds that a process may take to end by itself."""
 ECHO = 0.3
 """Seconds in which a second signal is the same one: `timeout` sends to a process and then to its group."""
@@ -25,6 +25,9 @@ _saving = 0
 """How many are in `unhurried` now."""
 _said = False
 """Whether the sentence about the interrupt is out."""
+last: Callable[[], object] | None = None
+"""What saves the work where the main thread cannot. It is called from another thread, while compiled code may
+run, and so must not run any."""
 _calm = 0.0
 """When the last saving ended."""
 remains: str | None = None
@@ -113,6 +116,8 @@ def _end(number: int) -> None:
     """End the process as it is, without the temporary files that it was writing."""
     with contextlib.suppress(Exception):
         remove_unfinished()
+        if last is not None:
+            last()
     if not _said:
         with contextlib.suppress(OSError):
             os.write(2, f"Error: {printable(remains or 'interrupted')}\n".encode())

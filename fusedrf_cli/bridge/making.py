@@ -241,14 +241,17 @@ class Maker:
                 raise checkpoint_mismatch(request.output)
             take_up(run, saved, request.output)
 
-        def checkpoint() -> tuple[dict, dict]:
+        def checkpoint() -> Saved:
             arrays, state = run.checkpoint()
             return arrays, state | made_with
+
+        def held() -> Saved | None:
+            return run.held and (run.held[0], run.held[1] | made_with)
 
         def learnt() -> bool:
             return run.learnt_seconds > WORTH_SAVING
 
-        with resumable(request.output, checkpoint, self.progress, learnt) as uninterrupted:
+        with resumable(request.output, checkpoint, held, self.progress, learnt) as uninterrupted:
             student, did = run.finish(*self.telling(), uninterrupted)
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)

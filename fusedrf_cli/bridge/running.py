@@ -125,12 +125,23 @@ class Uninterrupted:
 
 @contextlib.contextmanager
 def resumable(
-    output: str, checkpoint, progress, learnt: Callable[[], bool] = bool
+    output: str,
+    checkpoint: Callable[[], Saved],
+    held: Callable[[], Saved | None],
+    progress,
+    learnt: Callable[[], bool] = bool,
 ) -> Iterator[Uninterrupted]:
     """Run steps inside the `Uninterrupted` that this gives; an interrupt leaves `checkpoint()` beside the
-    output and goes on its way, saying so, and every few minutes one is left there unasked. So is one at the
-    end, where `learnt()`: what comes then may be interrupted, too."""
+    output, or `held()` where a step takes too long to be waited for, and goes on its way, saying so, and
+    every few minutes one is left there unasked. So is one at the end, where `learnt()`: what comes then may
+    be interrupted, too."""
     steps = Uninterrupted(lambda: save_checkpoint(output, *checkpoint()), progress.warn)
+
+    def last() -> None:
+        if (saved := held()) is not None:
+            signals.remains = saved_somewhere(output, *saved)
+
+    signals.last = last
     try:
         yield steps
         if learnt():
@@ -139,6 +150,8 @@ def resumable(
         if not steps.torn:
             interrupt.sentence = saved_somewhere(output, *checkpoint())
         raise
+    finally:
+        signals.last = None
 
 
 @contextlib.contextmanager

@@ -332,7 +332,7 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     """Train to the end; an interrupt leaves a checkpoint and goes on its way."""
     progress.phase("training", 1.0)
     started = time.monotonic()
-    with resumable(output, run.checkpoint, progress) as uninterrupted:
+    with resumable(output, run.checkpoint, lambda: run.held, progress) as uninterrupted:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
     run.forget()
     warn_of_numbers(run.guard.figures(), progress)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from formats import past
-from formats.bundle import single_field_bundle
-from formats.errors import BadSchema, FormatError, MissingFile
-from formats.past import history, keep, past_of, undo
+from formats.bundle import sha256_of, single_field_bundle
+from formats.errors import BadSchema, FormatError, MissingFile, ResourceError
+from formats.past import check_past, history, keep, past_of, undo
 from formats.records import FieldRecord
 
 
@@ -110,6 +110,85 @@ def test_odd_histories_are_listed(tmp_path, entry):
     path = tmp_path / "one.rfpack"
     write(path, 0, entry)
     assert history(path)["history"][0]["objects"] == []
+
+
+def test_what_others_put_there_stays_and_what_was_just_kept_too(tmp_path, monkeypatch):
+    """Files beside it that are newer, a user's own bundle, and one that only looks like ours."""
+    monkeypatch.setattr(past, "KEPT", 2)
+    path, folder = tmp_path / "one.rfpack", tmp_path / "one.rfpack.history"
+    folder.mkdir()
+    for i in range(4):
+        write(folder / f"mine{i}.rfpack", 100 + i)
+    write(folder / f"{'a' * 64}.rfpack", 200)
+    (folder / "notes.txt").write_text("mine")
+    mine = {place: place.read_bytes() for place in folder.iterdir()}
+    for place in mine:
+        os.utime(place, (2**31, 2**31))
+    write(path, 0)
+    os.utime(path, (0, 0))
+    entries = ()
+    for value in range(1, 6):
+        _, entries = edited(path, value, *entries)
+        os.utime(path, (0, 0))
+        assert history(path)["undoable"] == min(value, 2)
+    assert all(place.read_bytes() == data for place, data in mine.items())
+    assert len(list(folder.iterdir())) == len(mine) + 2
+
+
+def test_what_another_bundle_left_goes_first(tmp_path, monkeypatch):
+    """Of an output that was replaced by something else: its own edits stay, however old their files."""
+    monkeypatch.setattr(past, "KEPT", 2)
+    path = tmp_path / "one.rfpack"
+    write(path, 50)
+    edited(path, 51)
+    entries = ()
+    write(path, 0)
+    for value in (1, 2):
+        os.utime(path, (0, 0))
+        _, entries = edited(path, value, *entries)
+    assert history(path)["undoable"] == 2 and len(list(past_of(path).iterdir())) == 2
+
+
+@pytest.mark.parametrize("linked", [True, False])
+def test_what_is_kept_is_on_the_disk(tmp_path, monkeypatch, linked):
+    """P3: the file before its name in the folder, and the folder's own name."""
+    flushed = []
+    real = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (flushed.append(os.fstat(fd).st_ino), real(fd)))
+    if not linked:
+        monkeypatch.setattr(past.os, "link", lambda *_: (_ for _ in ()).throw(OSError()))
+    path = tmp_path / "one.rfpack"
+    write(path, 0)
+    flushed.clear()
+    keep(path, path)
+    (kept,) = past_of(path).iterdir()
+    where = [place.stat().st_ino for place in (kept, past_of(path), tmp_path)]
+    assert set(where) <= set(flushed) and flushed[-1] == where[1]
+
+
+@pytest.mark.parametrize("harm", ["a file", "a dangling link", "no permission"])
+def test_a_folder_that_cannot_keep_is_found_before(tmp_path, monkeypatch, harm):
+    """P6."""
+    path = tmp_path / "one.rfpack"
+    write(path, 0)
+    if harm == "a file":
+        past_of(path).touch()
+    elif harm == "a dangling link":
+        past_of(path).symlink_to("nowhere")
+    else:
+        past_of(path).mkdir()
+        monkeypatch.setattr(os, "access", lambda place, _: place != past_of(path))
+    with pytest.raises(ResourceError, match="keep-history"):
+        check_past(path, path)
+
+
+def test_a_file_in_the_place_of_what_is_to_be_kept_is_told(tmp_path):
+    path = tmp_path / "one.rfpack"
+    write(path, 0)
+    past_of(path).mkdir()
+    (past_of(path) / f"{sha256_of(path)}.rfpack").write_text("mine")
+    with pytest.raises(ResourceError, match="something else than its name says"):
+        keep(path, path)
 
 
 def test_a_scene_has_none(tmp_path):

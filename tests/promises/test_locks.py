@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from formats.bundle import read_bundle
 from formats.errors import FormatWarning, ResourceError
-from formats.locks import ENDING, output_lock
+from formats.locks import ENDING, output_lock, temporary_folder
 from tests.promises.packs import generation_of, write_generation
 
 ROOT = Path(__file__).parents[2]
@@ -235,3 +236,38 @@ def test_a_pack_that_was_edited_says_so_in_one_generation(tmp_path):
         [sys.executable, "-c", code, path], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert json.loads(run.stdout)["bytes"] == size and generation_of(path) == 2
+
+
+# --- temporary folders --------------------------------------------------------------------------------------
+
+HOLDING = """
+import sys
+from formats.locks import temporary_folder
+with temporary_folder("fusedrf-poses-") as folder:
+    print(folder, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_temporary_folders_of_killed_processes_are_removed_and_those_of_others_not(tmp_path, monkeypatch):
+    """P2: whoever lives holds a lock on its folder."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    words = [sys.executable, "-c", HOLDING]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with (
+        subprocess.Popen(words, cwd=ROOT, env=environment, **pipes) as killed,
+        subprocess.Popen(words, cwd=ROOT, env=environment, **pipes) as living,
+    ):
+        dead, alive = (Path(process.stdout.readline().strip()) for process in (killed, living))
+        killed.kill()
+        killed.wait()
+        (tmp_path / "fusedrf-poses-file").write_text("mine")
+        (tmp_path / "fusedrf-poses-link").symlink_to(tmp_path)
+        assert dead.is_dir()
+        with temporary_folder("fusedrf-poses-") as own:
+            assert own.is_dir() and alive.is_dir() and not dead.exists()
+        assert not own.exists() and (tmp_path / "fusedrf-poses-link").is_symlink()
+        living.stdin.close()
+        living.wait()
+        assert not alive.exists()

@@ -138,6 +138,8 @@ class DistillRun:
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
         self.epochs, self.count = Epochs(settings.rays, self.generator), RAYS_AT_FIRST
+        self.held: tuple[dict[str, np.ndarray], dict] | None = None
+        """What `checkpoint` says between the steps, where other things may take long."""
         self.asked, self.random = False, None
         """Whether the teacher was asked, and the state the generator has to be in then; None: as it is."""
 
@@ -152,6 +154,7 @@ class DistillRun:
         report, settings = self.report, self.settings
         self.began = working_time() - (report.curve[-1][0] if report.curve else 0.0)
         clock = _Clock(report.seconds)
+        self.held = self.checkpoint()
         phase("asking the teachers")
         self.generator.manual_seed(settings.seed + 1)
         judge = self.judge or scattered_judge(self.teacher, settings.views, settings.view_size, settings.seed)
@@ -184,6 +187,7 @@ class DistillRun:
             clock.lap("pictures")
         with uninterrupted():
             self._leave_haze_out(pool)
+        self.held = None
         report.numeric = self.guard.figures()
         return self.student, report
 
@@ -240,6 +244,7 @@ class DistillRun:
         """The steps of one phase."""
         entered = working_time()
         started = entered - self.elapsed
+        self.held = None
         while (share := self._share(steps, working_time() - started)) < self.schedule.end:
             with uninterrupted():
                 if self.refined is not None and share >= COARSE_UNTIL:
@@ -256,6 +261,7 @@ class DistillRun:
                 advance(share / self.schedule.end, figures)
         self.learnt_seconds += working_time() - entered
         self.guard.check()
+        self.held = self.checkpoint()
 
     def _look(self, held_out: HeldOut, share: float) -> None:
         """A point of the learning curve, which the schedule follows."""

@@ -3,6 +3,7 @@ occupancy grid is set."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,6 +179,9 @@ class FitRun:
         self.refinements = list(REFINED_AT) if settings.poses else []
         self.mse, self.rays = None, LEAST_RAYS
         self.found_matter, self.found_nothing = False, 0
+        self.held: tuple[dict[str, np.ndarray], dict] | None = None
+        """What `checkpoint` said before the refresh that is going on, which may take long and changes no
+        array."""
         self.guard = Guard(lambda: self.optimiser.numbers())
 
     @classmethod
@@ -214,15 +218,20 @@ class FitRun:
         divergence."""
         while (share := self.share()) < 1.0 and not self.reached():
             with uninterrupted():
-                self.refresh(share)
+                if self.due(share):
+                    self.held = deepcopied(*self.checkpoint())
+                    self.refresh(share)
+                    self.held = None
                 self.step(share)
             if self.steps % 20 == 0:
                 advance(share, {"psnr": self.psnr})
         with uninterrupted():
             if self.refreshes:  # not where the run was interrupted after it
+                self.held = deepcopied(*self.checkpoint())
                 self.refreshes.clear()
                 self.guard.check()
                 self.refresh_occupancy()
+        self.held = None
         return self.field
 
     def reached(self) -> bool:
@@ -313,10 +322,19 @@ class FitRun:
             return (working_time() - self.started) / self.settings.time_budget
         return self.steps / self.settings.steps
 
+    def shows(self) -> bool:
+        """Whether the field shows where things are."""
+        return self.steps >= STEPS_TO_SHOW and self.optimiser.steps >= CALM_AFTER
+
+    def due(self, share: float) -> bool:
+        """Whether `refresh` has anything to do."""
+        refreshes = self.refreshes if self.shows() else []
+        at = [*refreshes[:1], *(at for at, _ in self.stages[:1]), *self.exposures[:1], *self.refinements[:1]]
+        return any(share >= due for due in at)
+
     def refresh(self, share: float) -> None:
         """Occupancy, box and resolution changes that are due."""
-        shows = self.steps >= STEPS_TO_SHOW and self.optimiser.steps >= CALM_AFTER
-        if shows and self.refreshes and share >= self.refreshes[0]:
+        if self.shows() and self.refreshes and share >= self.refreshes[0]:
             self.refreshes = [at for at in self.refreshes if at > share]
             self.guard.check()
             self.refresh_occupancy()
@@ -484,6 +502,11 @@ class FitRun:
 def decay(share: float) -> float:
     """The rate after a share of the run, as a share of the first."""
     return FALL ** (max(0.0, share - FALLS_FROM) / (1 - FALLS_FROM))
+
+
+def deepcopied(arrays: dict[str, np.ndarray], state: dict) -> tuple[dict[str, np.ndarray], dict]:
+    """A checkpoint whose state goes its own way."""
+    return arrays, deepcopy(state)
 
 
 def part_of(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

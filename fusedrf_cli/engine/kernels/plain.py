@@ -22,7 +22,8 @@ from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
 
 FLAGS = dict(fastmath=True, error_model="numpy", cache=True)
-loop = njit(**FLAGS, parallel=not ONE_THREAD)
+# Other threads go on while a loop runs: one of them ends the process where it is told to (signals.py).
+loop = njit(**FLAGS, parallel=not ONE_THREAD, nogil=True)
 # A task is the serial work of one core. Without the reference counting of array arguments (_nrt) it is up to
 # eight times faster, so tasks allocate nothing: the loops around them hand in the scratch.
 task = njit(**FLAGS, _nrt=False)
