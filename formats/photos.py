@@ -105,9 +105,9 @@ def pictures(folder: Path) -> list[Path]:
 
 def find_photo(folder: Path, name: str) -> Path | None:
     """The photo `name` of a folder, with the extension it has on disk; None where there is none."""
-    if not name:
-        return None
     exact = folder / name
+    if not (name and exact.name):
+        return None
     if is_file(exact):
         return exact
     stem = split_ending(exact.name)[0]
