@@ -1,4 +1,4 @@
-"""Photos are matched to poses by name: at their own camera, or left out with a sentence, never at another's."""
+"""Photos are matched to poses by name: at their own camera, or left out with a sentence."""
 
 import json
 import os
@@ -23,9 +23,7 @@ LEVELS = [40 * i + 20 for i in range(6)]
 
 def grey(path: Path, i: int, size=(100, 80), kind: str | None = None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    Pillow.new("RGB", size, (LEVELS[i],) * 3).save(
-        path, kind, **({"lossless": True} if kind == "WEBP" else {})
-    )
+    Pillow.new("RGB", size, (LEVELS[i],) * 3).save(path, kind)
 
 
 def capture(folder: Path, photos: dict[int, str], files: list[str], **keys) -> Path:
