@@ -60,6 +60,8 @@ def read_document(path: Path) -> dict:
         raise LimitExceeded(f"{path}: JSON of more than {MAX_VALUES:,} values; at most so many are read")
     try:
         text = decoded(data)
+        if not text.strip():
+            raise BadJson(f"{path}: the file is empty; export it again")
         if "//" in text or "/*" in text:
             text = JSON_TOKEN.sub(_without_comment, text)
         document = json.loads(text)
@@ -78,18 +80,20 @@ def _without_comment(token: re.Match) -> str:
 
 
 def _cure(error: ValueError) -> str:
-    """What to do about a slip that is made by hand; empty for others."""
+    """What to do about a slip that is easily made; empty for others."""
+    if isinstance(error, UnicodeDecodeError):
+        return "; save it as UTF-8"
     slips = ("Expecting property name", "Illegal trailing comma", "Expecting value")
     slip = isinstance(error, json.JSONDecodeError) and error.msg.startswith(slips)
     return "; remove a comma before it, or write what is missing" if slip else ""
 
 
 def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
-    """The frames as listed; BadSchema unless they are a list of objects."""
+    """The frames as listed, empty for those that are no objects; BadSchema unless they are a list of some."""
     frames = document.get(key)
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+    if not isinstance(frames, list) or frames and not any(isinstance(frame, dict) for frame in frames):
         raise BadSchema(f'{path}: expected "{key}" to be a list of objects, one per camera, with their poses')
-    return frames
+    return [frame if isinstance(frame, dict) else {} for frame in frames]
 
 
 def frame_photo(path: Path, frame: dict) -> Path | None:

@@ -20,7 +20,7 @@ from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews
 from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
-from formats.matching import instead, match_photos
+from formats.matching import gone, match_photos
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
@@ -131,6 +131,8 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
         return _read_llff(path / llff.NAME, downscale)
     if (folders := polycam.keyframes(path)) is not None:
         return _read_polycam(path, *folders, downscale)
+    if len(below := list(path.glob("*/transforms.json"))) == 1:
+        return _read_transforms(below[0], downscale, path)
     found = "pictures but" if has_pictures(path) else "no pictures and"
     raise NoPoses(
         f"{path}: found {found} no camera poses (transforms.json, transforms_train.json, COLMAP's sparse/0, "
@@ -148,8 +150,8 @@ def _read_blender(
     return _capture(path, "blender", *parts, stated=BLENDER_AABB)
 
 
-def _read_transforms(path: Path, downscale: int | None) -> Capture:
-    document, train, test = read_splits(path, downscale)
+def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:
+    document, train, test = read_splits(path, base or path.parent, downscale)
     sparse = sparse_points(path, document, train.views + test.views)
     train, test = (replace(part, views=sparse.told(path, part.views)) for part in (train, test))
     return _capture(path, "transforms", train, test, stated_aabb(path, document), sparse.points, sparse.notes)
@@ -157,13 +159,13 @@ def _read_transforms(path: Path, downscale: int | None) -> Capture:
 
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     model = colmap.read_model(folder)
-    base = colmap.capture_folder(folder) if path == folder else path
+    base = colmap.capture_folder(folder) if path == folder or path.name in colmap.MODELS_IN else path
     files = {image.name: image.name.replace("\\", "/") for image in model.images}
     matched = match_photos(folder, base, files.values(), downscale, ("images", "input", ""))
     if not matched.photos:
         raise MissingFile(
             f"{folder}: names {len(files)} photos such as {min(files, key=natural)}, but none of them is "
-            f"there: {instead(base)}"
+            f"there: {matched.hint}"
         )
     images = sorted(model.images, key=lambda image: natural(image.name))
     images = [image for image in images if files[image.name] in matched.photos]
@@ -179,7 +181,7 @@ def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
         headers.append(header)
         return view
 
-    views, broken = read_sound(folder, images, read, lambda image: image.name)
+    views, broken = read_sound(folder, images, read, lambda image: str(matched.photos[files[image.name]][0]))
     notes = (*_other_models(path, folder), *model.notes, *matched.notes, *broken)
     part = Part(tuple(views), any(header.alpha for header in headers), matched.missing, notes)
     return _capture(path, "colmap", part, Part(), None, model.points)
@@ -232,7 +234,7 @@ def _read_llff(path: Path, downscale: int | None) -> Capture:
         f"of their names, {photos[0].name} to {photos[-1].name}"
     )
     empty = tuple(photo.name for photo in photos if not photo.stat().st_size)
-    notes = (order, *broken, *repair_notes(path, views))
+    notes = (order, *(f"{path}: {note}" for note in gone(empty)), *broken, *repair_notes(path, views))
     part = Part(tuple(views), any(header.alpha for header in headers), empty, notes)
     return _capture(path, "llff", part, Part(), None)
 
@@ -258,7 +260,10 @@ def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None
         return view
 
     views, broken = read_sound(cameras, [name for name in files if name in matched.photos], read, str)
-    notes = (*matched.notes, *broken, *repair_notes(cameras, views))
+    photos, poses = polycam.FOLDERS[0]
+    lost = images.name != photos and (images.parent / poses).is_dir()
+    uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
+    notes = (*matched.notes, *uncorrected, *broken, *repair_notes(cameras, views))
     part = Part(tuple(views), any(header.alpha for header in headers), matched.missing, notes)
     return _capture(path, "polycam", part, Part(), None)
 

@@ -70,6 +70,8 @@ NUMBERS = [
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 ]
 """Names of the models by their number in binary files."""
+MODELS_IN = ("sparse", "colmap")
+"""Folders that models lie in, in the folder of their capture."""
 NO_POINT = 2**64 - 1
 SMALLEST_IMAGE = 73
 """Bytes of an image without a name or observations."""
@@ -159,7 +161,7 @@ def image_count(folder: Path) -> int:
 def capture_folder(model: Path) -> Path:
     """The folder above a model, in which the photos lie: `x` of `x/sparse/0` and of `x/colmap/sparse/0`."""
     for _ in range(3):
-        if model.name.isdecimal() or model.name in ("sparse", "colmap"):
+        if model.name.isdecimal() or model.name in MODELS_IN:
             model = model.resolve().parent
     return model
 
@@ -361,7 +363,7 @@ def _text_images(path: Path, data: bytes) -> list[tuple]:
         if len(words) < 10:
             raise BadModel(f"{path}: line {line}: expected an id, a pose, a camera and a name")
         image, camera = (_number(path, line, words[i], int) for i in (0, 8))
-        numbers = [_number(path, line, word, float) for word in words[1:8]]
+        numbers = [_pose_number(path, line, word) for word in words[1:8]]
         name = words[9]
         seen = np.empty(0, np.int64)
         if lines and not _is_image(lines[0][1]):
@@ -471,6 +473,11 @@ def _lines(path: Path, data: bytes) -> Iterator[tuple[int, str]]:
         text = line.strip()
         if not text.startswith("#"):
             yield i, text
+
+
+def _pose_number(path: Path, line: int, word: str) -> float:
+    """A number of a pose, which may be NaN: its image alone is then of no use."""
+    return math.nan if word.lower().lstrip("+-") in ("nan", "inf") else _number(path, line, word, float)
 
 
 def _number(path: Path, line: int, word: str, kind: type):

@@ -17,6 +17,11 @@ def printable(text: str, limit: int = MAX_SENTENCE) -> str:
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
+def counted(count: int, one: str, several: str) -> str:
+    """A number with the words that go with it: 1 photo is, 2 photos are."""
+    return f"{count:,} {one if count == 1 else several}"
+
+
 class FormatError(Exception):
     """A file that cannot be read, or an output that cannot be written."""
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
-from formats.errors import BadPose, FormatError, ResourceError
+from formats.errors import BadPose, FormatError, ResourceError, counted
 from formats.views import View
 
 FEW = 5
@@ -33,8 +33,8 @@ def once(
             kept.append(frame)
     if not repeated:
         return kept, []
-    frames_are = "frame is" if len(repeated) == 1 else "frames are"
-    return kept, [f"{where}: {len(repeated)} {frames_are} listed again, such as {repeated[0]}, and read once"]
+    said = counted(len(repeated), "frame is", "frames are")
+    return kept, [f"{where}: {said} listed again, such as {repeated[0]}, and read once"]
 
 
 def read_sound(
@@ -73,6 +73,6 @@ def repair_notes(where: object, views: Iterable[View]) -> list[str]:
         if view.repair:
             named.setdefault(view.repair, []).append(view.name)
     return [
-        f"{where}: the poses of {len(names)} photos, such as {names[0]}, {repair}"
+        f"{where}: the poses of {counted(len(names), 'photo', 'photos')}, such as {names[0]}, {repair}"
         for repair, names in named.items()
     ]

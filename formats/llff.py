@@ -6,18 +6,22 @@ seen.
 """
 
 import io
+import warnings
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
 from formats.cameras import checked_focal, checked_size
 from formats.errors import BadIntrinsics, BadModel, BadPose
 from formats.inputs import read_input
-from formats.views import View, checked_pose
+from formats.views import FARTHEST, View, checked_pose
 
 NAME = "poses_bounds.npy"
 MAX_BYTES = 16 * 2**20
 COLUMNS = 17
+HEADER_ERRORS = (ValueError, TypeError, SyntaxError, EOFError, LookupError, MemoryError, TokenError)
+"""What numpy raises on headers that are none; it parses them as Python's literals."""
 
 
 def read_poses_bounds(path: Path) -> np.ndarray:
@@ -32,8 +36,10 @@ def read_poses_bounds(path: Path) -> np.ndarray:
         read = (
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
-        shape, fortran, kind = read(file, max_header_size=10_000)
-    except (ValueError, TypeError, SyntaxError, EOFError, UnicodeError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that Python 2 wrote
+            shape, fortran, kind = read(file, max_header_size=10_000)
+    except HEADER_ERRORS as error:
         raise BadModel(f"{path}: not an array saved by numpy; export it again") from error
     if len(shape) != 2 or shape[1] != COLUMNS or kind.kind != "f":
         size = "x".join(map(str, shape)) or "one"
@@ -55,7 +61,7 @@ def row_view(where: str, row: np.ndarray) -> View:
         raise BadPose(f"{where}: holds NaN or infinity; export the poses again")
     height, width, focal = matrix[:, 4]
     focal = checked_focal(float(focal), where)
-    if not 0 < near < far:
+    if not 0 < near < far < FARTHEST:
         raise BadIntrinsics(
             f"{where}: bounds of {near:g} and {far:g}, expected a near and a greater far depth; estimate the "
             "poses again"

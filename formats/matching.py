@@ -14,11 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from formats.images import Header
+from formats.errors import counted
 from formats.photos import (
     Folder,
     chosen_copy,
-    copies,
     is_file,
     is_hidden,
     is_picture,
@@ -48,10 +47,8 @@ class Matched:
     missing: tuple[str, ...]
     """Paths without a photo, in the order asked."""
     notes: tuple[str, ...]
-
-    def reduction(self, file: str, header: Header, downscale: int | None) -> int:
-        """By how much the photo of a path is to be made smaller (`Folder.reduction`)."""
-        return self.photos[file][1].reduction(header, downscale)
+    hint: str
+    """What to do, as the end of a sentence, where no photo was found."""
 
 
 def match_photos(
@@ -76,34 +73,33 @@ def match_photos(
             break
     paths, found, ambiguous = max(tries, key=lambda item: sum(map(bool, item[1].values())))
     moved = {}
-    if lost := [file for file in files if not found[file] and file not in ambiguous]:
+    # Of a folder that is there some photos may be gone: those are not elsewhere.
+    there = {rooted(paths[file])[0] for file in files if found[file] or file in ambiguous}
+    if lost := {file: paths[file] for file in files if rooted(paths[file])[0] not in there}:
         taken = {photo for several in found.values() for photo in several.values()}
         moved, unclear = _elsewhere(base, lost, taken)
         again, more = _as_written(listings, base, moved)
         found, ambiguous = found | again, ambiguous | unclear | more
     photos, notes = {}, []
     for root, group in _groups({file: moved.get(file, paths[file]) for file in files if found[file]}).items():
-        folder, note = _folder(base / root, [found[file] for file in group], downscale)
+        places = listings.copies(base / root)
+        folder, note = _folder(places, [found[file] for file in group], downscale)
         photos |= {file: (found[file][folder.path], folder) for file in group if folder.path in found[file]}
         notes += [note] if note else []
     missing = tuple(file for file in files if file not in photos)
-    notes += _how(base, photos, moved, ambiguous)
-    notes += _gone([file for file in missing if file not in ambiguous])
-    return Matched(photos, missing, tuple(f"{where}: {note}" for note in notes))
-
-
-def instead(base: Path) -> str:
-    """What lies in a folder in which no photo was found, as the end of a sentence that says what to do."""
-    held = sorted(("/".join(photo) for photo, _ in _tree(base)), key=natural)
-    there = f"holds {len(held)} others, such as {held[0]}" if held else "holds no photos"
-    return f"{base} {there}; put the photos there under the names that the poses have"
+    notes += _how(base, photos, moved)
+    if unclear := _unclear(base, {file: photos for file, photos in ambiguous.items() if file in missing}):
+        notes.append(unclear)
+    notes += gone([file for file in missing if file not in ambiguous])
+    hint = "" if photos else unclear or _instead(base)
+    return Matched(photos, missing, tuple(f"{where}: {note}" for note in notes), hint)
 
 
 def find_file(base: Path, file: str) -> Path | None:
     """A file that is no photo, by a path from `base`, or where that is another computer's by its end."""
     parts = PurePosixPath(file).parts
-    tails = (base / file, *(base.joinpath(*parts[i:]) for i in range(1, len(parts))))
-    return next((path for path in tails if is_file(path)), None)
+    tails = (base.joinpath(*parts[i:]) for i in range(1, len(parts)) if ".." not in parts[i:])
+    return next((path for path in (base / file, *tails) if is_file(path)), None)
 
 
 def rooted(file: str) -> tuple[str, str]:
@@ -125,10 +121,23 @@ def stem_key(name: str) -> str:
 
 
 class Listings:
-    """The pictures of folders, each of which is listed once."""
+    """The pictures of folders and the smaller copies of folders, each of which is listed once."""
 
     def __init__(self):
         self._known: dict[Path, dict[str, list[str]]] = {}
+        self._copies: dict[Path, dict[str, list[Folder]]] = {}
+
+    def copies(self, folder: Path) -> list[Folder]:
+        """As `formats.photos.copies`."""
+        if folder.parent not in self._copies:
+            named = defaultdict(list)
+            for entry in _entries(folder.parent):
+                plain, _, factor = entry.name.rpartition("_")
+                if factor.isdecimal() and int(factor) > 0 and _is_folder(entry):
+                    named[plain].append(Folder(folder.parent / entry.name, int(factor)))
+            self._copies[folder.parent] = dict(named)
+        beside = self._copies[folder.parent].get(folder.name, [])
+        return [Folder(folder), *sorted(beside, key=lambda place: place.factor)]
 
     def of(self, folder: Path) -> dict[str, list[str]]:
         """Names of a folder's pictures by `stem_key`; hidden and empty files are none."""
@@ -186,7 +195,7 @@ def _as_written(
     for root, group in _groups(files).items():
         home = base / root
         # Beside the capture itself lie other captures, not copies of it.
-        for place in copies(home) if home != base else [Folder(home)]:
+        for place in listings.copies(home) if home != base else [Folder(home)]:
             suited = {}
             for file in group:
                 inner = PurePosixPath(rooted(files[file])[1])
@@ -229,19 +238,17 @@ def _claims(suited: dict[str, list[tuple]]) -> tuple[dict[str, Path], dict[str, 
 
 
 def _folder(
-    home: Path, found: Sequence[dict[Path, Path]], downscale: int | None
+    places: list[Folder], found: Sequence[dict[Path, Path]], downscale: int | None
 ) -> tuple[Folder, str | None]:
-    """The folder to read photos from, out of `home` and its copies: one that has as many of them as any; and
-    a sentence where it is not `home`, or where a copy lacks some. `found` are the photos by folder."""
-    held = [
-        (place, [photos[place.path] for photos in found if place.path in photos])
-        for place in _places(home, found)
-    ]
+    """The folder to read photos from, out of one and its copies: one that has as many of them as any; and a
+    sentence where it is a copy, or where a copy lacks some. `found` are the photos by folder."""
+    held = [(place, [photos[place.path] for photos in found if place.path in photos]) for place in places]
+    held = [(place, photos) for place, photos in held if photos]
     most = max(len(photos) for _, photos in held)
     chosen = chosen_copy([(place, photos[0]) for place, photos in held if len(photos) == most], downscale)
-    wanted = chosen_copy([(place, photos[0]) for place, photos in held if photos], downscale)
+    wanted = chosen_copy([(place, photos[0]) for place, photos in held], downscale)
     if chosen.factor > 1:
-        return chosen, f"photos are read from {chosen.path.name} instead of {home.name}"
+        return chosen, f"photos are read from {chosen.path.name} instead of {places[0].path.name}"
     if wanted.path != chosen.path:
         count = next(len(photos) for place, photos in held if place.path == wanted.path)
         return chosen, (
@@ -251,59 +258,58 @@ def _folder(
     return chosen, None
 
 
-def _places(home: Path, found: Sequence[dict[Path, Path]]) -> list[Folder]:
-    """`home` and its copies, those that have any of the photos."""
-    used = {folder for photos in found for folder in photos}
-    return [place for place in (Folder(home), *copies(home)[1:]) if place.path in used]
-
-
 # --- elsewhere ----------------------------------------------------------------------------------------------
 
 
 def _elsewhere(
-    base: Path, files: Sequence[str], taken: set[Path]
+    base: Path, files: dict[str, str], taken: set[Path]
 ) -> tuple[dict[str, str], dict[str, list[Path]]]:
-    """For files that are not where their paths say, the paths from `base` of photos below it whose names suit
-    them; and those that several suit.
+    """For files whose paths do not lead to their photos, the paths from `base` at which photos below it lie
+    whose names suit them; and those for which photos of several folders do.
 
     Folders that the path has and the photo lacks, or the other way round, are passed over, but not both: a
     photo in `right/` is none of `left/`.
     """
-    names = defaultdict(list)
+    beside, inside = defaultdict(set), defaultdict(set)
     for photo, folders in _tree(base):
         if base.joinpath(*photo) not in taken:
-            names[stem_key(photo[-1])].append((photo, folders))
-    suited = {}
-    for file in files:
-        *stated, name = PurePosixPath(file).parts
-        near = names.get(stem_key(name)) or names.get(key(name)) or []
-        ranks = [
-            ((*rank, key(photo[-1]) != key(name)), "/".join((*folders, photo[-1])))
-            for photo, folders in near
-            if (rank := _kinship([key(part) for part in stated], [key(part) for part in folders]))
-        ]
-        best = min(ranks, default=(0, ""))[0]
-        # A photo and its smaller copies are one.
-        suited[file] = [
-            (rank, path)
-            for rank, path in dict((split_ending(p)[0], (r, p)) for r, p in ranks if r == best).values()
-        ]
-    claims, unclear = _claims(suited)
-    return claims, {file: [Path(path) for path in paths] for file, paths in unclear.items()}
+            stem, named = stem_key(photo[-1]), tuple(map(key, folders))
+            below = _below(named)
+            beside[named, stem].add(folders)
+            beside[below, stem].add(folders)
+            for i in range(1, len(below) + 1):
+                inside[below[i:], stem].add(folders)
+    suited = {file: _suited(beside, inside, path) for file, path in files.items()}
+    # Where photos lie as their paths say from some folder on, others of that folder do not lie deeper.
+    sure = {rooted(files[file])[0] for file, (deeper, folders) in suited.items() if folders and not deeper}
+    moved, unclear = {}, {}
+    for file, (deeper, folders) in suited.items():
+        paths = sorted("/".join((*parts, PurePosixPath(file).name)) for parts in folders)
+        if not paths or deeper and rooted(files[file])[0] in sure:
+            continue
+        if len(paths) == 1:
+            moved[file] = paths[0]
+        else:
+            unclear[file] = [base / path for path in paths]
+    return moved, unclear
 
 
-def _kinship(stated: list[str], folders: list[str]) -> tuple[int, int] | None:
-    """How far the folders of a path are from those that a photo lies in; None where they contradict."""
-    stated, folders = _below(stated), _below(folders)
-    shared = 0
-    while shared < min(len(stated), len(folders)) and stated[-1 - shared] == folders[-1 - shared]:
-        shared += 1
-    if shared == len(folders):
-        return 0, -shared
-    return (1, -shared) if shared == len(stated) else None
+def _suited(beside: dict, inside: dict, path: str) -> tuple[bool, set[tuple[str, ...]]]:
+    """The folders of the photos whose path shares the longest end with `path`, and whether these lie in
+    folders that it does not name. `beside` has the folders of photos by the whole of their keys and the
+    photo's, `inside` by their ends."""
+    *stated, name = PurePosixPath(path).parts
+    stated = tuple(map(key, stated))
+    for i in range(len(stated) + 1):
+        for stem in (stem_key(name), key(name)):
+            if found := beside.get((stated[i:], stem)):
+                return False, found
+            if stated[i:] == _below(stated) and (found := inside.get((stated[i:], stem))):
+                return True, found
+    return False, set()
 
 
-def _below(folders: list[str]) -> list[str]:
+def _below(folders: tuple[str, ...]) -> tuple[str, ...]:
     """Folders below the one that photos usually lie in."""
     return folders[1:] if folders and folders[0] in PHOTO_FOLDERS else folders
 
@@ -345,43 +351,49 @@ def _original(name: str, beside: set[str]) -> str:
 # --- what is said -------------------------------------------------------------------------------------------
 
 
-def _how(
-    base: Path,
-    photos: dict[str, tuple[Path, Folder]],
-    moved: dict[str, str],
-    ambiguous: dict[str, list[Path]],
-) -> Iterator[str]:
+def _how(base: Path, photos: dict[str, tuple[Path, Folder]], moved: dict[str, str]) -> Iterator[str]:
     """Sentences about photos that are not quite where their paths say."""
     other = [file for file in photos if file in moved]
     if other:
         yield (
-            f"{_count(other, 'photo is', 'photos are')} not where the file says and taken by name from "
+            f"{counted(len(other), 'photo is', 'photos are')} not where the file says and taken by name from "
             f"elsewhere, such as {_local(base, photos[other[0]][0])} for {other[0]}"
         )
     renamed = [file for file, (photo, _) in photos.items() if file not in moved and _differs(file, photo)]
     if renamed:
+        said = counted(len(renamed), "photo has", "photos have")
         yield (
-            f"{_count(renamed, 'photo has', 'photos have')} another ending or other letters than the file "
-            f"says, such as {photos[renamed[0]][0].name} for {PurePosixPath(renamed[0]).name}"
-        )
-    unclear = [file for file in ambiguous if file not in photos]
-    if unclear:
-        both = " and ".join(_local(base, photo) for photo in ambiguous[unclear[0]][:2])
-        more = "more than one photo suits" if len(ambiguous[unclear[0]]) > 1 else "more than one path suits"
-        yield (
-            f"{_count(unclear, 'photo is', 'photos are')} left out, since {more}: {both} for {unclear[0]}; "
-            "give each photo the name that the file says"
+            f"{said} another ending or other letters than the file says, such as "
+            f"{photos[renamed[0]][0].name} for {PurePosixPath(renamed[0]).name}"
         )
 
 
-def _gone(missing: Sequence[str]) -> list[str]:
+def _unclear(base: Path, ambiguous: dict[str, list[Path]]) -> str:
+    """A sentence about files that several photos suit, and photos that suit several files; empty without."""
+    if not ambiguous:
+        return ""
+    file, photos = next(iter(ambiguous.items()))
+    several = "more than one photo suits" if len(photos) > 1 else "its photo suits other paths too"
+    return (
+        f"{counted(len(ambiguous), 'path has', 'paths have')} no photo alone, such as {file}: {several} "
+        f"({' and '.join(_local(base, photo) for photo in photos[:2])}); give photos the names of the paths"
+    )
+
+
+def _instead(base: Path) -> str:
+    """What lies in a folder in which no photo was found, and what to do, as the end of a sentence."""
+    held = sorted(("/".join(photo) for photo, _ in _tree(base)), key=natural)
+    there = f"holds {len(held)} others, such as {held[0]}" if held else "holds no photos"
+    return f"{base} {there}; put the photos there under the names that the poses have"
+
+
+def gone(missing: Sequence[str]) -> list[str]:
+    """A sentence about photos that are left out since they are not there or of 0 bytes."""
     if not missing:
         return []
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    said = (
-        "photo is not there or empty and is" if len(missing) == 1 else "photos are not there or empty and are"
-    )
-    return [f"{len(missing)} {said} left out: {', '.join(missing[:NAMED])}{more}"]
+    said = counted(len(missing), "photo is not there or empty", "photos are not there or empty")
+    return [f"{said} and left out: {', '.join(missing[:NAMED])}{more}"]
 
 
 def _differs(file: str, photo: Path) -> bool:
@@ -392,7 +404,3 @@ def _differs(file: str, photo: Path) -> bool:
 
 def _local(base: Path, photo: Path) -> str:
     return str(photo.relative_to(base) if photo.is_relative_to(base) else photo)
-
-
-def _count(items: Sequence, one: str, several: str) -> str:
-    return f"{len(items)} {one if len(items) == 1 else several}"

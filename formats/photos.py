@@ -15,7 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadIntrinsics, BadMask, MissingFile, MixedSizes, NoViews, ResourceError
+from formats.errors import (
+    BadIntrinsics,
+    BadMask,
+    FormatError,
+    MissingFile,
+    MixedSizes,
+    NoViews,
+    ResourceError,
+)
 from formats.images import Header, oriented, read_image, read_image_header, read_mask
 from formats.views import View
 
@@ -97,9 +105,9 @@ def pictures(folder: Path) -> list[Path]:
 
 def find_photo(folder: Path, name: str) -> Path | None:
     """The photo `name` of a folder, with the extension it has on disk; None where there is none."""
-    if not name:
-        return None
     exact = folder / name
+    if not (name and exact.name):
+        return None
     if is_file(exact):
         return exact
     stem = split_ending(exact.name)[0]
@@ -138,8 +146,11 @@ def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Fol
     if downscale is not None:
         whole = [place for place, _ in places if downscale % place.factor == 0]
         return whole[-1] if whole else places[0][0] if places else None
-    for place, photo in places:
-        header = read_image_header(photo)
+    for place, photo in places[:-1]:
+        try:
+            header = read_image_header(photo)
+        except FormatError:  # which its frame tells
+            continue
         if max(header.width, header.height) <= LONGEST:
             return place
     return places[-1][0] if places else None

@@ -1,6 +1,7 @@
 """Captures whose cameras stand in `transforms*.json`: Blender's, instant-ngp's and nerfstudio's."""
 
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +19,11 @@ from formats.cameras import (
     read_frames,
     written_path,
 )
-from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError
+from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError, counted
 from formats.frame import depth_range
 from formats.frame_list import once, read_sound, repair_notes
 from formats.images import read_image_header
-from formats.matching import Matched, find_file, instead, match_photos, stem_key
+from formats.matching import Matched, find_file, match_photos, stem_key
 from formats.photos import natural, on_photo
 from formats.points import MAX_POINTS, Points, read_ply_points, thinned_notes
 from formats.views import View
@@ -49,16 +50,17 @@ class Part:
 def read_part(path: Path, downscale: int | None) -> Part:
     """All frames of a file."""
     document = read_document(path)
-    (part,) = _views(path, document, [_frames(path, document)], downscale)
+    (part,) = _views(path, document, path.parent, [_frames(path, document)], downscale)
     return part
 
 
-def read_splits(path: Path, downscale: int | None) -> tuple[dict, Part, Part]:
-    """The document of a nerfstudio or instant-ngp file, and its frames to train on and to test with."""
+def read_splits(path: Path, base: Path, downscale: int | None) -> tuple[dict, Part, Part]:
+    """The document of a nerfstudio or instant-ngp file in a capture's folder `base` or below it, and its
+    frames to train on and to test with."""
     document = read_document(path)
     frames = _frames(path, document)
     *splits, notes = _split(path, document, frames)
-    train, test = _views(path, document, splits, downscale)
+    train, test = _views(path, document, base, splits, downscale)
     return document, replace(train, notes=(*train.notes, *notes)), test
 
 
@@ -78,26 +80,34 @@ def _frames(path: Path, document: dict) -> list[Numbered]:
 
 
 def _views(
-    path: Path, document: dict, splits: Sequence[list[Numbered]], downscale: int | None
+    path: Path, document: dict, base: Path, splits: Sequence[list[Numbered]], downscale: int | None
 ) -> tuple[Part, ...]:
     """Views of the frames of each split whose photo exists, their cameras scaled to what is read of it."""
     splits = [sorted(frames, key=lambda item: natural(_file(item))) for frames in splits]
-    matched = match_photos(path, path.parent, [_file(item) for part in splits for item in part], downscale)
+    files = [_file(item) for part in splits for item in part]
+    homes = (str(path.parent.relative_to(base)), "") if path.parent != base else ("",)
+    matched = match_photos(path, base, files, downscale, homes)
     if not matched.photos:
         named = matched.missing[0] if matched.missing else "none"
         raise NoViews(
             f"{path}: no view is left, none of its {len(matched.missing)} photos such as {named} is there: "
-            f"{instead(path.parent)}"
+            f"{matched.hint}"
         )
     parts = [_part(path, document, frames, matched, downscale) for frames in splits]
-    return (replace(parts[0], notes=(*matched.notes, *parts[0].notes)), *parts[1:])
+    notes = list(matched.notes)
+    if nameless := sum(not _file(item) for frames in splits for item in frames):
+        notes.append(f"{path}: {counted(nameless, 'frame has', 'frames have')} no file_path and no photo")
+    return (replace(parts[0], notes=(*notes, *parts[0].notes)), *parts[1:])
 
 
 def _part(
     path: Path, document: dict, frames: list[Numbered], matched: Matched, downscale: int | None
 ) -> Part:
+    def photo_of(item: Numbered) -> str:  # however its path is written
+        return os.path.normpath(matched.photos[_file(item)][0])
+
     found = [item for item in frames if _file(item) in matched.photos]
-    found, notes = once(path, found, _file, lambda item: json.dumps(item[1].get("transform_matrix")))
+    found, notes = once(path, found, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
     names = dict(zip((i for i, _ in found), frame_names([frame for _, frame in found]), strict=True))
     headers = []
 
@@ -112,7 +122,7 @@ def _part(
         headers.append(header)
         return view
 
-    views, broken = read_sound(path, found, read, _file)
+    views, broken = read_sound(path, found, read, photo_of)
     missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
     notes = (*notes, *broken, *repair_notes(path, views))
     return Part(tuple(views), any(header.alpha for header in headers), missing, notes)
@@ -159,15 +169,23 @@ def _split(
     files = [_file(item) for item in frames]
     is_train = [file in train if train is not None else file not in test for file in files]
     is_test = [file in test for file in files]
-    notes = []
-    if unused := [file for file, *chosen in zip(files, is_train, is_test, strict=True) if not any(chosen)]:
-        notes.append(
-            f"{path}: {len(unused)} frames such as {unused[0]} are in no list of file names that is used"
+    uses = list(zip(files, is_train, is_test, strict=True))
+    listed = (train or set()) | test
+    if listed and not listed & set(files):
+        raise BadSchema(
+            f"{path}: its lists of file names have no frame's, but {min(listed, key=natural)} and the like; "
+            "write them as the frames' file_path"
         )
-    if both := [file for file, *chosen in zip(files, is_train, is_test, strict=True) if all(chosen)]:
-        notes.append(f"{path}: {len(both)} photos such as {both[0]} are both learnt from and held out")
-    if unknown := sorted(((train or set()) | test) - set(files), key=natural):
-        notes.append(f"{path}: its lists of file names have {len(unknown)} such as {unknown[0]} of no frame")
+    notes = []
+    if unused := [file for file, learnt, held in uses if not (learnt or held)]:
+        said = counted(len(unused), "frame is", "frames are")
+        notes.append(f"{path}: {said} in no list of file names that is used, such as {unused[0]}")
+    if both := [file for file, learnt, held in uses if learnt and held]:
+        said = counted(len(both), "photo is", "photos are")
+        notes.append(f"{path}: {said} both learnt from and held out, such as {both[0]}")
+    if unknown := sorted(listed - set(files), key=natural):
+        said = counted(len(unknown), "name is", "names are")
+        notes.append(f"{path}: {said} of no frame in its lists of file names, such as {unknown[0]}")
     chosen = ([item for item, use in zip(frames, uses, strict=True) if use] for uses in (is_train, is_test))
     return *chosen, notes
 

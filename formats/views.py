@@ -204,8 +204,8 @@ def checked_pose(matrix: object, where: str) -> tuple[np.ndarray, str]:
 
 def _rotation(axes: np.ndarray, where: str) -> tuple[np.ndarray, str]:
     """The rotation (3, 3) that a pose's axes are, and what was mended of them."""
-    lengths = np.linalg.norm(axes, axis=0)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):
+        lengths = np.linalg.norm(axes, axis=0)
         unit = axes / lengths
         error = float(np.abs(unit.T @ unit - np.eye(3)).max())
     if not error <= ROUNDED:  # also NaN, of an axis without length

@@ -11,8 +11,8 @@ import pytest
 from formats import errors, inputs, records, scene
 from formats.archive import MAX_MEMBERS, write_archive
 from formats.bundle import member_name
-from formats.records import MAX_HEADER
 from formats.names import MAX_NAME_BYTES
+from formats.records import MAX_HEADER
 from formats.rig import MAX_CAMERAS
 from formats.scene import SceneGraph, dump_scene, expand_scene, make_node, parse_scene, write_scene
 from tests.formats.test_records import HOSTILE as BAD_FIELDS
