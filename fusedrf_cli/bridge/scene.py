@@ -145,9 +145,10 @@ def needs_of(bundle: OpenBundle, member: str) -> FieldNeeds:
     """What a field of a bundle needs of memory, told by its header before it is read. InvalidInput where that
     makes no field."""
     header = bundle.headers[member]
-    arrays = partial(bundle.array, member)
+    shapes = {name: shape for name, (_, shape) in header.arrays.items()}
     try:
-        needs = registry.kind(header.kind).field_needs(header.metadata, header.arrays, arrays)
+        kind = registry.kind(header.kind)
+        needs = kind.field_needs(header.metadata, shapes, partial(bundle.array, member))
     except MALFORMED:  # reading the field says what is wrong
         needs = FieldNeeds(header.decoded_size, 0)
     shared = shared_members(member, header, bundle.headers, str(bundle.path)).values()

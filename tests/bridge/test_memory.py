@@ -9,11 +9,15 @@ import sys
 import tempfile
 import time
 import tracemalloc
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from formats.bundle import single_field_bundle
+from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge import memory, training
 from fusedrf_cli.bridge.memory import Memory
@@ -21,7 +25,12 @@ from fusedrf_cli.bridge.running import load_checkpoint, save_checkpoint
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.kinds.vm.field import VMShape
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.vm.field import VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm_mlp.field import untrained
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.errors import ResourceProblem
 from tests.analytic import scenes
@@ -127,6 +136,120 @@ def test_a_shelf_keeps_what_was_asked_for_last():
     shelf.resize(0)
     shelf.take("z", 50, lambda: "z")
     assert shelf.take("z", 50, lambda: pytest.fail("read again")) == "z"
+
+
+# -- few bytes that say many numbers -------------------------------------------------------------------------
+
+BOX = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
+
+
+def boxed(path: Path, name: str, texels: int, full: bool, precision: str, cells: int = 1, **shape) -> Path:
+    """A pack of one field over a box, so many texels and cells a side, all of them empty or full."""
+    kind = registry.kind(name).field
+    grid = OccupancyGrid(np.array(BOX), np.full((cells,) * 3, full))
+    bare = kind(kind.shape_type(**shape), BOX, (texels,) * 3, 1.0, params=torch.zeros(0), occupancy=grid)
+    numbers = np.random.default_rng(0).standard_normal
+
+    def stored(part):
+        if part.on_vertices and not full:  # of which none is used
+            return np.zeros((0, part.columns) if part.columns else 0, np.float32)
+        return 0.1 * (numbers if full else np.zeros)(bare.stored_shape(part)).astype(np.float32)
+
+    arrays = {part.name: stored(part) for part in bare.parts}
+    metadata = {
+        **{"aabb": BOX, "resolution": [texels] * 3, "scale": 1.0, "shift": -8.0, "shape": asdict(bare.shape)},
+        "cells": {"aabb": BOX, "counts": [cells] * 3},
+    }
+    arrays["occupancy"] = np.packbits(grid.occupied)
+    record = FieldRecord(name, arrays, metadata)
+    single_field_bundle(record, name, precision=precision).write(path)
+    return path
+
+
+def placed(path: Path, name: str, texels: int, full: bool, precision: str, cells=1, blocks=1) -> Path:
+    """A pack of one tensor, in one block or several."""
+    shape = VMShape()
+    tensor = VMTensor((texels,) * 3, np.array(BOX), 1.0, occupied=np.full((cells,) * 3, full))
+    make = np.random.default_rng(0).standard_normal if full else np.zeros
+    arrays = {f"tensor_0.{n}": 0.1 * make(s).astype(np.float32) for n, s in tensor.sections(shape)}
+    arrays["tensor_0.occupancy"] = np.packbits(tensor.occupied)
+    if name == "vm-mlp":
+        weights = untrained(3 * shape.coefficients, 64, torch.Generator().manual_seed(0))
+        arrays |= {f"network.{key}": weight.numpy() for key, weight in weights.items()}
+    moves = [np.eye(4) for _ in range(blocks)]
+    for i, move in enumerate(moves):
+        move[0, 3] = 0.6 * i
+    told = {"resolution": [texels] * 3, "aabb": BOX, "scale": 1.0, "shift": -8.0, "occupancy": [cells] * 3}
+    named = [{"tensor": 0, "object_to_field": m.tolist(), "name": f"b{i}"} for i, m in enumerate(moves)]
+    metadata = {"aabb": BOX, "shape": asdict(shape), "tensors": [told], "blocks": named}
+    single_field_bundle(FieldRecord(name, arrays, metadata), name, precision=precision).write(path)
+    return path
+
+
+def bricks(path: Path, side: int, level: int = 0) -> Path:
+    """A pack of bricks: so many a side, or a row of single ones deep in their top cells."""
+    at = np.argwhere(np.ones((side,) * 3 if not level else (side, 1, 1), bool))
+    counts = tuple(at.max(0) + 1)
+    masks = np.ones((len(at), 4, 4, 4), bool)
+    tree = BrickTree.of(np.zeros(3), 1 / side, counts, np.full(len(at), level, np.uint8), at << level, masks)
+    field = SparseField(SparseShape(), Lattice(tree, 4), 1.0)
+    single_field_bundle(FieldRecord("sparse", *field.state()), "sparse", precision="int8").write(path)
+    return path
+
+
+PACKS = {
+    "dense, empty": lambda path: boxed(path, "dense", 200, False, "float16"),
+    "dense, full": lambda path: boxed(path, "dense", 110, True, "float16", 64),
+    "dense-mlp, empty": lambda path: boxed(path, "dense-mlp", 200, False, "float16"),
+    "dense-mlp, full": lambda path: boxed(path, "dense-mlp", 100, True, "int8", 64),
+    "cp, empty": lambda path: boxed(path, "cp", 8000, False, "int8", density_rank=1024, colour_rank=1024),
+    "cp, full": lambda path: boxed(path, "cp", 4000, True, "int4", density_rank=1024, colour_rank=1024),
+    "vm, empty": lambda path: placed(path, "vm", 1000, False, "int8"),
+    "vm, full": lambda path: placed(path, "vm", 500, True, "float32", 64),
+    "vm-mlp": lambda path: placed(path, "vm-mlp", 500, True, "int8", 64),
+    "blocks": lambda path: placed(path, "vm", 200, True, "float16", 128, blocks=4),
+    "cells": lambda path: placed(path, "vm", 2, True, "float16", 320),
+    "sparse, full": lambda path: bricks(path, 24),
+    "sparse, deep": lambda path: bricks(path, 30, level=7),
+}
+LOADED = """
+import json, sys
+from fusedrf_cli.bridge import memory, scene
+from fusedrf_cli.engine import kernels
+budget = memory.Memory()
+loaded = scene.load_scene(sys.argv[1], budget=budget)
+loaded.placed[0].field.occupancy.arrays
+print(json.dumps([budget.base, budget.predicted - memory.COMPILED, memory.peak()]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PACKS)
+def test_reading_takes_no_more_than_foretold(tmp_path, name):
+    """The emptiest and the fullest pack of each kind: what its numbers need once they are in arrays."""
+    path = PACKS[name](tmp_path / "a.rfpack")
+    words = [sys.executable, "-c", LOADED, str(path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    base, foretold, peak = json.loads(done.stdout)
+    assert foretold - base > 20 << 20 and peak <= 1.05 * foretold
+
+
+@pytest.mark.parametrize("verb", ["render", "eval", "fuse", "add", "extract", "convert"])
+def test_a_thousand_bytes_that_say_gigabytes_are_refused(run, folder, verb):
+    """Before any of it is allocated, whatever is free here."""
+    boxed(folder / "big.rfpack", "dense", 8192, False, "float16")
+    words = {
+        "render": ("big.rfpack", "-o", "out.png"),
+        "eval": ("big.rfpack", "--against", "red.rfpack"),
+        "fuse": ("big.rfpack", "-o", "out.rfpack"),
+        "add": ("red.rfpack", "big.rfpack", "--name", "new", "-o", "out.rfpack"),
+        "extract": ("big.rfpack", "--box", "0,0,0,0.5,0.5,0.5", "-o", "out.rfpack"),
+        "convert": ("big.rfpack", "--kind", "vm", "-o", "out.rfpack"),
+    }
+    result = run(verb, *words[verb])
+    assert result.exit_code == 5 and "needs about" in result.stderr, result.stderr
 
 
 # -- against real processes ----------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """Files to placed fields: names, sharing, background, and inputs that are wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -86,3 +88,27 @@ def test_a_source_outside_is_read_where_allowed(folder, run):
     (folder.parent / "out.rfpack").write_bytes((folder / "red.rfpack").read_bytes())
     write_scene(folder / "odd.json", SceneGraph((make_node("red", source="../out.rfpack"),)))
     assert run("fuse", "odd.json", "-o", "fused.rfpack", "--allow-outside").exit_code == 0
+
+
+def test_a_source_that_is_replaced_meanwhile_is_read_as_it_was(folder, tmp_path):
+    """P7: as many fields as there is room for are in memory; the others are read from the version that was
+    opened, good or damaged as what has taken its name may be."""
+    loaded = load_scene(str(folder / "scene.json"))
+    before = [opened(placed.field).params.clone() for placed in loaded.placed]
+    loaded.shelf.resize(0)
+    for name in ("floor", "red", "blue"):
+        damaged = bytearray((folder / f"{name}.rfpack").read_bytes())
+        damaged[-2000:-1000] = bytes(1000)
+        (folder / "other").write_bytes(damaged)
+        (folder / "other").replace(folder / f"{name}.rfpack")
+    for placed, params in zip(loaded.placed, before, strict=True):
+        assert opened(placed.field).params.equal(params)
+
+
+def test_nodes_that_show_a_field_differently_each_count(folder):
+    """A field that is thinned has numbers of its own: so many take so many times the memory."""
+    red = make_node("n", source="red.rfpack")
+    nodes = [replace(red, name=f"n{i}", showing={"opacity": 0.1 * i}) for i in range(1, 9)]
+    write_scene(folder / "thinned.json", SceneGraph(tuple(nodes)))
+    sizes = load_scene(str(folder / "thinned.json")).sizes
+    assert len(sizes) == 8 and len(load_scene(str(folder / "scene.json")).sizes) == 3

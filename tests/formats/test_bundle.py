@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 import re
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from formats.bundle import (
 from formats.records import FieldRecord, encode_field
 from formats.scene import SceneGraph, dump_scene, make_node, write_scene
 
+ROOT = Path(__file__).parents[2]
 GOLDEN = Path(__file__).parent / "golden" / "lamp.rfpack"
 SPEC = Path(__file__).parents[2] / "formats" / "SPEC.md"
 LAMP = FieldRecord("dense", {"sigma": np.array([[[0.5]], [[2.0]]])}, {"aabb": [0, 0, 0, 2, 1, 1]})
@@ -316,3 +318,33 @@ def test_a_part_that_is_not_there_is_refused_by_name(tmp_path, shared):
     for read in (read_bundle, read_headers, lambda path: OpenBundle(path).field(member_name(data))):
         with pytest.raises(errors.FormatError, match="shared|shares"):
             read(tmp_path / "a.rfpack")
+
+
+def test_an_opened_bundle_stays_the_version_that_was_opened(tmp_path):
+    """P7: whatever takes its name meanwhile, good or damaged, what is read later was verified."""
+    path, versions = tmp_path / "a.rfpack", []
+    for number in (1.0, 2.0):
+        record = FieldRecord("dense", {"sigma": np.full((4, 4, 4), number, np.float32)}, {})
+        single_field_bundle(record, "node").write(path, overwrite=True)
+        versions.append(path.read_bytes())
+    path.write_bytes(versions[0])
+    bundle = OpenBundle(path)
+    (member,) = bundle.headers
+    for other in (versions[1], versions[0][:-300] + b"\0" * 300, b""):
+        (tmp_path / "other").write_bytes(other)
+        os.replace(tmp_path / "other", path)
+        assert (bundle.field(member).arrays["sigma"] == 1).all()
+        assert bundle.sha256 == hashlib.sha256(versions[0]).hexdigest() and bundle.size == len(versions[0])
+        copied = BundleWriter()
+        assert copied.copy_field(bundle, member) == member_name(copied.members[member])
+    assert bytes(bundle.data(member)) in versions[0]
+
+
+def test_more_bundles_than_a_process_may_open_by_default(tmp_path):
+    """Each stays open as long as its scene."""
+    code = (
+        "import resource, sys\nresource.setrlimit(resource.RLIMIT_NOFILE, (40, 4000))\n"
+        f"from formats.bundle import OpenBundle\nheld = [OpenBundle({str(GOLDEN)!r}) for _ in range(100)]\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 0, run.stderr

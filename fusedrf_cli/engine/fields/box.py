@@ -224,9 +224,10 @@ class BoxField(ComputedField):
     def unpack(self, part: Part, stored: torch.Tensor, values: torch.Tensor) -> None:
         """Inverse of `pack`, into a part that is 0, as what is not stored stays."""
         if part.on_vertices:
-            rows, stored = values.view(np.prod(self.resolution), -1), stored.view(len(stored), -1)
-            rows = rows[:, : stored.shape[1]]
-            rows.index_copy_(0, torch.from_numpy(np.flatnonzero(self.used)), stored)
+            rows = values.view(math.prod(self.resolution), -1)
+            width = math.prod(stored.shape[1:])
+            used = torch.from_numpy(np.flatnonzero(self.used))
+            rows[:, :width].index_copy_(0, used, stored.view(-1, width))
         else:
             values[..., : stored.shape[-1]] = stored
 

@@ -133,3 +133,85 @@ def test_the_working_clock_stands_still_while_something_is_compiled():
     compiled = kernels._compiling.duration
     passed = time.monotonic() - started
     assert 0 < compiled and kernels.working_time() - worked < passed - 0.5 * min(compiled, passed)
+
+
+KEPT = """
+import os, sys
+from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.kernels import locator
+locator.PACKAGE = locator.Path(__file__).parent
+import numba
+exec(compile("@numba.njit(cache=True)\\ndef cube(x):\\n    return x**3", __file__, "exec"))
+said, told = [], []
+with kernels.telling_of_compilation(lambda: told.append(1), said.append):
+    assert cube(2.0) == 8 and cube(3) == 27
+print(len(told), *said, sep="\\n")
+"""
+"""Compiles a function for two types, or loads it; says whether it was compiled, and what was warned of."""
+
+
+@pytest.fixture
+def cube(tmp_path):
+    """(cube(), folder): run that script, and where it keeps what it has compiled."""
+    (tmp_path / "script.py").write_text(KEPT)
+    folder = tmp_path / "cache"
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(folder), "PYTHONPATH": str(Path(kernels.__file__).parents[3])
+    }  # fmt: skip
+
+    def run(before: str = "") -> tuple[bool, list[str]]:
+        command = [sys.executable, "-c", f"__file__ = {str(tmp_path / 'script.py')!r}\n{before}\n{KEPT}"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        compiled, *said = done.stdout.splitlines()
+        return compiled == "1", said
+
+    assert run() == (True, []) and run() == (False, [])
+    return run, folder
+
+
+DAMAGES = {
+    "a bit": lambda data: data[:-9] + bytes([data[-9] ^ 4]) + data[-8:],
+    "a bit of the checksum": lambda data: bytes([data[0] ^ 1]) + data[1:],
+    "cut short": lambda data: data[: len(data) // 2],
+    "empty": lambda data: b"",
+    "another pickle": lambda data: b"\x80\x04\x8c\x02no\x94.",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_kernels_are_compiled_again(cube, damage):
+    """With a warning, once, and then they are kept again: what is kept is code."""
+    run, folder = cube
+    files = sorted(folder.rglob("*.kept"))
+    assert len(files) == 2
+    for file in files:
+        file.write_bytes(DAMAGES[damage](file.read_bytes()))
+    compiled, said = run()
+    assert compiled and len(said) == 1 and "are damaged; they are compiled again" in said[0]
+    assert run() == (False, [])
+
+
+def test_kernels_of_another_function_under_a_name_are_not_run(cube):
+    run, folder = cube
+    one, other = sorted(folder.rglob("*.kept"))
+    one.write_bytes(other.read_bytes())
+    assert run()[0] and run() == (False, [])
+
+
+@pytest.mark.parametrize("trouble", ["a full disk", "a file in the way", "no folder"])
+def test_kernels_that_cannot_be_kept_are_compiled_with_one_warning(cube, trouble):
+    run, folder = cube
+    shutil.rmtree(folder)
+    if trouble == "no folder":  # removed while a process runs: made again
+        assert run() == (True, []) and run() == (False, [])
+        return
+    before = ""
+    if trouble == "a full disk":
+        before = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        before += "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)"
+    else:
+        folder.write_text("")
+    compiled, said = run(before)
+    assert compiled and len(said) == 1 and "cannot be kept" in said[0]
+    assert not [path for path in folder.rglob("*") if path.is_file()]

@@ -19,6 +19,7 @@ MAX_LEVEL = 7
 MAX_TOP_CELLS = 1 << 22
 LONGEST = (1 << 20) // (SIDE << MAX_LEVEL)  # top cells along an axis: places in units fit in 21 bits
 MAX_ENTRIES = 1 << 26  # of all top cells' tables: 256 MB
+ENTRIES_AT_ONCE = 1 << 20  # while they are filled
 MAX_BRICKS = 1 << 22
 
 EMPTY, BRICK, SPLIT = 0, 1, 2
@@ -371,8 +372,9 @@ class Lattice:
         return total.tocsr()
 
 
-def table_entries(nodes: np.ndarray, top: int) -> int:
-    """How many entries the tables of `top` top cells have, at most, as their nodes' codes tell (`packed`)."""
+def table_entries(nodes: np.ndarray, top: int) -> tuple[int, int]:
+    """How many entries the tables of `top` top cells have, at most, as their nodes' codes tell (`packed`), and
+    how deep these go."""
     code = np.unpackbits(nodes).reshape(-1, 2)
     split = (code[:, 0] == 1) & (code[:, 1] == 0)
     level, start, count, cells = 0, 0, top, 0
@@ -380,7 +382,8 @@ def table_entries(nodes: np.ndarray, top: int) -> int:
         inner = int(np.count_nonzero(split[start : start + count]))
         cells = inner if level == 0 else cells
         start, count, level = start + count, 8 * inner, level + 1
-    return min(top + cells * 8 ** min(level - 1, MAX_LEVEL), MAX_ENTRIES)
+    depth = min(level - 1, MAX_LEVEL)
+    return min(top + cells * 8**depth, MAX_ENTRIES), depth
 
 
 def sides(top) -> np.ndarray:
@@ -460,8 +463,10 @@ def fill_cubes(
     cell = nodes >> level
     start, deep = offset[tuple(cell.T)], depth[tuple(cell.T)].astype(np.int64)
     for finer in range(MAX_LEVEL - level + 1):
-        own = (start >= 0) & (deep == level + finer)
-        if own.any():
+        reached = np.flatnonzero((start >= 0) & (deep == level + finer))
+        at_once = max(1, ENTRIES_AT_ONCE >> 3 * finer)
+        for first in range(0, len(reached), at_once):
+            own = reached[first : first + at_once]
             a, b, c = ((nodes[own] - (cell[own] << level)) << finer).T
             side = np.arange(1 << finer)
             n = 1 << (level + finer)

@@ -42,6 +42,7 @@ from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
 PER_BRICK_MADE = 5000  # more while they are found
+PER_BRICK_JOINED = 20_000  # more while hanging vertices are found, where there are several levels
 PER_TOP_CELL = 10  # its table's place and depth
 PER_NODE = 60  # of a node while the tree is walked: its code and place, and those of its children
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
@@ -294,12 +295,12 @@ class SparseField(ComputedField):
         """See Kind.field_needs; with the tables that follow from the tree."""
         (bricks,), counts = shapes["masks"], metadata["counts"]
         top, bricks = math.prod(counts), bricks // 8
-        entries = table_entries(array("nodes"), top)
+        entries, depth = table_entries(array("nodes"), top)
         numbers = sum(math.prod(shapes[name]) for name in ("rows", "bands") if name in shapes)
         cells = OCCUPANCY_CELLS**3 if max(counts) < OCCUPANCY_CELLS else top
         held = PER_BRICK * bricks + 4 * (numbers + entries) + PER_TOP_CELL * top + PER_CELL * cells
-        walked = PER_NODE * 4 * shapes["nodes"][0]
-        return FieldNeeds(held, PER_BRICK_MADE * bricks + PER_CELL_MADE * cells + walked)
+        made = (PER_BRICK_MADE + (PER_BRICK_JOINED if depth else 0)) * bricks
+        return FieldNeeds(held, made + PER_CELL_MADE * cells + PER_NODE * 4 * shapes["nodes"][0])
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "SparseField":
