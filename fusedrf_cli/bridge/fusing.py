@@ -53,21 +53,10 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
         kept = {f.member: f.path for f in loaded.fields} if request.keep_sources else {}
         nodes = history_nodes(loaded, request.output, kept)
         cameras = kept_cameras(loaded, progress)
-        asked = student_request(request, scene, graph_bytes(nodes, cameras))
-        try:
-            student = kind.student(scene.composed, asked)
-            held = make_room(memory, student, scene, request)
-            maker, choosing, seconds = begin(student, scene, request, place, progress)
-            maker.sources_in_memory = held
-            found = search(maker, choosing, student, request, saved, seconds)
-        except TooSmall as error:
-            raise UsageProblem(
-                f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
-                f"where {readable_size(asked.limit)} were allowed; give more"
-            ) from error
+        overhead = graph_bytes(nodes, cameras)
+        found, student, figures = best_of(request, scene, kind, overhead, memory, place, progress, saved)
         details = student.details(found.field)
         warn_of_detail(details, remedy(kind, loaded, scene.composed), progress)
-        figures = figures_of(found, maker, choosing, seconds)
         entry = {
             "event": "fused",
             "kind": kind.name,
@@ -75,7 +64,7 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
             "nodes": nodes,
             "settings": {
                 "seed": request.seed,
-                "max_size": asked.limit,
+                "max_size": student.request.limit,
                 "rgb": request.rgb,
                 "from_scratch": request.from_scratch,
             },
@@ -107,6 +96,33 @@ def fuse(request: FuseRequest, progress, load: Load = load_to_fuse) -> dict:
     }
     check_target(report, request.target_psnr, request.output)
     return report
+
+
+def best_of(
+    request: FuseRequest,
+    scene: Scene,
+    kind: Kind,
+    overhead: int,
+    memory: Memory,
+    place: str,
+    progress,
+    saved: Saved | None = None,
+) -> tuple[Kept, Student, dict]:
+    """The best stand of a kind for a scene, and what the report says of it; overhead: bytes of the bundle
+    besides its field. UsageProblem where nothing fits the size that is allowed."""
+    asked = student_request(request, scene, overhead)
+    try:
+        student = kind.student(scene.composed, asked)
+        held = make_room(memory, student, scene, request)
+        maker, choosing, seconds = begin(student, scene, request, place, progress)
+        maker.sources_in_memory = held
+        found = search(maker, choosing, student, request, saved, seconds)
+    except TooSmall as error:
+        raise UsageProblem(
+            f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
+            f"where {readable_size(asked.limit)} were allowed; give more"
+        ) from error
+    return found, student, figures_of(found, maker, choosing, seconds)
 
 
 def student_request(request: FuseRequest, scene: Scene, overhead: int) -> StudentRequest:

@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.hashed import TOGETHER, WIDTH
+from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
@@ -220,7 +220,7 @@ def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Con
             if name == "detail" and tensor.held:
                 rows, blocks = tensor.held
                 section = rows, section[1]
-                sections.append(Section("detail.runs", (blocks, 2 + WIDTH)))  # and the scales of every run
-                bits += tensor.hashed.shape[0] // TOGETHER + blocks * TOGETHER
+                sections.append(Section("detail.scales", (blocks, WIDTH)))  # more than of whole blocks
+                bits += tensor.hashed.shape[0] // TOGETHER + 8 * blocks * PER_BLOCK
             sections.append(Section(name, section, used))
     return Contents(sections, bits, len(tensors), blocks)
