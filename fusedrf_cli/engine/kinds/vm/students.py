@@ -218,9 +218,8 @@ def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Con
         for name, section in tensor.sections(shape):
             used = read_texels(tensor, int(name[-1])) if "_plane_" in name else None
             if name == "detail" and tensor.held:
-                rows, blocks = tensor.held
-                section = rows, section[1]
-                sections.append(Section("detail.scales", (blocks, WIDTH)))  # more than of whole blocks
-                bits += tensor.hashed.shape[0] // TOGETHER + 8 * blocks * PER_BLOCK
+                rows, of_blocks = tensor.held
+                section = rows, WIDTH
+                bits += tensor.hashed.shape[0] // TOGETHER + 8 * PER_BLOCK * of_blocks
             sections.append(Section(name, section, used))
     return Contents(sections, bits, len(tensors), blocks)

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.kinds.vm.reference import hashed_row
 
 REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
 ROUNDED = 1e-3
-"""Of a density before activation, and of the spacing of a detail's vertices: what rounding may make of them."""
+"""Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
 MOST_MET = 8.0  # cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked
 VERTICES_AT_ONCE = 1 << 22  # of a detail's lattice: some 100 MB
 
