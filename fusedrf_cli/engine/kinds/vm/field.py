@@ -25,7 +25,16 @@ from fusedrf_cli.engine.fields.box import (
     unit_texels,
     whole_numbers,
 )
-from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Group, StoredAs, runs_of, unpack_bits
+from fusedrf_cli.engine.fields.computed import (
+    FEW_CELLS,
+    WHITE,
+    ComputedField,
+    Group,
+    StoredAs,
+    packed_bits,
+    runs_of,
+    unpack_bits,
+)
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed, Held
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import (
@@ -482,17 +491,19 @@ class VMField(ComputedField):
             for t in range(len(self.tensors))
             for name, view in self.sections(t).items()
         }
+        needs = {"hashed"} if any(t.hashed for t in self.tensors) else set()
         grids = [t.occupancy.occupied for t in self.tensors]
-        arrays |= {f"tensor_{t}.occupancy": np.packbits(grid) for t, grid in enumerate(grids)}
-        needs = ["hashed"] if any(t.hashed for t in self.tensors) else []
-        for t in range(len(self.tensors)):
+        for t, grid in enumerate(grids):
             detail = f"tensor_{t}.detail"
             held = Held.of(arrays[detail]) if detail in arrays else None
             if held is not None:
-                needs = ["hashed", "held", "runs"]
+                needs |= {"held", "runs"}
                 arrays |= {detail: arrays[detail][held.rows], runs_of(detail): held.lengths}
                 arrays |= {f"{detail}_{name}": bits for name, bits in held.state().items()}
-        metadata = ({"needs": needs} if needs else {}) | {
+            cells = packed_bits(f"tensor_{t}.occupancy", grid, FEW_CELLS if held is None else 0)
+            needs |= {"held"} if len(cells) > 1 else set()
+            arrays |= cells
+        metadata = ({"needs": sorted(needs)} if needs else {}) | {
             "aabb": self.aabb.tolist(),
             "shape": {
                 "density_rank": self.shape.density_rank,

@@ -9,6 +9,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.computed import BRICK
 from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
@@ -32,6 +33,7 @@ from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
 from fusedrf_cli.engine.selection.cells import Selection
 
 SHAPE = VMShape(16, 24, 2)
+BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
 NOISE = 0.03  # of the factors of a student that takes over others' numbers
 
 
@@ -105,9 +107,9 @@ class VMKind(Kind):
         } | ({"detail_rows": rows} if rows else {})
 
     def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
-        """All rows of details of which few are stored."""
-        bits = sum(8 * shape[0] for name, shape in shapes.items() if name.endswith(".detail_blocks"))
-        return decoded + bits * TOGETHER * WIDTH * 4
+        """With all rows of details, and all cells, of which few are stored."""
+        bits = {end: sum(8 * s[0] for n, s in shapes.items() if n.endswith(end)) for end in (BLOCKS, BRICKS)}
+        return decoded + 4 * bits[BLOCKS] * TOGETHER * WIDTH + bits[BRICKS] // 2 * BRICK**3
 
     def counts(self, field: VMField) -> dict[str, int]:
         """Its blocks."""
