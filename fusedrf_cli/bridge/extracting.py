@@ -153,6 +153,8 @@ def extract(request: ExtractRequest, progress) -> dict:
         if request.invert:
             wanted, figures["hole"] = mended(request, fused, wanted, found, memory, place, progress)
             parts = found, wanted
+        progress.phase("trimming", None)
+        wanted = fused.kind.trimmed(wanted)
         bundle = bundle_of(request, fused, found)
         piece = Piece(wanted, fused.origin, precision_of(request, fused, wanted))
         if request.max_size is not None:

@@ -29,7 +29,7 @@ from fusedrf_cli.engine.kinds.vm import editing
 from fusedrf_cli.engine.kinds.vm.blocks import LEARNT, common_shape, reshaped, without
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.places import place_student
-from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
+from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated, without_unasked
 from fusedrf_cli.engine.selection.cells import Selection
 
 SHAPE = VMShape(16, 24, 2)
@@ -138,6 +138,10 @@ class VMKind(Kind):
     def cropped(self, field: VMField, holds: splitting.Holds) -> VMField | None:
         """See vm/editing.py."""
         return editing.cropped(field, holds)
+
+    def trimmed(self, field: VMField) -> VMField:
+        """See vm/trimming.py."""
+        return without_unasked(field)
 
     def thinned(self, field: VMField, factor: float) -> VMField:
         """Each tensor has a scale of its own."""
