@@ -32,7 +32,7 @@ from formats.quantised import (
 
 KEY = "fusedrf"
 PLAIN, CODED, VERSION = 1, 2, 3  # of fields without coded arrays, with them, and that need what is in NEEDS
-NEEDS = ("hashed", "held", "runs")  # what a field's metadata may say that a reader must know, to show it as it is
+NEEDS = ("hashed", "held", "runs")  # that a field's metadata may say a reader must know, to show it as it is
 MAX_HEADER = 1 << 20
 MAX_ARRAYS = 4096
 MAX_ARRAY_BYTES = 2 << 30
@@ -397,8 +397,8 @@ def _in_runs(
     can tell."""
     if said is not True or len(shape) != 2:
         raise BadSchema(f"{where}: 'runs' of array {name!r} should be true, and the array of two sizes")
-    if runs is None or runs.dtype != DTYPES["I32"] or len(runs.shape) != 1:
-        raise BadArray(f"{where}: array {name!r} lacks {runs_of(name)!r}, int32 in one dimension")
+    if runs is None or runs.dtype not in (DTYPES["I32"], DTYPES["U8"]) or len(runs.shape) != 1:
+        raise BadArray(f"{where}: array {name!r} lacks {runs_of(name)!r}, whole numbers in one dimension")
     (count,), blocks = runs.shape, scales.shape[0] if scales.shape else 0
     least, *columns = scales_shape(tuple(shape))
     if not max(least, count) <= blocks <= least + count:

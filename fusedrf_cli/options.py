@@ -394,6 +394,9 @@ max_size = click.option("--max-size", type=BYTES, help="Largest output file, suc
 fused_max_size = click.option(
     "--max-size", type=BYTES, help="Largest output file; default: 25MB, and what places of the scene take."
 )
+extracted_max_size = click.option(
+    "--max-size", type=BYTES, help="Largest output file; numbers are left out and learnt again where needed."
+)
 memory = click.option(
     "--memory", type=BYTES, help="Most memory to take, such as 8GiB; default: 80 % of what is free."
 )
@@ -420,7 +423,7 @@ allow_outside = click.option(
 extracted_precision = click.option(
     "--precision",
     type=PRECISION,
-    help="How numbers are stored; default: float16, with --invert as those of FIELD are.",
+    help="How numbers are stored; default: as those of FIELD are, where they stay the same, else float16.",
 )
 PLACEMENT = {  # flags -> what click.option takes; `compose` has them once per input
     ("-t", "--translate"): {"type": VECTOR, "help": "Move by x,y,z."},

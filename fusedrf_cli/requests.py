@@ -207,7 +207,8 @@ class ExtractRequest(MendingRequest):
     preview: str | None
     """A folder of pictures."""
     precision: str | None
-    """None: float16 of an object, the field's own of what is left."""
+    """None: the field's own, where an object's numbers stay what they are by it, else float16."""
+    max_size: int | None
 
 
 @dataclass(frozen=True, kw_only=True)

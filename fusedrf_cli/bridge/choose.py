@@ -173,7 +173,7 @@ class Choosing:
             ]
             if not near and not (chosen.whole and side > 0):
                 made = self.make(chosen.way, round(chosen.bytes * NEIGHBOUR**side), True)
-                near = [made] if made is not None else []
+                near = [made] if made is not None and made.bytes != chosen.bytes else []
             if near:
                 best = max(near, key=lambda t: (t.psnr - chosen.psnr) / abs(math.log(t.bytes / chosen.bytes)))
                 found[f"next_{name}"] = best.report(self.kind)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from formats.atomic import atomic_folder, check_writable
 from formats.captures import read_cameras
@@ -15,27 +16,36 @@ from formats.filenames import distinct
 from formats.hulls import Hull
 from formats.images import read_mask, write_png
 from formats.photos import pictures
+from formats.records import BITS
 from formats.rig import Rig, read_rig
+from formats.scene import SceneGraph
 from formats.views import View
 from fusedrf_cli.bridge.editing import Fused, read_fused
+from fusedrf_cli.bridge.fusing import best_of, best_suited
 from fusedrf_cli.bridge.history import summed_up
-from fusedrf_cli.bridge.memory import Memory, ownership
+from fusedrf_cli.bridge.making import Scene
+from fusedrf_cli.bridge.memory import FLOAT, Memory, ownership
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.mending import mended
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import to_pixels
 from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
-from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.bridge.scene import LoadedScene, PlacedRig, SourceField, stored, write_field
+from fusedrf_cli.bridge.shelf import Shelf
+from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, graph_bytes
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
 from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, shown_by, well_shown
+from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput, UsageProblem
-from fusedrf_cli.requests import ExtractRequest
+from fusedrf_cli.requests import ExtractRequest, FuseRequest
 
 LONGEST = 512
 """Pixels along the longer side of a view, in which masks are looked at."""
@@ -82,6 +92,16 @@ class Told:
     """(K, 3) points on it."""
     outside: np.ndarray
     """(L, 3) points that are not."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """The object, or what is left, as it is written."""
+
+    field: StoredField
+    origin: np.ndarray
+    """Where its frame lies in the world: a position (3,), or a placement (4, 4)."""
+    precision: str = ""
 
 
 def extract(request: ExtractRequest, progress) -> dict:
@@ -133,16 +153,34 @@ def extract(request: ExtractRequest, progress) -> dict:
         if request.invert:
             wanted, figures["hole"] = mended(request, fused, wanted, found, memory, place, progress)
             parts = found, wanted
+        progress.phase("trimming", None)
+        wanted = fused.kind.trimmed(wanted)
+        bundle = bundle_of(request, fused, found)
+        piece = Piece(wanted, fused.origin, precision_of(request, fused, wanted))
+        if request.max_size is not None:
+            piece, told = within_size(request, fused, piece, bundle, memory, place, progress)
+            figures |= told
         with held_back(request.output):
             size = written_somewhere(
-                request.output, lambda output: write(request, output, fused, wanted, found)
+                request.output,
+                lambda output: write_field(
+                    output,
+                    piece.field,
+                    precision=piece.precision,
+                    overwrite=request.overwrite,
+                    origin=piece.origin,
+                    **bundle,
+                ),
             )
-        files = previews(request, fused, rig, parts, progress) if request.preview else []
+        whole = [None if part is None else Piece(part, fused.origin) for part in parts]
+        whole[bool(request.invert)] = piece
+        files = previews(request, fused, rig, whole, progress) if request.preview else []
         box = placed_box(found.occupancy.subject, fused.origin)
     return {
         "output": request.output,
         "bytes": size,
-        "kind": wanted.kind,
+        "kind": piece.field.kind,
+        "precision": piece.precision,
         "box": [float(x) for x in box],
         **figures,
         **({"preview": files} if files else {}),
@@ -427,22 +465,78 @@ def cut(
 # -- writing -------------------------------------------------------------------------------------------------
 
 
-def write(request: ExtractRequest, output: str, fused: Fused, wanted: StoredField, found: StoredField) -> int:
-    """Write one of the two fields as a bundle; the bytes written."""
+def bundle_of(request: ExtractRequest, fused: Fused, found: StoredField) -> dict:
+    """What `write_field` writes beside the field: of what is left all that the bundle had, of the object what
+    is its own."""
     if request.invert:
         history = summed_up((*fused.scene.history, {"event": "extracted", "names": [], "nodes": []}))
-        return write_field(
-            output, wanted, fused.node.name, precision=request.precision or fused.precision,
-            overwrite=request.overwrite, origin=fused.origin, history=history,
-            kept=dict.fromkeys(fused.others, fused.bundle), extras=fused.scene.extras, framing=fused.framing,
-            cameras=fused.scene.cameras,
-        )  # fmt: skip
-    return write_field(
-        output, found, request.name or "object", precision=request.precision or "float16",
-        overwrite=request.overwrite, origin=fused.origin,
-        framing=placed_box(found.occupancy.subject, fused.origin),
-        cameras=own_cameras(fused, found),
+        return {
+            "name": fused.node.name,
+            "history": history,
+            "kept": dict.fromkeys(fused.others, fused.bundle),
+            "extras": fused.scene.extras,
+            "framing": fused.framing,
+            "cameras": fused.scene.cameras,
+        }
+    return {
+        "name": request.name or "object",
+        "framing": placed_box(found.occupancy.subject, fused.origin),
+        "cameras": own_cameras(fused, found),
+    }
+
+
+def precision_of(request: ExtractRequest, fused: Fused, wanted: StoredField) -> str:
+    """As asked for, or as the numbers of the field are stored; those of an object in 8 or 4 bits only where
+    they stay what they are, else in float16."""
+    if request.precision or request.invert:
+        return request.precision or fused.precision
+    if fused.precision not in BITS:
+        return "float16"
+    same = torch.equal(stored(wanted, fused.precision).params, wanted.params)
+    return fused.precision if same else "float16"
+
+
+def within_size(
+    request: ExtractRequest,
+    fused: Fused,
+    piece: Piece,
+    bundle: dict,
+    memory: Memory,
+    place: str,
+    progress,
+) -> tuple[Piece, dict]:
+    """The piece, where its bundle is as small as was asked for, else as `fuse --max-size` makes it; and what
+    the report says of that."""
+    overhead = graph_bytes(list(bundle.get("history", ())), bundle["cameras"], bundle.get("extras"))
+    overhead += sum(BESIDES + fused.bundle.headers[member].size for member in bundle.get("kept", ()))
+    if overhead + BundleSizes().exactly(piece.field, piece.precision) <= request.max_size:
+        return piece, {}
+    wanted = FuseRequest(
+        scene=request.field, output=request.output, overwrite=request.overwrite, kind=registry.AUTO,
+        max_size=request.max_size, target_psnr=None, precision=request.precision, ranks=None,
+        sh_degree=None, rgb=True, from_scratch=False, keep_sources=False, memory=request.memory,
+        allow_outside=False, resume=False, sources=None, time_budget=request.time_budget,
+        seed=request.seed, device=request.device, threads=request.threads,
     )  # fmt: skip
+    scene = Scene.of(alone(fused, piece, bundle))
+    kind, _ = best_suited(scene.composed)
+    if kind.field is not None:  # which would learn what the piece's own kind is made of
+        kind = registry.kind(piece.field.kind)
+    kept, _, figures_of_it = best_of(wanted, scene, kind, overhead, memory, place, progress)
+    figures = figures_of_it()
+    told = {name: figures[name] for name in ("psnr", "chosen")}
+    return Piece(kept.field, scene.composed.origin, kept.tried.way.precision), told
+
+
+def alone(fused: Fused, piece: Piece, bundle: dict) -> LoadedScene:
+    """A piece as a scene of its own, with the cameras that its bundle keeps."""
+    background = piece.field.space is not bounded
+    at, cameras = placement(piece.origin), bundle["cameras"]
+    placed = Placed(bundle["name"], piece.field, at)
+    rigs = () if cameras is None else (PlacedRig(bundle["name"], background, cameras, np.eye(4)),)
+    needs = FieldNeeds(held=piece.field.params.numel() * FLOAT, reading=0)
+    field = SourceField(placed, background, fused.bundle, fused.node.field, needs)
+    return LoadedScene((field,), "max", SceneGraph(()), Path(fused.path), Shelf(), rigs)
 
 
 def own_cameras(fused: Fused, found: StoredField) -> dict | None:
@@ -460,11 +554,11 @@ def own_cameras(fused: Fused, found: StoredField) -> dict | None:
 
 
 def previews(
-    request: ExtractRequest, fused: Fused, rig: dict[str, View], parts: tuple, progress
+    request: ExtractRequest, fused: Fused, rig: dict[str, View], parts: list[Piece | None], progress
 ) -> list[str]:
     """Pictures of a few views: the object, the rest, and the whole with the object marked."""
     views = [small(view, SHOWN) for view in shown_views(request, rig)]
-    cameras = [camera_of(view) for view in views] or [framed(fused, parts[0])]
+    cameras = [camera_of(view) for view in views] or [framed(parts[0])]
     progress.phase("previews", len(cameras))
     files, folder = [], Path(request.preview)
     names = distinct([camera.name or "view" for camera in cameras], ("_object", "_marked", "_rest"))
@@ -488,25 +582,25 @@ def shown_views(request: ExtractRequest, rig: dict[str, View]) -> list[View]:
     )
 
 
-def framed(fused: Fused, found: StoredField) -> Camera:
+def framed(found: Piece) -> Camera:
     """A view of where the object stands, for want of cameras."""
     lens = framing_lens(SHOWN, SHOWN)
-    box = placed_box(found.occupancy.subject, fused.origin)
+    box = placed_box(found.field.occupancy.subject, found.origin)
     grown = enclosing([box + 0.5 * (box[3:] - box[:3]).max() * np.repeat([-1, 1], 3)])
     return framing(grown, lens).camera(lens)
 
 
-def pictures_of(fused: Fused, parts: tuple, camera: Camera) -> dict[str, np.ndarray]:
+def pictures_of(fused: Fused, parts: list[Piece | None], camera: Camera) -> dict[str, np.ndarray]:
     """(H, W, 3 or 4) uint8 of the object alone, over nothing; of the rest; and of the whole, in which the
     object is red."""
     found, rest = parts
     whole = render_image(fused.field, camera, origin=fused.origin)
-    alone = render_image(found, camera, origin=fused.origin)
-    marked, own = whole.over((1, 1, 1)), alone.over((1, 1, 1))
-    hidden = (alone.depth > whole.depth * BEFORE) & (np.abs(marked - own).mean(-1) > ALIKE)
-    before = (alone.opacity > 0.5) & ~hidden
+    by_itself = render_image(found.field, camera, origin=found.origin)
+    marked, own = whole.over((1, 1, 1)), by_itself.over((1, 1, 1))
+    hidden = (by_itself.depth > whole.depth * BEFORE) & (np.abs(marked - own).mean(-1) > ALIKE)
+    before = (by_itself.opacity > 0.5) & ~hidden
     marked[before] = 0.5 * marked[before] + 0.5 * MARKED
-    shown = {"object": to_pixels(alone, None), "marked": np.rint(255 * marked).astype(np.uint8)}
+    shown = {"object": to_pixels(by_itself, None), "marked": np.rint(255 * marked).astype(np.uint8)}
     if rest is not None:
-        shown["rest"] = to_pixels(render_image(rest, camera, origin=fused.origin), (1.0, 1.0, 1.0))
+        shown["rest"] = to_pixels(render_image(rest.field, camera, origin=rest.origin), (1.0, 1.0, 1.0))
     return shown

@@ -69,19 +69,10 @@ def fuse(
         cameras = kept_cameras(loaded, progress)
         framing = kept_framing(loaded, scene.composed, cameras)
         check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
-        asked = student_request(request, scene, graph_bytes(nodes, cameras))
-        try:
-            student = kind.student(scene.composed, asked)
-            held = make_room(memory, student, scene, request)
-            maker, choosing, seconds = begin(student, scene, request, place, progress)
-            maker.sources_in_memory = held
-            found = search(maker, choosing, student, request, saved, seconds)
-        except TooSmall as error:
-            raise UsageProblem(
-                f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
-                f"where {readable_size(asked.limit)} were allowed; give more"
-            ) from error
-        reached = reached_by(found, student)
+        overhead = graph_bytes(nodes, cameras)
+        found, student, figures_of_it = best_of(
+            request, scene, kind, overhead, memory, place, progress, saved
+        )
         entry = {
             "event": "fused",
             "kind": kind.name,
@@ -89,11 +80,11 @@ def fuse(
             "nodes": nodes,
             "settings": {
                 "seed": request.seed,
-                "max_size": asked.limit,
+                "max_size": student.request.limit,
                 "rgb": request.rgb,
                 "from_scratch": request.from_scratch,
             },
-            "psnr": reached,
+            "psnr": reached_by(found, student),
         }
         with held_back(request.output):  # what was made comes before what is found out about it
             size = somewhere(
@@ -114,7 +105,7 @@ def fuse(
             checkpoint_path(request.output).unlink(missing_ok=True)
         details = student.details(found.field)
         warn_of_detail(details, remedy(kind, loaded, scene.composed), progress)
-        figures = figures_of(found, maker, choosing, seconds)
+        figures = figures_of_it()
     report = {
         "output": request.output,
         "bytes": size,
@@ -128,6 +119,34 @@ def fuse(
     }
     check_target(report, request.target_psnr, request.output)
     return report
+
+
+def best_of(
+    request: FuseRequest,
+    scene: Scene,
+    kind: Kind,
+    overhead: int,
+    memory: Memory,
+    place: str,
+    progress,
+    saved: Saved | None = None,
+) -> tuple[Kept, Student, Callable[[], dict]]:
+    """The best stand of a kind for a scene, and what tells of it for the report, which may try more;
+    overhead: bytes of the bundle besides its field. UsageProblem where nothing fits the size that is
+    allowed."""
+    asked = student_request(request, scene, overhead)
+    try:
+        student = kind.student(scene.composed, asked)
+        held = make_room(memory, student, scene, request)
+        maker, choosing, seconds = begin(student, scene, request, place, progress)
+        maker.sources_in_memory = held
+        found = search(maker, choosing, student, request, saved, seconds)
+    except TooSmall as error:
+        raise UsageProblem(
+            f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
+            f"where {readable_size(asked.limit)} were allowed; give more"
+        ) from error
+    return found, student, lambda: figures_of(found, maker, choosing, seconds)
 
 
 def student_request(request: FuseRequest, scene: Scene, overhead: int) -> StudentRequest:

@@ -23,6 +23,7 @@ from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.kinds import registry, splitting
 from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm.trimming import without_unasked
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.holes import patches
@@ -112,7 +113,8 @@ def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredFie
     looked_in = learnt.occupancy.aabb
     if same:
         looked_in = splitting.common_box(looked_in, box)
-    return splitting.within(learnt, learnt.tensors[0].aabb, learnt.voxel_size, inside, looked_in)
+    behind = splitting.within(learnt, learnt.tensors[0].aabb, learnt.voxel_size, inside, looked_in)
+    return behind and without_unasked(behind)
 
 
 # -- learning from photos ------------------------------------------------------------------------------------

@@ -59,11 +59,13 @@ def kept_texels(used: np.ndarray) -> int:
     return int(sides[0] @ held @ sides[1])
 
 
-def graph_bytes(nodes: list[dict], cameras: dict | None = None) -> int:
-    """At most so many bytes for all of a fused bundle but its field; nodes are those of its history."""
+def graph_bytes(nodes: list[dict], cameras: dict | None = None, extras: dict | None = None) -> int:
+    """At most so many bytes for all of a fused bundle but its field; nodes are those of its history, extras
+    the scene's keys that this version does not know."""
     node = make_node("fused", field=f"fields/{'0' * 16}.safetensors", translation=(math.pi,) * 3)
     framing = (-math.pi,) * 3 + (math.pi,) * 3
-    scene = SceneGraph((node,), history=({"nodes": nodes},), framing=framing, cameras=cameras)
+    history = ({"nodes": nodes},)
+    scene = SceneGraph((node,), history=history, framing=framing, cameras=cameras, extras=extras or {})
     return BESIDES + len(dump_scene(scene))
 
 

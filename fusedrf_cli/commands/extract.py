@@ -38,6 +38,7 @@ from fusedrf_cli.requests import ExtractRequest
 )
 @options.mending
 @options.time_budget
+@options.extracted_max_size
 @options.extracted_precision
 @options.memory
 @options.seeded

@@ -156,6 +156,26 @@ def test_the_object_keeps_its_cameras_and_stands_free(report, folder):
     assert scene.framing[3] < 0.1
 
 
+@pytest.mark.parametrize("kind", ["blocks", "vm", "sparse", "dense"])
+def test_no_more_bytes_than_allowed(report, run, folder, kind):
+    words = ("extract", f"{kind}.rfpack", "--box", AROUND, "-o", "object.rfpack", "-w")
+    whole = report(*words)["bytes"]
+    assert report(*words, "--max-size", str(whole))["bytes"] == whole
+    said = report(*words, "--max-size", str(whole * 2 // 3))
+    assert said["bytes"] == (folder / "object.rfpack").stat().st_size <= whole * 2 // 3
+    assert said["psnr"]["stored"] > 20 and iou(folder, "object.rfpack") > 0.75
+    kept = (folder / "object.rfpack").read_bytes()
+    result = run(*words, "--max-size", "1200")
+    assert result.exit_code == 2 and "--max-size is too small: the file takes" in result.stderr
+    assert (folder / "object.rfpack").read_bytes() == kept
+
+
+def test_what_is_left_takes_no_more_bytes_than_allowed(report, folder):
+    words = ("extract", "blocks.rfpack", "--name", "red", "--invert", "-o", "rest.rfpack", "-w")
+    whole = report(*words)["bytes"]
+    assert report(*words, "--max-size", str(whole * 2 // 3))["bytes"] <= whole * 2 // 3
+
+
 BAD = {
     "nothing is told": ((), 2, "say which object"),
     "no cameras": (("--masks", "masks"), 3, "keeps no cameras"),

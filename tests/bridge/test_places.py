@@ -375,3 +375,77 @@ def test_what_a_place_takes_comes_on_top_of_the_default_size(fused):
     loaded = load_scene(str(fused / "place.json"))
     assert place_bytes(loaded) == (fused / "room.rfpack").stat().st_size < source_bytes(loaded)
     assert place_bytes(load_scene(str(fused / "scene.json"))) == 0
+
+
+# -- what is cut out -----------------------------------------------------------------------------------------
+
+
+def furnished() -> VMField:
+    """Far walls, and a ball in the core that shows a sixth of the detail's rows."""
+    kind, generator = registry.kind("vm"), torch.Generator().manual_seed(3)
+    way = replace(way_of(SHAPE), hashed=Hashed((1 / 16, 1 / 32), 1 << 15))
+    field = kind.create(kind.plan_at(WHOLE, (49,) * 3, way), generator)
+    field.sections(0)["detail"].normal_(0, 0.5, generator=generator)
+    grid = OccupancyGrid.full(WHOLE, 64, unbounded)
+    at = grid.centres()
+    there = (abs(at).max(1) > 1.9) | (np.linalg.norm(at - [0.3, 0, 0], axis=1) < 0.25)
+    field = field.with_occupancy(grid.marked(there.reshape(grid.occupied.shape)))
+    tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
+    return VMField(field.shape, (tensor,), field.blocks, 4 * field.params, field.occupancy)
+
+
+@pytest.fixture
+def cut(folder, report, monkeypatch):
+    """room.rfpack, in 8 bits, and ball.rfpack, which was cut out of it; what the command said."""
+    monkeypatch.setattr("formats.quantised.LEAST", {2: 4096, 3: 256})  # the ball's arrays are coded too
+    room = str(folder / "room.rfpack")
+    write_field(room, furnished(), "room", precision="int8", overwrite=True, origin=LIES)
+    return report("extract", "room.rfpack", "--sphere", "0.7,0,-0.2,0.6", "-o", "ball.rfpack")
+
+
+def test_an_object_out_of_a_place_has_the_numbers_that_it_asks_alone(folder, report, cut):
+    """Those of the place to the bit, in a fraction of its bytes."""
+    (room, _), (ball, _) = (load_scene(str(folder / n)).lone() for n in ("room.rfpack", "ball.rfpack"))
+    assert cut["precision"] == "int8" and cut["bytes"] < 0.2 * (folder / "room.rfpack").stat().st_size
+    rows, own = (field.sections(0)["detail"] for field in (room, ball))
+    asked = (own != 0).any(1)
+    assert torch.equal(own[asked], rows[asked]) and 0.02 < asked.float().mean() < 0.5
+    rng, grid = np.random.default_rng(0), ball.occupancy
+    points = grid.centres() + (rng.random((len(grid.centres()), 3)) - 0.5) * grid.cell
+    points = torch.from_numpy(points[room.occupancy.contains(points)])
+    dirs = torch.from_numpy(unit(rng.normal(size=points.shape)))
+    for one, other in zip(ball.query(points, dirs), room.query(points, dirs), strict=True):
+        torch.testing.assert_close(one, other, rtol=2e-4, atol=1e-5)  # float32 in another box
+    report("extract", "room.rfpack", "--sphere", "0.7,0,-0.2,0.6", "-o", "again.rfpack")
+    assert (folder / "again.rfpack").read_bytes() == (folder / "ball.rfpack").read_bytes()
+
+
+def test_what_is_left_is_no_larger(folder, report, cut):
+    said = report("extract", "room.rfpack", "--sphere", "0.7,0,-0.2,0.6", "--invert", "-o", "rest.rfpack")
+    assert said["bytes"] < 1.05 * (folder / "room.rfpack").stat().st_size
+
+
+def test_it_stays_small_where_it_is_put(folder, report, cut):
+    """Fused beside itself and added to that again, its numbers are there once; out of it comes what went
+    in."""
+    nodes = [make_node(n, source="ball.rfpack", translation=(x, 0, 0)) for n, x in (("a", 0), ("b", 3))]
+    write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
+    said = report("fuse", "two.json", "-o", "two.rfpack", "--no-rgb", "--precision", "int8")
+    assert said["bytes"] < 1.1 * cut["bytes"] + 4000
+    report("add", "two.rfpack", "ball.rfpack", "--name", "c", "--translate", "0,3,0", "-o", "three.rfpack")
+    three = (folder / "three.rfpack").stat().st_size
+    assert three < 1.2 * cut["bytes"] + 8000
+    report("delete", "three.rfpack", "a", "-o", "left.rfpack")
+    assert (folder / "left.rfpack").stat().st_size <= three
+    said = report("extract", "three.rfpack", "--name", "b", "-o", "b.rfpack")
+    (ball, _), (b, _) = (load_scene(str(folder / n)).lone() for n in ("ball.rfpack", "b.rfpack"))
+    assert said["precision"] == "int8" and torch.equal(b.sections(0)["detail"], ball.sections(0)["detail"])
+
+
+def test_its_size_can_be_limited(folder, report, cut):
+    """To half of what it takes."""
+    words = ("extract", "room.rfpack", "--sphere", "0.7,0,-0.2,0.6", "-o", "small.rfpack")
+    said = report(*words, "--max-size", str(cut["bytes"] // 2))
+    assert (folder / "small.rfpack").stat().st_size <= cut["bytes"] // 2 and said["psnr"]["stored"] > 15
+    report(*words, "-w", "--max-size", str(2 * cut["bytes"]))
+    assert (folder / "small.rfpack").read_bytes() == (folder / "ball.rfpack").read_bytes()

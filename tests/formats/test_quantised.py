@@ -199,7 +199,7 @@ BAD_RUNS = {
     "a negative run": (little(100, 1, 69899), little(102, -1, 69899), "of 1 row and more, 70,000 in all"),
     "too few rows": (little(100, 1, 69899), little(100, 1, 69898), "of 1 row and more, 70,000 in all"),
     "other blocks": (little(100, 1, 69899), little(64, 36, 69900), "do not have 1,096 blocks"),
-    "no runs": (b'"a.runs":', b'"b.runs":', "lacks 'a.runs', int32 in one dimension"),
+    "no runs": (b'"a.runs":', b'"b.runs":', "lacks 'a.runs', whole numbers in one dimension"),
     "said otherwise": (b'\\"runs\\":true', b'\\"runs\\":1234', "should be true"),
 }
 
@@ -210,6 +210,37 @@ def test_runs_that_fit_no_array_are_refused(name):
     old, new, sentence = BAD_RUNS[name]
     with pytest.raises(errors.FormatError, match=f"^here: .*{sentence}"):
         decode_field(altered(in_runs([100, 1, 69899]), old, new), "here")
+
+
+# --- what is left of an array keeps its codes ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", [8, 4])
+@pytest.mark.parametrize("shape", [(1000, 5), (40, 33, 3)])
+def test_numbers_that_are_left_keep_their_values(bits, shape):
+    """Whatever else of their blocks is made 0, the number that told the scale too."""
+    rng = np.random.default_rng(0)
+    array = rng.standard_normal(shape).astype(np.float32) * np.exp(rng.normal(size=shape[-1])).astype("f4")
+    read = dequantised(*quantised.quantised(array, bits), bits, shape, "a")
+    for share in (0.5, 0.05):
+        left = np.where(rng.random(shape) < share, read, 0)
+        scales, codes = quantised.quantised(left, bits)
+        again = dequantised(scales, codes, bits, shape, "a")
+        np.testing.assert_array_equal(again, left)
+        for one, other in zip(quantised.quantised(again, bits), (scales, codes), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("bits", [8, 4])
+def test_rows_that_are_left_keep_their_values_in_runs_of_their_blocks(bits):
+    rng = np.random.default_rng(1)
+    read = rng.standard_normal((64 * 30, 4)).astype(np.float32)
+    read = dequantised(*quantised.quantised(read, bits), bits, read.shape, "a")
+    kept = rng.random(len(read)) < 0.2
+    runs = kept.reshape(-1, 64).sum(1).astype(np.uint8)
+    left = read[kept]
+    again = dequantised(*quantised.quantised(left, bits, runs), bits, left.shape, "a", runs)
+    np.testing.assert_array_equal(again, left)
 
 
 # --- bytes --------------------------------------------------------------------------------------------------

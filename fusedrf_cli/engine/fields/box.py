@@ -16,6 +16,7 @@ from fusedrf_cli.engine.fields.computed import (
     ComputedField,
     Group,
     Reads,
+    packed_bits,
     unpack_bits,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -196,8 +197,8 @@ class BoxField(ComputedField):
             part.name: self.pack(part, view.detach().cpu()).numpy()
             for part, view in zip(self.parts, self.sections().values(), strict=True)
         }
-        arrays["occupancy"] = np.packbits(self.occupancy.occupied)
-        metadata = {
+        arrays |= packed_bits("occupancy", self.occupancy.occupied)
+        metadata = ({} if "occupancy" in arrays else {"needs": ["held"]}) | {
             "aabb": self.box.tolist(),
             "resolution": list(self.resolution),
             "scale": self.scale,

@@ -30,6 +30,11 @@ from fusedrf_cli.engine.kernels.tinting import with_tints
 
 CELLS_PER_TASK = 256
 CELLS_AT_ONCE = 1 << 18
+BRICK = 4  # cells a side
+FEW_CELLS, MOST_CELLS = 1 << 22, 1 << 26
+"""Of a grid up to which files have its bits one after the other, and that is read in bricks: no grid of a fit
+has more than the first."""
+WORTH = 0.75  # of the bytes of all bits, from which bricks are worth it
 StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
 """The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
 the runs of its rows, or None."""
@@ -389,13 +394,57 @@ def as_array(values: np.ndarray | torch.Tensor, kind: np.dtype) -> np.ndarray:
     return np.ascontiguousarray(values, kind)
 
 
+def packed_bits(name: str, grid: np.ndarray, least: int = FEW_CELLS) -> dict[str, np.ndarray]:
+    """The arrays of a grid (X, Y, Z) bool of that name: its bits; of more than `least` cells, where that is
+    less, for bricks of BRICK cells a side whether they have any and whether they have all, and the bits of
+    the others."""
+    packed = {name: np.packbits(grid)}
+    if grid.size <= least:
+        return packed
+    bricks = in_bricks(np.pad(grid, [(0, -n % BRICK) for n in grid.shape], "edge"))
+    some, whole = bricks.any(1), bricks.all(1)
+    mixed = np.packbits(bricks[some & ~whole], axis=1)
+    parts = {f"{name}.bricks": np.packbits(np.stack([some, whole])), f"{name}.mixed": mixed}
+    return parts if sum(part.nbytes for part in parts.values()) < WORTH * packed[name].nbytes else packed
+
+
+def in_bricks(grid: np.ndarray) -> np.ndarray:
+    """(N, BRICK³) the cells of each brick of a grid of whole ones."""
+    x, y, z = (n // BRICK for n in grid.shape)
+    cells = grid.reshape(x, BRICK, y, BRICK, z, BRICK)
+    return cells.transpose(0, 2, 4, 1, 3, 5).reshape(x * y * z, BRICK**3)
+
+
 def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> np.ndarray:
-    """Inverse of np.packbits for the named array, a grid of a known shape. Raises ValueError naming it."""
+    """Inverse of `packed_bits` for the named array, a grid of a known shape. Raises ValueError naming it."""
     count = int(np.prod(shape))
     packed = arrays.get(name)
+    if packed is None and f"{name}.bricks" in arrays:
+        return unpacked_bricks(arrays[f"{name}.bricks"], arrays.get(f"{name}.mixed"), name, shape)
     if packed is None or packed.shape != (-(-count // 8),):
         have = "nothing" if packed is None else list(packed.shape)
         raise ValueError(
             f"array '{name}' should have shape {[-(-count // 8)]} for a grid of {shape}, found {have}"
         )
     return np.unpackbits(packed, count=count).reshape(shape).view(bool)
+
+
+def unpacked_bricks(
+    marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]
+) -> np.ndarray:
+    """(X, Y, Z) bool of the bricks of a grid. Raises ValueError where they are not its."""
+    if np.prod(shape, dtype=float) > MOST_CELLS:
+        raise ValueError(f"array '{name}' is of {shape} cells, but at most {MOST_CELLS:,} are read")
+    counts = [-(-n // BRICK) for n in shape]
+    number = int(np.prod(counts))
+    if marks.dtype != np.uint8 or marks.shape != (-(-number // 4),):
+        raise ValueError(f"array '{name}.bricks' should be {-(-number // 4)} bytes for a grid of {shape}")
+    some, whole = np.unpackbits(marks, count=2 * number).reshape(2, number).astype(bool)
+    some &= ~whole
+    if mixed is None or mixed.dtype != np.uint8 or mixed.shape != (some.sum(), BRICK**3 // 8):
+        raise ValueError(f"array '{name}.mixed' should have {some.sum()} rows of {BRICK**3 // 8} bytes")
+    bricks = np.zeros((number, BRICK**3), bool)
+    bricks[whole] = True
+    bricks[some] = np.unpackbits(mixed, axis=1)
+    cells = bricks.reshape(*counts, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
+    return cells.reshape([n * BRICK for n in counts])[tuple(slice(n) for n in shape)].copy()

@@ -16,6 +16,7 @@ EMPTY_FROM = -6.0  # density before activation, shift included, under which none
 MAX_LEVELS, MAX_ROWS = 8, 1 << 24
 MAX_VERTEX = 1 << 20  # along an axis: past it, float32 would not tell where between two a point is
 TOGETHER = 64  # rows that files code by one scale
+PER_BLOCK = TOGETHER // RUN // 8 + 1 + 2 * WIDTH  # bytes of those: which are held, how many, and scales
 WORTH = 0.75  # of the bytes of all rows: up to which a file has those alone that are not 0
 
 
@@ -44,50 +45,62 @@ class Hashed:
 
 @dataclass(frozen=True)
 class Held:
-    """Which rows of a detail a file holds: of an object that was cut out those that it can ask, the others
-    being 0."""
+    """Which runs of RUN rows of a detail a file holds: of an object that was cut out those that it can ask,
+    the others being 0."""
 
-    rows: np.ndarray
-    """(R,) bool, R a multiple of TOGETHER."""
+    runs: np.ndarray
+    """(R / RUN,) bool, R a multiple of TOGETHER."""
 
     @classmethod
     def of(cls, detail: np.ndarray) -> "Held | None":
-        """Of a detail (R, WIDTH) the rows other than 0; None where a file is to hold all of them."""
+        """Of a detail (R, WIDTH) the runs with a number other than 0; None where a file is to hold all."""
         if len(detail) % TOGETHER:
             return None
-        held = cls(detail.any(1))
-        blocks = TOGETHER // 8 + 4 + 2 * WIDTH  # bytes of each: its mask, its length, scales
-        small = held.rows.sum() * WIDTH + len(held.masks) * blocks <= WORTH * WIDTH * len(detail)
-        return held if small else None
+        held = cls(detail.reshape(-1, RUN * WIDTH).any(1))
+        bytes_held = held.count * WIDTH + len(held.masks) * PER_BLOCK
+        return held if bytes_held <= WORTH * WIDTH * len(detail) else None
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(R,) bool: the rows of these runs."""
+        return self.runs.repeat(RUN)
+
+    @property
+    def count(self) -> int:
+        """Of rows."""
+        return RUN * int(np.count_nonzero(self.runs))
+
+    @cached_property
+    def blocks(self) -> np.ndarray:
+        """(R / TOGETHER,) bool: which blocks of rows hold any."""
+        return self.runs.reshape(-1, TOGETHER // RUN).any(1)
 
     @cached_property
     def masks(self) -> np.ndarray:
-        """(K, TOGETHER) bool: of each block of rows of which any is held, which."""
-        blocks = self.rows.reshape(-1, TOGETHER)
-        return blocks[blocks.any(1)]
+        """(K, TOGETHER / RUN) bool: the runs of those blocks."""
+        return self.runs.reshape(-1, TOGETHER // RUN)[self.blocks]
 
     @property
-    def runs(self) -> np.ndarray:
-        """(K,) int32 how many rows of each such block are held: they are coded by scales of their own, as
-        they are among all rows, so that they keep their codes."""
-        return self.masks.sum(1, dtype=np.int32)
+    def lengths(self) -> np.ndarray:
+        """(K,) uint8 how many rows each of them holds: they are coded by scales of their own, as they are
+        among all rows, so that they keep their codes."""
+        return RUN * self.masks.sum(1, dtype=np.uint8)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Bits, first which blocks hold any, then which of their rows they hold."""
-        blocks = self.rows.reshape(-1, TOGETHER).any(1)
-        return {"blocks": np.packbits(blocks), "rows": np.packbits(self.masks, axis=1)}
+        """Bits: which blocks hold any rows, and which of their runs."""
+        return {"blocks": np.packbits(self.blocks), "held": np.packbits(self.masks, axis=1)}
 
     @classmethod
-    def from_state(cls, blocks: np.ndarray, rows: np.ndarray, count: int) -> "Held":
+    def from_state(cls, blocks: np.ndarray, held: np.ndarray, rows: int) -> "Held":
         """Inverse of `state`, of so many rows in all. Raises ValueError where that cannot be."""
-        found = np.zeros((count // TOGETHER, TOGETHER), bool)
-        if count % TOGETHER or blocks.dtype != np.uint8 or blocks.shape != (-(-len(found) // 8),):
-            raise ValueError(f"which of {count} rows are held should be told by a bit for {TOGETHER}")
+        found = np.zeros((rows // TOGETHER, TOGETHER // RUN), bool)
+        if rows % TOGETHER or blocks.dtype != np.uint8 or blocks.shape != (-(-len(found) // 8),):
+            raise ValueError(f"which of {rows} rows are held should be told by a bit for {TOGETHER}")
         bits = np.unpackbits(blocks)
-        some = bits[: len(found)].astype(bool)
-        if rows.dtype != np.uint8 or rows.shape != (some.sum(), TOGETHER // 8) or bits[len(found) :].any():
-            raise ValueError(f"{some.sum()} times {TOGETHER} rows are held in part, but not told which")
-        found[some] = np.unpackbits(rows, axis=1).astype(bool)
+        some, rest = bits[: len(found)].astype(bool), bits[len(found) :]
+        if held.dtype != np.uint8 or held.shape != (some.sum(), found.shape[1] // 8) or rest.any():
+            raise ValueError(f"which rows are held of {some.sum()} times {TOGETHER} should be told")
+        found[some] = np.unpackbits(held, axis=1).astype(bool)
         if not found[some].any(1).all():
-            raise ValueError(f"{TOGETHER} rows are held in part, but none of them is")
+            raise ValueError(f"of {TOGETHER} rows that are said to be held none is")
         return cls(found.ravel())

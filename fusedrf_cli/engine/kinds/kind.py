@@ -172,6 +172,11 @@ class Kind:
         None where there is nothing. Raises ValueError as `cut_out`."""
         return splitting.cropped(self.on_one_grid(field), field.box, holds)
 
+    def trimmed(self, field: StoredField) -> StoredField:
+        """The same field without the numbers that none of its cells asks, where that makes its files
+        smaller."""
+        return field
+
     def on_one_grid(self, field: StoredField) -> BoxField:
         """The field, which can be taken apart as it is; ValueError where it cannot."""
         if not isinstance(field, BoxField):

@@ -11,14 +11,19 @@ import torch
 
 from formats.errors import FormatError
 from formats.records import FieldRecord, decode_field, encode_field
+from fusedrf_cli.bridge.scene import stored
+from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Hashed
+from fusedrf_cli.engine.kinds import registry, splitting
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, reshaped, tensor_field, without
 from fusedrf_cli.engine.kinds.vm.field import DETAIL_STEP, VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.reference import hashed_row
-from fusedrf_cli.engine.kinds.vm.trimming import truncated
+from fusedrf_cli.engine.kinds.vm.reference import hashed_row, vm_density_feature
+from fusedrf_cli.engine.kinds.vm.students import contents_of
+from fusedrf_cli.engine.kinds.vm.trimming import asked_rows, truncated, without_unasked
+from fusedrf_cli.engine.selection.cells import Lattice, Selection
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 from tests.analytic.rays import affine
 
@@ -148,6 +153,139 @@ def test_it_comes_back_from_a_file_that_older_readers_refuse():
     assert b'\\"version\\":3' in data
     plain = encode_field(FieldRecord("vm", *random_vm().state()), "float32")
     assert b'\\"version\\":1' in plain
+
+
+def sparse_detail(rows=1 << 9, dtype=torch.float64):
+    """A tensor of which few cells are occupied, and in half of those planes and lines say that there is
+    nothing."""
+    hashed = Hashed((0.31, 0.07), rows)
+    field = random_vm(cells=12, hashed=hashed, scale=300.0, shift=-6.0, dtype=dtype)
+    held = np.random.default_rng(1).random(field.occupancy.occupied.shape) < 0.01
+    return field.with_occupancy(replace(field.occupancy, occupied=held))
+
+
+def within_cells(field, count=400):
+    """Points of every occupied cell, both of its corners among them."""
+    grid = field.occupancy
+    cells = np.argwhere(grid.occupied)
+    inside = np.random.default_rng(2).random((count, len(cells), 3))
+    inside[0], inside[1] = 1e-12, 1 - 1e-12
+    return torch.from_numpy((grid.aabb[:3] + (cells + inside) * grid.cell).reshape(-1, 3))
+
+
+def test_rows_that_no_cell_asks_change_no_answer():
+    field = sparse_detail()
+    trimmed = without_unasked(field)
+    points = within_cells(field)
+    dirs = torch.from_numpy(unit(np.random.default_rng(0).normal(size=points.shape)))
+    for found, wanted in zip(trimmed.query(points, dirs), field.query(points, dirs), strict=True):
+        assert torch.equal(found, wanted)
+    left = (trimmed.sections(0)["detail"] != 0).any(1)
+    assert 0.02 < left.float().mean() < 0.7
+
+
+def test_rows_are_asked_if_and_only_if_a_point_with_matter_is_near():
+    """By the rule, of points drawn: every row that one of them reads, and next to none besides."""
+    field = sparse_detail(1 << 16)
+    tensor, found = field.tensors[0], asked_rows(field, 0)
+    points = within_cells(field, 3000)
+    low, high = torch.from_numpy(field.aabb).view(2, 3)
+    feature = vm_density_feature(field.sections(0), (points - low) / (high - low))
+    dense = feature + tensor.shift > EMPTY_FROM
+    assert 0.2 < dense.float().mean() < 0.8
+    wanted = np.zeros_like(found)
+    for level, spacing in enumerate(tensor.hashed.spacings):
+        below = torch.floor(points[dense] / spacing).long()
+        for corner in product((0, 1), repeat=3):
+            rows = hashed_row(tensor.hashed, below + torch.tensor(corner))
+            wanted[level * tensor.hashed.rows + rows.numpy()] = True
+    assert not (wanted & ~found).any()
+    assert (found & ~wanted).sum() < 0.6 * wanted.sum()  # a cell between texels is asked in whole
+
+
+def test_all_rows_of_a_level_that_is_met_everywhere_are_kept(monkeypatch):
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.trimming.MOST_MET", 1e-6)
+    assert asked_rows(sparse_detail(), 0).all()
+
+
+@pytest.mark.parametrize("precision", ["float32", "float16", "int8", "int4"])
+def test_a_file_holds_the_rows_that_are_asked_alone(monkeypatch, precision):
+    """A quarter of the bytes or less, the same numbers as told, and again the same bytes."""
+    monkeypatch.setattr("formats.quantised.LEAST", {2: 512, 3: 4096})  # so that the detail is coded
+    field = sparse_detail(1 << 14, torch.float32)
+    trimmed = without_unasked(field)
+    whole, small = (encode_field(FieldRecord("vm", *f.state()), precision) for f in (field, trimmed))
+    assert len(small) < 0.25 * len(whole) and b'\\"needs\\":[\\"hashed\\",\\"held\\",\\"runs\\"]' in small
+    read = decode_field(small, "somewhere")
+    back = VMField.from_state(read.arrays, read.metadata)
+    assert torch.equal(back.params, stored(trimmed, precision).params)
+    assert encode_field(FieldRecord("vm", *back.state()), precision) == small
+    assert back.tensors[0].held == trimmed.tensors[0].held
+    if precision == "float32":
+        assert all(torch.equal(back.sections(0)[name], view) for name, view in trimmed.sections(0).items())
+
+
+@pytest.mark.parametrize("precision", ["int8", "int4"])
+def test_cut_numbers_keep_the_codes_that_they_had(monkeypatch, precision):
+    """Of a field that was read from 8 or 4 bits, cut to a corner that begins at the eighth texel."""
+    monkeypatch.setattr("formats.quantised.LEAST", {2: 512, 3: 64})
+    field = random_vm(
+        THIRTY_TWO, (30, 30, 30), torch.float32, hashed=Hashed((0.31, 0.07), 1 << 14), scale=300.0, shift=-6.0
+    )
+    field = stored(field, precision)
+    middle, box = Lattice.over(field, field.aabb * 0.4, 8), field.tensors[0].aabb
+    part = splitting.cut_out(field, box, Selection(middle, np.ones(len(middle.points), bool)))
+    first = np.rint((part.aabb[:3] - box[:3]) / field.tensors[0].voxel_size).astype(int)
+    assert (first % 8 == 0).all() and first.any()
+    cut = without_unasked(part)
+    assert torch.equal(stored(cut, precision).params, cut.params)
+    own = tuple(slice(a, a + n) for a, n in zip(first[:2], cut.resolution, strict=False))
+    plane, whole = cut.sections(0)["density_plane_0"], field.sections(0)["density_plane_0"][own]
+    assert ((plane == whole) | (plane == 0)).all() and (plane != 0).any()
+
+
+def test_blocks_keep_few_rows_few_and_are_said_to():
+    """And what a limit on bytes is held against knows of it."""
+    cut = without_unasked(sparse_detail(1 << 14, torch.float32))
+    field = blocks_of([Placed("a", cut, np.eye(4)), Placed("b", cut, affine(1.0, (3, 0, 0)))])
+    assert [t.held for t in field.tensors] == [cut.tensors[0].held]
+    for precision in ("float16", "int8"):
+        found = len(encode_field(FieldRecord("vm", *field.state()), precision))
+        said = BundleSizes().of(contents_of(field.shape, field.tensors, 2), precision)
+        assert found <= said <= 1.3 * found + 8000
+
+
+HOSTILE_HELD = {
+    "too few bits": ("detail_blocks", lambda a: a[:-1], "told by a bit"),
+    "other bits": ("detail_blocks", lambda a: np.zeros_like(a), "should be told"),
+    "an empty block": ("detail_held", np.zeros_like, "none is"),
+    "other rows": ("detail_held", lambda a: a ^ np.uint8(255), "none is|its detail|should have shape"),
+    "masks of another type": ("detail_held", lambda a: a.astype(np.int32), "should be told"),
+    "no masks": ("detail_held", lambda a: None, "should have shape"),
+    "other runs": ("detail.runs", lambda a: a[::-1] + np.uint8(1), "runs of its detail"),
+    "fewer numbers": ("detail", lambda a: a[:-1], "should have shape"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_HELD)
+def test_held_rows_that_do_not_fit_are_refused(name):
+    which, change, said = HOSTILE_HELD[name]
+    arrays, metadata = without_unasked(sparse_detail(1 << 12, torch.float32)).state()
+    changed = change(arrays[f"tensor_0.{which}"])
+    arrays = arrays | {f"tensor_0.{which}": changed} if changed is not None else arrays
+    if changed is None:
+        del arrays[f"tensor_0.{which}"]
+    with pytest.raises(ValueError, match=said):
+        VMField.from_state(arrays, metadata)
+
+
+def test_what_a_small_file_unfolds_to_is_foretold_and_bounded(monkeypatch):
+    arrays, metadata = without_unasked(sparse_detail(1 << 14, torch.float32)).state()
+    shapes = {name: array.shape for name, array in arrays.items()}
+    assert registry.kind("vm").held_bytes(100, shapes) >= 100 + 2 * (1 << 14) * 16
+    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.MAX_NUMBERS", 1 << 16)
+    with pytest.raises(ValueError, match="at most 65,536 are read"):
+        VMField.from_state(arrays, metadata)
 
 
 @pytest.mark.parametrize(

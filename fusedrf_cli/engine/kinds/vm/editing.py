@@ -24,7 +24,6 @@ from fusedrf_cli.engine.kinds.vm.blocks import (
     tensor_field,
 )
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMTensor
-from fusedrf_cli.engine.kinds.vm.trimming import without_unasked
 from fusedrf_cli.engine.selection.cells import Selection
 
 NUMBERS = 2_000_000  # of a tensor that a region or an object is learnt into
@@ -64,7 +63,6 @@ def cut_out(field: VMField, selection: Selection) -> VMField | None:
         lambda own, block: splitting.cut_out(
             own, own.tensors[0].aabb, selection, to_field(field, own, block)
         ),
-        asked=True,
     )
 
 
@@ -82,7 +80,7 @@ def cropped(field: VMField, holds: splitting.Holds) -> VMField | None:
 
         return splitting.cropped(own, own.tensors[0].aabb, held)
 
-    return apart(field, part, asked=True)
+    return apart(field, part)
 
 
 def to_field(field: VMField, own: VMField, block: Block) -> splitting.ToField:
@@ -90,16 +88,12 @@ def to_field(field: VMField, own: VMField, block: Block) -> splitting.ToField:
     return splitting.placed_in(field, block.object_to_field, own.space)
 
 
-def apart(
-    field: VMField, part_of: Callable[[VMField, Block], VMField | None], asked: bool = False
-) -> VMField | None:
-    """A part of each block's tensor, placed as the block; None where none has any. `asked`: with the numbers
-    alone that it asks."""
+def apart(field: VMField, part_of: Callable[[VMField, Block], VMField | None]) -> VMField | None:
+    """A part of each block's tensor, placed as the block; None where none has any."""
     found = []
     for block in field.blocks:
         part = part_of(tensor_field(field, block.tensor), block)
         if part is not None:
-            part = without_unasked(part) if asked else part
             alone = replace(part.blocks[0], name=block.name)
             part = tinted(replaced(part, (alone,)), block.tint)
             found.append(Placed("", part, block.object_to_field))

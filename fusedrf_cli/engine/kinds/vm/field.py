@@ -29,6 +29,7 @@ from fusedrf_cli.engine.fields.box import (
     whole_numbers,
 )
 from fusedrf_cli.engine.fields.computed import (
+    FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
     WHITE,
@@ -36,6 +37,7 @@ from fusedrf_cli.engine.fields.computed import (
     Group,
     Reads,
     StoredAs,
+    packed_bits,
     runs_of,
     unpack_bits,
 )
@@ -297,9 +299,9 @@ class VMField(ComputedField):
                 held = Held.of(numbers) if name == "detail" else None
                 if held is None:
                     target[name].copy_(torch.from_numpy(as_stored(numbers, name, None)))
-                else:
-                    rows = torch.from_numpy(held.rows).to(self.params.device)
-                    target[name][rows] = torch.from_numpy(as_stored(numbers[held.rows], name, held.runs)).to(view)
+                    continue
+                found = torch.from_numpy(as_stored(numbers[held.rows], name, held.lengths))
+                target[name][torch.from_numpy(held.rows)] = found.to(view)
         return back
 
     # -- reading ---------------------------------------------------------------------------------------------
@@ -489,17 +491,19 @@ class VMField(ComputedField):
             for t in range(len(self.tensors))
             for name, view in self.sections(t).items()
         }
+        needs = {"hashed"} if any(t.hashed for t in self.tensors) else set()
         grids = [t.occupancy.occupied for t in self.tensors]
-        arrays |= {f"tensor_{t}.occupancy": np.packbits(grid) for t, grid in enumerate(grids)}
-        needs = ["hashed"] if any(t.hashed for t in self.tensors) else []
-        for t in range(len(self.tensors)):
+        for t, grid in enumerate(grids):
             detail = f"tensor_{t}.detail"
             held = Held.of(arrays[detail]) if detail in arrays else None
             if held is not None:
-                needs = ["hashed", "held", "runs"]
-                arrays |= {detail: arrays[detail][held.rows], runs_of(detail): held.runs}
+                needs |= {"held", "runs"}
+                arrays |= {detail: arrays[detail][held.rows], runs_of(detail): held.lengths}
                 arrays |= {f"{detail}_{name}": bits for name, bits in held.state().items()}
-        metadata = ({"needs": needs} if needs else {}) | {
+            cells = packed_bits(f"tensor_{t}.occupancy", grid, FEW_CELLS if held is None else 0)
+            needs |= {"held"} if len(cells) > 1 else set()
+            arrays |= cells
+        metadata = ({"needs": sorted(needs)} if needs else {}) | {
             "aabb": self.aabb.tolist(),
             "shape": {
                 "density_rank": self.shape.density_rank,
@@ -583,25 +587,25 @@ def stored_tensor(i: int, stored: dict, arrays: dict[str, np.ndarray], shape: VM
     for name, expected in tensor.sections(shape):
         found = arrays.get(f"tensor_{i}.{name}")
         if name == "detail" and held is not None:
-            expected = int(held.rows.sum()), expected[1]
+            expected = held.count, expected[1]
         if found is None or found.shape != expected:
             have = "nothing" if found is None else list(found.shape)
             raise ValueError(f"array 'tensor_{i}.{name}' should have shape {list(expected)}, found {have}")
-    return tensor if held is None else replace(tensor, held=(int(held.rows.sum()), len(held.masks)))
+    return tensor if held is None else replace(tensor, held=(held.count, len(held.masks)))
 
 
 def held_of(i: int, tensor: VMTensor, arrays: dict[str, np.ndarray]) -> Held | None:
     """Which rows of its detail are stored of the i-th tensor; None: all. Raises ValueError naming what does
     not fit."""
-    blocks, rows = (arrays.get(f"tensor_{i}.detail_{name}") for name in ("blocks", "rows"))
-    if blocks is None or rows is None:
+    blocks, runs = (arrays.get(f"tensor_{i}.detail_{name}") for name in ("blocks", "held"))
+    if blocks is None or runs is None:
         return None
     try:
-        held = Held.from_state(blocks, rows, tensor.hashed.shape[0])
+        held = Held.from_state(blocks, runs, tensor.hashed.shape[0])
     except ValueError as error:
         raise ValueError(f"tensor {i}: {error}") from None
-    runs = arrays.get(f"tensor_{i}.{runs_of('detail')}")
-    if runs is None or not np.array_equal(runs, held.runs):
+    lengths = arrays.get(f"tensor_{i}.{runs_of('detail')}")
+    if lengths is None or not np.array_equal(lengths, held.lengths):
         raise ValueError(f"tensor {i}: the runs of its detail are not those of its blocks")
     return held
 

@@ -9,7 +9,8 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.hashed import TOGETHER, WIDTH
+from fusedrf_cli.engine.fields.computed import BRICK
+from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
@@ -28,10 +29,11 @@ from fusedrf_cli.engine.kinds.vm import editing
 from fusedrf_cli.engine.kinds.vm.blocks import LEARNT, common_shape, reshaped, without
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.places import place_student
-from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated
+from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated, without_unasked
 from fusedrf_cli.engine.selection.cells import Selection
 
 SHAPE = VMShape(16, 24, 2)
+BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
 NOISE = 0.03  # of the factors of a student that takes over others' numbers
 
 
@@ -105,9 +107,9 @@ class VMKind(Kind):
         } | ({"detail_rows": rows} if rows else {})
 
     def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
-        """All rows of details of which few are stored."""
-        bits = sum(8 * shape[0] for name, shape in shapes.items() if name.endswith(".detail_blocks"))
-        return decoded + bits * TOGETHER * WIDTH * 4
+        """With all rows of details, and all cells, of which few are stored."""
+        bits = {end: sum(8 * s[0] for n, s in shapes.items() if n.endswith(end)) for end in (BLOCKS, BRICKS)}
+        return decoded + 4 * bits[BLOCKS] * TOGETHER * WIDTH + bits[BRICKS] // 2 * BRICK**3
 
     def counts(self, field: VMField) -> dict[str, int]:
         """Its blocks."""
@@ -136,6 +138,10 @@ class VMKind(Kind):
     def cropped(self, field: VMField, holds: splitting.Holds) -> VMField | None:
         """See vm/editing.py."""
         return editing.cropped(field, holds)
+
+    def trimmed(self, field: VMField) -> VMField:
+        """See vm/trimming.py."""
+        return without_unasked(field)
 
     def thinned(self, field: VMField, factor: float) -> VMField:
         """Each tensor has a scale of its own."""
@@ -218,9 +224,8 @@ def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Con
         for name, section in tensor.sections(shape):
             used = read_texels(tensor, int(name[-1])) if "_plane_" in name else None
             if name == "detail" and tensor.held:
-                rows, blocks = tensor.held
-                section = rows, section[1]
-                sections.append(Section("detail.runs", (blocks, 2 + WIDTH)))  # and the scales of every run
-                bits += tensor.hashed.shape[0] // TOGETHER + blocks * TOGETHER
+                rows, of_blocks = tensor.held
+                section = rows, WIDTH
+                bits += tensor.hashed.shape[0] // TOGETHER + 8 * PER_BLOCK * of_blocks
             sections.append(Section(name, section, used))
     return Contents(sections, bits, len(tensors), blocks)

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.kinds.vm.reference import hashed_row
 
 REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
 ROUNDED = 1e-3
-"""Of a density before activation, and of the spacing of a detail's vertices: what float32 may make of them."""
+"""Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
 MOST_MET = 8.0  # cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked
 VERTICES_AT_ONCE = 1 << 22  # of a detail's lattice: some 100 MB
 
@@ -69,7 +69,7 @@ def without_unasked(field: VMField) -> VMField:
             detail = trimmed.sections(t)["detail"]
             detail[torch.from_numpy(~asked_rows(field, t))] = 0
             held = Held.of(detail.numpy())
-            tensors[t] = replace(tensor, held=held and (int(held.rows.sum()), len(held.masks)))
+            tensors[t] = replace(tensor, held=held and (held.count, len(held.masks)))
     params, occupancy = trimmed.params, field.occupancy
     return VMField(field.shape, tuple(tensors), field.blocks, params, occupancy, field.owners)
 
