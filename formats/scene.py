@@ -559,14 +559,15 @@ def check_affine(matrix: np.ndarray, who: str) -> None:
         raise BadSchema(f"{who}: last row {matrix[3].tolist()}, expected [0, 0, 0, 1]; columns act on points")
     if np.abs(matrix[:3, 3]).max() > MAX_TRANSLATION:
         raise LimitExceeded(
-            f"{who}: translation {matrix[:3, 3].tolist()} is beyond {MAX_TRANSLATION:g} units"
+            f"{who}: translation {matrix[:3, 3].tolist()} is beyond {MAX_TRANSLATION:g} units; "
+            "move it nearer to the origin"
         )
     high, _, low = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if not _within(matrix, MAX_TRANSLATION, SINGULAR_VALUES) or not high / low <= MAX_CONDITION:
         smallest, largest = SINGULAR_VALUES
         raise SingularTransform(
             f"{who}: scales by {low:.3g} to {high:.3g}, expected {smallest:g} to {largest:g} "
-            f"with a ratio of at most {MAX_CONDITION:g}"
+            f"with a ratio of at most {MAX_CONDITION:g}; choose another unit, or stretch it less"
         )
     if high / low > WARN_CONDITION:
         text = f"{who}: stretched {high / low:.0f} times more along one axis than along another"

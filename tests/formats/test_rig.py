@@ -3,6 +3,7 @@
 import copy
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +87,7 @@ def test_cameras_come_back(lens):
         assert [getattr(one, key) for key in kept] == [getattr(other, key) for key in kept]
 
 
-@pytest.mark.parametrize("scale", [1e-2, 1.0, 1e4])
-@pytest.mark.parametrize("away", [0.0, 5e6])
+@pytest.mark.parametrize(("scale", "away"), [*product((1e-2, 1.0, 1e4), (0.0, 5e6)), (1e-9, 0), (1e9, 5e12)])
 def test_rounding_moves_no_pixel(scale, away):
     """By a thousandth, in any unit, and far from the origin, as surveyed captures are."""
     views = inward(5, 4 * scale, 1.5 * scale, (away, -away, away / 10))
@@ -95,6 +95,12 @@ def test_rounding_moves_no_pixel(scale, away):
     for one, other in zip(back_again(rig).views, rig.views, strict=True):
         points = seen_points(other, rig.distance)
         np.testing.assert_allclose(projected(one, points), projected(other, points), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("away", "far"), [(9e11, False), (2e12, True)])
+def test_cameras_that_stand_far_away_require_a_reader_that_takes_them(away, far):
+    data = dump_scene(SceneGraph((), cameras=rig_of(inward(3, 4e3, 1e3, (away, 0, 0))).content()))
+    assert parse_scene(data, "here").far == far == (b'"requires": [' in data)
 
 
 def test_lenses_are_stored_once():

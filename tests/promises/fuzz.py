@@ -35,7 +35,7 @@ PATIENCE = 5.0  # seconds of computing; other processes may slow the clock on th
 WAITING = 60.0
 GOOD = (
     *("lamp.rfpack", "pair.rfpack", "ring.rfpack", "later.rfpack"),
-    *("coded-8.rfpack", "coded-4.rfpack", "bricks.rfpack"),
+    *("coded-8.rfpack", "coded-4.rfpack", "bricks.rfpack", "far.rfpack"),
 )
 CELLS = 16  # of ownership grids, here: a good pack of two blocks then loads in a hundredth of the time
 

@@ -16,6 +16,7 @@ from formats.images import read_image
 from formats.rig import read_rig
 from fusedrf_cli.bridge.rendering import renderable, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.main import cli
@@ -33,8 +34,10 @@ def rendered(path) -> np.ndarray:
     field, origin = renderable(load_scene(str(path)))
     field = copy(field)._afresh("arrays", "grid")
     field.occupancy = replace(field.occupancy, stride=None, unit=FINE)
-    camera = orbit(field.occupancy.tight_aabb(0) + np.tile(origin, 2), 1, 48, 48)[0]
-    return to_pixels(render_image(field, camera, origin=origin), WHITE)
+    camera = orbit(field.occupancy.tight_aabb(0), 1, 48, 48)[0]
+    linear, pose = placement(origin)[:3, :3], camera.camera_to_world.copy()
+    pose[:3, 3] = linear @ pose[:3, 3] + placement(origin)[:3, 3]
+    return to_pixels(render_image(field, replace(camera, camera_to_world=pose), origin=origin), WHITE)
 
 
 def decibels(one: np.ndarray, other: np.ndarray) -> float:
@@ -48,6 +51,7 @@ def decibels(one: np.ndarray, other: np.ndarray) -> float:
         ("pair.rfpack", "pair.png"),
         ("ring.rfpack", "pair.png"),
         ("later.rfpack", "pair.png"),
+        ("far.rfpack", "pair.png"),
         ("coded-8.rfpack", "coded.png"),
         ("coded-4.rfpack", "coded.png"),
     ],
@@ -72,6 +76,15 @@ def test_kept_cameras_stand_where_they_stood():
         np.testing.assert_allclose(view.camera_to_world[2, 0], 0, atol=1e-7)
     assert [view.fisheye for view in rig.views] == [False, False, True, False]
     assert rig.views[2].distortion == (0.05, -0.02, 0.006, -0.001)
+
+
+def test_the_kept_pack_of_a_far_world_lies_where_it_lay():
+    """P1: the pair in a unit of 2.5e8, which readers before version 1.3 refuse for what it requires."""
+    scene = read_bundle(GOLDEN / "far.rfpack").scene
+    (leaf,) = scene.leaves()
+    assert scene.version == "1.3" and scene.far
+    np.testing.assert_array_equal(leaf.object_to_world[:3, 3], [-7e11, 5411200.0, 1e12])
+    np.testing.assert_array_equal(leaf.object_to_world[:3, :3], 2.5e8 * np.eye(3))
 
 
 def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
