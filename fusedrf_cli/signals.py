@@ -64,10 +64,11 @@ def seen_to() -> bool:
 
 
 def leave() -> None:
-    """The command is over: from here on a signal ends the process as it does by default."""
+    """The command is over: from here on a signal ends the process as it does by default, but where one has
+    done so already."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is interrupt:
-            signal.signal(number, signal.SIG_DFL)
+            signal.signal(number, signal.SIG_DFL if _first is None else signal.SIG_IGN)
 
 
 @contextlib.contextmanager

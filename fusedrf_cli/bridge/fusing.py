@@ -14,6 +14,7 @@ from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
 from fusedrf_cli.bridge.running import (
     Saved,
     check_checkpoint,
+    checkpoint_mismatch,
     checkpoint_path,
     engine,
     held_back,
@@ -222,8 +223,12 @@ def search(
 ) -> Kept:
     """The best of what was tried, its numbers as they were measured. Raises TooSmall where nothing fits."""
     started = time.monotonic()
+    if saved is not None:
+        if saved[1].get("kind") != student.kind.name or not (student.learnt or maker.tries_once):
+            raise checkpoint_mismatch(request.output)
+        maker.saved = saved
     if student.learnt:
-        choosing.first_reaching(maker.learn(saved), request.target_psnr)
+        choosing.first_reaching(maker.learn(), request.target_psnr)
     else:
         choose(choosing, student, request)
     if maker.best is None:

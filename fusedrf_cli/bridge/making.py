@@ -1,6 +1,7 @@
 """Makes, stores and measures a kind's students of one scene, and keeps the best of them as it is."""
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -90,6 +91,8 @@ class Maker:
         self.sources_in_memory = True
         """Whether all sources may be in memory at once, as a teacher."""
         self.finished_tries = 0
+        self.saved: Saved | None = None
+        """What an interrupted run left, until it is taken up."""
 
     def measured(self, field: StoredField, way: Way) -> float:
         """PSNR (dB) of the field as it will be read back."""
@@ -149,10 +152,51 @@ class Maker:
         lesson = self.student.lesson_of(field.params.numel(), seconds)
         settings = replace(lesson, seed=self.request.seed)
         run = DistillRun(self.teacher, learnt, self.scene.sampler, settings, True, judge=self.judge)
-        student, did = run.finish(*self.telling())
+        with self.saving(run) as uninterrupted:
+            student, did = run.finish(*self.telling(), uninterrupted)
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)
         return student, did
+
+    @property
+    def tries_once(self) -> bool:
+        """Whether one student learns and no other."""
+        return self.request.target_psnr is None and not self.student.compares
+
+    def saving(self, run: DistillRun):
+        """What steps of a run go through, which is saved where it is the only one of its command: of others
+        that came before the numbers would have to be saved as well."""
+        if not self.tries_once or self.finished_tries > 1:
+            return nullcontext(nullcontext)
+        boxes = self.scene.sampler.boxes
+        return self.resumed(run, {"kind": self.student.kind.name, "limit": self.request_limit}, boxes)
+
+    def resumed(self, run: DistillRun, made_with: dict, boxes: list[np.ndarray]):
+        """`resumable` for a run, which goes on from what was saved; with other words that would be something
+        else."""
+        made_with |= {
+            "numbers": run.student.params.numel() if run.refined is None else run.refined.params.numel(),
+            "rgb": self.request.rgb,
+            "seed": self.request.seed,
+            "boxes": [box.tolist() for box in boxes],
+        }
+        saved, self.saved = self.saved, None
+        if saved is not None:
+            if any(saved[1].get(word) != value for word, value in made_with.items()):
+                raise checkpoint_mismatch(self.request.output)
+            take_up(run, saved, self.request.output)
+
+        def checkpoint() -> Saved:
+            arrays, state = run.checkpoint()
+            return arrays, state | made_with
+
+        def held() -> Saved | None:
+            return run.held and (run.held[0], run.held[1] | made_with)
+
+        def learnt() -> bool:
+            return run.learnt_seconds > WORTH_SAVING
+
+        return resumable(self.request.output, checkpoint, held, self.progress, learnt)
 
     def tries_to_come(self) -> int:
         """How many tries the seconds that are left have to do for, about."""
@@ -174,7 +218,7 @@ class Maker:
 
     # -- students that learn from nothing --------------------------------------------------------------------
 
-    def learn(self, saved: Saved | None) -> Iterator[Tried]:
+    def learn(self) -> Iterator[Tried]:
         """Students of growing size, each from what the one before has learnt, in every precision."""
         before: StoredField | None = None
         ways = [way for group in self.student.ways() for way in group]
@@ -183,10 +227,11 @@ class Maker:
             if before is not None and self.budget.over:
                 return
             begun, start, recipe = self.begun(plan, before)
-            if saved is not None and len(plans) > 1 and saved[1].get("numbers") != begun.params.numel():
+            grown = self.saved is not None and self.saved[1].get("numbers") != begun.params.numel()
+            if grown and len(plans) > 1:
                 continue  # the run that was interrupted had grown further
-            field, did = self.taught(begun.to(self.place), start, recipe, saved, len(plans) - i)
-            before, saved = field.to("cpu"), None
+            field, did = self.taught(begun.to(self.place), start, recipe, len(plans) - i)
+            before = field.to("cpu")
             whole = self.student.whole(before)
             for way in ways:
                 size = self.student.bytes_of_plan(plan, way)
@@ -220,38 +265,16 @@ class Maker:
         return field, start, recipe
 
     def taught(
-        self, field: StoredField, start: str, recipe: Recipe, saved: Saved | None, tries: int
+        self, field: StoredField, start: str, recipe: Recipe, tries: int
     ) -> tuple[StoredField, DistillReport]:
         """A student that has learnt; an interrupt saves a checkpoint."""
         request, seconds = self.request, self.budget.part(tries)
         settings = replace(self.student.lesson_of(field.params.numel(), seconds), seed=request.seed)
         sampler = RaySampler.of(self.student.scene, self.scene.views)
         run = DistillRun(self.teacher, field, sampler, settings, request.rgb, recipe, self.judged_whole)
-        made_with = {  # with other words the saved numbers would go on to something else
-            "kind": self.student.kind.name,
-            "numbers": field.params.numel(),
-            # one that grows to a target goes on from whatever it started from
-            "start": start if request.target_psnr is None else None,
-            "rgb": request.rgb,
-            "seed": request.seed,
-            "boxes": [box.tolist() for box in sampler.boxes],
-        }
-        if saved is not None:
-            if any(saved[1].get(word) != value for word, value in made_with.items()):
-                raise checkpoint_mismatch(request.output)
-            take_up(run, saved, request.output)
-
-        def checkpoint() -> Saved:
-            arrays, state = run.checkpoint()
-            return arrays, state | made_with
-
-        def held() -> Saved | None:
-            return run.held and (run.held[0], run.held[1] | made_with)
-
-        def learnt() -> bool:
-            return run.learnt_seconds > WORTH_SAVING
-
-        with resumable(request.output, checkpoint, held, self.progress, learnt) as uninterrupted:
+        # one that grows to a target goes on from whatever it started from
+        made_with = {"kind": self.student.kind.name, "start": start if request.target_psnr is None else None}
+        with self.resumed(run, made_with, sampler.boxes) as uninterrupted:
             student, did = run.finish(*self.telling(), uninterrupted)
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)

@@ -8,7 +8,7 @@ import pytest
 from formats.bundle import read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import done, write_scene_of
+from tests.bridge.conftest import done, part, write_scene_of
 
 VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
 
@@ -138,6 +138,30 @@ def test_a_fuse_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_st
     said = report(*WITH_RGB, "fused.rfpack", "--resume")
     assert said["psnr"]["after_rgb"] is not None and not (folder / "fused.rfpack.checkpoint").exists()
     assert (folder / "fused.rfpack").read_bytes() == straight
+
+
+def test_a_kind_that_is_made_goes_on_to_the_same_bytes(report, run, folder, interrupted_in_step):
+    """It learns from pictures alone; another kind does not go on from its numbers."""
+    words = ("fuse", "pair.json", "--kind", "sparse", "-o")
+    report(*words, "straight.rfpack")
+    with interrupted_in_step(5):
+        result = run(*words, "fused.rfpack")
+    assert result.exit_code == 130 and "--resume" in result.stderr
+    wrong = run("fuse", "pair.json", *VM, "-o", "fused.rfpack", "--resume")
+    assert wrong.exit_code == 3 and "other settings" in wrong.stderr
+    report(*words, "fused.rfpack", "--resume")
+    assert (folder / "fused.rfpack").read_bytes() == (folder / "straight.rfpack").read_bytes()
+
+
+def test_an_interrupt_after_the_choice_leaves_the_output(report, run, folder, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(part("making").Maker, "verdict", stop)
+        result = run("fuse", "pair.json", *VM, "-o", "fused.rfpack")
+    assert result.exit_code == 130 and "fused.rfpack is written whole" in result.stderr
+    assert report("eval", "fused.rfpack", "--against", "pair.json", "--size", "16x16")
 
 
 def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):

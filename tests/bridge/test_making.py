@@ -127,7 +127,7 @@ def test_a_student_that_learns_from_nothing_is_taught_by_the_sources_put_togethe
     student = Student(VM, SCENE, StudentRequest(BundleSizes(), 10_000_000))
     maker = maker_of(monkeypatch, student, lambda field: 0.0, asked())
     with pytest.raises(InterruptedError):
-        next(maker.learn(None))
+        next(maker.learn())
     assert taught_by == [maker.teacher] and maker.teacher is not SCENE
 
 

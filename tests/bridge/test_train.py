@@ -215,7 +215,8 @@ def test_divergence_is_exit_6(run, folder, monkeypatch):
 
 def test_a_checkpoint_of_something_else_is_refused(run, folder):
     path = folder / "out.rfpack.checkpoint"
-    contents = ((b"junk", 3, "not a readable"), (save({}, {"fusedrf": "{}"}), 4, "earlier"), (None, 3, "no checkpoint"))
+    old = save({}, {"fusedrf": "{}"})
+    contents = (b"junk", 3, "not a readable"), (old, 4, "earlier"), (None, 3, "no checkpoint")
     for content, code, says in contents:
         path.unlink(missing_ok=True)
         if content:

@@ -59,8 +59,8 @@ def of(*arrays, **words) -> bytes:
     [
         *(sealed({}), sealed([]), sealed(b"{"), sealed(b"[" * 100_000), sealed({}, length=1 << 62)),
         *(of(state=3), of(arrays=3), of(3), of(["a", "<f4"]), of([1, "<f4", []]), of(["a", 7, [1]])),
-        *(of(["a", "<f4", [1 << 62]]), of(["a", "<f4", [-1]]), of(["a", "|O8", [1]]), of(["a", "<f4", [1.5]])),
-        *(of(["a", "<f4", [0] * 64]), of(["a", "<f4", 3]), of(["a", "<f4", [True]]), sealed({}, b"more")),
+        *(of(["a", "<f4", [1 << 62]]), of(["a", "<f4", [-1]]), of(["a", "|O8", [1]]), of(["a", "<f4", 1])),
+        *(of(["a", "<f4", [0] * 64]), of(["a", "<f4", [.5]]), of(["a", "<f4", [True]]), sealed({}, b"more")),
     ],
 )  # fmt: skip
 def test_hostile_headers_are_refused_by_a_sentence(path, content):
