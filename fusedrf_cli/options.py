@@ -447,7 +447,7 @@ _seed = click.option(
     type=click.IntRange(0, 2**63 - 1),
     default=0,
     show_default=True,
-    help="Same seed, same device: same bytes.",
+    help="On the CPU, as many steps by as many threads: same seed, same bytes. A GPU adds in no fixed order.",
 )
 _REPORTING = (
     click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout."),
