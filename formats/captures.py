@@ -16,7 +16,7 @@ import numpy as np
 from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
-from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews
+from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
 from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
@@ -123,10 +123,12 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
     if (model := colmap.model_folder(path)) is not None:
         try:
             return _read_colmap(path, model, downscale)
-        except MissingFile:
+        except MissingFile as error:
             # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
             if not is_file(path / llff.NAME):
                 raise
+            capture = _read_llff(path / llff.NAME, downscale)
+            return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
     if is_file(path / llff.NAME):
         return _read_llff(path / llff.NAME, downscale)
     if (folders := polycam.keyframes(path)) is not None:
@@ -297,7 +299,8 @@ def _capture(
         cut_out = object_box(poses[:, :3, 3], np.array(corners))
     doubt = upward_doubt(poses) if frame is not None and len(views) >= LEAST_VIEWS else None
     doubts = [f"{path}: {doubt}"] if doubt else []
-    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_smaller(path, views), *doubts)))
+    notes = (*train.notes, *test.notes, *notes, *_smaller(path, views), *doubts)
+    notes = tuple(dict.fromkeys(map(printable, notes)))  # they have names from the file
     return Capture(path, kind, train.views, test.views, box, opaque, cut_out, missing, points, frame, notes)
 
 

@@ -16,6 +16,7 @@ from urllib.parse import unquote
 
 from formats.errors import counted
 from formats.photos import (
+    HEIF,
     Folder,
     chosen_copy,
     is_file,
@@ -160,6 +161,7 @@ class Listings:
         ranks = [
             (1 if key(photo) == key(name) or bare and photo == f"{name}.png" else 2, photo)
             for photo in suited
+            if len(suited) == 1 or not photo.lower().endswith(HEIF)  # it may not be readable
         ]
         best = min(ranks, default=(0, ""))[0]
         return [item for item in ranks if item[0] == best]
@@ -316,8 +318,10 @@ def _below(folders: tuple[str, ...]) -> tuple[str, ...]:
 
 def _tree(base: Path) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
     """The parts of the path of each picture below `base`, and the folders that it or its full-size original
-    lies in; what is nearer comes first. Links are followed, but into no folder twice."""
-    waiting, entered, count = [((), ())], {os.path.realpath(base)}, 0
+    lies in; what is nearer comes first. Links are followed where they stay below it or have the name of a
+    folder of photos, and into no folder twice."""
+    root = os.path.realpath(base)
+    waiting, entered, count = [((), ())], {root}, 0
     for path, folders in waiting:
         inner = [entry for entry in _entries(base.joinpath(*path))]
         named = {entry.name for entry in inner}
@@ -330,7 +334,8 @@ def _tree(base: Path) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
                     yield (*path, entry.name), folders
             elif len(path) < MAX_DEPTH and key(entry.name) not in OTHER_FOLDERS and _is_folder(entry):
                 real = os.path.realpath(entry.path)
-                if real not in entered:
+                below = Path(real).is_relative_to(root) or key(entry.name) in PHOTO_FOLDERS
+                if below and real not in entered:
                     entered.add(real)
                     waiting.append(((*path, entry.name), (*folders, _original(entry.name, named))))
 

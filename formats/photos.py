@@ -32,6 +32,7 @@ EXTENSIONS = (
     *(".avif", ".heic", ".heif"),
 )
 """Endings of photos, in letters of any case."""
+HEIF = EXTENSIONS[-2:]
 UNREAD = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".raw", ".exr", ".gif")
 """Endings that poses may name for photos which were converted since."""
 LONGEST = 1080
@@ -97,10 +98,13 @@ def has_pictures(folder: Path) -> bool:
 
 
 def pictures(folder: Path) -> list[Path]:
-    """The pictures of a folder by name, as LLFF counts them; none where there is no folder."""
+    """The pictures of a folder by name, as LLFF counts them; none where there is no folder. A phone's HEIC
+    photo beside the same one in another format is left out."""
     if not folder.is_dir():
         return []
-    return sorted(file for file in folder.iterdir() if is_picture(file.name) and is_file(file))
+    files = sorted(file for file in folder.iterdir() if is_picture(file.name) and is_file(file))
+    stems = {file.stem for file in files if file.suffix.lower() not in HEIF}
+    return [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
 
 
 def find_photo(folder: Path, name: str) -> Path | None:

@@ -164,6 +164,12 @@ def test_links(tmp_path):
     os.symlink("..", folder / "store/up")
     os.symlink("self", folder / "self")
     assert numbers(read_capture(folder)) == list(range(6))
+    outside = capture(tmp_path / "t", {}, all_of("D:/x/p{}.png"))
+    os.symlink(folder / "store", outside / "other")
+    with pytest.raises(NoViews, match="holds no photos"):
+        read_capture(outside)
+    os.symlink(folder / "store", outside / "images")
+    assert numbers(read_capture(outside)) == list(range(6))
 
 
 def test_poses_in_a_folder_of_their_own(tmp_path):
@@ -200,6 +206,7 @@ def test_endings(tmp_path, ending):
     for i in range(6):
         grey(tmp_path / f"images/p{i}.{ending}", i, kind=KINDS[ending])
         (tmp_path / f"images/._p{i}.{ending}").write_bytes(b"\0\5\26\7")
+        (tmp_path / f"images/p{i}.HEIC").write_bytes(b"of a phone, beside its JPEG")
     assert len(photos_to_pose(tmp_path)) == 6
     np.save(tmp_path / "poses_bounds.npy", llff_rows(6, (100, 80), 80.0))
     read = read_capture(tmp_path / "poses_bounds.npy")
