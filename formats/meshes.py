@@ -48,6 +48,8 @@ FROM_BEHIND = (
 )
 FARTHEST = 1e150
 """Coordinates whose squares are numbers."""
+SMALLEST = 1e-12
+"""Of the farthest coordinate: a mesh smaller than that is a point."""
 
 
 def is_mesh(path: Path | str) -> bool:
@@ -142,7 +144,8 @@ def mesh_surfaces(path: Path | str) -> tuple[list[Surface], tuple[str, ...]]:
     if not surfaces:
         raise BadMesh(f"{path}: the mesh has no faces, expected a surface of triangles")
     if kind in GLTF:
-        surfaces = [replace(s, positions=s.positions @ UPRIGHT[:3, :3].T) for s in surfaces]
+        for surface in surfaces:
+            surface.positions[:] = surface.positions @ UPRIGHT[:3, :3].T
     return surfaces, tuple(notes.sentences)
 
 
@@ -151,23 +154,27 @@ NO_MESH = "{}: not a mesh that can be read; expected .glb, .gltf, .obj, .ply or 
 
 def _load(path: Path | str) -> Mesh:
     surfaces, notes = mesh_surfaces(path)
-    counts = [len(surface.positions) for surface in surfaces]
-    starts = np.cumsum([0, *counts[:-1]])
+    starts = np.cumsum([0, *(len(surface.positions) for surface in surfaces[:-1])])
     faces = np.concatenate([s.faces + np.int32(first) for s, first in zip(surfaces, starts, strict=True)])
     points = np.concatenate([surface.positions for surface in surfaces])
-    used = np.zeros(len(points), bool)
-    used[faces.reshape(-1)] = True
-    seen = points[used]
-    if not (np.abs(seen) < FARTHEST).all():  # false for NaN too
+    surfaces = [replace(surface, positions=None) for surface in surfaces]  # not held twice
+    unused = np.ones(len(points), bool)
+    unused[faces.reshape(-1)] = False
+    points[unused] = points[faces[0, 0]]
+    if not (np.abs(points).max() < FARTHEST):  # false for NaN too
         raise BadMesh(f"{path}: the mesh has vertices that are NaN or infinite; export it again")
-    centre = (seen.min(0) + seen.max(0)) / 2
-    radius = float(np.linalg.norm(seen - centre, axis=1).max())
-    if radius <= 1e-12 * np.abs(seen).max():
+    centre = (points.min(0) + points.max(0)) / 2
+    radius = math.sqrt(
+        max(((part - centre) ** 2).sum(1).max() for part in np.array_split(points, 64) if len(part))
+    )
+    if radius <= SMALLEST * np.abs(points).max():
         raise BadMesh(f"{path}: all vertices of the mesh are one point, expected a surface")
-    points = np.where(used[:, None], points, centre)
-    triangles = ((points - centre) / radius).astype(np.float32), faces
+    unit = np.empty(points.shape, np.float32)
+    for axis in range(3):
+        unit[:, axis] = (points[:, axis] - centre[axis]) / radius
     first_faces = np.cumsum([0, *(len(s.faces) for s in surfaces[:-1])])
-    mesh = Mesh(seen, surfaces, first_faces, centre, radius, triangles, notes, embree_scene(*triangles))
+    scene = embree_scene(unit, faces)
+    mesh = Mesh(points, surfaces, first_faces, centre, radius, (unit, faces), notes, scene)
     return replace(mesh, notes=(*notes, f"{path}: {FROM_BEHIND}")) if seen_from_behind(mesh) else mesh
 
 

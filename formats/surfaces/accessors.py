@@ -13,8 +13,11 @@ from formats.surfaces.beside import Beside
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-FREE_ELEMENTS = 1_000_000
+FREE_ELEMENTS = 100_000
 """Accessors without bytes are zeros; they may count so many, or as many as the file has bytes."""
+FREE_BYTES = 16 << 20
+BYTES_PER_BYTE = 256
+"""Compressed data may become so many bytes, or so many for each of its own."""
 MESHOPT = ("KHR_meshopt_compression", "EXT_meshopt_compression")
 
 
@@ -89,9 +92,11 @@ class Buffers:
                 "that, or save the file without compression"
             ) from error
         data = self._cut(packed.buffer, packed.byte_offset, packed.byte_length, "compressed data")
-        # Blocks of vertices that do not change take a byte for 16 and more; triangles at least one each.
-        if packed.count > 4096 * max(len(data), 1) or packed.count * packed.byte_stride > 2**31:
-            raise LimitExceeded(f"{self.path}: {packed.count:,} elements of {name} in {len(data):,} bytes")
+        if packed.count * packed.byte_stride > max(FREE_BYTES, BYTES_PER_BYTE * len(data)):
+            raise LimitExceeded(
+                f"{self.path}: {packed.count:,} elements by {name} in {len(data):,} bytes are not plausible; "
+                "export it again"
+            )
         try:
             rows = meshopt.decode_gltf_buffer(
                 bytes(data), packed.count, packed.byte_stride, packed.mode, packed.filter

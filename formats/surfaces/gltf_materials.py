@@ -59,7 +59,7 @@ class Materials:
         self.pictures: dict[int, np.ndarray | None] = {}
         self.used: set[int] = set()
         """Of the document's images, those that are shown."""
-        self.share = share_of(len(document.images))
+        self.share = share_of(len(document.images), notes)
 
     def look(self, index: int | None) -> Look:
         """What material `index` shows. Raises BadMesh."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from formats.errors import FormatError
 from formats.surfaces.beside import Beside
+from formats.surfaces.lines import lines_of
 from formats.surfaces.pictures import read_picture, share_of
 from formats.surfaces.surface import Notes, Paint, Texture, listed, opaque
 
@@ -81,14 +82,6 @@ def parse_mtl(data: bytes, notes: Notes, file: str) -> dict[str, Material]:
     return found
 
 
-def lines_of(data: bytes) -> list[str]:
-    """Lines of text without marks, comments and outer spaces; a backslash at the end goes on in the next."""
-    text = data.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape")
-    text = re.sub(r"\\[ \t]*(\r\n|\n|\r)", " ", text.replace("\t", " "))
-    stripped = (line.strip() for line in re.split(r"\r\n|\n|\r", text))
-    return [line for line in stripped if line and not line.startswith("#")]
-
-
 def _set(material: Material, word: str, rest: str) -> None:
     if word in ("kd", "ka", "ke"):
         numbers = tuple(map(float, rest.split()))
@@ -133,7 +126,7 @@ class Looks:
         self.pictures: dict[str, np.ndarray | None] = {}
         self.looks: dict[str, Look] = {}
         named = {m.name for material in materials.values() for m in material.maps.values()}
-        self.share = share_of(len(named))
+        self.share = share_of(len(named), notes)
 
     def look(self, name: str) -> Look:
         if name not in self.looks:

@@ -7,7 +7,8 @@ import numpy as np
 from formats.errors import BadMesh, FormatError
 from formats.inputs import read_input
 from formats.surfaces.beside import Beside
-from formats.surfaces.mtl import Looks, lines_of, parse_mtl
+from formats.surfaces.lines import lines_of, numbers_in
+from formats.surfaces.mtl import Looks, parse_mtl
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
     Notes,
@@ -111,7 +112,7 @@ def _numbers(tokens: list[str]) -> np.ndarray:
     slashes = {token.count("/") for token in tokens}
     if len(slashes) == 1:
         width = slashes.pop() + 1
-        rows = np.array(text.replace("/", " ").split(), np.int64)
+        rows = numbers_in(text.replace("/", " "), np.int64)
         if len(rows) == width * len(tokens):
             rows = rows.reshape(-1, width)
             return rows[:, :2] if width > 1 else np.column_stack([rows, np.zeros_like(rows)])
@@ -123,11 +124,10 @@ def _table(lines: list[str]) -> list[np.ndarray]:
     """Rows of numbers, as one array where all have as many, else one for each row."""
     widths = {len(line.split()) for line in lines[:1000]}
     if len(widths) == 1:
-        flat = np.array(" ".join(lines).split(), np.float64)
         width = widths.pop()
-        if width and len(flat) == width * len(lines) and all(len(line.split()) == width for line in lines):
-            return flat.reshape(-1, width)
-    return [np.array(line.split(), np.float64) for line in lines]
+        if width and all(len(line.split()) == width for line in lines):
+            return numbers_in(" ".join(lines)).reshape(-1, width)
+    return [numbers_in(line) for line in lines]
 
 
 def _points(lines: list[str], path: Path | str) -> tuple[np.ndarray, np.ndarray | None]:

@@ -12,7 +12,7 @@ from formats.surfaces.surface import Notes
 
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF", "TIFF", "DDS", "TGA")
 """What is decoded, in this order of asking; TGA, which has no signature, by its ending alone."""
-MAX_TEXELS = 2**26
+MAX_TEXELS = 2**25
 """Of all pictures of a mesh together; one is made smaller where its share is less."""
 LEAST_SHARE = 2**16
 MAX_PICTURES = 1024
@@ -42,10 +42,12 @@ def read_picture(data: bytes, name: str, share: int, notes: Notes) -> np.ndarray
         raise BadImage(f"{name}: the picture cannot be decoded ({error}); save it again") from error
 
 
-def share_of(n_pictures: int) -> int:
-    """Texels that each of so many pictures may have. Raises LimitExceeded."""
+def share_of(n_pictures: int, notes: Notes) -> int:
+    """Texels that each of a mesh's so many pictures may have. Raises LimitExceeded."""
     if n_pictures > MAX_PICTURES:
-        raise LimitExceeded(f"{n_pictures:,} pictures, at most {MAX_PICTURES:,} are read; join them")
+        raise LimitExceeded(
+            f"{notes.path}: {n_pictures:,} pictures, at most {MAX_PICTURES:,} are read; join them"
+        )
     return max(MAX_TEXELS // max(n_pictures, 1), LEAST_SHARE)
 
 

@@ -10,6 +10,7 @@ from formats.errors import BadMesh, FormatError
 from formats.inputs import read_input
 from formats.points import ENDS, MAX_HEADER, TYPES
 from formats.surfaces.beside import Beside
+from formats.surfaces.lines import numbers_in
 from formats.surfaces.pictures import read_picture, share_of
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
@@ -211,17 +212,19 @@ class _Text:
         lines = self.rows[self.at : self.at + element.count]
         self.at += element.count
         try:
-            return self._columns(element, [line.split() for line in lines])
+            return self._columns(element, lines)
         except (ValueError, IndexError, OverflowError) as error:
             raise BadMesh(
                 f"{self.path}: a line of {element.name[:40]!r} is not what the header says ({error}); "
                 "export it again"
             ) from error
 
-    def _columns(self, element: _Element, rows: list[list[str]]) -> dict:
+    def _columns(self, element: _Element, rows: list[str]) -> dict:
         found, places = {}, np.zeros(len(rows), int)
-        widths = np.array([len(row) for row in rows], int)
-        flat = np.array([word for row in rows for word in row], np.float64)
+        widths = np.array([len(row.split()) for row in rows], int)
+        flat = numbers_in(" ".join(rows))
+        if len(flat) != widths.sum():
+            raise ValueError("words that are no numbers")
         starts = np.cumsum(widths) - widths
         for each in element.properties:
             if (places >= widths).any():
@@ -288,7 +291,7 @@ def _surfaces(path, read: dict[str, dict], textures: list[str], n_bytes: int, no
 
 def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Notes) -> list[Surface]:
     """A surface for each picture; every corner becomes a vertex of its own."""
-    beside, share, found = Beside(path), share_of(len(textures)), []
+    beside, share, found = Beside(path), share_of(len(textures), notes), []
     numbers = np.where((numbers >= 0) & (numbers < len(textures)), numbers, 0)
     pictures: dict[int, np.ndarray] = {}
     for number in np.unique(numbers):

@@ -10,8 +10,8 @@ from formats.errors import BadMesh, LimitExceeded, printable
 
 MAX_TRIANGLES = 10_000_000
 """Of all surfaces together, as placed."""
-FREE_TRIANGLES = 1_000_000
-TRIANGLES_PER_BYTE = 10
+FREE_TRIANGLES = 500_000
+TRIANGLES_PER_BYTE = 4
 """Small files may place at most FREE_TRIANGLES, larger ones so many per byte: instances cost no bytes."""
 MAX_NOTES = 50
 NAMED = 4
@@ -58,8 +58,8 @@ class Paint:
     uv: np.ndarray | None = None
     """(V, 2) float32 per vertex, (0, 0) at the texture's upper left corner, v down."""
     reach: np.ndarray | None = None
-    """(2, 2) the least and the largest of `uv`. Texels beyond it are not mixed in: where a whole picture is laid on
-    a surface, its borders do not take colour from the opposite side."""
+    """(2, 2) the least and the largest of `uv`. Texels beyond it are not mixed in: where a whole picture is
+    laid on a surface, its borders do not take colour from the opposite side."""
     coverage: Texture | None = None
     """A second picture at the same coordinates whose alpha replaces the texture's (`map_d` of .mtl)."""
 
@@ -71,8 +71,8 @@ WHITE = Paint(np.ones(4, np.float32))
 class Surface:
     """Triangles that share a material, in the world of their file."""
 
-    positions: np.ndarray
-    """(V, 3) float64."""
+    positions: np.ndarray | None
+    """(V, 3) float64; None in a mesh, which holds those of all its surfaces."""
     faces: np.ndarray
     """(F, 3) int32 indices of vertices."""
     paint: Paint = WHITE

@@ -32,7 +32,7 @@ class Mesh:
     """All surfaces of a file, placed in its world, to be seen by rays."""
 
     vertices: np.ndarray
-    """(V, 3) float64, those that faces use."""
+    """(V, 3) float64, of all surfaces in turn."""
     surfaces: list[Surface]
     first_faces: np.ndarray
     """(n_surfaces,) index of each surface's first face among all faces."""
@@ -207,8 +207,8 @@ def _interpolate(weights: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def texels(texture: Texture, uv: np.ndarray, linear: bool, reach: np.ndarray | None = None) -> np.ndarray:
-    """(n, 4) of the texture at (n, 2) coordinates, bilinear or nearest, mixed in linear light if asked; of the
-    texels that lie within `reach` (2, 2), where that is given."""
+    """(n, 4) of the texture at (n, 2) coordinates, bilinear or nearest, mixed in linear light if asked; of
+    the texels that lie within `reach` (2, 2), where that is given."""
     size = np.array(texture.pixels.shape[1::-1])
     flat = texture.pixels.reshape(-1, 4)
     place = uv.astype(np.float64) * size
