@@ -17,16 +17,18 @@ class Hull:
         """Raises BadMesh for what is no mesh or not closed, and what reading raises."""
         import trimesh
 
-        parts = [trimesh.Trimesh(s.positions, s.faces) for s in mesh_surfaces(path)[0]]
+        parts = [trimesh.Trimesh(s.positions, s.faces, process=False) for s in mesh_surfaces(path)[0]]
         self.mesh = trimesh.util.concatenate(parts)
+        self.box = np.asarray(self.mesh.bounds, np.float64).reshape(6)
+        self.centre, self.size = (self.box[:3] + self.box[3:]) / 2, float(np.ptp(self.mesh.bounds, 0).max())
+        self.mesh.vertices = self.seen(self.mesh.vertices)
         self.mesh.merge_vertices()
         if not self.mesh.is_watertight:
             raise BadMesh(f"{path}: the mesh is not closed, so that nothing lies inside; close its holes")
 
-    @property
-    def box(self) -> np.ndarray:
-        """(6,) around it."""
-        return np.asarray(self.mesh.bounds, np.float64).reshape(6)
+    def seen(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) about the middle of the mesh, in its size: trimesh has tolerances without a unit."""
+        return (points - self.centre) / (self.size or 1.0)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool: which points (N, 3) lie inside."""
@@ -34,5 +36,5 @@ class Hull:
         near = np.flatnonzero(((points >= self.box[:3]) & (points <= self.box[3:])).all(1))
         for part in np.array_split(near, -(-len(near) // ASKED_AT_ONCE) or 1):
             if len(part):
-                found[part] = self.mesh.contains(points[part])
+                found[part] = self.mesh.contains(self.seen(points[part]))
         return found

@@ -15,8 +15,10 @@ import numpy as np
 
 from formats.errors import BadMesh, FormatError
 from formats.inputs import open_input
+from formats.points import MAX_HEADER
 from formats.surfaces.gltf import read_gltf
 from formats.surfaces.obj import read_obj
+from formats.surfaces.off import read_off
 from formats.surfaces.ply import read_ply
 from formats.surfaces.stl import read_stl
 from formats.surfaces.surface import Notes, Surface
@@ -34,7 +36,14 @@ __all__ = [
     "unreadable_mesh",
 ]
 
-READERS = {"glb": read_gltf, "gltf": read_gltf, "obj": read_obj, "ply": read_ply, "stl": read_stl}
+READERS = {
+    "glb": read_gltf,
+    "gltf": read_gltf,
+    "obj": read_obj,
+    "ply": read_ply,
+    "stl": read_stl,
+    "off": read_off,
+}
 GLTF = ("glb", "gltf")
 FIELD_OF_VIEW = math.radians(40)
 MARGIN = 0.02
@@ -58,12 +67,12 @@ def is_mesh(path: Path | str) -> bool:
 
 
 def mesh_type(path: Path | str) -> str | None:
-    """ "glb", "ply", "obj", "gltf", "stl" or None."""
+    """ "glb", "ply", "obj", "gltf", "stl", "off" or None."""
     if Path(path).is_dir():
         return None
     try:
         with open_input(path) as file:
-            head = file.read(4096)
+            head = file.read(MAX_HEADER)
     except FormatError:
         return None
     if head.startswith(b"glTF"):
@@ -73,7 +82,7 @@ def mesh_type(path: Path | str) -> str | None:
     ending = Path(path).suffix.lower()[1:]
     if ending == "glb" and head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
         return "gltf"
-    return ending if ending in ("obj", "gltf", "stl") else None
+    return ending if ending in ("obj", "gltf", "stl", "off") else None
 
 
 def mesh_capture(
@@ -149,7 +158,7 @@ def mesh_surfaces(path: Path | str) -> tuple[list[Surface], tuple[str, ...]]:
     return surfaces, tuple(notes.sentences)
 
 
-NO_MESH = "{}: not a mesh that can be read; expected .glb, .gltf, .obj, .ply or .stl with faces"
+NO_MESH = "{}: not a mesh that can be read; expected .glb, .gltf, .obj, .ply, .stl or .off with faces"
 
 
 def _load(path: Path | str) -> Mesh:

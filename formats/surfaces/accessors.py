@@ -7,7 +7,7 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from formats.errors import BadMesh, LimitExceeded, MissingExtra
+from formats.errors import BadMesh, FormatError, LimitExceeded, MissingExtra
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.beside import Beside
 
@@ -50,7 +50,10 @@ class Buffers:
         if entry.uri is not None:
             if entry.uri.startswith("data:"):
                 return data_uri(entry.uri, f"{self.path}: buffer {index}")
-            return self.beside.read(entry.uri, uri=True)[0]
+            try:
+                return self.beside.read(entry.uri, uri=True)[0]
+            except FormatError as error:
+                raise error.within(f"{self.path}: buffer {index}") from error
         if index == 0 and self.binary is not None:
             return self.binary
         raise BadMesh(f"{self.path}: buffer {index} has no bytes; export the file again")

@@ -2,6 +2,7 @@
 
 import os
 import re
+import unicodedata
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -45,7 +46,7 @@ class Beside:
             raise MissingFile(f"{name[:80]}…: no such file beside the mesh")
         if SCHEME.match(name):
             raise OutsideFolder(f"{name}: an address, and only files beside the mesh are read; put it there")
-        spellings = dict.fromkeys([unquote(name), name] if uri else [name])
+        spellings = dict.fromkeys([unquote(name), name] if uri else [name, _western(name)])
         refused = None
         for spelling in spellings:
             parts = [part for part in re.split(r"[\\/]+", spelling) if part not in ("", ".")]
@@ -72,7 +73,7 @@ class Beside:
                 self._check(where)
                 continue
             if not os.path.lexists(there):
-                same = [entry for entry in _entries(where) if entry.casefold() == part.casefold()]
+                same = [entry for entry in _entries(where) if _key(entry) == _key(part)]
                 if not same:
                     return None
                 there = where / min(same)
@@ -84,6 +85,16 @@ class Beside:
         real = os.path.realpath(path)
         if os.path.commonpath([real, self.root]) != self.root:
             raise OutsideFolder(f"{path}: lies outside of {self.root}; put it beside the mesh")
+
+
+def _key(name: str) -> str:
+    """Equal for names that differ in case, or in how accents are put together."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _western(name: str) -> str:
+    """Bytes that are no UTF-8 taken for the letters of Windows."""
+    return name.encode("utf-8", "surrogateescape").decode("cp1252", "replace")
 
 
 def _entries(folder: Path) -> list[str]:

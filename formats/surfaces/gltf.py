@@ -90,7 +90,7 @@ def _document(path: Path | str) -> tuple[schema.Document, bytes | None]:
     if not chunks or chunks[0][0] != JSON_CHUNK:
         raise BadMesh(f"{path}: does not begin with a chunk of JSON; export it again")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == BINARY_CHUNK else None
-    return schema.decode(bytes(chunks[0][1]), str(path)), binary
+    return schema.decode(bytes(chunks[0][1]).rstrip(b"\0 "), str(path)), binary
 
 
 def _chunks(data: bytes, path: Path | str) -> Iterator[tuple[int, memoryview]]:
@@ -273,7 +273,7 @@ class _Shape:
             reader.notes.add(f"{where.removeprefix(f'{reader.path}: ')} has no positions and is left out")
             return
         count = self._count()
-        faces = _triangles(self._indices(count), primitive.mode)
+        faces = _triangles(self._indices(count), TRIANGLES if self.unpacked else primitive.mode)
         check_indices(where, faces.reshape(-1), count)
         used = np.zeros(count, bool)
         used[faces.reshape(-1)] = True

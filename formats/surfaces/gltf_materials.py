@@ -193,7 +193,8 @@ def image_label(image: schema.Image, index: int) -> str:
 
 
 def _transform(moved: schema.TextureTransform) -> np.ndarray:
-    """(2, 3) translation * rotation * scale, as KHR_texture_transform defines them."""
+    """(2, 3) translation * rotation * scale of KHR_texture_transform, turned as in Khronos' own viewer and
+    test model: the code in the extension's text turns the other way."""
     (x, y), (s, t) = moved.offset or (0, 0), moved.scale or (1, 1)
     c, w = math.cos(moved.rotation), math.sin(moved.rotation)
     return np.array([[c * s, w * t, x], [-w * s, c * t, y]])

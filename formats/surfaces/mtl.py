@@ -155,7 +155,7 @@ class Looks:
         factor = np.array([*colour, np.clip(material.alpha, 0, 1)], np.float32)
         placed = base or maps.get("map_d") or Map("", {})
         return Look(
-            Paint(factor, texture, None, coverage),
+            Paint(factor, texture, coverage=coverage),
             self._glow(material, called),
             material.alpha < 1 or coverage is not None,
             placed.numbers("-s", 1),

@@ -131,18 +131,18 @@ def _table(lines: list[str]) -> list[np.ndarray]:
 
 
 def _points(lines: list[str], path: Path | str) -> tuple[np.ndarray, np.ndarray | None]:
-    """(V, 3) positions, and (V, 4) colours where vertices have them: x y z, then w, or r g b, or both."""
+    """(V, 3) positions, and (V, 4) colours where vertices have them: x y z, then w, or r g b, or r g b a."""
     rows = _table(lines)
     if isinstance(rows, list):
         if any(len(row) < 3 for row in rows):
             raise BadMesh(f"{path}: a vertex has fewer than three numbers; export the mesh again")
-        coloured = [row[-3:] if len(row) in (6, 7) else np.ones(3) for row in rows]
-        colours = np.array(coloured) if any(len(row) in (6, 7) for row in rows) else None
+        coloured = [row[3:6] if len(row) >= 6 else np.ones(3) for row in rows]
+        colours = np.array(coloured) if any(len(row) >= 6 for row in rows) else None
         positions = np.array([row[:3] for row in rows])
     else:
         if rows.shape[1] < 3:
             raise BadMesh(f"{path}: a vertex has fewer than three numbers; export the mesh again")
-        positions, colours = rows[:, :3], rows[:, -3:] if rows.shape[1] in (6, 7) else None
+        positions, colours = rows[:, :3], rows[:, 3:6] if rows.shape[1] >= 6 else None
     if colours is not None:
         colours = sound_colours(colours / (255 if np.nanmax(colours, initial=0) > 1 else 1))
     return np.ascontiguousarray(positions), colours

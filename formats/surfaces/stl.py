@@ -21,7 +21,7 @@ def read_stl(path: Path | str, notes: Notes) -> list[Surface]:
     count = int.from_bytes(data[80:84], "little")
     if len(data) >= HEADER and HEADER + RECORD.itemsize * count == len(data):
         corners = _binary(data, count, notes)
-    elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:4096].lower():
+    elif data.lstrip()[:5].lower() == b"solid" and b"\0" not in data[:512]:
         corners = _text(data, path)
     elif len(data) >= HEADER and 0 < HEADER + RECORD.itemsize * count < len(data):
         notes.add("has bytes behind its last triangle, which are left out")
@@ -36,7 +36,8 @@ def _binary(data: bytes, count: int, notes: Notes) -> np.ndarray:
     rows = np.frombuffer(data, RECORD, count, HEADER)
     if rows["more"].any():
         notes.add("has colours in its spare bytes, which are not shown")
-    return rows["corners"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # signalling NaN, which is refused later
+        return rows["corners"].astype(np.float64)
 
 
 def _text(data: bytes, path: Path | str) -> np.ndarray:

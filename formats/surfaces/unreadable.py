@@ -30,7 +30,7 @@ ENDINGS = {
     **dict.fromkeys((".ma", ".mb"), ("a Maya scene", "export glTF (.glb) from Maya")),
     **dict.fromkeys((".x3d", ".wrl", ".vrml"), ("an X3D or VRML scene", CONVERT)),
     **dict.fromkeys((".3mf", ".amf"), ("a model for printing", CONVERT)),
-    **dict.fromkeys((".off", ".x", ".lwo", ".ac", ".b3d", ".md2", ".md5mesh"), ("a mesh", CONVERT)),
+    **dict.fromkeys((".x", ".lwo", ".ac", ".b3d", ".md2", ".md5mesh"), ("a mesh", CONVERT)),
     ".abc": ("an Alembic scene", CONVERT),
     ".skp": ("a SketchUp model", "export glTF (.glb) from SketchUp"),
     **dict.fromkeys(
