@@ -33,12 +33,14 @@ def read_picture(data: bytes, name: str, share: int, notes: Notes) -> np.ndarray
     """
     if data.startswith(KTX2):
         return _reduced_array(_ktx2(data, name), name, share, notes)
+    from PIL.Image import DecompressionBombError
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             image = _identified(data, name)
             return _pixels(image, len(data), name, share, notes)
-    except DECODING_ERRORS as error:
+    except (*DECODING_ERRORS, RuntimeError, DecompressionBombError) as error:
         raise BadImage(f"{name}: the picture cannot be decoded ({error}); save it again") from error
 
 
