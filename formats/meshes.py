@@ -147,7 +147,8 @@ def mesh_surfaces(path: Path | str) -> tuple[list[Surface], tuple[str, ...]]:
     if kind in GLTF:
         notes.add(UPRIGHT_NOTE)
     try:
-        surfaces = [surface for surface in READERS[kind](path, notes) if len(surface.faces)]
+        with np.errstate(all="ignore"):  # numbers of hostile files; what is not finite is looked for later
+            surfaces = [surface for surface in READERS[kind](path, notes) if len(surface.faces)]
     except MemoryError as error:
         raise BadMesh(f"{path}: the mesh does not fit into memory; simplify it") from error
     if not surfaces:
@@ -155,7 +156,7 @@ def mesh_surfaces(path: Path | str) -> tuple[list[Surface], tuple[str, ...]]:
     if kind in GLTF:
         for surface in surfaces:
             surface.positions[:] = surface.positions @ UPRIGHT[:3, :3].T
-    return surfaces, tuple(notes.sentences)
+    return surfaces, notes.sentences()
 
 
 NO_MESH = "{}: not a mesh that can be read; expected .glb, .gltf, .obj, .ply, .stl or .off with faces"

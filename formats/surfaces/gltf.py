@@ -171,8 +171,7 @@ class _Reader:
         for index in order:
             parent = parents[index]
             local = _local(nodes[index])
-            with np.errstate(over="ignore", invalid="ignore"):
-                worlds[index] = local if parent is None else worlds[parent] @ local
+            worlds[index] = local if parent is None else worlds[parent] @ local
         return worlds, order
 
     def _shown(self, order: list[int]) -> list[int]:
@@ -270,7 +269,7 @@ class _Shape:
         self.unpacked = self._draco()
         if "POSITION" not in primitive.attributes:
             self.faces, self.chosen = np.empty((0, 3), np.int32), np.empty(0, np.int64)
-            reader.notes.add(f"{where.removeprefix(f'{reader.path}: ')} has no positions and is left out")
+            reader.notes.add("has no positions and is left out", where.removeprefix(f"{reader.path}: "))
             return
         count = self._count()
         faces = _triangles(self._indices(count), TRIANGLES if self.unpacked else primitive.mode)
@@ -340,10 +339,6 @@ class _Shape:
         """The primitive's surface in each of its worlds (mesh_to_world, (4, 4))."""
         if not len(self.faces):
             return []
-        with np.errstate(over="ignore", invalid="ignore"):
-            return self._placed(worlds, weights, skin)
-
-    def _placed(self, worlds: list[np.ndarray], weights: list[float], skin: int | None) -> list[Surface]:
         look = self.reader.materials.look(self.primitive.material)
         colours = self._morphed("COLOR_0", (3, 4), weights)
         rest = {
@@ -370,10 +365,8 @@ class _Shape:
             return Paint(slot.factor)
         uv = self._morphed(f"TEXCOORD_{slot.tex_coord}", (2,), weights)
         if uv is None:
-            self.reader.notes.add(
-                f"{self.where.removeprefix(f'{self.reader.path}: ')} has a texture, but no coordinates "
-                f"TEXCOORD_{slot.tex_coord} for it; its upper left corner is shown"
-            )
+            lost = f"has a texture, but no TEXCOORD_{slot.tex_coord} for it; its upper left corner is shown"
+            self.reader.notes.add(lost, self.where.removeprefix(f"{self.reader.path}: "))
             uv = np.zeros((len(self.chosen), 2), np.float32)
         if slot.transform is not None:
             uv = uv @ slot.transform[:, :2].T + slot.transform[:, 2]
@@ -438,7 +431,7 @@ def _check_draco(data: bytes, where: str) -> None:
             at, shift = at + 1, shift + 7
             if data[at - 1] < 128:
                 break
-        check_budget(where, count, len(data))
+        check_budget(where, count, 2 * len(data))
 
 
 def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:

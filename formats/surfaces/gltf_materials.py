@@ -81,7 +81,7 @@ class Materials:
                 factor, info = glossy.diffuse_factor, glossy.diffuse_texture
         base = self._slot(factor, info, name)
         if material.alpha_mode not in MODES:
-            self.notes.add(f"{name} has the unknown alphaMode {material.alpha_mode[:20]!r}, shown as OPAQUE")
+            self.notes.add(f"the unknown alphaMode {material.alpha_mode[:20]!r} is shown as OPAQUE", name)
         cutoff = material.alpha_cutoff if material.alpha_mode == "MASK" else None
         blend = material.alpha_mode == "BLEND"
         return Look(base, self._glow(material, name), cutoff, blend, not material.double_sided)
@@ -93,7 +93,7 @@ class Materials:
         factor = [max(strength, 0) * max(value, 0) for value in material.emissive_factor or (0, 0, 0)]
         if max(factor) == 0:
             return None
-        self.notes.add(f"{name} glows, which is added to its colour")
+        self.notes.add("glows, which is added to its colour", name)
         return self._slot([*factor, 1], material.emissive_texture, name)
 
     def _slot(self, factor: list[float] | None, info: schema.TextureInfo | None, name: str) -> Slot:
@@ -126,7 +126,7 @@ class Materials:
                 return Texture(pixels, *self._sampling(texture))
         if not sources and texture.source is None:
             others = f" but by {listed(texture.extensions)}" if texture.extensions else ""
-            self.notes.add(f"{name} has a texture without a picture{others}, which is shown white")
+            self.notes.add(f"has a texture without a picture{others}, which is shown white", name)
         return None
 
     def _sampling(self, texture: schema.Texture) -> tuple[tuple[str, str], bool]:
@@ -146,7 +146,7 @@ class Materials:
                 self.pictures[index] = read_picture(data, label, self.share, self.notes)
             except FormatError as error:
                 self.pictures[index] = None
-                self.notes.add(f"a texture of {name} is not shown: {error}")
+                self.notes.add(f"has a texture that is not shown: {error}", name)
         return self.pictures[index]
 
     def _image_bytes(self, image: schema.Image, index: int, label: str) -> tuple[bytes, str]:
@@ -176,7 +176,7 @@ class Materials:
             glossy = self._extension(material, GLOSSINESS, schema.Glossiness)
             unused += ["specularGlossinessTexture"] if glossy.specular_glossiness_texture else []
         if unused:
-            self.notes.add(f"{name} is shown unlit, by its colour alone: {listed(unused)} not used")
+            self.notes.add(f"shown unlit, by colour alone; not used: {listed(unused)}", name)
 
     def tell_unused_images(self) -> None:
         """A note on pictures that no shown material uses."""

@@ -22,6 +22,7 @@ ARGUMENTS = {**dict.fromkeys(ONE_WORD, 1), "-mm": 2}
 PLACING = ("-o", "-s", "-t")
 
 MAPS = re.compile(r"(map_\w+|norm|bump|disp|decal|refl)$")
+SHOWN = ("map_kd", "map_ka", "map_d", "map_ke")
 GREY = 1 / 512
 MAX_MATERIALS = 100_000
 
@@ -125,7 +126,8 @@ class Looks:
         self.materials, self.beside, self.notes = materials, beside, notes
         self.pictures: dict[str, np.ndarray | None] = {}
         self.looks: dict[str, Look] = {}
-        named = {m.name for material in materials.values() for m in material.maps.values()}
+        maps = [item for material in materials.values() for item in material.maps.items()]
+        named = {m.name for word, m in maps if word in SHOWN}
         self.share = share_of(len(named), notes)
 
     def look(self, name: str) -> Look:
@@ -139,17 +141,17 @@ class Looks:
         base = maps.get("map_kd")
         if base is None and "map_ka" in maps:
             base = maps["map_ka"]
-            self.notes.add(f"{called} has no map_Kd, its map_Ka is shown")
+            self.notes.add("has no map_Kd, its map_Ka is shown", called)
         self._tell_unused(material, base, called)
         texture, coverage = self._texture(base, called), self._texture(maps.get("map_d"), called)
         if coverage is not None:
             coverage = Texture(_as_alpha(coverage.pixels), coverage.wrap)
         colour = self._colour(material, base, texture, called)
         if material.alpha < 1:
-            self.notes.add(f"{called} is see-through ({1 - material.alpha:.3g}), which is blended")
+            self.notes.add("see-through, which is blended", called)
         if texture is not None and coverage is None and (texture.pixels[..., 3] < 255).any():
             self.notes.add(
-                f"the transparency of {base.name} is not shown, since {called} does not ask for it by map_d"
+                f"the transparency of {base.name} is not shown, since no map_d asks for it", called
             )
             texture = replace(texture, pixels=opaque(texture.pixels))
         factor = np.array([*colour, np.clip(material.alpha, 0, 1)], np.float32)
@@ -169,9 +171,7 @@ class Looks:
         if max(kd) - min(kd) > GREY:
             return np.clip(kd, 0, 1)
         if texture is not None and abs(kd[0] - 1) > GREY:
-            self.notes.add(
-                f"{called} has the grey Kd {kd[0]:.3g} beside {base.name}, which is shown as it is"
-            )
+            self.notes.add(f"has the grey Kd {kd[0]:.3g} beside a picture, which is shown as it is", called)
         return np.ones(3) if texture is not None else np.clip(kd, 0, 1)
 
     def _glow(self, material: Material, called: str) -> Paint | None:
@@ -181,7 +181,7 @@ class Looks:
         )
         if max(ke) <= 0:
             return None
-        self.notes.add(f"{called} glows, which is added to its colour")
+        self.notes.add("glows, which is added to its colour", called)
         return Paint(np.array([*np.clip(ke, 0, 1000), 1], np.float32), texture)
 
     def _texture(self, wanted: Map | None, called: str) -> Texture | None:
@@ -193,7 +193,7 @@ class Looks:
                 self.pictures[wanted.name] = read_picture(data, found.name, self.share, self.notes)
             except FormatError as error:
                 self.pictures[wanted.name] = None
-                self.notes.add(f"a texture of {called} is not shown: {error}")
+                self.notes.add(f"has a texture that is not shown: {error}", called)
         pixels = self.pictures[wanted.name]
         wrap = "clamp" if wanted.options.get("-clamp", ["off"])[0].lower() == "on" else "repeat"
         return None if pixels is None else Texture(pixels, (wrap, wrap))
@@ -203,7 +203,7 @@ class Looks:
         unused = [f"{word} {m.name}" for word, m in material.maps.items() if word not in shown]
         unused = [text for text in unused if base is None or not text.endswith(f" {base.name}")]
         if unused:
-            self.notes.add(f"{called} is shown unlit, by its colour alone: {listed(unused)} not used")
+            self.notes.add(f"shown unlit, by colour alone; not used: {listed(unused)}", called)
         odd = {
             option
             for word, m in material.maps.items()
@@ -211,7 +211,7 @@ class Looks:
             if word in shown and option in ("-t", "-mm", "-imfchan", "-cc")
         }
         if odd:
-            self.notes.add(f"{called} has pictures with {listed(sorted(odd))}, which is not honoured")
+            self.notes.add(f"has pictures with {listed(sorted(odd))}, which is not honoured", called)
 
     def tell_unused(self) -> None:
         unused = [name for name in self.materials if name not in self.looks]

@@ -37,8 +37,7 @@ def read_obj(path: Path | str, notes: Notes) -> list[Surface]:
         text.read(data)
     except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: holds {error}; export the mesh again") from error
-    del data
-    return _surfaces(text, path, notes)
+    return _surfaces(text, path, len(data), notes)
 
 
 class _Text:
@@ -156,12 +155,11 @@ def _uvs(lines: list[str]) -> np.ndarray:
     return np.array([[*row[:2], 0, 0][:2] for row in rows], np.float64).reshape(-1, 2)
 
 
-def _surfaces(text: _Text, path: Path | str, notes: Notes) -> list[Surface]:
+def _surfaces(text: _Text, path: Path | str, n_bytes: int, notes: Notes) -> list[Surface]:
     if not text.counts:
         return []
-    size = max(1, sum(map(len, text.points)))
     counts, used = np.array(text.counts), np.array(text.used)
-    check_budget(path, int((counts - 2).sum()), 10 * size)
+    check_budget(path, int((counts - 2).sum()), n_bytes)
     try:
         positions, colours = _points(text.points, path)
         uvs = _uvs(text.uvs)
@@ -201,7 +199,7 @@ def _surface(corners, positions, uvs, colours, name: str | None, looks: Looks, n
         rest["blend"] = look.blend
     if colours is not None:
         if textured:
-            notes.add(f"vertex colours are not used where material {name[:60]!r} has a picture")
+            notes.add("vertex colours are not used beside its picture", f"material {name[:60]!r}")
         else:
             rest["colours"] = colours[vertex]
             if "paint" in rest and np.ptp(rest["paint"].factor[:3]) < 1 / 512:
@@ -214,7 +212,7 @@ def _coordinates(coordinate: np.ndarray, uvs: np.ndarray, look, name: str, notes
     """(V, 2), v down."""
     missing = (coordinate < 0) | (coordinate >= len(uvs))
     if missing.any():
-        notes.add(f"faces of material {name[:60]!r} have a picture, but lack coordinates for it")
+        notes.add("has a picture, but some faces lack coordinates for it", f"material {name[:60]!r}")
     uv = np.zeros((len(coordinate), 2))
     uv[~missing] = uvs[coordinate[~missing]]
     uv = uv * look.scale + look.offset

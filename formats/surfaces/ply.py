@@ -27,7 +27,7 @@ from formats.surfaces.surface import (
 )
 
 MAX_FILE = 2**31
-TEXTURE = re.compile(r"comment\s+texturefile:?\s+(\S.*?)\s*$", re.IGNORECASE)
+TEXTURE = re.compile(r"comment +texturefile:? +(.+)", re.IGNORECASE)
 AXES = ("x", "y", "z")
 HUES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
@@ -71,7 +71,9 @@ def read_ply(path: Path | str, notes: Notes) -> list[Surface]:
     read = {}
     for element in elements:
         read.setdefault(element.name, tables.read(element))
-    textures = [match[1] for line in lines if (match := TEXTURE.match(line.strip()))]
+    textures = [
+        match[1].strip() for line in lines if (match := TEXTURE.match(line.replace("\t", " ").strip()))
+    ]
     return _surfaces(path, read, textures, len(data), notes)
 
 

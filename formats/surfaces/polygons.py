@@ -1,9 +1,12 @@
 """Polygons as triangles."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 MAX_CORNERS = 1000
-"""Of a polygon that is cut at its ears, which takes time that grows with the square of them."""
+MAX_LOOKS = 300_000
+"""Corners that are looked at for ears, which takes seconds; polygons beyond, and larger ones, stay fans."""
 
 
 def triangulated(
@@ -22,10 +25,13 @@ def triangulated(
     fans = np.stack([first, first + step + 1, first + step + 2], 1)
     if (counts <= 3).all():
         return fans, polygon
+    looks = iter(range(MAX_LOOKS))
     for index in _concave(counts, starts, corners, positions, fans, polygon):
         own = np.arange(starts[index], starts[index] + counts[index])
-        if counts[index] <= MAX_CORNERS:
-            fans[polygon == index] = own[_ears(positions[corners[own]])]
+        if counts[index] > MAX_CORNERS:
+            continue
+        first = int(np.searchsorted(polygon, index))
+        fans[first : first + len(own) - 2] = own[_ears(positions[corners[own]], looks)]
     return fans, polygon
 
 
@@ -41,15 +47,15 @@ def _concave(counts, starts, corners, positions, fans, polygon) -> np.ndarray:
     return found[np.isfinite(whole[found]).all(1)]
 
 
-def _ears(points: np.ndarray) -> np.ndarray:
-    """(n - 2, 3) corners of a simple polygon (n, 3), seen along its area normal."""
+def _ears(points: np.ndarray, looks: Iterator[int]) -> np.ndarray:
+    """(n - 2, 3) corners of a simple polygon (n, 3), seen along its area normal, while there are `looks`."""
     centred = points - points.mean(0)
     normal = np.cross(centred, np.roll(centred, -1, 0)).sum(0)
     drop = int(np.abs(normal).argmax())
     flat = centred[:, [(drop + 1) % 3, (drop + 2) % 3]] * [np.sign(normal[drop]) or 1, 1]
     left, found = list(range(len(points))), []
     while len(left) > 3:
-        ear = next((k for k in range(len(left)) if _is_ear(flat, left, k)), 0)
+        ear = next((k for k, _ in zip(range(len(left)), looks, strict=False) if _is_ear(flat, left, k)), 0)
         found.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
     return np.array([*found, left])

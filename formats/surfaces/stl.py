@@ -36,8 +36,7 @@ def _binary(data: bytes, count: int, notes: Notes) -> np.ndarray:
     rows = np.frombuffer(data, RECORD, count, HEADER)
     if rows["more"].any():
         notes.add("has colours in its spare bytes, which are not shown")
-    with np.errstate(invalid="ignore"):  # signalling NaN, which is refused later
-        return rows["corners"].astype(np.float64)
+    return rows["corners"].astype(np.float64)
 
 
 def _text(data: bytes, path: Path | str) -> np.ndarray:

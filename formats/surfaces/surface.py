@@ -8,10 +8,10 @@ import numpy as np
 
 from formats.errors import BadMesh, LimitExceeded, printable
 
-MAX_TRIANGLES = 10_000_000
+MAX_TRIANGLES = 30_000_000
 """Of all surfaces together, as placed."""
 FREE_TRIANGLES = 500_000
-TRIANGLES_PER_BYTE = 4
+TRIANGLES_PER_BYTE = 2
 """Small files may place at most FREE_TRIANGLES, larger ones so many per byte: instances cost no bytes."""
 MAX_NOTES = 50
 NAMED = 4
@@ -22,11 +22,20 @@ class Notes:
 
     def __init__(self, path: Path | str):
         self.path = path
-        self.sentences: dict[str, None] = {}
+        self._subjects: dict[str, list[str]] = {}
 
-    def add(self, sentence: str) -> None:
-        if len(self.sentences) < MAX_NOTES:
-            self.sentences[printable(f"{self.path}: {sentence}")] = None
+    def add(self, sentence: str, subject: str | None = None) -> None:
+        """A sentence, of which the subject, such as a material, is told with all others of which it holds."""
+        if sentence in self._subjects or len(self._subjects) < MAX_NOTES:
+            self._subjects.setdefault(sentence, []).extend([] if subject is None else [subject])
+
+    def sentences(self) -> tuple[str, ...]:
+        """Led by the file's name."""
+        told = []
+        for sentence, subjects in self._subjects.items():
+            about = f"{listed(subjects)}: " if subjects else ""
+            told.append(printable(f"{self.path}: {about}{sentence}"))
+        return tuple(told)
 
 
 def listed(names: Iterable[str]) -> str:
