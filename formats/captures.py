@@ -16,12 +16,12 @@ import numpy as np
 from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
-from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
+from formats.errors import BadMesh, BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
 from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
 from formats.matching import gone, match_photos
-from formats.meshes import is_mesh, mesh_capture
+from formats.meshes import is_mesh, mesh_capture, unreadable_mesh
 from formats.photos import (
     Folder,
     chosen_copy,
@@ -104,6 +104,8 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
         return mesh_capture(path)
     if path.is_dir():
         return _read_folder(path, downscale)
+    if sentence := unreadable_mesh(path):
+        raise BadMesh(sentence)
     if path.name == llff.NAME:
         return _read_llff(path, downscale)
     if match := BLENDER_FILE.fullmatch(path.name):

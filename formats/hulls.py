@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh
-from formats.meshes import placed_geometries
+from formats.meshes import mesh_surfaces
 
 ASKED_AT_ONCE = 1 << 18
 
@@ -17,10 +17,7 @@ class Hull:
         """Raises BadMesh for what is no mesh or not closed, and what reading raises."""
         import trimesh
 
-        parts = [
-            trimesh.Trimesh(g.vertices @ m[:3, :3].T + m[:3, 3], g.faces, process=False)
-            for g, m in placed_geometries(path)
-        ]
+        parts = [trimesh.Trimesh(s.positions, s.faces, process=False) for s in mesh_surfaces(path)[0]]
         self.mesh = trimesh.util.concatenate(parts)
         self.box = np.asarray(self.mesh.bounds, np.float64).reshape(6)
         self.centre, self.size = (self.box[:3] + self.box[3:]) / 2, float(np.ptp(self.mesh.bounds, 0).max())

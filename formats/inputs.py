@@ -49,7 +49,7 @@ def read_input(path: Path | str, limit: int) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
             raise LimitExceeded(f"{path}: has {size:,} bytes, but at most {limit:,} are read")
-        return file.read(limit)
+        return file.read(size)  # and not of `limit`, which would be allocated first
 
 
 def decoded(data: bytes, errors: str = "strict") -> str:

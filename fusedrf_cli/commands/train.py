@@ -65,8 +65,8 @@ def command(source, output, progress, **words):
     """Learn one field from photos or a mesh.
 
     SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF or Polycam), its
-    transforms.json, or a .glb, .gltf, .obj or .ply mesh. Photos without poses are posed first, as by
-    `fusedrf pose`.
+    transforms.json, or a .glb, .gltf, .obj, .ply, .stl or .off mesh. Photos without poses are posed first,
+    as by `fusedrf pose`.
 
     \b
     Example:

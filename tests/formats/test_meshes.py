@@ -155,14 +155,16 @@ def test_obj_material(tmp_path):
 
 
 def slow_texel(texels: np.ndarray, u: float, v: float) -> np.ndarray:
-    """The four nearest of a texture that repeats for ever, v up, weighted by closeness."""
+    """The four nearest of a texture that repeats twice along each axis, v up, weighted by closeness; beyond
+    the surface its border goes on."""
     height, width, _ = texels.shape
     x, y = u * width, (1 - v) * height
     total = np.zeros(3)
-    for row in range(-height - 2, 2 * height + 2):
-        for column in range(-width - 2, 2 * width + 2):
+    for row in range(-height - 2, height + 2):
+        for column in range(-2, 2 * width + 2):
             near = max(0, 1 - abs(column + 0.5 - x)) * max(0, 1 - abs(row + 0.5 - y))
-            total += near * texels[row % height, column % width]
+            inside = np.clip(row, -height, height - 1), np.clip(column, 0, 2 * width - 1)
+            total += near * texels[inside[0] % height, inside[1] % width]
     return total
 
 
@@ -185,10 +187,16 @@ def test_texture_is_bilinear_upright_and_repeats(tmp_path):
             assert seen == pytest.approx(slow_texel(texels, u, v), abs=0.6)
 
 
-def test_mesh_without_colour_is_grey(tmp_path):
-    trimesh.creation.box().export(tmp_path / "a.stl")
-    trimesh.load_mesh(tmp_path / "a.stl").export(tmp_path / "a.obj", include_color=False)
-    assert len(colours_seen(tmp_path / "a.obj")) == 1
+@pytest.mark.parametrize("ending", ["stl", "stl_ascii", "off", "obj"])
+def test_mesh_without_colour_is_white(tmp_path, ending):
+    path = tmp_path / f"a.{ending.partition('_')[0]}"
+    path.write_bytes(as_bytes(trimesh.creation.box().export(file_type=ending)))
+    assert colours_seen(path) == {(255, 255, 255)}
+    assert mesh_capture(path, **FEW).aabb == pytest.approx([-0.52] * 3 + [0.52] * 3)
+
+
+def as_bytes(data: str | bytes) -> bytes:
+    return data.encode() if isinstance(data, str) else data
 
 
 # --- what is and what is not a mesh -------------------------------------------------------------------------

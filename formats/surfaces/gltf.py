@@ -1,0 +1,467 @@
+"""glTF 2.0 files, .gltf and .glb: the surfaces of their scene, placed, at rest.
+
+Nodes, skins and morph weights stand as the file has them; animations are not played. What the file
+requires and is not known is an error; whatever else it names and is not shown is a note.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from formats.errors import BadMesh, LimitExceeded, MissingExtra
+from formats.inputs import read_input
+from formats.rotations import matrices
+from formats.surfaces import gltf_schema as schema
+from formats.surfaces.accessors import MESHOPT, Buffers, normalised
+from formats.surfaces.beside import Beside
+from formats.surfaces.gltf_materials import (
+    GLOSSINESS,
+    PICTURE_EXTENSIONS,
+    STRENGTH,
+    TRANSFORM,
+    UNLIT,
+    Materials,
+    Slot,
+)
+from formats.surfaces.surface import (
+    Notes,
+    Paint,
+    Surface,
+    check_budget,
+    check_indices,
+    laid,
+    listed,
+    sound_colours,
+)
+
+DRACO = "KHR_draco_mesh_compression"
+INSTANCING = "EXT_mesh_gpu_instancing"
+VISIBILITY = "KHR_node_visibility"
+KNOWN = {
+    DRACO,
+    *MESHOPT,
+    INSTANCING,
+    VISIBILITY,
+    "KHR_mesh_quantization",
+    TRANSFORM,
+    GLOSSINESS,
+    STRENGTH,
+    UNLIT,
+    *PICTURE_EXTENSIONS,
+}
+COLOUR_ONLY = "KHR_materials_"
+"""Extensions of this name change how a material takes light, which is not shown; its colour is."""
+WITHOUT_LOOKS = {
+    "KHR_xmp_json_ld",
+    "KHR_xmp",
+    "KHR_node_selectability",
+    "KHR_node_hoverability",
+}
+MAX_FILE = 2**32
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+TRIANGLES, STRIP, FAN = 4, 5, 6
+MAX_INSTANCES = 1_000_000
+SKINNED_AT_ONCE = 1 << 16
+
+
+def read_gltf(path: Path | str, notes: Notes) -> list[Surface]:
+    """All triangles of the shown scene. Raises BadJson, BadMesh, LimitExceeded, MissingExtra, MissingFile,
+    OutsideFolder."""
+    document, binary = _document(path)
+    _check_extensions(document, path, notes)
+    buffers = Buffers(document, path, Beside(path), binary)
+    return _Reader(document, path, buffers, notes).surfaces()
+
+
+def _document(path: Path | str) -> tuple[schema.Document, bytes | None]:
+    data = read_input(path, MAX_FILE)
+    if not data.startswith(b"glTF"):
+        return schema.decode(data, str(path)), None
+    if len(data) < 12:
+        raise BadMesh(f"{path}: ends within its header; copy or export it again")
+    _, version, length = struct.unpack_from("<4sII", data)
+    if version != 2:
+        raise BadMesh(f"{path}: a .glb of version {version}, but 2 is read; convert it to glTF 2.0")
+    if length > len(data):
+        raise BadMesh(f"{path}: has {len(data):,} of {length:,} bytes; copy or export it again")
+    chunks = list(_chunks(data[:length], path))
+    if not chunks or chunks[0][0] != JSON_CHUNK:
+        raise BadMesh(f"{path}: does not begin with a chunk of JSON; export it again")
+    binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == BINARY_CHUNK else None
+    return schema.decode(bytes(chunks[0][1]).rstrip(b"\0 "), str(path)), binary
+
+
+def _chunks(data: bytes, path: Path | str) -> Iterator[tuple[int, memoryview]]:
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<II", data, at)
+        if at + 8 + length > len(data):
+            raise BadMesh(f"{path}: ends within a chunk of {length:,} bytes; copy or export it again")
+        yield kind, memoryview(data)[at + 8 : at + 8 + length]
+        at += 8 + length
+
+
+def _check_extensions(document: schema.Document, path: Path | str, notes: Notes) -> None:
+    def unknown(names):
+        return [name for name in names if name not in KNOWN | WITHOUT_LOOKS]
+
+    required = [name for name in unknown(document.extensions_required) if not name.startswith(COLOUR_ONLY)]
+    if required:
+        raise BadMesh(
+            f"{path}: requires {listed(required)}, which is not known here; export the mesh without it"
+        )
+    if used := unknown(document.extensions_used):
+        notes.add(f"uses {listed(used)}, which is not shown")
+
+
+class _Reader:
+    """One document's surfaces."""
+
+    def __init__(self, document: schema.Document, path: Path | str, buffers: Buffers, notes: Notes):
+        self.document, self.path, self.buffers, self.notes = document, path, buffers, notes
+        self.materials = Materials(document, buffers, notes)
+        self.left_out = 0
+        self.worlds: list[np.ndarray] = []
+        self.triangles = 0
+        self.shapes: dict[tuple[int, int], _Shape] = {}
+
+    def surfaces(self) -> list[Surface]:
+        self.worlds, order = self._worlds()
+        shown, found = self._shown(order), []
+        for index in shown:
+            if self.document.nodes[index].mesh is not None:
+                found += self._node(index)
+        self._tell(shown)
+        return [surface for surface in found if len(surface.faces)]
+
+    def _tell(self, shown: list[int]) -> None:
+        document = self.document
+        if self.left_out:
+            self.notes.add(f"{self.left_out} primitives of points or lines are left out")
+        if document.animations:
+            self.notes.add(
+                f"{len(document.animations)} animations are not played; nodes and weights are as stored"
+            )
+        placed = {document.nodes[index].mesh for index in shown}
+        hidden = [mesh.name or f"mesh {i}" for i, mesh in enumerate(document.meshes) if i not in placed]
+        if hidden:
+            self.notes.add(f"meshes that are not in the shown scene: {listed(hidden)}")
+        self.materials.tell_unused_images()
+
+    # --- nodes ----------------------------------------------------------------------------------------------
+
+    def _worlds(self) -> tuple[list[np.ndarray], list[int]]:
+        """node_to_world (4, 4) of every node, and the nodes with parents before their children."""
+        nodes = self.document.nodes
+        parents: list[int | None] = [None] * len(nodes)
+        for index, node in enumerate(nodes):
+            for child in node.children:
+                self.buffers.item("nodes", child)
+                if parents[child] is not None:
+                    raise BadMesh(f"{self.path}: node {child} has two parents; export the file again")
+                parents[child] = index
+        order = [index for index, parent in enumerate(parents) if parent is None]
+        for index in order:  # grows while it is walked
+            order.extend(nodes[index].children)
+        if len(order) < len(nodes):
+            raise BadMesh(f"{self.path}: nodes are their own children; export the file again")
+        worlds = [np.eye(4)] * len(nodes)
+        for index in order:
+            parent = parents[index]
+            local = _local(nodes[index])
+            worlds[index] = local if parent is None else worlds[parent] @ local
+        return worlds, order
+
+    def _shown(self, order: list[int]) -> list[int]:
+        """Nodes of the default scene, without those that are hidden."""
+        document = self.document
+        if document.scene is None and not document.scenes:
+            roots = set(range(len(document.nodes))) - {
+                child for node in document.nodes for child in node.children
+            }
+        else:
+            chosen = document.scene or 0
+            scene = self.buffers.item("scenes", chosen)
+            roots = set(scene.nodes)
+            if len(document.scenes) > 1:
+                others = [s.name or f"scene {i}" for i, s in enumerate(document.scenes) if i != chosen]
+                self.notes.add(f"shows {scene.name or f'scene {chosen}'}; not shown: {listed(others)}")
+        for root in roots:
+            self.buffers.item("nodes", root)
+        within, shown = set(roots), []
+        hidden = 0
+        for index in order:
+            if index not in within:
+                continue
+            node = document.nodes[index]
+            if VISIBILITY in node.extensions:
+                raw = node.extensions[VISIBILITY]
+                if not schema.typed(raw, schema.Visibility, f"{self.path}: {VISIBILITY}").visible:
+                    hidden += 1
+                    continue
+            within.update(node.children)
+            shown.append(index)
+        if hidden:
+            self.notes.add(f"{hidden} nodes are hidden by {VISIBILITY} and left out")
+        return shown
+
+    def _node(self, index: int) -> list[Surface]:
+        node = self.document.nodes[index]
+        mesh = self.buffers.item("meshes", node.mesh)
+        weights = mesh.weights if node.weights is None else node.weights
+        worlds = self._instances(node, self.worlds[index])
+        found = []
+        for number, primitive in enumerate(mesh.primitives):
+            where = f"{self.path}: mesh {mesh.name[:60] or node.mesh!r}, primitive {number}"
+            if primitive.mode not in (TRIANGLES, STRIP, FAN):
+                self.left_out += 1
+                continue
+            shape = self.shapes.get((node.mesh, number))
+            if shape is None:
+                shape = self.shapes[node.mesh, number] = _Shape(self, primitive, where)
+            self.triangles += len(shape.faces) * len(worlds)
+            check_budget(self.path, self.triangles, self.buffers.size)
+            found += shape.placed(worlds, weights, node.skin)
+        return found
+
+    def _instances(self, node: schema.Node, world: np.ndarray) -> list[np.ndarray]:
+        if INSTANCING not in node.extensions:
+            return [world]
+        typed = schema.typed(node.extensions[INSTANCING], schema.Instancing, f"{self.path}: {INSTANCING}")
+        given = {
+            name: self.buffers.numbers(typed.attributes[name], (width,)).astype(np.float64)
+            for name, width in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3))
+            if name in typed.attributes
+        }
+        counts = {len(rows) for rows in given.values()}
+        if len(counts) != 1:
+            raise BadMesh(f"{self.path}: {INSTANCING} counts {sorted(counts)} instances, expected one number")
+        n = counts.pop()
+        if n > MAX_INSTANCES:
+            raise LimitExceeded(f"{self.path}: {n:,} instances, at most {MAX_INSTANCES:,} are read")
+        local = np.tile(np.eye(4), (n, 1, 1))
+        local[:, :3, :3] = _rotations(given.get("ROTATION", np.tile([0.0, 0, 0, 1], (n, 1))))
+        local[:, :3, :3] *= given.get("SCALE", np.ones((n, 3)))[:, None]
+        local[:, :3, 3] = given.get("TRANSLATION", np.zeros((n, 3)))
+        return list(world @ local)
+
+    def joints(self, index: int) -> np.ndarray:
+        """(n_joints, 4, 4) from the mesh at rest to the world."""
+        skin = self.buffers.item("skins", index)
+        for joint in skin.joints:
+            self.buffers.item("nodes", joint)
+        worlds = np.array([self.worlds[joint] for joint in skin.joints]).reshape(-1, 4, 4)
+        if skin.inverse_bind_matrices is None:
+            return worlds
+        inverse = self.buffers.numbers(skin.inverse_bind_matrices, (16,)).astype(np.float64)
+        if len(inverse) < len(worlds):
+            raise BadMesh(f"{self.path}: skin {index} has fewer bind matrices than joints; export it again")
+        return worlds @ inverse[: len(worlds)].reshape(-1, 4, 4).transpose(0, 2, 1)
+
+
+class _Shape:
+    """One primitive of triangles: its faces and the attributes of the vertices that they use."""
+
+    def __init__(self, reader: _Reader, primitive: schema.Primitive, where: str):
+        self.reader, self.buffers, self.primitive, self.where = reader, reader.buffers, primitive, where
+        self.unpacked = self._draco()
+        if "POSITION" not in primitive.attributes:
+            self.faces, self.chosen = np.empty((0, 3), np.int32), np.empty(0, np.int64)
+            reader.notes.add("has no positions and is left out", where.removeprefix(f"{reader.path}: "))
+            return
+        count = self._count()
+        faces = _triangles(self._indices(count), TRIANGLES if self.unpacked else primitive.mode)
+        check_indices(where, faces.reshape(-1), count)
+        used = np.zeros(count, bool)
+        used[faces.reshape(-1)] = True
+        self.chosen = np.flatnonzero(used)
+        self.faces = (np.cumsum(used) - 1)[faces].astype(np.int32).reshape(-1, 3)
+
+    def _count(self) -> int:
+        if "POSITION" in self.unpacked:
+            return len(self.unpacked["POSITION"])
+        index = self.primitive.attributes["POSITION"]
+        return len(self.buffers.rows(index, (3,)))
+
+    def _indices(self, count: int) -> np.ndarray:
+        if "indices" in self.unpacked:
+            return self.unpacked["indices"].reshape(-1).astype(np.int64)
+        if self.primitive.indices is None:
+            return np.arange(count)
+        rows = self.buffers.rows(self.primitive.indices, (1,))
+        if rows.dtype.kind != "u":
+            raise BadMesh(f"{self.where}: its indices are {rows.dtype}, expected whole numbers without sign")
+        return rows[:, 0].astype(np.int64)
+
+    def _draco(self) -> dict[str, np.ndarray]:
+        """Decoded attributes by name, and "indices"; nothing where the primitive is not compressed, or where
+        it has its plain numbers too and the library is missing."""
+        if DRACO not in self.primitive.extensions:
+            return {}
+        typed = schema.typed(self.primitive.extensions[DRACO], schema.Draco, f"{self.where}: {DRACO}")
+        try:
+            return draco_arrays(bytes(self.buffers.view(typed.buffer_view)), typed.attributes, self.where)
+        except MissingExtra:
+            accessors = [self.buffers.item("accessors", i) for i in self.primitive.attributes.values()]
+            if any(accessor.buffer_view is None for accessor in accessors):
+                raise
+            return {}
+
+    def _attribute(self, name: str, widths: tuple[int, ...]) -> np.ndarray | None:
+        """(used vertices, n) float32 of an attribute, None where there is none."""
+        index = self.primitive.attributes.get(name)
+        if name in self.unpacked:
+            rows = self.unpacked[name]
+            if rows.ndim != 2 or rows.shape[1] not in widths:
+                raise BadMesh(f"{self.where}: {name} has {rows.shape[1:]} numbers a vertex")
+            scaled = index is not None and self.buffers.item("accessors", index).normalized
+            rows = rows[self.chosen]
+            return normalised(rows) if scaled else rows.astype(np.float32)
+        return None if index is None else self.buffers.numbers(index, widths, self.chosen)
+
+    def _morphed(self, name: str, widths: tuple[int, ...], weights: list[float]) -> np.ndarray | None:
+        """An attribute with its morph targets added by their weights."""
+        plain = self._attribute(name, widths)
+        if plain is None:
+            return None
+        for weight, target in zip(weights, self.primitive.targets, strict=False):
+            if weight and name in target:
+                moved = self.buffers.numbers(target[name], (), self.chosen)
+                if moved.shape[1] not in widths or moved.shape[1] > plain.shape[1]:
+                    raise BadMesh(f"{self.where}: a morph target of {name} has {moved.shape[1]} numbers")
+                plain = plain.copy()
+                plain[:, : moved.shape[1]] += np.float32(weight) * moved
+        return plain
+
+    def placed(self, worlds: list[np.ndarray], weights: list[float], skin: int | None) -> list[Surface]:
+        """The primitive's surface in each of its worlds (mesh_to_world, (4, 4))."""
+        if not len(self.faces):
+            return []
+        look = self.reader.materials.look(self.primitive.material)
+        colours = self._morphed("COLOR_0", (3, 4), weights)
+        rest = {
+            "faces": self.faces,
+            "paint": self._paint(look.base, weights),
+            "glow": None if look.glow is None else self._paint(look.glow, weights),
+            "colours": None if colours is None else sound_colours(colours),
+            "linear": True,
+            "cutoff": look.cutoff,
+            "blend": look.blend,
+            "single_sided": look.single_sided,
+        }
+        if more := [
+            name for name in self.primitive.attributes if name.startswith("COLOR_") and name != "COLOR_0"
+        ]:
+            self.reader.notes.add(f"vertex colours {listed(more)} are not used, COLOR_0 is")
+        points = self._morphed("POSITION", (3,), weights).astype(np.float64)
+        if skin is not None and "JOINTS_0" in self.primitive.attributes:
+            return [Surface(self._skinned(points, skin), **rest)]
+        return [Surface(points @ world[:3, :3].T + world[:3, 3], **rest) for world in worlds]
+
+    def _paint(self, slot: Slot, weights: list[float]) -> Paint:
+        if slot.texture is None:
+            return Paint(slot.factor)
+        uv = self._morphed(f"TEXCOORD_{slot.tex_coord}", (2,), weights)
+        if uv is None:
+            lost = f"has a texture, but no TEXCOORD_{slot.tex_coord} for it; its upper left corner is shown"
+            self.reader.notes.add(lost, self.where.removeprefix(f"{self.reader.path}: "))
+            uv = np.zeros((len(self.chosen), 2), np.float32)
+        if slot.transform is not None:
+            uv = uv @ slot.transform[:, :2].T + slot.transform[:, 2]
+        return laid(Paint(slot.factor, slot.texture), uv)
+
+    def _skinned(self, points: np.ndarray, skin: int) -> np.ndarray:
+        """Points moved by the joints that hold them; the node's own place does not count."""
+        joints = self.reader.joints(skin)[:, :3]
+        sets = [i for i in range(8) if f"JOINTS_{i}" in self.primitive.attributes]
+        holds = [self._attribute(f"JOINTS_{i}", (4,)).astype(np.int64) for i in sets]
+        weights = [self._attribute(f"WEIGHTS_{i}", (4,)) for i in sets]
+        if any(rows is None for rows in weights):
+            raise BadMesh(f"{self.where}: has joints without weights; export the file again")
+        hold, weight = np.concatenate(holds, 1), np.concatenate(weights, 1).astype(np.float64)
+        hold = np.where(weight == 0, 0, hold)
+        check_indices(f"{self.where}: skin {skin}", hold.reshape(-1), len(joints))
+        total = weight.sum(1, keepdims=True)
+        weight = np.divide(weight, total, out=np.zeros_like(weight), where=total > 0)
+        out = np.empty_like(points)
+        for start in range(0, len(points), SKINNED_AT_ONCE):
+            part = slice(start, start + SKINNED_AT_ONCE)
+            moves = np.einsum("vk,vkij->vij", weight[part], joints[hold[part]])
+            out[part] = np.einsum("vij,vj->vi", moves[:, :, :3], points[part]) + moves[:, :, 3]
+        return out
+
+
+def draco_arrays(data: bytes, names: dict[str, int], where: str) -> dict[str, np.ndarray]:
+    """Attributes (V, n) by name and "indices" (F, 3) of a Draco bitstream. Raises BadMesh, LimitExceeded,
+    MissingExtra."""
+    try:
+        import DracoPy
+    except ImportError as error:
+        raise MissingExtra(
+            f"{where}: is compressed by {DRACO}, which needs the library of fusedrf[draco]; install that, or "
+            "save the mesh without compression"
+        ) from error
+    _check_draco(data, where)
+    try:
+        mesh = DracoPy.decode(data)
+        by_id = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
+        found = {name: by_id[number] for name, number in names.items() if number in by_id}
+        found["indices"] = np.asarray(mesh.faces)
+    except Exception as error:  # the library raises errors of any class on broken data
+        raise BadMesh(f"{where}: {DRACO} cannot be decoded ({error}); export the mesh again") from error
+    if len({len(rows) for name, rows in found.items() if name != "indices"}) != 1:
+        raise BadMesh(f"{where}: {DRACO} lacks its attributes; export the mesh again")
+    return found
+
+
+def _check_draco(data: bytes, where: str) -> None:
+    """Counts of a Draco bitstream (its specification, sections 4 and 5) against its bytes, since the library
+    allocates what they say. Raises BadMesh, LimitExceeded."""
+    major, minor, kind, method = data[5:9] if len(data) > 11 else (0, 0, 0, 0)
+    flags = int.from_bytes(data[9:11], "little")
+    if not data.startswith(b"DRACO") or (major, minor) != (2, 2) or kind != 1 or flags & 0x8000:
+        raise BadMesh(f"{where}: {DRACO} holds no mesh of version 2.2 without metadata; export it again")
+    at = 12 if method == 1 else 11  # the way that a mesh is gone through
+    for _ in range(2):  # its vertices and faces
+        count, shift = 0, 0
+        while at < len(data) and shift < 35:
+            count |= (data[at] & 127) << shift
+            at, shift = at + 1, shift + 7
+            if data[at - 1] < 128:
+                break
+        check_budget(where, count, 2 * len(data))
+
+
+def _triangles(indices: np.ndarray, mode: int) -> np.ndarray:
+    """(F, 3) of a list, strip or fan of indices; what is left over is dropped."""
+    if mode == TRIANGLES:
+        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
+    if len(indices) < 3:
+        return np.empty((0, 3), np.int64)
+    if mode == STRIP:
+        faces = np.stack([indices[:-2], indices[1:-1], indices[2:]], 1)
+        faces[1::2] = faces[1::2, [0, 2, 1]]
+        return faces
+    return np.stack([indices[1:-1], indices[2:], np.full(len(indices) - 2, indices[0])], 1)
+
+
+def _local(node: schema.Node) -> np.ndarray:
+    """node_to_parent."""
+    if node.matrix is not None:
+        return np.array(node.matrix).reshape(4, 4).T
+    local = np.eye(4)
+    if node.rotation is not None:
+        local[:3, :3] = _rotations(np.array([node.rotation]))[0]
+    if node.scale is not None:
+        local[:3, :3] *= node.scale
+    if node.translation is not None:
+        local[:3, 3] = node.translation
+    return local
+
+
+def _rotations(quaternions: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of (n, 4) xyzw of any length; none where it is zero."""
+    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return matrices(np.where(lengths > 0, quaternions / np.maximum(lengths, 1e-300), [0, 0, 0, 1]))

@@ -1,0 +1,34 @@
+"""Text of meshes: its lines, and numbers in them."""
+
+import re
+import warnings
+
+import numpy as np
+
+
+def lines_of(data: bytes) -> list[str]:
+    """Lines without marks, comments and outer spaces; a backslash at the end goes on in the next."""
+    text = data.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape").replace("\t", " ")
+    if "\\" in text:
+        text = re.sub(r"\\ *(\r\n|\n|\r)", " ", text)
+    stripped = (line.strip() for line in re.split(r"\r\n|\n|\r", text))
+    return [line for line in stripped if line and line[0] != "#"]
+
+
+def numbers_in(text: str, kind: type = np.float64) -> np.ndarray:
+    """All numbers of a text, between spaces. Raises ValueError where something else is there."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, kind, sep=" ")
+        except (DeprecationWarning, ValueError):
+            word = next((word for word in text.split() if not _is_number(word)), text)
+            raise ValueError(f"{word[:40]!r} in place of a number") from None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,270 @@
+"""Wavefront .obj: polygons with texture coordinates, vertex colours and materials."""
+
+from pathlib import Path
+
+import numpy as np
+
+from formats.errors import BadMesh, FormatError
+from formats.inputs import read_input
+from formats.surfaces.beside import Beside
+from formats.surfaces.lines import lines_of, numbers_in
+from formats.surfaces.mtl import Looks, parse_mtl
+from formats.surfaces.polygons import triangulated
+from formats.surfaces.surface import (
+    Notes,
+    Paint,
+    Surface,
+    check_budget,
+    check_indices,
+    laid,
+    listed,
+    sound_colours,
+)
+
+MAX_FILE = 2**31
+AT_ONCE = 1 << 18
+"""Corners of faces that are kept as text."""
+FREE_FORM = ("curv", "curv2", "surf", "cstype", "parm")
+
+
+def read_obj(path: Path | str, notes: Notes) -> list[Surface]:
+    """All faces, a surface for each material. Raises BadMesh, LimitExceeded, MissingFile."""
+    data = read_input(path, MAX_FILE)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise BadMesh(f"{path}: is text in UTF-16; save the mesh in UTF-8")
+    text = _Text(path, notes)
+    try:
+        text.read(data)
+    except (ValueError, OverflowError) as error:
+        raise BadMesh(f"{path}: holds {error}; export the mesh again") from error
+    return _surfaces(text, path, len(data), notes)
+
+
+class _Text:
+    """What the lines of a file say, as arrays."""
+
+    def __init__(self, path: Path | str, notes: Notes):
+        self.path, self.notes = path, notes
+        self.points: list[str] = []
+        self.uvs: list[str] = []
+        self.tokens: list[str] = []
+        """Corners that are still text."""
+        self.relative: list[tuple[int, int]] = []
+        """Vertices and coordinates so far, for each of `tokens`, since corners may count back from them."""
+        self.corners: list[np.ndarray] = []
+        self.counts: list[int] = []
+        self.used: list[int] = []
+        """Which of `materials` each face has."""
+        self.materials: dict[str | None, int] = {None: 0}
+        self.libraries: list[str] = []
+        self.left_out: dict[str, int] = {}
+
+    def read(self, data: bytes) -> None:
+        material, points, uvs = 0, self.points, self.uvs
+        for line in lines_of(data):
+            word, _, rest = line.partition(" ")
+            if word == "v":
+                points.append(rest)
+            elif word == "vt":
+                uvs.append(rest)
+            elif word in ("f", "fo"):
+                self._face(rest, material)
+            elif word == "usemtl":
+                material = self.materials.setdefault(rest.strip(), len(self.materials))
+            elif word == "mtllib":
+                self.libraries.append(rest.strip())
+            elif word in ("l", "p", *FREE_FORM):
+                kind = "free-form curves and surfaces" if word in FREE_FORM else "points and lines"
+                self.left_out[kind] = self.left_out.get(kind, 0) + 1
+        self._flush()
+        for kind, count in self.left_out.items():
+            self.notes.add(f"{kind} are left out ({count} lines)")
+
+    def _face(self, rest: str, material: int) -> None:
+        tokens = rest.partition("#")[0].split() if "#" in rest else rest.split()
+        if len(tokens) < 3:
+            return
+        self.tokens += tokens
+        self.relative += [(len(self.points), len(self.uvs))] * len(tokens)
+        self.counts.append(len(tokens))
+        self.used.append(material)
+        if len(self.tokens) > AT_ONCE:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self.tokens:
+            return
+        so_far = np.array(self.relative)
+        found = _numbers(self.tokens)
+        found = np.where(found > 0, found - 1, np.where(found < 0, so_far + found, -1))
+        if (found[:, 0] < 0).any():
+            raise BadMesh(
+                f"{self.path}: a face refers to a vertex that does not exist; export the mesh again"
+            )
+        self.corners.append(np.minimum(found, 2**31 - 1).astype(np.int32))
+        self.tokens, self.relative = [], []
+
+
+def _numbers(tokens: list[str]) -> np.ndarray:
+    """(n, 2) vertex and texture coordinate as written, 0 for none, of "1", "1/2", "1/2/3" or "1//3"."""
+    text = " ".join(tokens).replace("//", "/0/")
+    slashes = {token.count("/") for token in tokens}
+    if len(slashes) == 1:
+        width = slashes.pop() + 1
+        rows = numbers_in(text.replace("/", " "), np.int64)
+        if len(rows) == width * len(tokens):
+            rows = rows.reshape(-1, width)
+            return rows[:, :2] if width > 1 else np.column_stack([rows, np.zeros_like(rows)])
+    parts = [(*token.replace("//", "/0/").split("/"), "0")[:2] for token in tokens]
+    return np.array([(int(a), int(b or 0)) for a, b in parts], np.int64)
+
+
+def _table(lines: list[str]) -> list[np.ndarray]:
+    """Rows of numbers, as one array where all have as many, else one for each row."""
+    widths = {len(line.split()) for line in lines[:1000]}
+    if len(widths) == 1:
+        width = widths.pop()
+        if width and all(len(line.split()) == width for line in lines):
+            return numbers_in(" ".join(lines)).reshape(-1, width)
+    return [numbers_in(line) for line in lines]
+
+
+def _points(lines: list[str], path: Path | str) -> tuple[np.ndarray, np.ndarray | None]:
+    """(V, 3) positions, and (V, 4) colours where vertices have them: x y z, then w, or r g b, or r g b a."""
+    rows = _table(lines)
+    if isinstance(rows, list):
+        if any(len(row) < 3 for row in rows):
+            raise BadMesh(f"{path}: a vertex has fewer than three numbers; export the mesh again")
+        coloured = [row[3:6] if len(row) >= 6 else np.ones(3) for row in rows]
+        colours = np.array(coloured) if any(len(row) >= 6 for row in rows) else None
+        positions = np.array([row[:3] for row in rows])
+    else:
+        if rows.shape[1] < 3:
+            raise BadMesh(f"{path}: a vertex has fewer than three numbers; export the mesh again")
+        positions, colours = rows[:, :3], rows[:, 3:6] if rows.shape[1] >= 6 else None
+    if colours is not None:
+        colours = sound_colours(colours / (255 if np.nanmax(colours, initial=0) > 1 else 1))
+    return np.ascontiguousarray(positions), colours
+
+
+def _uvs(lines: list[str]) -> np.ndarray:
+    """(n, 2), v up; v is 0 where it is not given."""
+    rows = _table(lines) if lines else np.empty((0, 2))
+    if not isinstance(rows, list) and rows.shape[1] > 1:
+        return rows[:, :2]
+    return np.array([[*row[:2], 0, 0][:2] for row in rows], np.float64).reshape(-1, 2)
+
+
+def _surfaces(text: _Text, path: Path | str, n_bytes: int, notes: Notes) -> list[Surface]:
+    if not text.counts:
+        return []
+    counts, used = np.array(text.counts), np.array(text.used)
+    check_budget(path, int((counts - 2).sum()), n_bytes)
+    try:
+        positions, colours = _points(text.points, path)
+        uvs = _uvs(text.uvs)
+    except (ValueError, OverflowError) as error:
+        raise BadMesh(f"{path}: holds {error}; export the mesh again") from error
+    corners = np.concatenate(text.corners)
+    check_indices(path, corners[:, 0], len(positions))
+    places, polygon = triangulated(counts, corners[:, 0], positions)
+    looks, names = _looks(text, path, notes)
+    found = []
+    for name, index in text.materials.items():
+        own = places[used[polygon] == index]
+        if len(own):
+            found.append(_surface(corners[own], positions, uvs, colours, names[name], looks, notes))
+    looks.tell_unused()
+    return found
+
+
+def _surface(corners, positions, uvs, colours, name: str | None, looks: Looks, notes: Notes) -> Surface:
+    """Of faces (F, 3, 2): vertex and coordinate, -1 for none."""
+    look = None if name is None else looks.look(name)
+    textured = look is not None and any(
+        picture is not None
+        for paint in (look.paint, look.glow)
+        if paint is not None
+        for picture in (paint.texture, paint.coverage)
+    )
+    keys = corners.reshape(-1, 2).astype(np.int64)
+    whole = keys[:, 0] * (len(uvs) + 2) + keys[:, 1] + 1 if textured else keys[:, 0]
+    _, first, faces = np.unique(whole, return_index=True, return_inverse=True)
+    vertex, coordinate = keys[first].T
+    rest = {"faces": faces.reshape(-1, 3).astype(np.int32)}
+    if look is not None:
+        uv = _coordinates(coordinate, uvs, look, name, notes) if textured else None
+        rest["paint"] = look.paint if uv is None else laid(look.paint, uv)
+        rest["glow"] = look.glow if uv is None or look.glow is None else laid(look.glow, uv)
+        rest["blend"] = look.blend
+    if colours is not None:
+        if textured:
+            notes.add("vertex colours are not used beside its picture", f"material {name[:60]!r}")
+        else:
+            rest["colours"] = colours[vertex]
+            if "paint" in rest and np.ptp(rest["paint"].factor[:3]) < 1 / 512:
+                alpha = rest["paint"].factor[3]
+                rest["paint"] = Paint(np.array([1, 1, 1, alpha], np.float32))
+    return Surface(positions[vertex], **rest)
+
+
+def _coordinates(coordinate: np.ndarray, uvs: np.ndarray, look, name: str, notes: Notes) -> np.ndarray:
+    """(V, 2), v down."""
+    missing = (coordinate < 0) | (coordinate >= len(uvs))
+    if missing.any():
+        notes.add("has a picture, but some faces lack coordinates for it", f"material {name[:60]!r}")
+    uv = np.zeros((len(coordinate), 2))
+    uv[~missing] = uvs[coordinate[~missing]]
+    uv = uv * look.scale + look.offset
+    return np.column_stack([uv[:, 0], 1 - uv[:, 1]])
+
+
+# --- materials ----------------------------------------------------------------------------------------------
+
+
+def _looks(text: _Text, path: Path | str, notes: Notes) -> tuple[Looks, dict[str | None, str | None]]:
+    """All materials, and which of them each name that faces use stands for."""
+    beside, materials = Beside(path), {}
+    for library in text.libraries:
+        for data, file in _libraries(library, beside, path, notes):
+            materials |= {
+                name: m for name, m in parse_mtl(data, notes, file).items() if name not in materials
+            }
+    looks = Looks(materials, beside, notes)
+    folded = {name.casefold(): name for name in materials}
+    chosen: dict[str | None, str | None] = {}
+    for name in text.materials:
+        if name is None:
+            chosen[name] = next(iter(materials)) if len(materials) == 1 else None
+        else:
+            chosen[name] = name if name in materials else folded.get(name.casefold())
+    lost = [name for name, found in chosen.items() if name is not None and found is None]
+    if lost:
+        notes.add(f"materials that no library holds: {listed(lost)}; their faces are shown white")
+    return looks, chosen
+
+
+def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> list[tuple[bytes, str]]:
+    """The files of one `mtllib`: one name that may hold spaces, or several; quotes are dropped. Where none is
+    there, the library that is called as the mesh is."""
+    found = []
+    for names in ([named.strip('"')], named.replace('"', " ").split()):
+        lost = []
+        for name in names:
+            try:
+                data, file = beside.read(name)
+                found.append((data, file.name))
+            except FormatError as error:
+                lost.append(f"the library of materials {name!r} is not read: {error}")
+        if found:
+            break
+    for sentence in lost:
+        notes.add(sentence)
+    if not found:
+        try:
+            data, file = beside.read(Path(path).with_suffix(".mtl").name)
+        except FormatError:
+            return []
+        notes.add(f"{file.name} is taken in its place")
+        found.append((data, file.name))
+    return found
