@@ -3,7 +3,7 @@ each photo, or many cameras, would otherwise be learnt as haze and as colours th
 
 A photo shows gain * colour + offset in each channel, of what is rendered (ComputedField.train_rays), and
 counts by a weight. Maps are (n, 3, 3) float64: of each photo the gains, the offsets, and the weights of its
-squared errors. The mean photo shows the colours as they are.
+squared errors. Colours are as the mean photo shows them; of photos by many people, as a bright one does.
 """
 
 import numpy as np
@@ -28,7 +28,10 @@ errors that are taken from each before."""
 APART = 0.15
 """Median of how far, in logarithms, a photo's mean colour is from that of the photo taken nearest to it, from
 which photos are many people's: of eight captures of one camera each it was 0.02 at most."""
-GAINS, OFFSETS = (1 / 8, 8.0), (-0.3, 0.3)
+BRIGHT = 0.9
+"""Share of photos by many people that are darker than the colours that are learnt. Those of the mean photo
+would have half the contrast, which counts a quarter against what keeps matter together."""
+GAINS, OFFSETS = (1 / 16, 16.0), (-0.3, 0.3)
 WARY = 0.01
 """Weight of an offset's square against a mean squared error: blurred colours hardly tell it from a gain."""
 FAIR = 3.0
@@ -58,7 +61,8 @@ def matched(photos: torch.Tensor, poses: Poses) -> np.ndarray | None:
         return None
     gain = np.clip(deviation / np.median(deviation, 0), *GAINS)
     offset = np.clip(mean - gain * np.median(mean, 0), *OFFSETS)
-    maps = gauged(gain, offset)
+    bright = np.stack([gain / np.quantile(gain, BRIGHT, axis=0), np.zeros_like(gain)], 1)
+    maps = gauged(gain, offset, bright)
     return weighed(maps, maps[:, 0])
 
 
@@ -141,9 +145,7 @@ def fitted(shown: torch.Tensor, truth: torch.Tensor, before: np.ndarray | None =
         error = truth - gain * shown - offset
         used = counts & ~(bright & (error < 0)) & ~(dark & (error > 0))
     missed = (torch.where(used, error**2, 0.0).sum(1) / used.sum(1).clamp(min=1)).sqrt()
-    import sys
-    print("X rms", np.log(gain.numpy()).std(), float(offset.std()), float((missed**2).mean()), file=sys.stderr)
-    return weighed(gauged(gain[:, 0].numpy(), offset[:, 0].numpy()), missed.numpy())
+    return weighed(gauged(gain[:, 0].numpy(), offset[:, 0].numpy(), start), missed.numpy())
 
 
 def identity(n: int) -> np.ndarray:
@@ -151,11 +153,11 @@ def identity(n: int) -> np.ndarray:
     return np.repeat([[[1.0] * 3, [0.0] * 3, [1.0] * 3]], n, 0)
 
 
-def gauged(gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """(n, 2, 3) the same gains and offsets (n, 3) of other colours: the gains' geometric mean is 1, the
-    offsets' mean 0."""
-    gain = gain / np.exp(np.log(gain).mean(0))
-    return np.stack([gain, offset - gain * offset.mean(0) / gain.mean(0)], 1)
+def gauged(gain: np.ndarray, offset: np.ndarray, like: np.ndarray) -> np.ndarray:
+    """(n, 2, 3) the same gains and offsets (n, 3) of other colours: those for which the gains' geometric mean
+    and the offsets' mean are those of maps (n, .., 3)."""
+    gain = gain * np.exp((np.log(like[:, 0]) - np.log(gain)).mean(0))
+    return np.stack([gain, offset + gain * (like[:, 1] - offset).mean(0) / gain.mean(0)], 1)
 
 
 def weighed(maps: np.ndarray, missed: np.ndarray) -> np.ndarray:

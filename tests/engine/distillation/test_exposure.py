@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.exposure import FEW, fitted, gauged, matched, measured, undone
+from fusedrf_cli.engine.distillation.exposure import FEW, fitted, gauged, identity, matched, measured, undone
 from fusedrf_cli.engine.distillation.fit import FINE_SAMPLES, FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import poses_of
@@ -49,7 +49,7 @@ def test_maps_are_those_that_photos_were_made_by():
     """But for what an offset's weight takes from it; whatever the colours that the field has come to."""
     rays, truth = looks(8, 400)
     gain, offset = somebodys(8)
-    photos, wanted = as_photos(truth, gain, offset), gauged(gain, offset)
+    photos, wanted = as_photos(truth, gain, offset), gauged(gain, offset, identity(len(gain)))
     for maps in (measured(BALL, rays, photos, 0.0, None), fitted(0.5 * truth.double() + 0.05, photos)):
         np.testing.assert_allclose(maps[:, 0], wanted[:, 0], rtol=0.15)
         np.testing.assert_allclose(np.log(maps[:, 0]).mean(0), 0, atol=1e-12)
@@ -59,7 +59,7 @@ def test_maps_are_those_that_photos_were_made_by():
 
 def test_another_gauge_of_the_colours_shows_the_same():
     gain, offset = somebodys(6)
-    maps = gauged(gain, offset)
+    maps = gauged(gain, offset, identity(len(gain)))
     scale, shift = gain / maps[:, 0], None
     np.testing.assert_allclose(scale, scale[:1].repeat(6, 0))
     shift = (offset - maps[:, 1]) / maps[:, 0]  # the other colours are scale * colour + shift

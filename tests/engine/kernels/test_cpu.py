@@ -377,11 +377,12 @@ def test_train_rays_of_photos_of_their_own_exposure_is_autograd():
     wanted, behind = torch.from_numpy(target), torch.from_numpy(background)
     shown = gain * (out[:, :3] + (1 - out[:, 3:4]) * behind) + offset
     truth = wanted[:, :3]
-    error = torch.where((truth >= CLIPPED) & (shown > truth), 0.0, shown - truth)
-    assert (error == 0).any()
+    square = torch.where((truth >= CLIPPED) & (shown > truth), 0.0, shown - truth) ** 2
+    assert (square == 0).any()
     opacity = ((out[:, 3] - wanted[:, 3]) ** 2).sum()
-    (((weight * error**2).mean(1).sum() + 0.3 * opacity) / 60).backward()
-    np.testing.assert_allclose(loss[:2], [float((error.detach() ** 2).mean(1).sum()), float(opacity.detach())], rtol=1e-10)
+    (((weight * square).mean(1).sum() + 0.3 * opacity) / 60).backward()
+    sums = [float(part.detach()) for part in (square.mean(1).sum(), opacity)]
+    np.testing.assert_allclose(loss[:2], sums, rtol=1e-10)
     np.testing.assert_allclose(grads, params.grad.numpy(), rtol=1e-7, atol=1e-11)
 
 
