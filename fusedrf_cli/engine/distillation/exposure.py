@@ -27,7 +27,7 @@ SAME, SURE = 0.022, 2
 errors that are taken from each before."""
 APART = 0.15
 """Median of how far, in logarithms, a photo's mean colour is from that of the photo taken nearest to it, from
-which photos are many people's: of eight captures of one camera each it was 0.02 at most."""
+which photos are many people's: of five captures of one camera each it was 0.02 at most."""
 BRIGHT = 0.9
 """Share of photos by many people that are darker than the colours that are learnt. Those of the mean photo
 would have half the contrast, which counts a quarter against what keeps matter together."""

@@ -347,12 +347,11 @@ class ComputedField:
         A ray of known depth D has a term more, depth_weight (Σ_i w_i a(t_i) + 1 - A), the light that ends
         elsewhere or nowhere: a is 0 where |t / D - 1| is up to DEPTH_TOLERANCE and 1 from twice that on. It
         is ours, after the losses along lidar's lines of sight of Urban Radiance Fields (Rematas et al. 2022).
-        With batch.exposure
-        a photo shows C_c + (1 - A) background_c times a gain, and an offset more; its difference to the
-        target is 0 where both are beyond what a photo can show (kernels/parts.py, `within`), and its square
-        is weighted. loss (parts, 3) gains the sums over rays of the colour term, without weights and where
-        no depth is known, of the opacity term and of the samples taken. With batch.light above 0 the gradient
-        is an estimate, whose mean over jitters is that of the loss (loops.py, `followed`).
+        With batch.exposure, what is compared is gain_c (C_c + (1 - A) background_c) + offset_c, only
+        one-sided where a photo's range ends (kernels/parts.py, `within`), and the squares are weighted.
+        loss (parts, 3) gains the sums over rays of the colour term, not weighted, where no depth is known, of
+        the opacity term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose
+        mean over jitters is that of the loss (loops.py, `followed`).
         """
         count = len(batch.rays_o)
         most = self.space.most_samples(self.aabb, batch.step)
