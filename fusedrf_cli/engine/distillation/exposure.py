@@ -28,6 +28,8 @@ errors that are taken from each before."""
 APART = 0.15
 """Median of how far, in logarithms, a photo's mean colour is from that of the photo taken nearest to it, from
 which photos are many people's: of five captures of one camera each it was 0.02 at most."""
+BESIDE = 0.7
+"""Distance, in the root mean square of the photos' from their middle, and turn, in radians, of such two."""
 BRIGHT = 0.9
 """Share of photos by many people that are darker than the colours that are learnt. Those of the mean photo
 would have half the contrast, which counts a quarter against what keeps matter together."""
@@ -57,7 +59,8 @@ def matched(photos: torch.Tensor, poses: Poses) -> np.ndarray | None:
     deviation = (torch.where(known, (values - mean[:, None]) ** 2, 0.0).sum(1) / count).sqrt().numpy()
     mean = mean.numpy()
     logs = np.log(mean + 0.01)
-    if len(mean) < 2 or np.median(abs(logs - logs[nearest(poses)])) < APART:
+    first, second = side_by_side(poses)
+    if len(first) < len(mean) / 2 or np.median(abs(logs[first] - logs[second])) < APART:
         return None
     gain = np.clip(deviation / np.median(deviation, 0), *GAINS)
     offset = np.clip(mean - gain * np.median(mean, 0), *OFFSETS)
@@ -66,17 +69,20 @@ def matched(photos: torch.Tensor, poses: Poses) -> np.ndarray | None:
     return weighed(maps, maps[:, 0])
 
 
-def nearest(poses: Poses) -> np.ndarray:
-    """(n,) of each photo the one that was taken nearest to it, looking the same way."""
+def side_by_side(poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """(m,) and (m,) photos, and of each the one that was taken nearest to it, looking the same way; without
+    those that have none BESIDE them."""
     place = poses.position - poses.position.mean(0)
     size = np.sqrt((place**2).sum(1).mean())
     stands = np.concatenate([place / max(size, 1e-12), -poses.rotation[:, :, 2]], 1)
-    found = np.empty(len(stands), np.int64)
+    pairs = []
     for i, stand in enumerate(stands):
-        away = ((stands - stand) ** 2).sum(1)
+        away = np.linalg.norm(stands - stand, axis=1)
         away[i] = np.inf
-        found[i] = away.argmin()
-    return found
+        if away.min() < BESIDE:
+            pairs.append((i, away.argmin()))
+    first, second = np.array(pairs, np.int64).reshape(-1, 2).T
+    return first, second
 
 
 def measured(

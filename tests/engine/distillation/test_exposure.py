@@ -11,7 +11,7 @@ from fusedrf_cli.engine.distillation.fit import FINE_SAMPLES, FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.rendering.cameras import look_at, orbit
-from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.rendering.metrics import colour_corrected, psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from tests.engine.conftest import BOX, Ball
 from tests.engine.distillation.test_fit import SETTINGS
@@ -186,8 +186,8 @@ def run(cameras, photos, exposure: bool) -> FitRun:
 
 @pytest.mark.slow
 def test_what_is_learnt_from_drifting_photos_is_neutral(drifting):
-    """Gains are found that are nearer to the true ones than none, and of what unseen views lose by the drift
-    most is regained."""
+    """Gains are found that are nearly the true ones, and of what unseen views lose by the drift most is
+    regained; the colours that are learnt are those of a bright photo."""
     cameras, images, photos, gains = drifting
     unseen = abreast(4, 1)
     truth = pictures(unseen) / 255
@@ -196,8 +196,11 @@ def test_what_is_learnt_from_drifting_photos_is_neutral(drifting):
     for learnt, exposure in ((images, False), (photos, False), (photos, True)):
         fitting = run(cameras, learnt, exposure)
         seen = np.stack([render_image(fitting.field, c).over((1, 1, 1)) for c in unseen])
-        reached.append(psnr(seen, wanted))
-    assert spread(fitting.maps[:, 0] / gains) < 0.95 * spread(gains)
+        corrected = colour_corrected(seen.reshape(-1, 3), wanted.reshape(-1, 3))
+        reached.append(psnr(corrected, wanted.reshape(-1, 3)))
+    ratio = fitting.maps[:, 0] / gains
+    assert spread(ratio / np.exp(np.log(ratio).mean(0))) < 0.2 * spread(gains)
+    assert np.exp(np.log(ratio).mean()) < 0.8
     even, drifted, mended = reached
     assert even - drifted > 1 and mended - drifted > 0.5 * (even - drifted)
 
