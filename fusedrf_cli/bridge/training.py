@@ -173,11 +173,11 @@ def train(request: TrainRequest, progress) -> dict:
 
 
 def exposure(run: FitRun) -> dict[str, float] | None:
-    """How bright the darkest and the brightest photo are, over their geometric mean, where photos were found
-    to differ; what was learnt, and every picture of it, is as bright as that mean."""
-    gains = run.pool.gains.double().log().mean(1).exp()
-    if bool((gains == 1).all()):
+    """The gains of the darkest and the brightest photo, over their geometric mean, where photos were found
+    to differ."""
+    if run.maps is None:
         return None
+    gains = np.exp(np.log(run.maps[:, 0]).mean(1) - np.log(run.maps[:, 0]).mean())
     return {"darkest": float(gains.min()), "brightest": float(gains.max())}
 
 

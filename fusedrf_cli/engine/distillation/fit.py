@@ -9,7 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.distillation.exposure import MEASURED_AT, OVERSHOT, RAYS, SAME, SURE, gains_of, spread
+from fusedrf_cli.engine.distillation.exposure import (
+    MEASURED_AT,
+    matched,
+    measured,
+    rays_of_each,
+    undone,
+)
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.keypoints import DEPTH_WEIGHT, KeyPoints, Known
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
@@ -26,7 +32,7 @@ from fusedrf_cli.engine.distillation.poses import (
 )
 from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.computed import NONE_KNOWN, Batch
+from fusedrf_cli.engine.fields.computed import AS_IT_IS, NONE_KNOWN, Batch
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
@@ -175,6 +181,10 @@ class FitRun:
         self.optimiser = self.fresh_optimiser()
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(settings.stages[1:]), [*OCCUPANCY_AT, 1.0]
+        self.maps: np.ndarray | None = None
+        """(n, 3, 3) what each picture makes of the field's colours (exposure.py); None: nothing."""
+        if settings.exposure:
+            self.maps = matched(self.sampled()[1], pool.poses)
         self.exposures = list(MEASURED_AT) if settings.exposure else []
         self.refinements = list(REFINED_AT) if settings.poses else []
         self.mse, self.rays = None, LEAST_RAYS
@@ -255,10 +265,11 @@ class FitRun:
         arrays |= self.optimiser.state()
         arrays |= {
             "random": self.generator.get_state().numpy(),
-            "gains": self.pool.gains.numpy(),
             "rotation": self.pool.rotation.numpy(),
             "position": self.pool.position.numpy(),
         }
+        if self.maps is not None:
+            arrays["exposure"] = self.maps
         order, drawn = self.pool.epochs.state()
         arrays |= order
         if self.keypoints is not None:
@@ -294,7 +305,7 @@ class FitRun:
         self.stages = self.stages[len(self.stages) - state["stages"] :]
         self.refreshes, self.exposures = state["refreshes"], state["exposures"]
         self.refinements = state["refinements"]
-        self.pool.gains.copy_(torch.from_numpy(arrays["gains"]))
+        self.maps = arrays.get("exposure")
         self.pool.place(Poses(arrays["rotation"], arrays["position"]))
         self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
@@ -344,7 +355,8 @@ class FitRun:
             self.resize(self.field.aabb, round(self.settings.longest * part))
         if self.exposures and share >= self.exposures[0]:
             self.exposures.pop(0)
-            self.measure_exposure()
+            rays, colours = self.sampled()
+            self.maps = measured(self.field, rays, colours, self.settings.near, self.maps)
         if self.refinements and share >= self.refinements[0]:
             self.refinements.pop(0)
             if self.found_matter:
@@ -357,17 +369,16 @@ class FitRun:
         *rays, colours = pool.sample(most, self.generator)
         first, last = TRIED_BY
         pixels = max(last, first * (last / first) ** (2 * share))
+        colours = colours if self.maps is None else undone(self.maps, colours)
         change = refined(self.field, rays, colours, self.settings.near, pixels * pool.pixel)
         pool.place(changed(pool.poses, change))
 
-    def measure_exposure(self) -> None:
-        """Divide the pictures' colours by what they are brighter than the field, once they surely differ."""
-        pool = self.pool
-        *rays, colours = pool.sample(RAYS, self.generator)
-        known = bool((pool.gains != 1).any())
-        gains = gains_of(self.field, rays, colours, self.settings.near, 0.0 if known else SURE)
-        if known or spread(gains) > SAME:
-            pool.gains.copy_(torch.from_numpy(pool.gains.double().numpy() * gains**OVERSHOT))
+    def sampled(self) -> tuple[list[np.ndarray], torch.Tensor]:
+        """Rays and colours of each picture from which its exposure is found. They are drawn apart, so that
+        looking changes nothing."""
+        apart = torch.Generator().manual_seed(self.steps)
+        *rays, colours = self.pool.sample(rays_of_each(len(self.pool.pixel)), apart)
+        return rays, colours
 
     def refresh_occupancy(self) -> None:
         """Mark the cells that hold matter, and cut the box down to them where that saves much; late in a run
@@ -393,8 +404,8 @@ class FitRun:
                 return
             self.occupy(occupancy)
         if self.share() >= HAZE_LEFT_FROM or not self.refreshes:
-            *rays, _ = self.pool.draw(RAYS_THAT_JUDGE)
-            self.occupy(without_haze(self.field, *rays, self.settings.near))
+            rays_o, rays_d, *_ = self.pool.draw(RAYS_THAT_JUDGE)
+            self.occupy(without_haze(self.field, rays_o, rays_d, self.settings.near))
 
     def shown_cells(self) -> OccupancyGrid:
         """Cells of which some training ray shows anything, grown by one: haze that no photo shows, and what
@@ -406,7 +417,7 @@ class FitRun:
             middles = OccupancyGrid.full(grid.aabb, max(counts)).centres()
             field = field.with_occupancy(grid.marked(grid.contains(middles).reshape(counts)))
             grid = field.occupancy  # bricks have counts of their own
-        rays_o, rays_d, _ = self.pool.draw(WEIGHED_RAYS)
+        rays_o, rays_d, *_ = self.pool.draw(WEIGHED_RAYS)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         weights = field.weights_in_cells(rays_o, rays_d, jitter, self.settings.near, field.voxel_size)
         return grid.marked(grid.marked(weights > SHOWN_FROM).dilated().occupied & grid.occupied)
@@ -433,13 +444,16 @@ class FitRun:
         """One batch of rays and one optimiser step."""
         settings, field = self.settings, self.field
         self.guard.keep()
-        rays_o, rays_d, pixels, depths = self.draw(share)
+        rays_o, rays_d, pixels, pictures, depths = self.draw(share)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         background = np.ones((len(rays_o), 3), np.float32)
         if settings.unbounded:  # haze before any one colour would be wrong before the others
             background = torch.rand(len(rays_o), 3, generator=self.generator).numpy()
-        target = pixels.clone()
-        target[:, :3] = pixels[:, :3] * pixels[:, 3:] + torch.from_numpy(background) * (1 - pixels[:, 3:])
+        target, behind, exposure = pixels.clone(), background, AS_IT_IS
+        if self.maps is not None:
+            exposure = self.maps[pictures]
+            behind = (exposure[:, 0] * background + exposure[:, 1]).astype(np.float32)
+        target[:, :3] = pixels[:, :3] * pixels[:, 3:] + torch.from_numpy(behind) * (1 - pixels[:, 3:])
         batch = Batch(
             rays_o,
             rays_d,
@@ -454,6 +468,7 @@ class FitRun:
             LIGHT if share > SETTLED else 0.0,
             DEPTH_WEIGHT,
             depths,
+            exposure,
         )
         loss = np.zeros((self.optimiser.parts, 3))
         field.train_rays(batch, self.optimiser.grads, loss)
@@ -462,17 +477,17 @@ class FitRun:
             self.learn(sums, len(rays_o), decay(share) * self.guard.rate, len(depths))
         self.steps += 1
 
-    def draw(self, share: float) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray]:
-        """Rays of a step with their pixels, as RayPool.draw gives them, and the depths (m,) of the first m,
-        which are known."""
+    def draw(self, share: float) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray, np.ndarray]:
+        """Rays of a step with their pixels and pictures, as RayPool.draw gives them, and the depths (m,) of
+        the first m, which are known."""
         wanted = 0 if self.keypoints is None else self.keypoints.wanted(self.rays, share)
         if not wanted:
             return *self.pool.draw(self.rays), NONE_KNOWN
         chosen, points = self.keypoints.draw(wanted)
         known, others = self.pool.of(chosen), self.pool.draw(self.rays - len(chosen))
         depths = np.linalg.norm(points - known[0], axis=1)
-        rays_o, rays_d = (np.concatenate(both) for both in zip(known[:2], others[:2], strict=True))
-        return rays_o, rays_d, torch.cat([known[2], others[2]]), depths
+        rays_o, rays_d, pictures = (np.concatenate([known[k], others[k]]) for k in (0, 1, 3))
+        return rays_o, rays_d, torch.cat([known[2], others[2]]), pictures, depths
 
     def near(self, share: float) -> float:
         """The distance from a camera before which nothing is learnt, which shrinks while the scene takes

@@ -39,33 +39,32 @@ class RayPool:
         self.place(poses_of(cameras))
         self.pixel = np.array([1 / camera.fl_x for camera in cameras])
         """(n,) the angle of a pixel in the middle of each picture, in radians."""
-        self.gains = torch.ones(len(cameras), 3)
-        """What the colours of each picture are divided by."""
         self.epochs = Epochs(len(self.images) if drawn is None else len(drawn), generator)
 
-    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """rays_o, rays_d (count, 3) float64 and pixels (count, 4) float32 in [0, 1], every pixel that is not
-        ignored once before any comes again."""
+    def draw(self, count: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray]:
+        """rays_o, rays_d (count, 3) float64, pixels (count, 4) float32 in [0, 1] and the numbers of their
+        pictures (count,) int64, every pixel that is not ignored once before any comes again."""
         chosen = self.epochs.draw(count)
         return self.of(chosen if self.drawn is None else self.drawn[chosen])
 
     def sample(self, count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
         """As many random pixels of each picture, one picture after the other: rays_o, rays_d (n * count, 3)
-        float64 and colours (n, count, 3) over the gains, nan where a pixel is ignored or not opaque."""
+        float64 and colours (n, count, 3), nan where a pixel is ignored or not opaque."""
         sizes = self.first.diff()[:, None]
         places = (torch.rand(len(sizes), count, generator=generator, dtype=torch.float64) * sizes).long()
         chosen = (self.first[:-1, None] + places).reshape(-1)
-        rays_o, rays_d, pixels = self.of(chosen)
+        rays_o, rays_d, pixels, _ = self.of(chosen)
         colours = pixels[:, :3]
         colours[pixels[:, 3] < 0.999] = torch.nan  # opaque is 1 within a rounding
         if self.ignored is not None:
             colours[self.ignored[chosen]] = torch.nan
         return rays_o, rays_d, colours.reshape(len(sizes), count, 3)
 
-    def of(self, chosen: torch.Tensor) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """Rays and pixels as in `draw`, of the pixels (N,), counted picture after picture."""
+    def of(self, chosen: torch.Tensor) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray]:
+        """Rays, pixels and pictures as in `draw`, of the pixels (N,), counted picture after picture."""
         count = len(chosen)
         rays_o, rays_d, pixels = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 4), np.float32)
+        pictures = np.empty(count, np.int64)
         rays_of_pixels(
             chosen.numpy(),
             self.first.numpy(),
@@ -73,10 +72,9 @@ class RayPool:
             self.local.numpy().reshape(-1),
             (self.rotation.numpy(), self.position.numpy()),
             self.images.numpy().reshape(-1),
-            self.gains.numpy(),
-            (rays_o, rays_d, pixels),
+            (rays_o, rays_d, pixels, pictures),
         )
-        return rays_o, rays_d, torch.from_numpy(pixels)
+        return rays_o, rays_d, torch.from_numpy(pixels), pictures
 
     @property
     def poses(self) -> Poses:

@@ -55,6 +55,7 @@ def runs_of(name: str) -> str:
 
 
 NONE_KNOWN = np.empty(0)
+AS_IT_IS = np.empty((0, 3, 3))
 
 
 class Batch(NamedTuple):
@@ -73,6 +74,8 @@ class Batch(NamedTuple):
     light: float = 0.0  # weight under which a sample is followed back by chance alone; 0: every one is
     depth_weight: float = 0.0  # weight of the loss by which matter comes to known depths
     depths: np.ndarray = NONE_KNOWN  # (m,) float64, how far away what the first m rays show is, if known
+    # (n, 3, 3) float64, gains and offsets that make a ray's colour that of its photo, and weights; or none
+    exposure: np.ndarray = AS_IT_IS
 
 
 WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
@@ -369,15 +372,18 @@ class ComputedField:
         A ray of known depth D has a term more, depth_weight (Σ_i w_i a(t_i) + 1 - A), the light that ends
         elsewhere or nowhere: a is 0 where |t / D - 1| is up to DEPTH_TOLERANCE and 1 from twice that on. It
         is ours, after the losses along lidar's lines of sight of Urban Radiance Fields (Rematas et al. 2022).
-        loss (parts, 3) gains the sums over rays of the colour term, where no depth is known, of the opacity
-        term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose mean over
-        jitters is that of the loss (loops.py, `followed`).
+        With batch.exposure, what is compared is gain_c (C_c + (1 - A) background_c) + offset_c, only
+        one-sided where a photo's range ends (kernels/parts.py, `within`), and the squares are weighted.
+        loss (parts, 3) gains the sums over rays of the colour term, not weighted, where no depth is known, of
+        the opacity term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose
+        mean over jitters is that of the loss (loops.py, `followed`).
         """
         count = len(batch.rays_o)
         most = self.space.most_samples(self.aabb, batch.step)
         batch = Batch(
             exact(batch.rays_o), exact(batch.rays_d), exact(batch.jitter), as_array(batch.target, self.real),
-            as_array(batch.background, self.real), *map(float, batch[5:-1]), exact(batch.depths),
+            as_array(batch.background, self.real), *map(float, batch[5:-2]), exact(batch.depths),
+            exact(batch.exposure),
         )  # fmt: skip
         self.loops.sweep("train_ray", self.arrays, self.grid, batch, count, most, grads, loss)
         self.collect(grads)

@@ -81,20 +81,20 @@ def holder(first, pixel):
 
 
 @task
-def rays_of_pixels_task(chosen, first, direction_at, directions, poses, colours, gains, low, high, out, view):
-    """`rays_of_pixels` for pixels chosen[low:high]; view (RAYS_PER_TASK,) is scratch."""
+def rays_of_pixels_task(chosen, first, direction_at, directions, poses, colours, low, high, out):
+    """`rays_of_pixels` for pixels chosen[low:high]."""
     rotation, position = poses
-    rays_o, rays_d, pixels = out
+    rays_o, rays_d, pixels, view = out
     for i in range(low, min(high, low + AHEAD)):
-        view[i - low] = holder(first, chosen[i])
+        view[i] = holder(first, chosen[i])
     for i in range(low, high):
         if i + AHEAD < high:
             later = chosen[i + AHEAD]
             v = holder(first, later)
-            view[i + AHEAD - low] = v
+            view[i + AHEAD] = v
             prefetch(colours, 4 * later)
             prefetch(directions, 3 * (direction_at[v] + later - first[v]))
-        p, v = chosen[i], view[i - low]
+        p, v = chosen[i], view[i]
         at = 3 * (direction_at[v] + p - first[v])
         x, y, z = np.float64(directions[at]), np.float64(directions[at + 1]), np.float64(directions[at + 2])
         r = rotation
@@ -105,23 +105,20 @@ def rays_of_pixels_task(chosen, first, direction_at, directions, poses, colours,
         rays_d[i, 0], rays_d[i, 1], rays_d[i, 2] = dx / length, dy / length, dz / length
         for c in range(3):
             rays_o[i, c] = position[v, c]
-            pixels[i, c] = np.float32(colours[4 * p + c]) / np.float32(255) / gains[v, c]
+            pixels[i, c] = np.float32(colours[4 * p + c]) / np.float32(255)
         pixels[i, 3] = np.float32(colours[4 * p + 3]) / np.float32(255)
 
 
 @loop
-def rays_of_pixels(chosen, first, direction_at, directions, poses, colours, gains, out):
+def rays_of_pixels(chosen, first, direction_at, directions, poses, colours, out):
     """For each of the pixels chosen (N,), counted picture after picture, its ray and its colour.
 
     Picture v has the pixels first[v] to first[v + 1], of colours (P * 4,) uint8, and its camera's directions,
     not turned yet, from direction_at[v] on in directions (D * 3,). poses is (rotation (n, 3, 3), position
-    (n, 3)), camera to world. out is (origins (N, 3), unit directions (N, 3), colours (N, 4) in [0, 1], their
-    first three over gains (n, 3)).
+    (n, 3)), camera to world. out is (origins (N, 3), unit directions (N, 3), colours (N, 4) in [0, 1], the
+    picture's number (N,) int64).
     """
     n = chosen.shape[0]
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
-        view = np.empty(RAYS_PER_TASK, np.int64)
-        rays_of_pixels_task(
-            chosen, first, direction_at, directions, poses, colours, gains, low, high, out, view
-        )
+        rays_of_pixels_task(chosen, first, direction_at, directions, poses, colours, low, high, out)

@@ -18,6 +18,7 @@ careful = njit(error_model="numpy", cache=True, forceinline=True, _nrt=False)  #
 LINE = 16  # floats in a cache line
 MIXED = 1 << 15  # added to a stride
 NEWTON_STEPS = 50
+CLIPPED = 0.97  # a photo's colour from which on more light would not have shown
 NEWTON_NEAR = 1e-13  # focal lengths, or radians
 FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must not be jumped over by rounding
 
@@ -223,16 +224,31 @@ def raise_to(out, i, value):
 
 
 @body
+def within(colour, target):
+    """A colour as a photo shows it, whose range ends: what is beyond CLIPPED, or below 0, shows as the target
+    does there."""
+    if (target >= CLIPPED and colour > target) or (target <= 0.0 and colour < target):
+        colour = target
+    return colour
+
+
+@body
 def compared(batch, i, colour, trans, work, loss):
     """Gradients of the loss of a batch of rays (ComputedField.train_rays) in ray i's colour and in the
     transmittance behind it; its colour error, unless its depth is known, opacity error and work are added to
     `loss`.
     """
-    target, background = batch.target, batch.background
+    target, background, exposure = batch.target, batch.background, batch.exposure
     red, green, blue = colour
-    e_r = red + trans * background[i, 0] - target[i, 0]
-    e_g = green + trans * background[i, 1] - target[i, 1]
-    e_b = blue + trans * background[i, 2] - target[i, 2]
+    red += trans * background[i, 0]
+    green += trans * background[i, 1]
+    blue += trans * background[i, 2]
+    exposed = exposure.shape[0] > 0
+    if exposed:
+        red = within(exposure[i, 0, 0] * red + exposure[i, 1, 0], target[i, 0])
+        green = within(exposure[i, 0, 1] * green + exposure[i, 1, 1], target[i, 1])
+        blue = within(exposure[i, 0, 2] * blue + exposure[i, 1, 2], target[i, 2])
+    e_r, e_g, e_b = red - target[i, 0], green - target[i, 1], blue - target[i, 2]
     e_a = (1.0 - trans) - target[i, 3]
     if i >= batch.depths.shape[0]:
         accumulate(loss, 0, (e_r * e_r + e_g * e_g + e_b * e_b) / 3.0)
@@ -241,6 +257,10 @@ def compared(batch, i, colour, trans, work, loss):
     n = target.shape[0]
     scale = 2.0 / (3.0 * n)
     g_r, g_g, g_b = scale * e_r, scale * e_g, scale * e_b
+    if exposed:
+        g_r *= exposure[i, 2, 0] * exposure[i, 0, 0]
+        g_g *= exposure[i, 2, 1] * exposure[i, 0, 1]
+        g_b *= exposure[i, 2, 2] * exposure[i, 0, 2]
     behind = g_r * background[i, 0] + g_g * background[i, 1] + g_b * background[i, 2]
     return (g_r, g_g, g_b), behind - 2.0 / n * batch.opacity_weight * e_a
 

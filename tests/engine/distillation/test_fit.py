@@ -112,14 +112,14 @@ def test_points_are_known_of_a_part_of_the_rays_in_the_first_half(capture):
     cameras, images = capture
     run = FitRun.start(cameras, images, BOX, SETTINGS, known=known_of(cameras, 400))
     run.rays = 1600
-    rays_o, rays_d, pixels, depths = run.draw(0.2)
+    rays_o, rays_d, pixels, _, depths = run.draw(0.2)
     assert len(rays_o) == len(rays_d) == len(pixels) == 1600 and len(depths) == 100
     surface = rays_o[:100] + depths[:, None] * rays_d[:100]
     assert np.linalg.norm(surface, axis=1) == pytest.approx(np.full(100, 0.7), abs=0.15)  # 1.5 pixels
-    assert len(run.draw(0.6)[3]) == 0
+    assert len(run.draw(0.6)[4]) == 0
     few = FitRun.start(cameras, images, BOX, SETTINGS, known=known_of(cameras, 40))
     few.rays = 1600
-    assert len(few.draw(0.2)[3]) == 10  # 320 of them, each once in 32 steps
+    assert len(few.draw(0.2)[4]) == 10  # 320 of them, each once in 32 steps
 
 
 def test_the_rate_holds_and_then_falls_by_equal_factors():
@@ -180,7 +180,7 @@ def test_every_pixel_comes_once_an_epoch(capture):
     pool = RayPool(cameras, numbered, torch.Generator().manual_seed(0))
     size = images[..., 0].size
     drawn = [pool.draw(size // 4) for _ in range(4)]
-    found = np.concatenate([np.rint(pixels.numpy()[:, :2] * 255) for _, _, pixels in drawn]) @ [1, 251]
+    found = np.concatenate([np.rint(pixels.numpy()[:, :2] * 255) for _, _, pixels, _ in drawn]) @ [1, 251]
     assert np.array_equal(np.sort(found), np.arange(size))
     everything = [camera.rays() for camera in cameras]
     for column in range(2):
@@ -192,7 +192,7 @@ def test_every_pixel_comes_once_an_epoch(capture):
 def test_more_rays_than_pixels_are_as_many_as_there_are(capture):
     cameras, images = capture
     pool = RayPool(cameras[:1], images[:1], torch.Generator().manual_seed(0))
-    rays_o, rays_d, pixels = pool.draw(5000)
+    rays_o, rays_d, pixels, _ = pool.draw(5000)
     assert rays_o.shape == rays_d.shape == (576, 3) and pixels.shape == (576, 4)
     np.testing.assert_allclose(rays_o, np.tile(cameras[0].camera_to_world[:3, 3], (576, 1)))
 
@@ -208,20 +208,13 @@ def test_pictures_of_several_sizes_and_pixels_that_are_ignored():
     pixels = np.repeat(np.arange(count, dtype=np.uint8)[:, None], 4, 1)
     ignored = np.random.default_rng(0).random(count) < 0.4
     pool = RayPool(cameras, Pictures(pixels, ignored), torch.Generator().manual_seed(0))
-    rays_o, rays_d, drawn = pool.draw(1000)
+    rays_o, rays_d, drawn, pictures = pool.draw(1000)
     found = np.rint(drawn.numpy()[:, 0] * 255).astype(int)
     assert np.array_equal(np.sort(found), np.flatnonzero(~ignored))
     wanted_o, wanted_d = (np.concatenate(part) for part in zip(*[c.rays() for c in cameras], strict=True))
     np.testing.assert_allclose(rays_o, wanted_o[found])
     np.testing.assert_allclose(rays_d, wanted_d[found], atol=1e-6)
-
-    gains = torch.tensor([[0.5, 2.0, 1.25], [1.0, 4.0, 0.75], [2.0, 1.0, 3.0]])
-    pool.gains.copy_(gains)
-    evened = pool.draw(1000)[2]  # colours over the gains of the picture; the alpha as it is
-    pixel = np.rint(evened[:, 3].numpy() * 255).astype(int)
-    assert np.array_equal(np.sort(pixel), np.flatnonzero(~ignored))
-    picture = np.repeat(np.arange(3), [w * h for w, h in sizes])[pixel]
-    np.testing.assert_allclose(evened[:, :3], pixel[:, None] / 255 / gains[picture].numpy(), rtol=1e-6)
+    assert np.array_equal(pictures, np.repeat(np.arange(3), [w * h for w, h in sizes])[found])
 
 
 def test_texels_are_near_cubic_but_for_flat_boxes():

@@ -41,7 +41,7 @@ def test_rays_of_the_pixels_pass_by_the_points():
     keypoints, pool = made()
     chosen, points = keypoints.draw(150)
     assert 100 < len(chosen) <= 150
-    rays_o, rays_d, _ = pool.of(chosen)
+    rays_o, rays_d, *_ = pool.of(chosen)
     away = points - rays_o
     aside = np.linalg.norm(np.cross(away, rays_d), axis=1) / np.linalg.norm(away, axis=1)
     assert (np.einsum("ni,ni->n", away, rays_d) > 0).all()

@@ -11,7 +11,7 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, plain, reference
 from fusedrf_cli.engine.kernels.loops import Answers, Points
-from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kernels.parts import CLIPPED, LINE
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
@@ -313,7 +313,7 @@ def test_query_backward_of_several_blocks_is_finite_differences():
 
 
 def train(
-    field, rays_o, rays_d, step, early_stop=0.0, near=0.0, parts=2, opacity_weight=0.3, seed=0
+    field, rays_o, rays_d, step, early_stop=0.0, near=0.0, parts=2, opacity_weight=0.3, seed=0, **more
 ):  # fmt: skip
     """train_rays with random targets, backgrounds and jitter: (target, background, jitter, gradients (P,),
     loss (3,))."""
@@ -322,7 +322,7 @@ def train(
     target, background = rng.random((n, 4)).astype(real), rng.random((n, 3)).astype(real)
     jitter = rng.random(n)
     grads, loss = np.zeros((parts, field.params.numel()), real), np.zeros((parts, 3))
-    batch = Batch(rays_o, rays_d, jitter, target, background, opacity_weight, near, step, early_stop)
+    batch = Batch(rays_o, rays_d, jitter, target, background, opacity_weight, near, step, early_stop, **more)
     field.train_rays(batch, grads, loss)
     return target, background, jitter, grads.sum(0), loss.sum(0)
 
@@ -357,6 +357,32 @@ def test_train_rays_is_autograd(early_stop, scale):
     np.testing.assert_allclose(loss[:2], [colour, opacity], rtol=1e-10)
     # The reference takes the derivative of 1 - exp, the kernel of its logarithm; both see every sample the
     # same.
+    np.testing.assert_allclose(grads, params.grad.numpy(), rtol=1e-7, atol=1e-11)
+
+
+def test_train_rays_of_photos_of_their_own_exposure_is_autograd():
+    """Gains, offsets and weights of each ray; colours that a photo cannot show are as far off as it can tell;
+    the sum of errors is that of the photos."""
+    field = random_vm(cells=5)
+    rays_o, rays_d = rays_at(BOX, 60)
+    rng = np.random.default_rng(4)
+    exposure = rng.uniform([[0.3], [-0.3], [0.2]], [[2.0], [0.3], [3.0]], (60, 3, 3))
+    target, background, jitter, grads, loss = train(field, rays_o, rays_d, 0.05, exposure=exposure)
+    params = field.params.clone().requires_grad_()
+    out = reference.render_rays(
+        with_params(field, params), torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, 0.05, 0.0,
+        torch.from_numpy(jitter), loops.COLOUR_FROM,
+    )  # fmt: skip
+    gain, offset, weight = torch.from_numpy(exposure).unbind(1)
+    wanted, behind = torch.from_numpy(target), torch.from_numpy(background)
+    shown = gain * (out[:, :3] + (1 - out[:, 3:4]) * behind) + offset
+    truth = wanted[:, :3]
+    square = torch.where((truth >= CLIPPED) & (shown > truth), 0.0, shown - truth) ** 2
+    assert (square == 0).any()
+    opacity = ((out[:, 3] - wanted[:, 3]) ** 2).sum()
+    (((weight * square).mean(1).sum() + 0.3 * opacity) / 60).backward()
+    sums = [float(part.detach()) for part in (square.mean(1).sum(), opacity)]
+    np.testing.assert_allclose(loss[:2], sums, rtol=1e-10)
     np.testing.assert_allclose(grads, params.grad.numpy(), rtol=1e-7, atol=1e-11)
 
 

@@ -153,13 +153,14 @@ def test_pictures_under_a_grid_that_knows_the_insides_of_cells():
         check(found, wanted)
 
 
-def trained(rays_o, rays_d, step):
+def trained(rays_o, rays_d, step, **more):
     """Work for `twice`: gradient, losses and samples of rays with random targets, of the first of which the
     depth is known."""
     n, rng = len(rays_o), np.random.default_rng(2)
     jitter, target, background = rng.random(n), rng.random((n, 4)), rng.random((n, 3))
     losses = {"opacity_weight": 0.3, "distortion": 0.1, "depth_weight": 0.5, "depths": rng.random(1) + 1}
-    batch = Batch(rays_o, rays_d, jitter, target, background, near=0.0, step=step, early_stop=1e-3, **losses)
+    sampling = {"near": 0.0, "step": step, "early_stop": 1e-3}
+    batch = Batch(rays_o, rays_d, jitter, target, background, **sampling, **losses, **more)
 
     def gradient(field):
         grads, loss = np.zeros((1, field.params.numel()), field.real), np.zeros((1, 3))
@@ -178,6 +179,14 @@ def test_train_rays(name, dtype, monkeypatch):
     for wanted, found in twice(field, trained(*rays_at(field.aabb, 3), 0.1)):
         check(found, wanted, dtype)
     assert wanted[0, 2] > 3  # samples
+
+
+@on_a_device
+def test_train_rays_of_photos_of_their_own_exposure():
+    exposure = np.random.default_rng(6).uniform(0.2, 1.5, (3, 3, 3))
+    field = vm(torch.float64)
+    for wanted, found in twice(field, trained(*rays_at(field.aabb, 3), 0.1, exposure=exposure)):
+        check(found, wanted, torch.float64)
 
 
 @on_a_device
