@@ -12,6 +12,7 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from formats.errors import BadIntrinsics, BadJson, BadSchema, NoViews, UnsupportedCamera
+from formats.foreign import foreign_json
 from formats.images import MAX_SIDE, read_image_header
 from formats.inputs import read_input
 from formats.photos import EXTENSIONS, find_photo
@@ -57,13 +58,16 @@ def read_document(path: Path) -> dict:
     except ValueError as error:
         raise BadJson(f"{path}: not JSON: {error}") from error
     if not isinstance(document, dict):
-        raise BadSchema(f"{path}: found a JSON {type(document).__name__}, expected an object with frames")
+        found = f"{path}: found a JSON {type(document).__name__}, expected an object with frames"
+        raise foreign_json(path) or BadSchema(found)
     return document
 
 
 def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
     """The frames as listed; BadSchema unless they are a list of objects."""
     frames = document.get(key)
+    if frames is None and key == "frames" and (foreign := foreign_json(path)):
+        raise foreign
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise BadSchema(f'{path}: expected "{key}" to be a list of objects, one per camera, with their poses')
     return frames

@@ -17,11 +17,14 @@ from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews
-from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
+from formats.foreign import is_json, not_a_capture
+from formats.frame import default_box, scene_frame, shown_box
 from formats.images import read_image_header, write_png
+from formats.masks import with_masks_beside
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
+    alike_turned,
     chosen_copy,
     copies,
     find_photo,
@@ -31,13 +34,12 @@ from formats.photos import (
     load_images,
     load_photos,
     natural,
-    object_boxes,
     on_photo,
     photo_folder,
     pictures,
-    plain_background,
 )
 from formats.points import Points
+from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
 from formats.transforms import (
     BLENDER_FILE,
     Part,
@@ -62,8 +64,6 @@ __all__ = [
     "write_cameras",
     "write_capture",
 ]
-
-BLENDER_AABB = np.array([-1.5, -1.5, -1.5, 1.5, 1.5, 1.5])
 
 
 def is_capture(path: Path | str) -> bool:
@@ -91,7 +91,7 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
     `downscale` times smaller (None: until it is at most LONGEST), or a copy of that size is read.
 
     Raises BadImage, BadIntrinsics, BadJson, BadMask, BadMesh, BadModel, BadPose, BadSchema, LimitExceeded,
-    MissingFile, NoPoses, NoViews, UnsupportedCamera.
+    MissingExtra, MissingFile, NoPoses, NoViews, NotACapture, UnsupportedCamera.
     """
     path = Path(path)
     if not path.exists():
@@ -104,6 +104,8 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
         return _read_folder(path, downscale)
     if path.name == llff.NAME:
         return _read_llff(path, downscale)
+    if path.suffix.lower() != ".json" and not is_json(path):
+        raise not_a_capture(path)
     if match := BLENDER_FILE.fullmatch(path.name):
         return _read_blender(path, downscale, **{"test" if match[1] == "test" else "train": path})
     return _read_transforms(path, downscale)
@@ -124,10 +126,11 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
         return _read_llff(path / llff.NAME, downscale)
     if (folders := polycam.keyframes(path)) is not None:
         return _read_polycam(path, *folders, downscale)
-    found = "pictures but" if has_pictures(path) else "no pictures and"
+    if not has_pictures(path):
+        raise not_a_capture(path)
     raise NoPoses(
-        f"{path}: found {found} no camera poses (transforms.json, transforms_train.json, COLMAP's sparse/0, "
-        "LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
+        f"{path}: found pictures but no camera poses (transforms.json, transforms_train.json, COLMAP's "
+        "sparse/0, LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
     )
 
 
@@ -138,7 +141,8 @@ def _read_blender(
     path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
 ) -> Capture:
     parts = [read_part(file, downscale) if file else Part() for file in (train, test)]
-    return _capture(path, "blender", *parts, stated=BLENDER_AABB)
+    first = train or test
+    return _capture(path, "blender", *parts, stated=stated_aabb(first, read_document(first)))
 
 
 def _read_transforms(path: Path, downscale: int | None) -> Capture:
@@ -159,8 +163,9 @@ def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
         if photo is None:
             continue
         header = read_image_header(photo)
-        mask, reduction = _model_mask(base, image.name), place.reduction(header, downscale)
-        views.append(on_photo(replace(image.view, name=name), photo, header, image.where, mask, reduction))
+        reduction = place.reduction(header, downscale)
+        view = replace(image.view, name=name)
+        views.append(on_photo(view, photo, header, image.where, reduction=reduction))
         alpha |= header.alpha
     missing = [image.name for image, photo in zip(images, photos, strict=True) if photo is None]
     part = Part(tuple(views), alpha, tuple(missing), notes)
@@ -194,13 +199,6 @@ def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
     """The folder out of `copies` to read photos from whose names say nothing: it has so many."""
     listed = [(place, pictures(place.path)) for place in copies(images)]
     return chosen_copy([(place, files[0]) for place, files in listed if len(files) == count > 0], downscale)
-
-
-def _model_mask(base: Path, name: str) -> Path | None:
-    """COLMAP's mask of a photo, `masks/a.jpg.png`, or one by the photo's own name."""
-    masks = base / "masks"
-    exact = masks / f"{name}.png"
-    return exact if is_file(exact) else find_photo(masks, name)
 
 
 def _read_llff(path: Path, downscale: int | None) -> Capture:
@@ -256,17 +254,26 @@ def _capture(
             f"{path}: no view is left, {len(missing)} of {len(missing)} listed frames have no photo on disk; "
             "put the photos where the file_path entries say"
         )
-    opaque = not (train.alpha or test.alpha)
-    poses = np.array([view.camera_to_world for view in views])
-    frame, box = None, subject_box(poses) if stated is None else stated.copy()
-    if opaque and not plain_background(views):
-        frame, box = _surroundings(views, poses, points)
-    cut_out = None
-    if (kept := object_boxes(views)) is not None:
-        corners = [view.corners(1.0, bounds) for view, bounds in zip(views, kept, strict=True)]
-        cut_out = object_box(poses[:, :3, 3], np.array(corners))
-    notes = tuple(dict.fromkeys((*train.notes, *test.notes, *notes, *_smaller(path, views))))
-    return Capture(path, kind, train.views, test.views, box, opaque, cut_out, missing, points, frame, notes)
+    views, sideways = alike_turned(views)
+    views, beside = with_masks_beside(views, path if path.is_dir() else path.parent)
+    masked = by_masks(views)
+    first_test = sum(view in masked.views for view in views[: len(train.views)])
+    seen = by_alpha(masked.views)
+    poses = np.array([view.camera_to_world for view in seen.views])
+    frame, box, opaque = None, stated, not seen.outlines
+    said = [sideways, *masked.notes, *seen.notes]
+    if opaque:
+        seen = by_ground(seen.views)
+        said += seen.notes
+    if not seen.outlines:
+        frame, box = _surroundings(seen.views, poses, points)
+    elif not opaque or box is None:
+        box = outline_box(seen, AMISS_ON_WHITE if opaque else AMISS)
+    cut_out = outline_box(masked) if masked.outlines else None
+    notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in said if note))
+    notes = tuple(dict.fromkeys((*notes, *_smaller(path, seen.views))))
+    parts = seen.views[:first_test], seen.views[first_test:]
+    return Capture(path, kind, *parts, box, opaque, cut_out, missing, points, frame, notes)
 
 
 def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:

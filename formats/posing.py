@@ -22,6 +22,7 @@ from formats import colmap
 from formats.atomic import atomic_folder
 from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
+from formats.foreign import not_a_capture
 from formats.frame import scene_frame, up_of_sideways
 from formats.images import Header, read_focal, read_image_header, write_smaller
 from formats.mapper import MAX_SIDE
@@ -40,8 +41,6 @@ UPS = {3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where up is in the stored picture (right, up), by EXIF orientation; (0, 1) of the others."""
 CAMERAS = "transforms.json"
 POINTS = "points.ply"
-UNREAD = (".heic", ".heif", ".HEIC", ".HEIF")
-"""Photos of phones that cannot be decoded here."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +71,20 @@ def check_extra(folder: Path | str) -> None:
 
 
 def photos_to_pose(folder: Path | str) -> list[Path]:
-    """The photos of a folder, or of its `images`, in natural order. Raises MissingFile, NoViews."""
+    """The photos of a folder, or of its `images` where there are more of them, in natural order.
+
+    Raises BadImage, MissingExtra, MissingFile, NotACapture, NoViews.
+    """
     folder = Path(folder)
+    if not folder.exists():
+        raise MissingFile(f"{folder}: no such folder; give the folder that the photos lie in")
+    if not folder.is_dir():
+        raise not_a_capture(folder)
     places = (folder, *(place.path for place in copies(folder / "images")))
-    found = next((files for files in map(pictures, places) if files), [])
+    found = max(map(pictures, places), key=len)  # one beside `images` is a thumbnail
     if not found:
-        unread = [file for place in places if place.is_dir() for file in place.iterdir()]
-        if unread := [file for file in unread if file.suffix in UNREAD]:
-            raise NoViews(
-                f"{folder}: its {len(unread)} photos such as {unread[0].name} are HEIC, which is not read; "
-                "convert them to JPEG, or set the phone to its most compatible format"
-            )
-        raise MissingFile(f"{folder}: holds no photos; give the folder that they lie in")
+        raise not_a_capture(folder)
+    read_image_header(found[0])  # of a kind that an extra reads, it is named before any work
     if len(found) < LEAST_PHOTOS:
         raise NoViews(
             f"{folder}: holds {len(found)} photos, but where they were taken follows from {LEAST_PHOTOS} or "

@@ -81,8 +81,12 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
         return _unbounded(request, capture)
     if capture.object_aabb is not None:
         return _around_object(request, capture)
-    box = capture.aabb if request.aabb is None else request.aabb
-    return Extent(np.asarray(box, np.float64))
+    if request.aabb is not None:
+        return Extent(np.asarray(request.aabb, np.float64))
+    if capture.opaque or capture.kind == "mesh":
+        return Extent(capture.aabb)
+    # Its cells are not kept to: transparent pixels tell what is empty in the box.
+    return Extent(visual_hull(capture.train, capture.aabb).aabb)
 
 
 def _around_object(request: TrainRequest, capture: Capture) -> Extent:

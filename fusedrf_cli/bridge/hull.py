@@ -1,12 +1,13 @@
-"""The visual hull of an object that masks cut out: where in a box it can be."""
+"""The visual hull of an object that masks or alpha cut out: where in a box it can be."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label, maximum
 
-from formats.captures import load_ignored
+from formats.silhouettes import shown_pixels
 from formats.views import View
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import projected
@@ -29,11 +30,12 @@ def visual_hull(views: Sequence[View], box: np.ndarray) -> OccupancyGrid:
     the views' masks leave room for an object in; a view says nothing of cells outside its picture, and cells
     that no view shows are left out.
 
-    Every view has a mask. All cells are kept where the masks agree on none. Raises BadMask, BadImage,
-    MissingFile.
+    The alpha of a photo is such a mask. All cells are kept where the masks agree on none. Raises BadMask,
+    BadImage, MissingFile.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), VIEWS)).astype(int))
-    masked = [mask for number in chosen if (mask := Mask.of(views[number]))]
+    with ThreadPoolExecutor() as threads:
+        masked = [mask for mask in threads.map(Mask.of, [views[i] for i in chosen]) if mask]
     coarse, fine = CELLS
     around = cropped(carved(OccupancyGrid.full(box, coarse), masked))
     grid = OccupancyGrid.full(around.aabb, fine)
@@ -42,7 +44,7 @@ def visual_hull(views: Sequence[View], box: np.ndarray) -> OccupancyGrid:
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """What the mask of a view keeps."""
+    """What the mask of a view keeps, and the alpha of its photo."""
 
     view: View
     stride: int
@@ -54,7 +56,7 @@ class Mask:
     def of(cls, view: View) -> "Mask | None":
         """A view's mask; None where that keeps nothing, which says nothing of the object."""
         stride = max(1, max(view.width, view.height) // LOOKED_AT)
-        ignored = load_ignored(view)[::stride, ::stride]
+        ignored = ~shown_pixels(view)[::stride, ::stride]
         if ignored.all():
             return None
         return cls(view, stride, (stride * distance_transform_edt(ignored)).astype(np.float32))
