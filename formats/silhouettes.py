@@ -34,7 +34,7 @@ GROUND = 8
 """Levels by which a pixel of an object differs from the white ground."""
 BARS = 0.97
 """Share of the box around it that a picture between bars fills; hardly any outline of an object does."""
-CELLS = 40
+CELLS = 32
 """Along a side of the grid in which the box of an object is looked for, twice."""
 AMISS, AMISS_ON_WHITE = 0.1, 0.34
 """Share of the outlines that may exclude a place where the object is: some are wrong, and what is white on
@@ -99,8 +99,10 @@ def ground_outline(view: View) -> Outline:
 def shown_pixels(view: View) -> np.ndarray:
     """(H, W) bool: what a view's mask keeps and its alpha shows. Raises as `load_ignored`."""
     shown = np.ones((view.height, view.width), bool) if view.mask_path is None else ~load_ignored(view)
-    if view.pixels is not None or not view.alpha:
-        return shown if view.pixels is None else shown & (view.pixels[..., 3] >= FAINT)
+    if view.pixels is not None:
+        return shown & (oriented(view.pixels, view.orientation)[..., 3] >= FAINT)
+    if view.image_path is None or not view.alpha:
+        return shown
     alpha = oriented(read_alpha(view.image_path), view.orientation)[:: view.reduction, :: view.reduction]
     return shown & (alpha[: view.height, : view.width] >= FAINT)
 

@@ -96,18 +96,10 @@ class View:
             rising = stretch + 2 * angle * angle * slope > 0
             u, v = np.array([x, -y]) * angle * stretch / np.maximum(aside, 1e-12)
         else:
-            away = -back
+            away, rising = -back, True
             u, v = np.array([x, -y]) / np.where(away > 0, away, np.inf)
-            k1, k2, k3, p1, p2, k4, *below = (*self.distortion, *(0.0,) * (9 - len(self.distortion)))
-            r2 = u * u + v * v
-            (up, up_slope), (down, down_slope) = _polynomial((k1, k2, k3, k4), r2), _polynomial(below, r2)
-            stretch = up / down
-            # Beyond a fold of the lens points would come back into the picture.
-            rising = stretch + 2 * r2 * (up_slope - stretch * down_slope) / down > 0
-            u, v = (
-                u * stretch + 2 * p1 * u * v + p2 * (r2 + 2 * u * u),
-                v * stretch + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v,
-            )
+            if any(self.distortion):
+                u, v, rising = _bent(u, v, self.distortion)
         column, row = self.cx + self.fl_x * u, self.cy + self.fl_y * v
         across, down = (column >= 0) & (column < self.width), (row >= 0) & (row < self.height)
         return column, row, away, (away > 0) & rising & across & down
@@ -118,6 +110,17 @@ class View:
         cy = height / 2 + (self.cy - self.height / 2) * scale
         focal = {"fl_x": self.fl_x * scale, "fl_y": self.fl_y * scale, "cx": self.cx * scale, "cy": cy}
         return replace(self, width=width, height=height, **focal)
+
+
+def _bent(u: np.ndarray, v: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """Where a lens shows (u, v), and whether no fold of it lies nearer, beyond which points come back."""
+    k1, k2, k3, p1, p2, k4, *below = (*distortion, *(0.0,) * (9 - len(distortion)))
+    r2 = u * u + v * v
+    (up, up_slope), (down, down_slope) = _polynomial((k1, k2, k3, k4), r2), _polynomial(below, r2)
+    stretch = up / down
+    rising = stretch + 2 * r2 * (up_slope - stretch * down_slope) / down > 0
+    across = 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    return u * stretch + across, v * stretch + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v, rising
 
 
 def _polynomial(factors: Sequence[float], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

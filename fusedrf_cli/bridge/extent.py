@@ -31,6 +31,9 @@ NEAR_OF_POINTS = 0.6
 """Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer is
 empty, for all other cameras too."""
 
+BOX_CELLS = 64
+"""Along the longest axis of the hull that only gives the box of what alpha shows."""
+
 
 @dataclass(frozen=True, eq=False)
 class Extent:
@@ -86,7 +89,7 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     if capture.opaque or capture.kind == "mesh":
         return Extent(capture.aabb)
     # Its cells are not kept to: transparent pixels tell what is empty in the box.
-    return Extent(visual_hull(capture.train, capture.aabb).aabb)
+    return Extent(visual_hull(capture.train, capture.aabb, BOX_CELLS).aabb)
 
 
 def _around_object(request: TrainRequest, capture: Capture) -> Extent:

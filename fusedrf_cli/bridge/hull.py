@@ -12,8 +12,8 @@ from formats.views import View
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import projected
 
-CELLS = (32, 112)
-"""Along the longest axis, of a first look and of a second one into what that leaves."""
+COARSE, FINE = 32, 112
+"""Cells along the longest axis, of a first look and of a second one into what that leaves."""
 VIEWS = 100
 """At most so many masks, evenly spaced in the list, are looked at."""
 LOOKED_AT = 300
@@ -25,20 +25,19 @@ RARELY = 0.5
 beside the object, and only photos tell of it in which it is in line with the object."""
 
 
-def visual_hull(views: Sequence[View], box: np.ndarray) -> OccupancyGrid:
+def visual_hull(views: Sequence[View], box: np.ndarray, finest: int | None = None) -> OccupancyGrid:
     """The smallest box, with cells in it, around those of a box (6,), in world units, that all but AMISS of
     the views' masks leave room for an object in; a view says nothing of cells outside its picture, and cells
     that no view shows are left out.
 
-    The alpha of a photo is such a mask. All cells are kept where the masks agree on none. Raises BadMask,
-    BadImage, MissingFile.
+    The alpha of a photo is such a mask. `finest` cells lie along the longest axis (None: FINE). All cells are
+    kept where the masks agree on none. Raises BadMask, BadImage, MissingFile.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), VIEWS)).astype(int))
     with ThreadPoolExecutor() as threads:
         masked = [mask for mask in threads.map(Mask.of, [views[i] for i in chosen]) if mask]
-    coarse, fine = CELLS
-    around = cropped(carved(OccupancyGrid.full(box, coarse), masked))
-    grid = OccupancyGrid.full(around.aabb, fine)
+    around = cropped(carved(OccupancyGrid.full(box, COARSE), masked))
+    grid = OccupancyGrid.full(around.aabb, finest or FINE)
     return cropped(carved(grid.marked(around.contains(grid.centres()).reshape(grid.occupied.shape)), masked))
 
 

@@ -51,7 +51,7 @@ def project(view: View, point: np.ndarray) -> tuple[float, float]:
 def photo(path: Path, size=SIZE, channels: int = 3, level: int = 100) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.full((size[1], size[0], channels), level, np.uint8)
-    pixels[0, 0] = 255 - level  # borders of one colour would be a ground
+    pixels[-1, -1] = 255 - level  # borders of one colour would be a ground
     write_png(path, pixels)
 
 
