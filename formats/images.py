@@ -1,7 +1,7 @@
 """Pictures: 8-bit sRGB in, PNG out, whole or not at all."""
 
+import os
 import struct
-import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -59,32 +59,14 @@ class Header(NamedTuple):
     """The EXIF orientation, 1 to 8: how to turn the stored pixels upright; 1 where none is given."""
 
 
-class _Budget:
-    """Memory that threads share: a piece is granted when it fits beside the others, or when it is alone."""
-
-    def __init__(self) -> None:
-        self.taken, self.changed = 0, threading.Condition()
-
-    @contextmanager
-    def granted(self, size: int) -> Iterator[None]:
-        with self.changed:
-            self.changed.wait_for(lambda: not self.taken or self.taken + size <= DECODING_BYTES)
-            self.taken += size
-        try:
-            yield
-        finally:
-            with self.changed:
-                self.taken -= size
-                self.changed.notify_all()
+def decoded_at_once(width: int, height: int) -> int:
+    """How many photos of so many stored pixels are decoded side by side."""
+    return min(os.cpu_count() or 1, max(1, DECODING_BYTES // (width * height * PER_STORED_PIXEL)))
 
 
-_budget = _Budget()
-
-
-def decoding_bytes(width: int, height: int, count: int) -> int:
-    """Memory that decoding `count` photos of so many stored pixels takes beside what comes out."""
-    one = width * height * PER_STORED_PIXEL
-    return max(one, min(count * one, DECODING_BYTES))
+def decoding_bytes(width: int, height: int) -> int:
+    """Memory that decoding such photos takes beside what comes out."""
+    return decoded_at_once(width, height) * width * height * PER_STORED_PIXEL
 
 
 def read_image(
@@ -183,8 +165,7 @@ def write_smaller(path: Path | str, smaller: Path, longest: int) -> tuple[int, i
         shrink = min(1.0, longest / max(image.size))
         size = tuple(max(1, round(side * shrink)) for side in image.size)
         image.draft("RGB", size)  # a JPEG is decoded at about this size, which is several times faster
-        with _room(image):
-            picture = _eight_bits(image).convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        picture = _eight_bits(image).convert("RGB").resize(size, Image.Resampling.LANCZOS)
     picture.save(smaller, "PNG", compress_level=1)
     return size
 
@@ -232,14 +213,13 @@ def _orientation(image) -> int:
 
 @contextmanager
 def _decoded(path: Path | str) -> Iterator:
-    """An open picture whose pixels are in memory, within what decoding may take."""
-    with _opened(path) as image, _room(image):
-        image.load()
-        yield image
-
-
-def _room(image):
-    return _budget.granted(image.width * image.height * PER_STORED_PIXEL)
+    """An open picture whose pixels are in memory until it is left."""
+    with _opened(path) as image:
+        try:
+            image.load()
+            yield image
+        finally:
+            image.close()
 
 
 @contextmanager

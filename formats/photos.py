@@ -18,6 +18,7 @@ import numpy as np
 from formats.errors import BadIntrinsics, BadMask, MissingFile, MixedSizes, NoViews, ResourceError
 from formats.images import (
     Header,
+    decoded_at_once,
     decoding_bytes,
     oriented,
     read_alpha,
@@ -261,7 +262,7 @@ def load_photos(views: Sequence[View], masks: str = "ignore") -> Photos:
         if view.mask_path:
             ignored[part] = load_ignored(view).ravel()
 
-    with ThreadPoolExecutor() as threads:
+    with decoders(views) as threads:
         for _ in threads.map(load, views, pairwise(first.tolist())):
             pass
     if masks == "alpha" and ignored is not None:
@@ -315,9 +316,18 @@ def _sampled(stored: int, shown: int, reduction: int) -> np.ndarray:
 
 def loading_bytes(views: Sequence[View]) -> int:
     """Memory that decoding photos takes at most, beside their pixels."""
+    return decoding_bytes(*_largest(views))
+
+
+def decoders(views: Sequence[View]) -> ThreadPoolExecutor:
+    """Threads for work that decodes a view's photo or mask each, fewer where photos are large."""
+    return ThreadPoolExecutor(decoded_at_once(*_largest(views)))
+
+
+def _largest(views: Sequence[View]) -> tuple[int, int]:
+    """Stored sides, about, of the largest photo."""
     largest = max(views, key=lambda view: view.width * view.height * view.reduction**2)
-    sides = (side * largest.reduction for side in (largest.width, largest.height))
-    return decoding_bytes(*sides, len(views))
+    return largest.width * largest.reduction, largest.height * largest.reduction
 
 
 def _named(view: View) -> Path | str:

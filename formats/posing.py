@@ -24,7 +24,7 @@ from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
 from formats.foreign import not_a_capture
 from formats.frame import scene_frame, up_of_sideways
-from formats.images import Header, read_focal, read_image_header, write_smaller
+from formats.images import Header, decoded_at_once, read_focal, read_image_header, write_smaller
 from formats.mapper import MAX_SIDE
 from formats.photos import copies, natural, pictures
 from formats.points import Points, write_ply_points
@@ -168,17 +168,17 @@ def _prepare(work: Path, photos: Sequence[Path], threads: int, progress) -> list
     """
     progress.phase("reading", len(photos))
 
-    def prepare(item: tuple[int, Path]) -> tuple[Header, tuple]:
+    def prepare(item: tuple[int, Path]) -> tuple:
         i, photo = item
         size = write_smaller(photo, work / f"{i:06d}.png", MAX_SIDE)
-        header, focal = read_image_header(photo), read_focal(photo)
-        pixels = None if focal is None else focal * float(np.hypot(*size))
-        return header, (*size, pixels)
+        focal = read_focal(photo)
+        return (*size, None if focal is None else focal * float(np.hypot(*size)))
 
-    headers, cameras = [], {}
-    with ThreadPoolExecutor(threads) as pool:
-        for i, (header, camera) in enumerate(pool.map(prepare, enumerate(photos))):
-            headers.append(header)
+    headers, cameras = [read_image_header(photo) for photo in photos], {}
+    largest = max(headers, key=lambda header: header.width * header.height)
+    at_once = min(threads, decoded_at_once(largest.width, largest.height))
+    with ThreadPoolExecutor(at_once) as pool:
+        for i, camera in enumerate(pool.map(prepare, enumerate(photos))):
             # Photos of one size and focal length are taken to be of one camera.
             cameras.setdefault(camera, []).append(f"{i:06d}.png")
             progress.advance(i + 1)

@@ -4,14 +4,13 @@ An alpha channel may say nothing, and borders of one colour may be a film's bars
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from formats.frame import nearest_point
 from formats.images import oriented, read_alpha
-from formats.photos import OPAQUE, decoded, load_ignored
+from formats.photos import OPAQUE, decoded, decoders, load_ignored
 from formats.views import View
 
 LOOKED_AT = 100_000_000
@@ -109,7 +108,7 @@ def shown_pixels(view: View) -> np.ndarray:
 
 def outlines(views: Sequence[View], outline: Callable[[View], Outline]) -> list[Outline]:
     """One of each view."""
-    with ThreadPoolExecutor() as threads:
+    with decoders(views) as threads:
         return list(threads.map(outline, views))
 
 

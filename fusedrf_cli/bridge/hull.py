@@ -1,12 +1,12 @@
 """The visual hull of an object that masks or alpha cut out: where in a box it can be."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label, maximum
 
+from formats.photos import decoders
 from formats.silhouettes import shown_pixels
 from formats.views import View
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -34,7 +34,7 @@ def visual_hull(views: Sequence[View], box: np.ndarray, finest: int | None = Non
     kept where the masks agree on none. Raises BadMask, BadImage, MissingFile.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), VIEWS)).astype(int))
-    with ThreadPoolExecutor() as threads:
+    with decoders(views) as threads:
         masked = [mask for mask in threads.map(Mask.of, [views[i] for i in chosen]) if mask]
     around = cropped(carved(OccupancyGrid.full(box, COARSE), masked))
     grid = OccupancyGrid.full(around.aabb, finest or FINE)
