@@ -45,6 +45,7 @@ KINDS = {
     "drawing": ("a drawing or document (PSD, PDF, EPS, SVG)", "save its picture as PNG"),
     "splats": ("a scene of Gaussian splats", "give the photos that it was made from"),
     "cloud": ("a cloud of points without faces", "give the photos that it was made from, or a mesh"),
+    "mesh": ("a mesh", "give that file itself"),
     "model": ("a 3D model in a format that is not read", "export it as .glb"),
     "usd": ("a USD scene", "export it as .glb"),
     "metashape": (
@@ -78,8 +79,9 @@ MAGICS = (
     (rb"....(ftyp|moov|mdat|wide)|RIFF....AVI |\x1aE\xdf\xa3|GIF8|FLV\x01|\0\0\x01[\xb3\xba]", "film"),
     (rb"\x89PNG|\xff\xd8\xff|RIFF....WEBP|BM.{4}\0\0\0\0|(II\x2a\0|MM\0\x2a)", "photo"),
     (rb"ply\r?\n(?s:.*)property \S+ (f_dc_0|scale_0|packed_position)\b", "splats"),
+    (rb"ply\r?\n(?s:.*)element face|glTF", "mesh"),
     (rb"ply\r?\n|LASF|ASTM-E57|# \.PCD|VERSION \.?7", "cloud"),
-    (rb"Kaydara FBX|BLENDER|(?s:.{0,200})<COLLADA|solid |glTF", "model"),
+    (rb"Kaydara FBX|BLENDER|(?s:.{0,200})<COLLADA", "model"),
     (rb"#usda|PXR-USDC", "usd"),
     (rb"(?s:.{0,400})<document(?s:.{0,800})<chunk", "metashape"),
     (rb"#name,\s*x,\s*y,\s*(alt|z)", "realitycapture"),
@@ -100,7 +102,8 @@ ENDINGS = {
     "drawing": "psd pdf eps svg ai",
     "splats": "splat ksplat spz sog sogs",
     "cloud": "las laz e57 pcd xyz pts ptx",
-    "model": "fbx blend dae 3ds max ma mb c4d 3dm stl off x3d wrl skp step stp iges igs obj gltf vrm",
+    "mesh": "obj gltf glb stl",
+    "model": "fbx blend dae 3ds max ma mb c4d 3dm off x3d wrl skp step stp iges igs vrm",
     "usd": "usd usda usdc usdz",
     "metashape": "psx psz",
     "cameras": "nvm out lst rcproj xmp csv xml",
@@ -204,19 +207,25 @@ def _of_folder(path: Path) -> FormatError:
             f"{path}: its photos lie in {_counted(len(nested), 'folder')} below it, {max(counts)} of them in "
             f"{most.relative_to(path)}; {cure}"
         )
-    known = [(file, found) for file in files if (found := _identified(file)) and found[:2] != KINDS["text"]]
-    if not known:
+    if (beside := beside_photos(path)) is None:
         return NotACapture(
             f"{path}: holds {_counted(len(files), 'file')} such as {files[0].name}, but no photos and no "
             "poses; give the folder that the photos lie in"
         )
-    first, found = known[0]
-    alike = sum(other.what == found.what for _, other in known)
+    name, found = beside
     kind = MissingExtra if found.extra else NotACapture
     return kind(
-        f"{path}: holds no photos that can be read and no poses, but {_counted(alike, 'file')} such as "
-        f"{first.name}, {found.what}; {found.cure}"
+        f"{path}: holds no photos that can be read and no poses, but {name}, {found.what}; {found.cure}"
     )
+
+
+def beside_photos(folder: Path) -> tuple[str, Foreign] | None:
+    """The name of a file in a folder that is neither a photo nor a text, and what it is; None without one."""
+    for file in _entries(folder):
+        found = _identified(file)
+        if found is not None and found[:2] not in (KINDS["text"], KINDS["photo"], KINDS["empty"]):
+            return file.name, found
+    return None
 
 
 def _counted(count: int, noun: str) -> str:

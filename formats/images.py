@@ -127,7 +127,7 @@ def read_mask(path: Path | str) -> np.ndarray:
     """
     with _decoded(path) as image:
         least = RINGING if image.format in LOSSY else 0
-        levels = np.asarray(_eight_bits(image).convert("RGB").convert("L"))
+        levels = np.array(image if image.mode.startswith("I") else image.convert("RGB").convert("L"))
         alpha = np.asarray(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
     if alpha is not None:
         if np.ptp(levels) == 0 < np.ptp(alpha):

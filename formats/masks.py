@@ -1,5 +1,6 @@
 """Masks that lie beside photos: in a folder `masks` or `mask`, or among them under names that say so."""
 
+import os
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,10 +26,11 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
     if not photos or any(view.mask_path for view in views):
         return tuple(views), ()
     shelves: dict[Path, _Shelf] = {}
+    around = {view.image_path.parent: _places(view.image_path, root) for view in photos}
     found, used, unused = [], {}, {}
     for view in views:
         mask = None
-        for place in _places(view.image_path, root) if view.image_path else ():
+        for place in around[view.image_path.parent] if view.image_path else ():
             shelf = shelves.get(place.folder) or shelves.setdefault(place.folder, _Shelf.of(place.folder))
             mask = shelf.mask_of(view.image_path, place.inner, own=place.folder == view.image_path.parent)
             if mask is not None:
@@ -66,10 +68,17 @@ def _places(photo: Path, root: Path) -> list[_Place]:
             break
         copy = below[0].rpartition("_")[2] if below else ""
         names = [*(f"{name}_{copy}" for name in FOLDERS if copy.isdecimal()), *FOLDERS]
-        places += [_Place(above / name, Path(*below[1:])) for name in names if (above / name).is_dir()]
+        places += [_Place(folder, Path(*below[1:])) for folder in _named_so(above, names)]
         if above == root or not below and not inside:
             break
     return [*places, _Place(parent, Path())]
+
+
+def _named_so(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The folders in a folder that have one of the names, in any case, in the order of the names."""
+    with os.scandir(folder) as entries:
+        found = [entry.name for entry in entries if entry.name.casefold() in names and entry.is_dir()]
+    return [folder / name for name in sorted(found, key=lambda name: names.index(name.casefold()))]
 
 
 def _of_photos(name: str) -> bool:

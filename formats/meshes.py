@@ -78,6 +78,23 @@ def mesh_capture(
     return Capture(Path(path), "mesh", seen[:n_train], seen[n_train:], mesh.aabb, opaque=False, notes=notes)
 
 
+def mesh_facts(path: Path | str) -> dict:
+    """What a mesh holds, without views of it: kind, surfaces, triangles, textures as "WxH", box, notes.
+
+    Raises as `mesh_capture`.
+    """
+    mesh = _load(path)
+    textures = {id(s.texture): s.texture.shape for s in mesh.surfaces if s.texture is not None}
+    return {
+        "kind": mesh_type(path),
+        "surfaces": len(mesh.surfaces),
+        "triangles": sum(len(surface.faces) for surface in mesh.surfaces),
+        "textures": [f"{width}x{height}" for height, width, _ in textures.values()],
+        "aabb": mesh.aabb.tolist(),
+        "notes": [f"{path}: {UPRIGHT_NOTE}"] if mesh_type(path) in GLTF else [],
+    }
+
+
 # --- loading ------------------------------------------------------------------------------------------------
 
 

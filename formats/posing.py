@@ -22,7 +22,7 @@ from formats import colmap
 from formats.atomic import atomic_folder
 from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
-from formats.foreign import not_a_capture
+from formats.foreign import beside_photos, not_a_capture
 from formats.frame import scene_frame, up_of_sideways
 from formats.images import Header, decoded_at_once, read_focal, read_image_header, write_smaller
 from formats.mapper import MAX_SIDE
@@ -86,9 +86,11 @@ def photos_to_pose(folder: Path | str) -> list[Path]:
         raise not_a_capture(folder)
     read_image_header(found[0])  # of a kind that an extra reads, it is named before any work
     if len(found) < LEAST_PHOTOS:
+        beside = beside_photos(folder)
+        more = f"; it holds {beside[0]} as well, {beside[1].what}: {beside[1].cure}" if beside else ""
         raise NoViews(
             f"{folder}: holds {len(found)} photos, but where they were taken follows from {LEAST_PHOTOS} or "
-            "more that overlap; take more, from different places"
+            f"more that overlap; take more, from different places{more}"
         )
     return sorted(found, key=lambda file: natural(file.name))
 

@@ -143,17 +143,16 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
     found = outlines(looked_at, alpha_outline)
     transparent = [outline for outline in found if outline.clear >= TRANSPARENT]
     share = len(transparent) / len(found) * len(having) / len(views)
-    named = having[0].image_path.name
+    channel = (
+        f"the alpha channel of {len(having)} of {len(views)} photos, such as {having[0].image_path.name},"
+    )
     nothing = not any(outline.box for outline in found)
     if share < 0.5 or nothing or _is_frame(transparent, looked_at):
-        notes = [f"the alpha channel of {len(having)} photos such as {named} is opaque and is not used"]
+        note = f"{channel} says nothing and is not used"
         if transparent:
-            what = "frames the photos" if share >= 0.5 else f"is transparent in {share:.0%} of the photos"
-            notes = [
-                f"the alpha channel of {len(having)} photos such as {named} {what}: they are taken to show "
-                "surroundings, and their transparent pixels are ignored"
-            ]
-        return Shown(tuple(_opaque(view, bool(transparent)) for view in views), notes=tuple(notes))
+            what = "frames them" if share >= 0.5 else f"is transparent in {share:.0%} of all"
+            note = f"{channel} {what}: photos show surroundings, and pixels that are transparent are ignored"
+        return Shown(tuple(_opaque(view, bool(transparent)) for view in views), notes=(note,))
     notes, whole = [], len(views) - round(share * len(views))
     if whole:
         notes.append(
