@@ -115,7 +115,7 @@ def read_alpha(path: Path | str) -> np.ndarray:
     with _decoded(path) as image:
         if not image.has_transparency_data:
             return np.full(image.size[::-1], 255, np.uint8)
-        return np.array(image.convert("RGBA").getchannel("A"))
+        return np.array(_rgba(image, True).getchannel("A"))
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -128,7 +128,7 @@ def read_mask(path: Path | str) -> np.ndarray:
     with _decoded(path) as image:
         least = RINGING if image.format in LOSSY else 0
         levels = np.array(image if image.mode.startswith("I") else image.convert("RGB").convert("L"))
-        alpha = np.asarray(image.convert("RGBA").getchannel("A")) if image.has_transparency_data else None
+        alpha = np.array(_rgba(image, True).getchannel("A")) if image.has_transparency_data else None
     if alpha is not None:
         if np.ptp(levels) == 0 < np.ptp(alpha):
             levels = alpha

@@ -77,7 +77,9 @@ def test_masks_beside_the_photos_of_every_capture(tmp_path, kind, form):
     assert any("masks of 3 of 3 photos are used" in note for note in read.notes)
 
 
-@pytest.mark.parametrize("at", ["Masks/A.PNG", "mask/a.png", "images/a_mask.png", "images/dynamic_mask_a.png"])
+@pytest.mark.parametrize(
+    "at", ["Masks/A.PNG", "mask/a.png", "images/a_mask.png", "images/dynamic_mask_a.png"]
+)
 def test_other_places_and_names(tmp_path, at):
     capture(tmp_path, "transforms", ["a.jpg"])
     keep(tmp_path / at, 255 - LEVELS if "dynamic" in at else LEVELS)

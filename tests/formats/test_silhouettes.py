@@ -117,7 +117,9 @@ def test_one_cut_out_photo_among_photos_of_a_room(tmp_path):
     assert (load_ignored(read.train[3]) == ~ball(3)).all()
 
 
-@pytest.mark.parametrize("scale, shift", [(1, (0, 0, 0)), (10, (0, 0, 0)), (1, (20, 5, 0)), (0.01, (3, 0, 0))])
+@pytest.mark.parametrize(
+    "scale, shift", [(1, (0, 0, 0)), (10, (0, 0, 0)), (1, (20, 5, 0)), (0.01, (3, 0, 0))]
+)
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json"])
 def test_the_box_of_what_alpha_shows(tmp_path, scale, shift, name):
     read = capture(tmp_path, free_ball, name, scale, shift, aabb_scale=16)
@@ -167,7 +169,12 @@ def framed(level: int) -> Callable:
     return photo
 
 
-SURROUNDED = {"black ground": on(0), "grey ground": on(128), "black frame": framed(0), "white frame": framed(255)}
+SURROUNDED = {
+    "black ground": on(0),
+    "grey ground": on(128),
+    "black frame": framed(0),
+    "white frame": framed(255),
+}
 
 
 @pytest.mark.parametrize("photo", SURROUNDED.values(), ids=SURROUNDED)
