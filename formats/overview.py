@@ -26,6 +26,8 @@ def overview(path: Path | str) -> dict | None:
     Raises as `read_capture` and `mesh_capture`.
     """
     path = Path(path)
+    if not path.exists():
+        return None
     if is_mesh(path):
         return {"path": str(path), "format": "mesh", **mesh_facts(path)}
     if path.is_file() and not is_capture(path):

@@ -1,4 +1,4 @@
-"""Photos of every kind that may be opened read alike, large ones alone; EXIF turns all of a capture or none."""
+"""Photos of every kind that is opened read alike, large ones alone; EXIF turns all of a capture or none."""
 
 import numpy as np
 import pytest
