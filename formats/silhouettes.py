@@ -55,18 +55,23 @@ class Outline:
     border: float
     """Of the pixels along its borders."""
     middle: float
-    """Of the pixels of its middle, half as wide and high."""
+    """Opaque ones, of the pixels of its middle, half as wide and high."""
     soft: float = 0.0
     """Share of the photo's pixels that are neither opaque nor transparent."""
     clear: float = 0.0
     """Share of the photo's pixels that are transparent."""
 
     @classmethod
-    def of(cls, kept: np.ndarray, scale: float, **shares: float) -> "Outline":
-        """The outline of what is kept (H, W) of a photo, a pixel of which is `scale` of the view's."""
+    def of(
+        cls, kept: np.ndarray, scale: float, solid: np.ndarray | None = None, **shares: float
+    ) -> "Outline":
+        """The outline of what is kept (H, W) of a photo, whose pixel is `scale` of the view's; `solid` is
+        what of it is opaque."""
         high, wide = kept.shape
         rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
-        middle = kept[high // 4 : high - high // 4, wide // 4 : wide - wide // 4]
+        middle = (kept if solid is None else solid)[
+            high // 4 : high - high // 4, wide // 4 : wide - wide // 4
+        ]
         border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
         box, filled = None, 0.0
         if len(rows):
@@ -82,7 +87,7 @@ def alpha_outline(view: View) -> Outline:
     clear, soft = float((alpha < OPAQUE).mean()), float(((alpha >= FAINT) & (alpha < 255 - FAINT)).mean())
     if alpha.min() == alpha.max():  # which says nothing
         clear = soft = 0.0
-    return Outline.of(alpha >= FAINT, 1 / view.reduction, clear=clear, soft=soft)
+    return Outline.of(alpha >= FAINT, 1 / view.reduction, alpha >= OPAQUE, clear=clear, soft=soft)
 
 
 def mask_outline(view: View) -> Outline:
