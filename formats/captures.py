@@ -257,8 +257,9 @@ def _capture(
     views, sideways = alike_turned(views)
     views, beside = with_masks_beside(views, path if path.is_dir() else path.parent)
     masked = by_masks(views)
-    first_test = sum(view in masked.views for view in views[: len(train.views)])
+    first_test = _left(views, masked.views, len(train.views))
     seen = by_alpha(masked.views)
+    first_test = _left(masked.views, seen.views, first_test)
     poses = np.array([view.camera_to_world for view in seen.views])
     frame, box, opaque = None, stated, not seen.outlines
     said = [sideways, *masked.notes, *seen.notes]
@@ -274,6 +275,11 @@ def _capture(
     notes = tuple(dict.fromkeys((*notes, *_smaller(path, seen.views))))
     parts = seen.views[:first_test], seen.views[first_test:]
     return Capture(path, kind, *parts, box, opaque, cut_out, missing, points, frame, notes)
+
+
+def _left(before: tuple[View, ...], after: tuple[View, ...], first: int) -> int:
+    """How many of the first views are there still."""
+    return first if len(after) == len(before) else sum(view in after for view in before[:first])
 
 
 def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:

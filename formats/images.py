@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, MixedSizes
-from formats.foreign import HEAD, identify
+from formats.foreign import HEAD, KINDS, identify
 from formats.inputs import open_input
 from formats.png import png_writer
 
@@ -115,7 +115,8 @@ def read_alpha(path: Path | str) -> np.ndarray:
     with _decoded(path) as image:
         if not image.has_transparency_data:
             return np.full(image.size[::-1], 255, np.uint8)
-        return np.array(_rgba(image, True).getchannel("A"))
+        has_channel = "A" in image.getbands()
+        return np.array((image if has_channel else _rgba(image, True)).getchannel("A"))
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -264,9 +265,9 @@ def _unidentified(error: Exception) -> bool:
 def _unread(path: Path | str, head: bytes) -> FormatError:
     """The error for a file that is no picture of a known format."""
     found = identify(head, Path(path).suffix)
-    if found is None:
+    if found is None or not found.extra and found.what in (KINDS["photo"][0], KINDS["heif"][0]):
         return BadImage(
-            f"{path}: the picture cannot be decoded (it is in no known format); replace or remove it"
+            f"{path}: the picture cannot be decoded (damaged, or in no known format); replace or remove it"
         )
     kind = MissingExtra if found.extra else BadImage
     return kind(f"{path}: is {found.what}, which is not read as a photo; {found.cure}")

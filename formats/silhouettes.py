@@ -146,25 +146,30 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
         return Shown(views)
     looked_at = sampled(having)
     found = outlines(looked_at, alpha_outline)
-    transparent = [outline for outline in found if outline.clear >= TRANSPARENT]
-    share = len(transparent) / len(found) * len(having) / len(views)
-    channel = (
-        f"the alpha channel of {len(having)} of {len(views)} photos, such as {having[0].image_path.name},"
-    )
-    nothing = not any(outline.box for outline in found)
-    if share < 0.5 or nothing or _is_frame(transparent, looked_at):
+    telling = [outline for outline in found if outline.box]  # others show nothing at all
+    transparent = [outline for outline in telling if outline.clear >= TRANSPARENT]
+    share = len(transparent) / max(len(telling), 1)
+    name = having[0].image_path.name
+    channel = f"the alpha channel of {len(having)} of {len(views)} photos, such as {name},"
+    most = share * len(having) >= 0.5 * len(views)
+    if not most or _is_frame(transparent, looked_at):
         note = f"{channel} says nothing and is not used"
         if transparent:
-            what = "frames them" if share >= 0.5 else f"is transparent in {share:.0%} of all"
+            what = "frames them" if most else "is transparent in too few to cut an object out"
             note = f"{channel} {what}: photos show surroundings, and pixels that are transparent are ignored"
         return Shown(tuple(_opaque(view, bool(transparent)) for view in views), notes=(note,))
-    notes, whole = [], len(views) - round(share * len(views))
-    if whole:
+    notes = []
+    if bare := len(views) - len(having):
         notes.append(
-            f"{whole} of {len(views)} photos show no transparency where the others cut out what they show; "
-            "what is around it in these is learnt as well: cut them out too, or remove them"
+            f"{bare} of {len(views)} photos have no alpha and are left out, since it cuts out the others"
         )
-    return Shown(views, tuple(looked_at), tuple(found), tuple(notes))
+    if share < 1:
+        whole = round((1 - share) * len(having))
+        notes.append(
+            f"{whole} of {len(views)} photos show no transparency where that cuts out the others: all that they "
+            "show is learnt; cut them out too, or remove them"
+        )
+    return Shown(tuple(having), tuple(looked_at), tuple(found), tuple(notes))
 
 
 def _opaque(view: View, ignoring: bool) -> View:

@@ -136,6 +136,16 @@ def test_a_wrong_outline_does_not_widen_the_box(tmp_path):
     assert "1 of 12 photos show no transparency" in read.notes[0]
 
 
+def test_photos_without_alpha_among_those_that_it_cuts_out(tmp_path):
+    read = capture(tmp_path, lambda i: room(i) if i in (0, 7) else free_ball(i))
+    assert len(read.train) == 10 and "2 of 12 photos have no alpha and are left out" in read.notes[0]
+
+
+def test_photos_that_show_nothing_of_it_tell_nothing(tmp_path):
+    read = capture(tmp_path, lambda i: free_ball(i) if i < 8 else with_alpha(room(i), 0))
+    assert not read.opaque and len(read.train) == 12 and read.notes == ()
+
+
 # --- grounds ------------------------------------------------------------------------------------------------
 
 
