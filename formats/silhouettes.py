@@ -166,8 +166,8 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
     if share < 1:
         whole = round((1 - share) * len(having))
         notes.append(
-            f"{whole} of {len(views)} photos show no transparency where that cuts out the others: all that they "
-            "show is learnt; cut them out too, or remove them"
+            f"{whole} of {len(views)} photos show no transparency where that cuts out the others: all that "
+            "they show is learnt; cut them out too, or remove them"
         )
     return Shown(tuple(having), tuple(looked_at), tuple(found), tuple(notes))
 
