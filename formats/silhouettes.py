@@ -38,6 +38,10 @@ CELLS = 32
 AMISS, AMISS_ON_WHITE = 0.1, 0.34
 """Share of the outlines that may exclude a place where the object is: some are wrong, and what is white on
 white is in none."""
+RARELY = 0.5
+"""Of the median number of views that show a place which outlines leave: what fewer show lies beside it."""
+LEAST_WHOLE = 3
+"""Outlines that their photos do not cut off, at least, if they are to tell how large the object is."""
 MARGIN = 1.05
 """Factor on how far the rays around an object pass its middle."""
 
@@ -267,19 +271,20 @@ def outline_box(shown: Shown, amiss: float = AMISS) -> np.ndarray:
 
 
 def _around(views: Sequence[View], boxes: Sequence[tuple]) -> np.ndarray:
-    """(6,) cube that holds what the outlines show: of one that its photo cuts off, at least as far as the
-    cameras."""
-    eyes = np.array([view.camera_to_world[:3, 3] for view in views])
-    corners = np.array([view.corners(1.0, box) for view, box in zip(views, boxes, strict=True)])
-    rays = corners - eyes[:, None]
+    """(6,) cube that holds what the outlines show, as those tell that their photos do not cut off; without
+    any, as far as the cameras."""
+    sizes = np.array([(view.width, view.height) for view in views])
+    whole = (np.array(boxes)[:, :2] > 1).all(1) & (np.array(boxes)[:, 2:] < sizes - 1).all(1)
+    told = whole if whole.sum() >= LEAST_WHOLE else np.ones(len(views), bool)
+    eyes = np.array([view.camera_to_world[:3, 3] for view in views])[told]
+    corners = [view.corners(1.0, box) for view, box, tells in zip(views, boxes, told, strict=True) if tells]
+    rays = np.array(corners) - eyes[:, None]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     middles = rays.mean(1) / np.linalg.norm(rays.mean(1), axis=1, keepdims=True)
     centre = nearest_point(eyes, middles)
     away = np.linalg.norm(np.cross(centre - eyes[:, None], rays), axis=2).max(1)
     half = MARGIN * float(np.quantile(away, 1 - AMISS / 2))
-    sizes = np.array([(view.width, view.height) for view in views])
-    cut = (np.array(boxes)[:, :2] <= 1).any(1) | (np.array(boxes)[:, 2:] >= sizes - 1).any(1)
-    if cut.mean() > AMISS:
+    if told is not whole:
         half = max(half, float(np.median(np.linalg.norm(eyes - centre, axis=1))))
     return np.concatenate([centre - half, centre + half])
 
@@ -296,7 +301,6 @@ def _narrowed(box: np.ndarray, views: Sequence[View], boxes: Sequence[tuple], am
         beside = np.maximum(np.maximum(left - column, column - right), np.maximum(top - row, row - bottom))
         seen += inside
         excluded += inside & (beside > slack)
-    kept = steps[(seen > 0) & (excluded <= amiss * seen)]
-    if not len(kept):
-        return box
+    left = (seen > 0) & (excluded <= amiss * seen)
+    kept = steps[left & (seen >= RARELY * np.median(seen[left]))] if left.any() else steps
     return np.concatenate([low + kept.min(0) * cell, low + (kept.max(0) + 1) * cell])

@@ -136,6 +136,16 @@ def test_a_wrong_outline_does_not_widen_the_box(tmp_path):
     assert "1 of 12 photos show no transparency" in read.notes[0]
 
 
+def test_the_box_where_photos_cut_the_object_off(tmp_path):
+    """Some of them, at their borders: the others tell how large it is."""
+    centre = np.array([1.9, -0.2, 0.5])
+    cut = [any(ball(i, centre)[at].any() for at in (0, -1, (..., 0), (..., -1))) for i in range(12)]
+    assert 4 <= sum(cut) <= 9
+    read = capture(tmp_path, lambda i: with_alpha(room(i), 255 * ball(i, centre)))
+    low, high = (read.aabb.reshape(2, 3) - centre) / RADIUS
+    assert (low <= -1).all() and (high >= 1).all() and low.min() > -3 and high.max() < 3
+
+
 def test_photos_without_alpha_among_those_that_it_cuts_out(tmp_path):
     read = capture(tmp_path, lambda i: room(i) if i in (0, 7) else free_ball(i))
     assert len(read.train) == 10 and "2 of 12 photos have no alpha and are left out" in read.notes[0]
