@@ -12,6 +12,7 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from formats.errors import BadIntrinsics, BadJson, BadSchema, LimitExceeded, NoViews, UnsupportedCamera
+from formats.foreign import foreign_json
 from formats.images import MAX_SIDE, read_image_header
 from formats.inputs import decoded, read_input
 from formats.names import distinct_names
@@ -70,7 +71,8 @@ def read_document(path: Path) -> dict:
     except ValueError as error:
         raise BadJson(f"{path}: not JSON: {error}{_cure(error)}") from error
     if not isinstance(document, dict):
-        raise BadSchema(f"{path}: found a JSON {type(document).__name__}, expected an object with frames")
+        found = f"{path}: found a JSON {type(document).__name__}, expected an object with frames"
+        raise foreign_json(path) or BadSchema(found)
     return document
 
 
@@ -91,6 +93,8 @@ def _cure(error: ValueError) -> str:
 def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
     """The frames as listed, empty for those that are no objects; BadSchema unless they are a list of some."""
     frames = document.get(key)
+    if frames is None and key == "frames" and (foreign := foreign_json(path)):
+        raise foreign
     if not isinstance(frames, list) or frames and not any(isinstance(frame, dict) for frame in frames):
         raise BadSchema(f'{path}: expected "{key}" to be a list of objects, one per camera, with their poses')
     return [frame if isinstance(frame, dict) else {} for frame in frames]

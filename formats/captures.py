@@ -16,29 +16,30 @@ import numpy as np
 from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
-from formats.errors import BadMesh, BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
-from formats.frame import default_box, object_box, scene_frame, shown_box, subject_box
+from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
+from formats.foreign import is_json, not_a_capture
+from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
+from formats.masks import with_masks_beside
 from formats.matching import gone, match_photos
-from formats.meshes import is_mesh, mesh_capture, unreadable_mesh
+from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
+    alike_turned,
     chosen_copy,
     copies,
-    find_photo,
     has_pictures,
     is_file,
     load_ignored,
     load_images,
     load_photos,
     natural,
-    object_boxes,
     on_photo,
     pictures,
-    plain_background,
 )
 from formats.points import Points
+from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
 from formats.transforms import (
     BLENDER_FILE,
     Part,
@@ -64,8 +65,6 @@ __all__ = [
     "write_cameras",
     "write_capture",
 ]
-
-BLENDER_AABB = np.array([-1.5, -1.5, -1.5, 1.5, 1.5, 1.5])
 
 
 def is_capture(path: Path | str) -> bool:
@@ -93,7 +92,7 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
     `downscale` times smaller (None: until it is at most LONGEST), or a copy of that size is read.
 
     Raises BadImage, BadIntrinsics, BadJson, BadMask, BadMesh, BadModel, BadPose, BadSchema, LimitExceeded,
-    MissingFile, NoPoses, NoViews, UnsupportedCamera.
+    MissingExtra, MissingFile, NoPoses, NoViews, NotACapture, UnsupportedCamera.
     """
     path = Path(path)
     if not path.exists():
@@ -104,10 +103,10 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
         return mesh_capture(path)
     if path.is_dir():
         return _read_folder(path, downscale)
-    if sentence := unreadable_mesh(path):
-        raise BadMesh(sentence)
     if path.name == llff.NAME:
         return _read_llff(path, downscale)
+    if path.suffix.lower() != ".json" and not is_json(path):
+        raise not_a_capture(path)
     if match := BLENDER_FILE.fullmatch(path.name):
         return _read_blender(path, downscale, **{"test" if match[1] == "test" else "train": path})
     return _read_transforms(path, downscale)
@@ -137,10 +136,11 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
         return _read_polycam(path, *folders, downscale)
     if len(below := list(path.glob("*/transforms.json"))) == 1:
         return _read_transforms(below[0], downscale, path)
-    found = "pictures but" if has_pictures(path) else "no pictures and"
+    if not has_pictures(path):
+        raise not_a_capture(path)
     raise NoPoses(
-        f"{path}: found {found} no camera poses (transforms.json, transforms_train.json, COLMAP's sparse/0, "
-        "LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
+        f"{path}: found pictures but no camera poses (transforms.json, transforms_train.json, COLMAP's "
+        "sparse/0, LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
     )
 
 
@@ -151,7 +151,8 @@ def _read_blender(
     path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
 ) -> Capture:
     parts = [read_part(file, downscale) if file else Part() for file in (train, test)]
-    return _capture(path, "blender", *parts, stated=BLENDER_AABB)
+    first = train or test
+    return _capture(path, "blender", *parts, stated=stated_aabb(first, read_document(first)))
 
 
 def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:
@@ -174,20 +175,17 @@ def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     images = sorted(model.images, key=lambda image: natural(image.name))
     images = [image for image in images if files[image.name] in matched.photos]
     names = dict(zip(images, frame_names([{"file_path": image.name} for image in images]), strict=True))
-    headers = []
 
     def read(image: colmap.Image) -> View:
         photo, place = matched.photos[files[image.name]]
         header = read_image_header(photo)
-        mask, reduction = _model_mask(base, image.name), place.reduction(header, downscale)
+        reduction = place.reduction(header, downscale)
         view = replace(image.view, name=names[image])
-        view = on_photo(view, photo, header, image.where, mask, reduction)
-        headers.append(header)
-        return view
+        return on_photo(view, photo, header, image.where, reduction=reduction)
 
     views, broken = read_sound(folder, images, read, lambda image: str(matched.photos[files[image.name]][0]))
     notes = (*_other_models(path, folder), *model.notes, *matched.notes, *broken)
-    part = Part(tuple(views), any(header.alpha for header in headers), matched.missing, notes)
+    part = Part(tuple(views), matched.missing, notes)
     return _capture(path, "colmap", part, Part(), None, model.points)
 
 
@@ -200,13 +198,6 @@ def _other_models(path: Path, folder: Path) -> Iterator[str]:
             f"{path}: {folder.relative_to(path)}, a model of {colmap.image_count(folder)} photos, is read, "
             f"and not {named}; give the folder {others[0]} to read that one"
         )
-
-
-def _model_mask(base: Path, name: str) -> Path | None:
-    """COLMAP's mask of a photo, `masks/a.jpg.png`, or one by the photo's own name."""
-    masks = base / "masks"
-    exact = masks / f"{name}.png"
-    return exact if is_file(exact) else find_photo(masks, name)
 
 
 def _read_llff(path: Path, downscale: int | None) -> Capture:
@@ -222,15 +213,12 @@ def _read_llff(path: Path, downscale: int | None) -> Capture:
         )
     photos = pictures(place.path)
     sound = [(i, photo) for i, photo in enumerate(photos) if photo.stat().st_size]
-    headers = []
 
     def read(item: tuple[int, Path]) -> View:
         i, photo = item
         where, header = f"{path}: row {i} ({photo.name})", read_image_header(photo)
         view = replace(llff.row_view(where, rows[i]), name=photo.stem)
-        view = on_photo(view, photo, header, where, reduction=place.reduction(header, downscale))
-        headers.append(header)
-        return view
+        return on_photo(view, photo, header, where, reduction=place.reduction(header, downscale))
 
     views, broken = read_sound(path, sound, read, lambda item: item[1].name)
     order = (
@@ -239,7 +227,7 @@ def _read_llff(path: Path, downscale: int | None) -> Capture:
     )
     empty = tuple(photo.name for photo in photos if not photo.stat().st_size)
     notes = (order, *(f"{path}: {note}" for note in gone(empty)), *broken, *repair_notes(path, views))
-    part = Part(tuple(views), any(header.alpha for header in headers), empty, notes)
+    part = Part(tuple(views), empty, notes)
     return _capture(path, "llff", part, Part(), None)
 
 
@@ -252,23 +240,20 @@ def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
     files = {file.stem: file for file in polycam.camera_files(cameras)}
     matched = match_photos(cameras, images, files, downscale)
-    headers = []
 
     def read(name: str) -> View:
         photo, place = matched.photos[name]
         header = read_image_header(photo)
         view = polycam.read_camera(files[name], header[:2])
         reduction = place.reduction(header, downscale)
-        view = on_photo(view, photo, header, str(files[name]), reduction=reduction)
-        headers.append(header)
-        return view
+        return on_photo(view, photo, header, str(files[name]), reduction=reduction)
 
     views, broken = read_sound(cameras, [name for name in files if name in matched.photos], read, str)
     photos, poses = polycam.FOLDERS[0]
     lost = images.name != photos and (images.parent / poses).is_dir()
     uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
     notes = (*matched.notes, *uncorrected, *broken, *repair_notes(cameras, views))
-    part = Part(tuple(views), any(header.alpha for header in headers), matched.missing, notes)
+    part = Part(tuple(views), matched.missing, notes)
     return _capture(path, "polycam", part, Part(), None)
 
 
@@ -290,20 +275,35 @@ def _capture(
             f"{path}: no view is left, {len(missing)} of {len(missing)} listed frames have no photo on disk; "
             "put the photos where the file_path entries say"
         )
-    opaque = not (train.alpha or test.alpha)
-    poses = np.array([view.camera_to_world for view in views])
-    frame, box = None, subject_box(poses) if stated is None else stated.copy()
-    if opaque and not plain_background(views):
-        frame, box = _surroundings(views, poses, points)
-    cut_out = None
-    if (kept := object_boxes(views)) is not None:
-        corners = [view.corners(1.0, bounds) for view, bounds in zip(views, kept, strict=True)]
-        cut_out = object_box(poses[:, :3, 3], np.array(corners))
-    doubt = upward_doubt(poses) if frame is not None and len(views) >= LEAST_VIEWS else None
-    doubts = [f"{path}: {doubt}"] if doubt else []
-    notes = (*train.notes, *test.notes, *notes, *_smaller(path, views), *doubts)
+    views, sideways = alike_turned(views)
+    views, beside = with_masks_beside(views, path if path.is_dir() else path.parent)
+    masked = by_masks(views)
+    first_test = _left(views, masked.views, len(train.views))
+    seen = by_alpha(masked.views)
+    first_test = _left(masked.views, seen.views, first_test)
+    poses = np.array([view.camera_to_world for view in seen.views])
+    frame, box, opaque = None, stated, not seen.outlines
+    said = [sideways, *masked.notes, *seen.notes]
+    if opaque:
+        seen = by_ground(seen.views)
+        said += seen.notes
+    if not seen.outlines:
+        frame, box = _surroundings(seen.views, poses, points)
+    elif not opaque or box is None:
+        box = outline_box(seen, AMISS_ON_WHITE if opaque else AMISS)
+    cut_out = outline_box(masked) if masked.outlines else None
+    if frame is not None and len(seen.views) >= LEAST_VIEWS:
+        said.append(upward_doubt(poses))
+    notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in said if note))
+    notes = (*notes, *_smaller(path, seen.views))
     notes = tuple(dict.fromkeys(map(printable, notes)))  # they have names from the file
-    return Capture(path, kind, train.views, test.views, box, opaque, cut_out, missing, points, frame, notes)
+    parts = seen.views[:first_test], seen.views[first_test:]
+    return Capture(path, kind, *parts, box, opaque, cut_out, missing, points, frame, notes)
+
+
+def _left(before: tuple[View, ...], after: tuple[View, ...], first: int) -> int:
+    """How many of the first views are there still."""
+    return first if len(after) == len(before) else sum(view in after for view in before[:first])
 
 
 def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:

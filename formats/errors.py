@@ -154,6 +154,10 @@ class CyclicScene(FormatError):
 # --- captures and pictures ----------------------------------------------------------------------------------
 
 
+class NotACapture(FormatError):
+    """What was given as a capture is another kind of file, or a folder without photos and poses."""
+
+
 class NoPoses(FormatError):
     """Pictures, or a file, without the camera poses that say where they were taken from."""
 

@@ -23,8 +23,6 @@ OUTLIERS = 0.001
 """Share of a view's points that may lie nearer than its `near`, and farther than its `far`."""
 MARGIN = 1.25
 """Factor on the extent of the sparse points, since other parts of the scene may reach farther."""
-OBJECT_MARGIN = 1.05
-"""Factor on the extent of an object that masks cut out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +96,6 @@ def _crossings(eyes: np.ndarray, looks: np.ndarray) -> tuple[np.ndarray, np.ndar
     return middle, (t_i > 0) & (t_j > 0)
 
 
-def subject_box(poses: np.ndarray) -> np.ndarray:
-    """(6,) cube around the point nearest to all optical axes, out to the median camera distance: for a
-    subject that stands free before the cameras."""
-    centre = nearest_point(poses[:, :3, 3], poses[:, :3, 2])
-    half = float(np.median(np.linalg.norm(poses[:, :3, 3] - centre, axis=1))) or 1.0
-    return np.concatenate([centre - half, centre + half])
-
-
 def nearest_point(eyes: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """(3,) the point with the least sum of squared distances to lines through eyes (N, 3) along unit axes."""
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -129,21 +119,6 @@ def default_box(frame: SceneFrame, poses: np.ndarray, points: np.ndarray | None)
         far = np.quantile(np.abs(points - frame.focus).max(1), SHOWN) / unit
         reach = float(np.clip(MARGIN * far, *REACHES))
     return np.concatenate([frame.focus - reach * unit, frame.focus + reach * unit])
-
-
-def object_box(eyes: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(6,) cube around an object that (N, 3) eyes see between the rays through (N, 4, 3) points.
-
-    The centre is nearest to the rays through the middles of those; the cube holds the largest of the spheres
-    around it that reach out to a view's rays, except for outliers.
-    """
-    rays = corners - eyes[:, None]
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    middle = rays.mean(1) / np.linalg.norm(rays.mean(1), axis=1, keepdims=True)
-    centre = nearest_point(eyes, middle)
-    away = np.linalg.norm(np.cross(centre - eyes[:, None], rays), axis=2).max(1)
-    half = OBJECT_MARGIN * float(np.quantile(away, 0.95))
-    return np.concatenate([centre - half, centre + half])
 
 
 def shown_box(corners: np.ndarray) -> np.ndarray:

@@ -24,7 +24,16 @@ from formats.errors import (
     NoViews,
     ResourceError,
 )
-from formats.images import Header, oriented, read_image, read_image_header, read_mask
+from formats.images import (
+    Header,
+    decoded_at_once,
+    decoding_bytes,
+    oriented,
+    read_alpha,
+    read_image,
+    read_image_header,
+    read_mask,
+)
 from formats.views import View
 
 EXTENSIONS = (
@@ -40,12 +49,10 @@ LONGEST = 1080
 photo is made smaller; unless a factor is asked for."""
 MAX_ASPECT_ERROR = 0.02
 """Relative difference allowed between the aspect ratios of a photo and its camera, for rounded sizes."""
-SAMPLED = 6
-"""Number of photos that are examined for a plain background."""
-PLAIN = 3
-"""Levels of 255 by which a plain background may vary."""
-BORDER_KEPT = 0.3
-"""Masks that keep less than this share of the photos' borders cut out an object; others hide passers-by."""
+OPAQUE = 128
+"""Alpha from which on a pixel of a photo counts where its transparent ones are ignored."""
+MOVING = "dynamic_mask_"
+"""instant-ngp's masks begin so, and are white where the photo must be ignored."""
 DIGITS = re.compile(r"(\d+)")
 
 
@@ -169,14 +176,14 @@ def on_photo(
     """The view with its camera scaled to the photo on disk, which is made `reduction` times smaller.
 
     Tools disagree on whether poses refer to the pixels as stored or as turned by EXIF: the orientation whose
-    aspect ratio equals the camera's is used, and the pixels as stored where both do. Raises BadIntrinsics
-    where neither does, and BadMask where the mask has neither the photo's nor the camera's size.
+    aspect ratio is nearer to the camera's is used, and the pixels as stored where both are as near (see
+    `alike_turned`). Raises BadIntrinsics where neither fits, and BadMask where the mask has another shape.
     """
-    for orientation in (1, header.orientation):
-        size = (header.width, header.height)[:: -1 if orientation >= 5 else 1]
-        if _same_shape(size, (view.width, view.height)):
-            break
-    else:
+    stored, camera = (header.width, header.height), (view.width, view.height)
+    turned = stored[:: -1 if header.orientation >= 5 else 1]
+    choices = ((1, stored), (header.orientation, turned))
+    orientation, size = min(choices, key=lambda choice: _shape_error(choice[1], camera))
+    if not _same_shape(size, camera):
         raise BadIntrinsics(
             f"{where}: w and h say {view.width}x{view.height}, but {photo.name} is {header.width}x"
             f"{header.height}, another shape; use the photos that the poses were estimated from"
@@ -186,21 +193,57 @@ def on_photo(
             f"{where}: {photo.name} is {header.width}x{header.height} and cannot be made {reduction} times "
             "smaller; give a smaller --downscale"
         )
-    fitted = replace(view.stretched(*size), image_path=photo, orientation=orientation).reduced(reduction)
-    if mask is None:
-        return fitted
-    found = read_image_header(mask)
-    if (found.width, found.height) not in (size, (view.width, view.height)):
+    fitted = replace(
+        view.stretched(*size),
+        image_path=photo,
+        orientation=orientation,
+        exif=header.orientation,
+        alpha=header.alpha,
+    ).reduced(reduction)
+    return fitted if mask is None else with_mask(fitted, mask, where)
+
+
+def with_mask(view: View, mask: Path, where: str | None = None) -> View:
+    """The view with a mask; BadMask where that has another shape than its photo."""
+    header, size, photo = read_image_header(mask), (view.width, view.height), view.image_path
+    found = (header.width, header.height)
+    turns = [found, found[::-1]] if view.orientation >= 5 else [found]
+    slack = 1 + (view.reduction > 1) / min(size)  # what is cut off of a photo that is made smaller
+    if min(_shape_error(sides, size) for sides in turns) > slack * (1 + MAX_ASPECT_ERROR):
+        wide, high = (side * view.reduction for side in size)
         raise BadMask(
-            f"{where}: the mask {mask} is {found.width}x{found.height}, but {photo.name} is {size[0]}x"
-            f"{size[1]}; make masks of the photo's size"
+            f"{where or photo}: the mask {mask} is {found[0]}x{found[1]}, but {photo.name} is {wide}x{high}; "
+            "make masks of the photo's size"
         )
-    return replace(fitted, mask_path=mask)
+    return replace(view, mask_path=mask)
+
+
+def alike_turned(views: Sequence[View]) -> tuple[tuple[View, ...], str | None]:
+    """Views whose photos are all read as stored or all as their EXIF turns them, as those say whose shape
+    tells it; and a sentence where nothing tells, but it matters."""
+    told = [view.orientation for view in views if view.exif >= 5 and view.width != view.height]
+    turned = sum(orientation != 1 for orientation in told)
+    open_ = [view for view in views if view.exif != 1 and (view.exif < 5 or view.width == view.height)]
+    if not open_ or 2 * turned < len(told):
+        return tuple(views), None
+    if not told:
+        return tuple(views), (
+            f"EXIF turns {len(open_)} of {len(views)} photos, such as {open_[0].image_path.name}, and their "
+            "shape does not tell whether the poses are of them so: they are read as stored"
+        )
+    chosen = {id(view) for view in open_}
+    return tuple(replace(v, orientation=v.exif) if id(v) in chosen else v for v in views), None
+
+
+def _shape_error(a: tuple[int, int], b: tuple[int, int]) -> float:
+    """The ratio of two sizes' aspect ratios, 1 or more."""
+    ratio = a[0] * b[1] / (a[1] * b[0])
+    return max(ratio, 1 / ratio)
 
 
 def _same_shape(a: tuple[int, int], b: tuple[int, int]) -> bool:
     """Whether two sizes have the same aspect ratio, up to rounding."""
-    return abs(a[0] * b[1] / (a[1] * b[0]) - 1) <= MAX_ASPECT_ERROR
+    return _shape_error(a, b) <= 1 + MAX_ASPECT_ERROR
 
 
 # --- decoding -----------------------------------------------------------------------------------------------
@@ -244,11 +287,11 @@ def load_photos(views: Sequence[View], masks: str = "ignore") -> Photos:
 
     def load(view: View, span: tuple[int, int]) -> None:
         part = slice(*span)
-        pixels[part] = _decoded(view).reshape(-1, 4)
+        _decode(view, pixels[part].reshape(view.height, view.width, 4))
         if view.mask_path:
             ignored[part] = load_ignored(view).ravel()
 
-    with ThreadPoolExecutor() as threads:
+    with decoders(views) as threads:
         for _ in threads.map(load, views, pairwise(first.tolist())):
             pass
     if masks == "alpha" and ignored is not None:
@@ -273,11 +316,16 @@ def load_images(views: Sequence[View]) -> np.ndarray:
 
 
 def load_ignored(view: View) -> np.ndarray | None:
-    """(H, W) bool, True where the view's mask is dark; None where it has none. A larger mask is sampled at
-    the photo's pixel centres. Raises BadMask, BadImage, MissingFile."""
+    """(H, W) bool, True where the view's mask is dark; None where it has none. A mask of another size is
+    sampled at the photo's pixel centres. Raises BadMask, BadImage, MissingFile."""
     if view.mask_path is None:
         return None
-    kept = read_mask(view.mask_path)
+    if view.mask_path == view.image_path:
+        kept = oriented(read_alpha(view.mask_path) >= OPAQUE, view.orientation)
+    else:
+        kept = read_mask(view.mask_path) != view.mask_path.name.startswith(MOVING)
+        if not _same_shape(kept.shape[::-1], (view.width, view.height)) and view.orientation >= 5:
+            kept = oriented(kept, view.orientation)
     high, wide = kept.shape
     rows, columns = _sampled(high, view.height, view.reduction), _sampled(wide, view.width, view.reduction)
     if not _same_shape((wide, high), (view.width, view.height)) and view.reduction == 1:
@@ -295,57 +343,36 @@ def _sampled(stored: int, shown: int, reduction: int) -> np.ndarray:
     return ((np.arange(shown) + 0.5) * span / shown).astype(int)
 
 
-def plain_background(views: Sequence[View]) -> bool:
-    """Whether SAMPLED of the photos all have one and the same colour along their borders, as pictures of an
-    object without surroundings do."""
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
-    lowest, highest = np.full(3, 255), np.zeros(3, int)
-    for view in chosen:
-        picture = _decoded(view)[..., :3]
-        border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
-        lowest, highest = np.minimum(lowest, border.min(0)), np.maximum(highest, border.max(0))
-        if (highest - lowest > PLAIN).any():
-            return False
-    return True
+def loading_bytes(views: Sequence[View]) -> int:
+    """Memory that decoding photos takes at most, beside their pixels."""
+    return decoding_bytes(*_largest(views))
 
 
-def object_boxes(views: Sequence[View]) -> list[tuple[int, int, int, int]] | None:
-    """Left, top, right, bottom of what the mask of each view keeps, where masks cut out an object: all views
-    have one, and most of the border of the photos is ignored. None otherwise."""
-    if not all(view.mask_path for view in views):
-        return None
-    with ThreadPoolExecutor() as threads:
-        found = list(threads.map(_kept_box, views))
-    if np.mean([share for _, share in found]) > BORDER_KEPT:
-        return None
-    return [box for box, _ in found]
+def decoders(views: Sequence[View]) -> ThreadPoolExecutor:
+    """Threads for work that decodes a view's photo or mask each, fewer where photos are large."""
+    return ThreadPoolExecutor(decoded_at_once(*_largest(views)))
 
 
-def _kept_box(view: View) -> tuple[tuple[int, int, int, int], float]:
-    """Bounds of what a mask keeps (of the photo, if nothing), and the kept share of the border."""
-    kept = ~load_ignored(view)
-    border = float(np.mean(np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])))
-    if not kept.any():
-        return (0, 0, view.width, view.height), border
-    rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
-    return (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1), border
+def _largest(views: Sequence[View]) -> tuple[int, int]:
+    """Stored sides, about, of the largest photo."""
+    largest = max(views, key=lambda view: view.width * view.height * view.reduction**2)
+    return largest.width * largest.reduction, largest.height * largest.reduction
 
 
 def _named(view: View) -> Path | str:
     return view.image_path or view.name
 
 
-def _decoded(view: View) -> np.ndarray:
-    """(H, W, 4) uint8 of one view's photo."""
-    if view.pixels is None and view.image_path is None:
-        raise MissingFile(f"view {view.name}: has a camera but no photo")
+def decoded(view: View) -> np.ndarray:
+    """(H, W, 4) uint8 of one view's photo. Raises as `load_photos`."""
+    return _decode(view, np.empty((view.height, view.width, 4), np.uint8))
+
+
+def _decode(view: View, out: np.ndarray) -> np.ndarray:
+    """The same into an array."""
     if view.pixels is not None:
-        pixels = oriented(view.pixels, view.orientation)
-    else:
-        pixels = read_image(view.image_path, view.orientation, view.reduction)
-    if pixels.shape != (view.height, view.width, 4):
-        height, width = pixels.shape[:2]
-        raise MixedSizes(
-            f"{_named(view)} is {width}x{height} now, expected {view.width}x{view.height}; read it again"
-        )
-    return pixels
+        out[:] = oriented(view.pixels, view.orientation)
+        return out
+    if view.image_path is None:
+        raise MissingFile(f"view {view.name}: has a camera but no photo")
+    return read_image(view.image_path, view.orientation, view.reduction, view.alpha, out)

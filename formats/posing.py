@@ -21,8 +21,9 @@ from formats import colmap
 from formats.atomic import atomic_folder
 from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
+from formats.foreign import beside_photos, not_a_capture
 from formats.frame import scene_frame
-from formats.images import Header, read_focal, read_image_header, write_smaller
+from formats.images import Header, decoded_at_once, read_focal, read_image_header, write_smaller
 from formats.locks import temporary_folder
 from formats.mapper import MAX_SIDE
 from formats.photos import copies, natural, pictures
@@ -71,17 +72,26 @@ def check_extra(folder: Path | str) -> None:
 
 
 def photos_to_pose(folder: Path | str) -> list[Path]:
-    """The photos of a folder, or of its `images`, in natural order. Raises MissingFile, NoViews."""
+    """The photos of a folder, or of its `images` where there are more of them, in natural order.
+
+    Raises BadImage, MissingExtra, MissingFile, NotACapture, NoViews.
+    """
     folder = Path(folder)
+    if not folder.exists():
+        raise MissingFile(f"{folder}: no such folder; give the folder that the photos lie in")
+    if not folder.is_dir():
+        raise not_a_capture(folder)
     places = (folder, *(place.path for place in copies(folder / "images")))
-    found = next((files for files in map(pictures, places) if files), [])
+    found = max(map(pictures, places), key=len)  # one beside `images` is a thumbnail
     if not found:
-        raise MissingFile(f"{folder}: holds no photos; give the folder that they lie in")
+        raise not_a_capture(folder)
     read_image_header(found[0])  # of a kind that is not read, it is named before any work
     if len(found) < LEAST_PHOTOS:
+        beside = beside_photos(folder)
+        more = f"; it holds {beside[0]} as well, {beside[1].what}: {beside[1].cure}" if beside else ""
         raise NoViews(
             f"{folder}: holds {len(found)} photos, but where they were taken follows from {LEAST_PHOTOS} or "
-            "more that overlap; take more, from different places"
+            f"more that overlap; take more, from different places{more}"
         )
     return sorted(found, key=lambda file: natural(file.name))
 
@@ -160,17 +170,17 @@ def _prepare(work: Path, photos: Sequence[Path], threads: int, progress) -> list
     """
     progress.phase("reading", len(photos))
 
-    def prepare(item: tuple[int, Path]) -> tuple[Header, tuple]:
+    def prepare(item: tuple[int, Path]) -> tuple:
         i, photo = item
         size = write_smaller(photo, work / f"{i:06d}.png", MAX_SIDE)
-        header, focal = read_image_header(photo), read_focal(photo)
-        pixels = None if focal is None else focal * float(np.hypot(*size))
-        return header, (*size, pixels)
+        focal = read_focal(photo)
+        return (*size, None if focal is None else focal * float(np.hypot(*size)))
 
-    headers, cameras = [], {}
-    with ThreadPoolExecutor(threads) as pool:
-        for i, (header, camera) in enumerate(pool.map(prepare, enumerate(photos))):
-            headers.append(header)
+    headers, cameras = [read_image_header(photo) for photo in photos], {}
+    largest = max(headers, key=lambda header: header.width * header.height)
+    at_once = min(threads, decoded_at_once(largest.width, largest.height))
+    with ThreadPoolExecutor(at_once) as pool:
+        for i, camera in enumerate(pool.map(prepare, enumerate(photos))):
             # Photos of one size and focal length are taken to be of one camera.
             cameras.setdefault(camera, []).append(f"{i:06d}.png")
             progress.advance(i + 1)

@@ -38,11 +38,9 @@ AGREEING = 0.95
 
 @dataclass(frozen=True)
 class Part:
-    """The views of one split, whether any has alpha, the missing photos, and notes on where photos are read
-    from."""
+    """The views of one split, the missing photos, and notes on where photos are read from."""
 
     views: tuple[View, ...] = ()
-    alpha: bool = False
     missing: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -109,7 +107,6 @@ def _part(
     found = [item for item in frames if _file(item) in matched.photos]
     found, notes = once(path, found, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
     names = dict(zip((i for i, _ in found), frame_names([frame for _, frame in found]), strict=True))
-    headers = []
 
     def read(item: Numbered) -> View:
         (i, frame), where = item, frame_where(path, *item)
@@ -118,14 +115,12 @@ def _part(
         view = frame_view(where, document, frame, names[i], header[:2])
         mask = _mask(path, folder.factor, frame, where)
         view = replace(view, seen=_stated_points(where, frame))
-        view = on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
-        headers.append(header)
-        return view
+        return on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
 
     views, broken = read_sound(path, found, read, photo_of)
     missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
     notes = (*notes, *broken, *repair_notes(path, views))
-    return Part(tuple(views), any(header.alpha for header in headers), missing, notes)
+    return Part(tuple(views), missing, notes)
 
 
 def _file(item: Numbered) -> str:

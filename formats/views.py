@@ -6,6 +6,7 @@ distortion, or for a fisheye (x, -y) * r(a) / |(x, y)| with a the angle from -z.
 and down, and the centre of the top left pixel is (0.5, 0.5).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,11 +52,16 @@ class View:
     image_path: Path | None = None
     orientation: int = 1
     """EXIF orientation to apply to the photo's stored pixels to get this camera's; 1 for none."""
+    exif: int = 1
+    """The orientation that the photo's EXIF states, applied or not."""
     reduction: int = 1
     """Pixels a side of the turned photo that one of this camera's is the mean of; those that are left over at
     its right and lower border are not used."""
     mask_path: Path | None = None
-    """A picture of the same aspect ratio, black where the photo must be ignored."""
+    """A picture of the same aspect ratio, black where the photo must be ignored; or the photo itself, whose
+    transparent pixels must be."""
+    alpha: bool = True
+    """Whether the photo's alpha channel, if it has one, says where nothing is; False: all of it is opaque."""
     near: float | None = None
     far: float | None = None
     """Depths (along -z, world units) between which lie the sparse points that it sees, except for one in a
@@ -89,12 +95,50 @@ class View:
         local = np.stack([x / self.fl_x, -y / self.fl_y, -np.ones(4)], 1) * depth
         return local @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3]
 
+    def shown(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Where the picture shows world points (N, 3): column, row, how far they are, along the axis or, of a
+        fisheye, in all, and which of them lie in the picture, (N,) each."""
+        x, y, back = ((points - self.camera_to_world[:3, 3]) @ self.camera_to_world[:3, :3]).T
+        if self.fisheye:
+            away, aside = np.sqrt(x * x + y * y + back * back), np.hypot(x, y)
+            angle = np.arctan2(aside, -back)
+            stretch, slope = _polynomial(self.distortion, angle * angle)
+            rising = stretch + 2 * angle * angle * slope > 0
+            u, v = np.array([x, -y]) * angle * stretch / np.maximum(aside, 1e-12)
+        else:
+            away, rising = -back, True
+            u, v = np.array([x, -y]) / np.where(away > 0, away, np.inf)
+            if any(self.distortion):
+                u, v, rising = _bent(u, v, self.distortion)
+        column, row = self.cx + self.fl_x * u, self.cy + self.fl_y * v
+        across, down = (column >= 0) & (column < self.width), (row >= 0) & (row < self.height)
+        return column, row, away, (away > 0) & rising & across & down
+
     def reframed(self, width: int, height: int) -> "View":
         """The same camera at another size: its horizontal field of view stays, rows are cut or added."""
         scale = width / self.width
         cy = height / 2 + (self.cy - self.height / 2) * scale
         focal = {"fl_x": self.fl_x * scale, "fl_y": self.fl_y * scale, "cx": self.cx * scale, "cy": cy}
         return replace(self, width=width, height=height, **focal)
+
+
+def _bent(u: np.ndarray, v: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """Where a lens shows (u, v), and whether no fold of it lies nearer, beyond which points come back."""
+    k1, k2, k3, p1, p2, k4, *below = (*distortion, *(0.0,) * (9 - len(distortion)))
+    r2 = u * u + v * v
+    (up, up_slope), (down, down_slope) = _polynomial((k1, k2, k3, k4), r2), _polynomial(below, r2)
+    stretch = up / down
+    rising = stretch + 2 * r2 * (up_slope - stretch * down_slope) / down > 0
+    across = 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    return u * stretch + across, v * stretch + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v, rising
+
+
+def _polynomial(factors: Sequence[float], x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """1 + f1 x + f2 x² + ..., and its slope."""
+    value, slope = np.zeros_like(x), np.zeros_like(x)
+    for factor in (*reversed(factors), 1.0):
+        value, slope = value * x + factor, slope * x + value
+    return value, slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +151,10 @@ class Capture:
     train: tuple[View, ...]
     test: tuple[View, ...]
     aabb: np.ndarray
-    """(6,) float64 [xmin ymin zmin xmax ymax zmax] in world units: where the subject is taken to be."""
+    """(6,) float64 [xmin ymin zmin xmax ymax zmax] in world units: where the subject is taken to be; where
+    alpha or a white ground shows its outlines, what they leave room for."""
     opaque: bool
-    """No picture has an alpha channel."""
+    """No picture's alpha says where nothing is."""
     object_aabb: np.ndarray | None = None
     """(6,) the box of the object that the masks cut out, where they do."""
     missing: tuple[str, ...] = ()

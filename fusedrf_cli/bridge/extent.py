@@ -39,6 +39,9 @@ empty, for all other cameras too."""
 FAR_AWAY = 64.0
 """Times its longest side from the world's origin a box has a frame of its own."""
 
+BOX_CELLS = 64
+"""Along the longest axis of the hull that only gives the box of what alpha shows."""
+
 
 @dataclass(frozen=True, eq=False)
 class Extent:
@@ -94,11 +97,15 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     box = capture.aabb if capture.object_aabb is None else capture.object_aabb
     box = np.asarray(box if request.aabb is None else request.aabb, np.float64)
     extent = in_own_frame(box)
-    if capture.object_aabb is None:
+    views = [extent.view(view) for view in capture.train]
+    if capture.object_aabb is not None:
+        # Rays through pixels of an object alone do not tell what is empty around it; its visual hull does.
+        hull = visual_hull(views, extent.box)
+        return replace(extent, box=hull.aabb, cells=hull)
+    if request.aabb is not None or capture.opaque or capture.kind == "mesh":
         return extent
-    # Rays through pixels of an object alone do not tell what is empty around it; its visual hull does.
-    hull = visual_hull([extent.view(view) for view in capture.train], extent.box)
-    return replace(extent, box=hull.aabb, cells=hull)
+    # Its cells are not kept to: transparent pixels tell what is empty in the box.
+    return replace(extent, box=visual_hull(views, extent.box, BOX_CELLS).aabb)
 
 
 def in_own_frame(box: np.ndarray) -> Extent:

@@ -1,4 +1,4 @@
-"""The visual hull of an object that masks cut out: where in a box it can be."""
+"""The visual hull of an object that masks or alpha cut out: where in a box it can be."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label, maximum
 
-from formats.captures import load_ignored
+from formats.photos import decoders
+from formats.silhouettes import shown_pixels
 from formats.views import View
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import projected
 
-CELLS = (32, 112)
-"""Along the longest axis, of a first look and of a second one into what that leaves."""
+COARSE, FINE = 32, 112
+"""Cells along the longest axis, of a first look and of a second one into what that leaves."""
 VIEWS = 100
 """At most so many masks, evenly spaced in the list, are looked at."""
 LOOKED_AT = 300
@@ -24,25 +25,25 @@ RARELY = 0.5
 beside the object, and only photos tell of it in which it is in line with the object."""
 
 
-def visual_hull(views: Sequence[View], box: np.ndarray) -> OccupancyGrid:
+def visual_hull(views: Sequence[View], box: np.ndarray, finest: int | None = None) -> OccupancyGrid:
     """The smallest box, with cells in it, around those of a box (6,), in world units, that all but AMISS of
     the views' masks leave room for an object in; a view says nothing of cells outside its picture, and cells
     that no view shows are left out.
 
-    Every view has a mask. All cells are kept where the masks agree on none. Raises BadMask, BadImage,
-    MissingFile.
+    The alpha of a photo is such a mask. `finest` cells lie along the longest axis (None: FINE). All cells are
+    kept where the masks agree on none. Raises BadMask, BadImage, MissingFile.
     """
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), VIEWS)).astype(int))
-    masked = [mask for number in chosen if (mask := Mask.of(views[number]))]
-    coarse, fine = CELLS
-    around = cropped(carved(OccupancyGrid.full(box, coarse), masked))
-    grid = OccupancyGrid.full(around.aabb, fine)
+    with decoders(views) as threads:
+        masked = [mask for mask in threads.map(Mask.of, [views[i] for i in chosen]) if mask]
+    around = cropped(carved(OccupancyGrid.full(box, COARSE), masked))
+    grid = OccupancyGrid.full(around.aabb, finest or FINE)
     return cropped(carved(grid.marked(around.contains(grid.centres()).reshape(grid.occupied.shape)), masked))
 
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """What the mask of a view keeps."""
+    """What the mask of a view keeps, and the alpha of its photo."""
 
     view: View
     stride: int
@@ -54,7 +55,7 @@ class Mask:
     def of(cls, view: View) -> "Mask | None":
         """A view's mask; None where that keeps nothing, which says nothing of the object."""
         stride = max(1, max(view.width, view.height) // LOOKED_AT)
-        ignored = load_ignored(view)[::stride, ::stride]
+        ignored = ~shown_pixels(view)[::stride, ::stride]
         if ignored.all():
             return None
         return cls(view, stride, (stride * distance_transform_edt(ignored)).astype(np.float32))

@@ -154,6 +154,11 @@ def learning(numbers: int, threads: int, moments: int = 2) -> dict[str, float]:
     return {"the field that learns": numbers * FLOAT * (2 * (1 + moments) + threads)}
 
 
+def decoding(pixels: int, masked: bool, beside: int) -> dict[str, float]:
+    """Photos of so many pixels together while they are read, and what their decoders take beside them."""
+    return {"the photos": pixels * (PER_PIXEL_OF_PHOTOS + masked), "decoding them": beside}
+
+
 def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> dict[str, float]:
     """Photos as they are drawn from, some pixels left out where they are `masked`, and the rays of so many
     different cameras."""

@@ -10,11 +10,12 @@ import torch
 from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_photos
 from formats.meshes import mesh_capture
+from formats.photos import loading_bytes
 from formats.views import Capture, check_parallax
 from fusedrf_cli.bridge.depths import known_points
 from fusedrf_cli.bridge.extent import Extent, extent_of
 from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
-from fusedrf_cli.bridge.memory import Memory, fitting, photos
+from fusedrf_cli.bridge.memory import Memory, decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.refined import aligned, moved, with_poses
@@ -105,6 +106,7 @@ def train(request: TrainRequest, progress) -> dict:
         plan = kind.untrained(extent.box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
         memory.expect(
+            loading(capture),
             fit_memory(capture, plan, settings),
             advice="use a smaller --max-size, fewer or smaller photos, or a lower --quality",
         )
@@ -209,6 +211,8 @@ def read_views(request: TrainRequest, progress) -> Capture:
     )
     if capture.missing:
         progress.warn(f"{source}: {len(capture.missing)} frames have no photo and were left out")
+    for note in capture.notes:
+        progress.tell(note)
     capture = hold_out(capture, request.holdout) if request.holdout else capture
     check_parallax(capture)
     return capture
@@ -316,6 +320,13 @@ def texels_of_place(box: np.ndarray, longest: float) -> int:
     a, b, c = box[3:] - box[:3]
     shrunk = np.sqrt((a * b + b * c + c * a) / (3 * (2 * SIDE) ** 2)) / (max(a, b, c) / (2 * SIDE))
     return round(longest / shrunk)
+
+
+def loading(capture: Capture) -> dict[str, float]:
+    """What decoding the photos to learn from needs."""
+    pixels = sum(view.width * view.height for view in capture.train)
+    masked = any(view.mask_path for view in capture.train)
+    return decoding(pixels, masked, 0 if capture.kind == "mesh" else loading_bytes(capture.train))
 
 
 def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:

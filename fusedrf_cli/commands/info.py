@@ -1,12 +1,17 @@
-"""`fusedrf info`: what is in a bundle or scene, without decoding its arrays."""
+"""`fusedrf info`: what is in a bundle or scene, without decoding its arrays, or what `train` would read."""
 
 import click
 
 from fusedrf_cli import options
 
+MOST_ROWS = 8
+"""Of a table about a capture, for people."""
+
 
 def _brief(summary: dict) -> dict:
     """The summary as people want it: matrices, arrays and checksums are for `--json`."""
+    if "nodes" not in summary:
+        return _brief_overview(summary)
     nodes = [
         {
             "name": "  " * (node["depth"] - 1) + node["name"],
@@ -30,6 +35,15 @@ def _brief(summary: dict) -> dict:
         "fields": fields,
         "history": history,
     }
+
+
+def _brief_overview(facts: dict) -> dict:
+    """What is to be told of a capture or mesh: what there is none of is left out, and tables are cut."""
+    brief = {key: part for key, part in facts.items() if part and (key, part) != ("made_smaller", 1)}
+    for key, noun in (("left_out", "photo"), ("sizes", "size"), ("lenses", "lens")):
+        if (more := len(facts.get(key, [])) - MOST_ROWS) > 0:
+            brief[key] = [*facts[key][:MOST_ROWS], {noun: f"{more} more"}]
+    return brief | {"notes": [{"note": note} for note in facts["notes"]]}
 
 
 def _cameras(cameras: dict) -> dict:
@@ -65,9 +79,10 @@ def _scalars(event: dict) -> dict:
 @click.argument("scene", type=options.SCENE)
 @options.reporting(brief=_brief)
 def command(scene, progress):
-    """List what a bundle or scene holds.
+    """List what a bundle or scene holds, or what `train` would read.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. Of one that was learnt from photos their
+    SCENE is a bundle, a scene.json, - for a scene on stdin, or a capture or mesh as `fusedrf train` takes it:
+    of those photos, lenses, box, masks and notes are told. Of one that was learnt from photos their
     cameras are counted. Of a fused bundle the objects are listed with kind, place, size in the world and
     bytes; an object that was distilled into one field with others has no bytes of its own. Damage is found,
     but arrays are not decoded, so the answer is quick.
@@ -77,8 +92,11 @@ def command(scene, progress):
       fusedrf info fused.rfpack --json
     """
     from formats.bundle import read_summary
+    from formats.overview import overview
 
-    return _of_stdin() if scene == options.STDIO else read_summary(scene)
+    if scene == options.STDIO:
+        return _of_stdin()
+    return overview(scene) or read_summary(scene)
 
 
 def _of_stdin() -> dict:

@@ -24,7 +24,8 @@ FISHEYE = (0.05, -0.01, 0.0, 0.0)
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    monkeypatch.setattr(hull, "CELLS", (12, 24))
+    monkeypatch.setattr(hull, "COARSE", 12)
+    monkeypatch.setattr(hull, "FINE", 24)
 
 
 def views_of(folder, count=16, distortion=(0.0,) * 5, fisheye=False, aside=0.0) -> list[View]:

@@ -6,6 +6,8 @@ import numpy as np
 
 from formats.bundle import read_summary, single_field_bundle
 from formats.records import FieldRecord
+from tests.formats.test_captures import frame, write
+from tests.formats.test_readers import noisy
 
 
 def test_info_as_json_is_the_summary(run):
@@ -73,3 +75,19 @@ def test_info_does_not_tell_a_trained_field_twice(run):
     assert "objects:" not in run("info", "chair.rfpack").stdout
     (chair,) = json.loads(run("info", "chair.rfpack", "--json").stdout)["objects"]
     assert chair["name"] == "chair" and chair["bytes"] > 0
+
+
+def test_info_of_a_capture_and_of_a_film(run, folder):
+    """For people only what there is, tables cut; the JSON has all of it."""
+    for i in range(9):
+        noisy(folder / f"garden/images/{i}.png")
+    frames = [frame(f"images/{i}.png", fl_x=80 + i) for i in range(9)]
+    write(folder / "garden", frames=frames)
+    lines = run("info", "garden").stdout.splitlines()
+    assert "photos: to learn from 9, held out 0" in lines and "  1 more" in lines
+    assert not any(line.startswith("masks") for line in lines)
+    told = json.loads(run("info", "garden", "--json").stdout)
+    assert len(told["lenses"]) == 9 and told["masks"] == 0 and "one point" in told["notes"][-1]
+    (folder / "walk.mp4").write_bytes(b"\0\0\0\x20ftypisom")
+    result = run("info", "walk.mp4")
+    assert result.exit_code == 3 and "a film" in result.stderr and result.stderr.count("\n") == 1

@@ -85,10 +85,10 @@ def test_longest_side_is_read(tmp_path):
     assert read_image(tmp_path / "a.png").shape == (1, 16384, 4)
 
 
-def test_deep_pictures_are_refused(tmp_path):
-    Image.fromarray(np.full((3, 3), 40000, np.uint16)).save(tmp_path / "a.png")
-    with pytest.raises(BadImage, match="8 bits"):
-        read_image(tmp_path / "a.png")
+def test_pictures_of_32_bits_are_refused(tmp_path):
+    Image.fromarray(np.full((3, 3), 0.5, np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(BadImage, match="8 or 16 bits"):
+        read_image(tmp_path / "a.tif")
 
 
 def test_missing(tmp_path):

@@ -15,7 +15,7 @@ from PIL import Image as Pillow
 
 from formats import posing
 from formats.captures import read_capture
-from formats.errors import BadImage, MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
+from formats.errors import BadImage, MissingExtra, MissingFile, NoPoses, NotACapture, NoViews, PosingFailed
 from formats.images import read_focal, write_smaller
 from formats.mapper import ALIKE, NEIGHBOURS, likely_pairs
 from formats.points import Points, read_ply_points, write_ply_points
@@ -64,11 +64,13 @@ def test_photos_are_found_in_natural_order(tmp_path):
 
 
 def test_no_photos(tmp_path):
-    with pytest.raises(MissingFile, match="holds no photos"):
+    with pytest.raises(NotACapture, match="the folder is empty"):
         photos_to_pose(tmp_path)
     (tmp_path / "IMG_1.HEIC").write_bytes(b"")
     with pytest.raises(BadImage, match=r"IMG_1\.HEIC"):
         photos_to_pose(tmp_path)
+    with pytest.raises(MissingFile, match="no such folder"):
+        photos_to_pose(tmp_path / "nowhere")
 
 
 def exif(path: Path, **keys) -> Path:

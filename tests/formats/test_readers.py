@@ -519,10 +519,10 @@ def test_masks_of_reduced_photos(tmp_path):
 
 def test_masks_that_do_not_fit(tmp_path):
     photo(tmp_path / "a.png")
-    photo(tmp_path / "mask.png", (50, 40))
+    photo(tmp_path / "mask.png", (50, 50))
     write(tmp_path, frames=[frame("a.png", mask_path="mask.png")], fl_x=80)
     with pytest.raises(
-        BadMask, match=r"frame 0 \(a\.png\): the mask .*mask\.png is 50x40, but a\.png is 100x80"
+        BadMask, match=r"frame 0 \(a\.png\): the mask .*mask\.png is 50x50, but a\.png is 100x80"
     ):
         read_capture(tmp_path)
     (tmp_path / "mask.png").unlink()
@@ -738,13 +738,6 @@ def test_a_box_as_large_as_the_points_say(tmp_path):
         assert read_capture(tmp_path).aabb == pytest.approx([-reach] * 3 + [reach] * 3, rel=1e-5)
 
 
-def test_plain_pictures_keep_a_tight_box(tmp_path):
-    photo(tmp_path / "a.png")
-    write(tmp_path, frames=posed(tmp_path, ring(9, 4, np.zeros(3))), fl_x=80)
-    capture = read_capture(tmp_path)
-    assert capture.frame is None and capture.aabb == pytest.approx([-4] * 3 + [4] * 3)
-
-
 def test_a_room_seen_from_its_middle(tmp_path):
     noisy(tmp_path / "a.png")
     poses = ring(9, 2, np.ones(3), inward=False)
@@ -812,8 +805,8 @@ def test_a_box_around_what_masks_cut_out(tmp_path, border):
         assert capture.object_aabb is None
     else:
         # Rays through the corners of a square pass its centre at root 2 times the half side, nearly.
-        half = 0.5 * np.sqrt(2) * 1.05
-        assert capture.object_aabb == pytest.approx([*(centre - half), *(centre + half)], abs=0.03)
+        reach = np.abs(capture.object_aabb - [*centre, *centre])
+        assert reach.min() > 0.5 and reach.max() < 0.5 * np.sqrt(2) * 1.07
 
 
 # --- real captures ------------------------------------------------------------------------------------------

@@ -1,0 +1,118 @@
+"""Masks that lie beside photos: in a folder `masks` or `mask`, or among them under names that say so."""
+
+import os
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from formats.photos import EXTENSIONS, MOVING, with_mask
+from formats.views import View
+
+FOLDERS = ("masks", "mask")
+PHOTOS = ("images", "input", "photos", "rgb", "color", "corrected_images")
+"""Folders of photos, or of smaller copies such as images_4, beside which a folder of masks is looked for."""
+NAMED = ("{}_mask", "{}.mask", "{}-mask", "mask_{}", MOVING + "{}")
+"""How programs name the mask of a photo, by its name with or without the ending."""
+
+
+def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ...], tuple[str, ...]]:
+    """Views with the masks that lie beside their photos, where none has one yet, and sentences about them.
+
+    `root` is the capture's folder. A mask is called as its photo is, COLMAP's `a.jpg.png` and `a_mask.png`
+    too. Raises BadMask, BadImage, as `with_mask`.
+    """
+    photos = [view for view in views if view.image_path is not None]
+    if not photos or any(view.mask_path for view in views):
+        return tuple(views), ()
+    shelves: dict[Path, _Shelf] = {}
+    around = {view.image_path.parent: _places(view.image_path, root) for view in photos}
+    found, used, unused = [], {}, {}
+    for view in views:
+        mask = None
+        for place in around[view.image_path.parent] if view.image_path else ():
+            shelf = shelves.get(place.folder) or shelves.setdefault(place.folder, _Shelf.of(place.folder))
+            mask = shelf.mask_of(view.image_path, place.inner, own=place.folder == view.image_path.parent)
+            if mask is not None:
+                break
+            if place.folder != view.image_path.parent and shelf.files:
+                unused[place.folder] = len(shelf.files)
+        found.append(view if mask is None else with_mask(view, mask))
+        if mask is not None:
+            used[mask.parent] = used.get(mask.parent, 0) + 1
+    notes = [f"{at}: its masks of {count} of {len(views)} photos are used" for at, count in used.items()]
+    notes += [
+        f"{at}: lies beside the photos, but none of its {count} pictures is called as one of them, and they "
+        "are not used; name masks as their photos"
+        for at, count in unused.items()
+        if not used
+    ]
+    return tuple(found), tuple(notes)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A folder in which the mask of a photo may be, below `inner` where photos lie in folders too."""
+
+    folder: Path
+    inner: Path
+
+
+def _places(photo: Path, root: Path) -> list[_Place]:
+    """Where the mask of a photo may be, the likeliest first."""
+    parent, places = photo.parent, []
+    for above in (parent, *parent.parents[:2]):
+        inside = above == root or above.is_relative_to(root)
+        below = photo.relative_to(above).parts[:-1]
+        if below and not (inside or _of_photos(below[0])):
+            break
+        copy = below[0].rpartition("_")[2] if below else ""
+        names = [*(f"{name}_{copy}" for name in FOLDERS if copy.isdecimal()), *FOLDERS]
+        places += [_Place(folder, Path(*below[1:])) for folder in _named_so(above, names)]
+        if above == root or not below and not inside:
+            break
+    return [*places, _Place(parent, Path())]
+
+
+def _named_so(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The folders in a folder that have one of the names, in any case, in the order of the names."""
+    with os.scandir(folder) as entries:
+        found = [entry.name for entry in entries if entry.name.casefold() in names and entry.is_dir()]
+    return [folder / name for name in sorted(found, key=lambda name: names.index(name.casefold()))]
+
+
+def _of_photos(name: str) -> bool:
+    start, _, number = name.lower().rpartition("_")
+    return (start if number.isdecimal() else name.lower()) in PHOTOS
+
+
+@dataclass(frozen=True)
+class _Shelf:
+    """The pictures of a folder and of those in it, by the folder below it and the name without its ending."""
+
+    files: dict[tuple[Path, str], Path]
+
+    @classmethod
+    def of(cls, folder: Path) -> "_Shelf":
+        """Hidden files are no masks."""
+        nested = [folder] + [entry for entry in sorted(folder.iterdir()) if entry.is_dir()]
+        pictures = [
+            file
+            for at in nested
+            for file in sorted(at.iterdir())
+            if file.suffix.lower() in EXTENSIONS and not file.name.startswith(".")
+        ]
+        return cls({(file.parent.relative_to(folder), _key(file.stem)): file for file in pictures})
+
+    def mask_of(self, photo: Path, inner: Path, own: bool) -> Path | None:
+        """A photo's mask; `own`: this is the photo's own folder, where a mask has a name that says so."""
+        names = [] if own else [photo.name, photo.stem]
+        names += [name.format(base) for name in NAMED for base in (photo.stem, photo.name)]
+        folders = (inner, Path()) if inner.parts else (inner,)
+        keys = ((folder, _key(name)) for folder in folders for name in names)
+        found = (self.files.get(key) for key in keys)
+        return next((file for file in found if file is not None and file != photo), None)
+
+
+def _key(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()

@@ -1,0 +1,306 @@
+"""Where photos show an object and where nothing is: by their alpha, by masks, or by a white ground.
+
+An alpha channel may say nothing, and borders of one colour may be a film's bars: so the photos are looked at.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from formats.frame import nearest_point
+from formats.images import oriented, read_alpha
+from formats.photos import OPAQUE, decoded, decoders, load_ignored
+from formats.views import View
+
+LOOKED_AT = 100_000_000
+"""Stored pixels that are decoded, about, to see what alpha or a ground says: a second or two."""
+LEAST_LOOKED_AT = 12
+"""Photos that are looked at however large they are."""
+FAINT = 8
+"""Alpha of 255 below which a pixel shows nothing."""
+TRANSPARENT = 0.005
+"""Share of a photo's pixels that are transparent at least, if alpha says something: a stray one does not."""
+SOFT = 0.15
+"""Share of half transparent pixels from which alpha is a vignette, not the outline of a thing."""
+BORDER_KEPT = 0.3
+"""What keeps less than this share of the photos' borders cuts out an object; other masks hide passers-by."""
+SAMPLED = 6
+"""Photos whose borders are looked at for a ground of one colour, before more are."""
+WHITE, PLAIN = 250, 3
+"""The least level of a white ground, and levels by which the colour of a ground may vary."""
+GROUND = 8
+"""Levels by which a pixel of an object differs from the white ground."""
+BARS = 0.97
+"""Share of the box around it that a picture between bars fills; hardly any outline of an object does."""
+CELLS = 32
+"""Along a side of the grid in which the box of an object is looked for, twice."""
+AMISS, AMISS_ON_WHITE = 0.1, 0.34
+"""Share of the outlines that may exclude a place where the object is: some are wrong, and what is white on
+white is in none."""
+RARELY = 0.5
+"""Of the median number of views that show a place which outlines leave: what fewer show lies beside it."""
+LEAST_WHOLE = 3
+"""Outlines that their photos do not cut off, at least, if they are to tell how large the object is."""
+MARGIN = 1.05
+"""Factor on how far the rays around an object pass its middle."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a photo shows of an object, where the rest of it shows nothing."""
+
+    box: tuple[float, float, float, float] | None
+    """Left, top, right, bottom around it, in pixels of the view; None where nothing of it is shown."""
+    filled: float
+    """Share of that box."""
+    share: float
+    """Of the photo's pixels."""
+    border: float
+    """Of the pixels along its borders."""
+    middle: float
+    """Opaque ones, of the pixels of its middle, half as wide and high."""
+    soft: float = 0.0
+    """Share of the photo's pixels that are neither opaque nor transparent."""
+    clear: float = 0.0
+    """Share of the photo's pixels that are transparent."""
+
+    @classmethod
+    def of(
+        cls, kept: np.ndarray, scale: float, solid: np.ndarray | None = None, **shares: float
+    ) -> "Outline":
+        """The outline of what is kept (H, W) of a photo, whose pixel is `scale` of the view's; `solid` is
+        what of it is opaque."""
+        high, wide = kept.shape
+        rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
+        middle = (kept if solid is None else solid)[
+            high // 4 : high - high // 4, wide // 4 : wide - wide // 4
+        ]
+        border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
+        box, filled = None, 0.0
+        if len(rows):
+            left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+            box = tuple(float(side) * scale for side in (left, top, right, bottom))
+            filled = float(kept[top:bottom, left:right].mean())
+        return cls(box, filled, *(float(part.mean()) for part in (kept, border, middle)), **shares)
+
+
+def alpha_outline(view: View) -> Outline:
+    """What the alpha of a view's photo keeps."""
+    alpha = oriented(read_alpha(view.image_path), view.orientation)
+    clear, soft = float((alpha < OPAQUE).mean()), float(((alpha >= FAINT) & (alpha < 255 - FAINT)).mean())
+    if alpha.min() == alpha.max():  # which says nothing
+        clear = soft = 0.0
+    return Outline.of(alpha >= FAINT, 1 / view.reduction, alpha >= OPAQUE, clear=clear, soft=soft)
+
+
+def mask_outline(view: View) -> Outline:
+    """What the mask of a view keeps."""
+    return Outline.of(~load_ignored(view), 1.0)
+
+
+def ground_outline(view: View) -> Outline:
+    """What is not white of a view's photo."""
+    return Outline.of((decoded(view)[..., :3] < 255 - GROUND).any(2), 1.0)
+
+
+def shown_pixels(view: View) -> np.ndarray:
+    """(H, W) bool: what a view's mask keeps and its alpha shows. Raises as `load_ignored`."""
+    shown = np.ones((view.height, view.width), bool) if view.mask_path is None else ~load_ignored(view)
+    if view.pixels is not None:
+        return shown & (oriented(view.pixels, view.orientation)[..., 3] >= FAINT)
+    if view.image_path is None or not view.alpha:
+        return shown
+    alpha = oriented(read_alpha(view.image_path), view.orientation)[:: view.reduction, :: view.reduction]
+    return shown & (alpha[: view.height, : view.width] >= FAINT)
+
+
+def outlines(views: Sequence[View], outline: Callable[[View], Outline]) -> list[Outline]:
+    """One of each view."""
+    with decoders(views) as threads:
+        return list(threads.map(outline, views))
+
+
+def sampled(views: Sequence[View]) -> list[View]:
+    """As many views, evenly spaced in the list, as are quickly decoded."""
+    each = np.mean([view.width * view.height * view.reduction**2 for view in views])
+    count = min(len(views), max(LEAST_LOOKED_AT, int(LOOKED_AT / each)))
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
+
+
+# --- alpha --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What of a capture's photos is nothing."""
+
+    views: tuple[View, ...]
+    looked_at: tuple[View, ...] = ()
+    outlines: tuple[Outline, ...] = ()
+    """Of those views, where they show an object that stands free."""
+    notes: tuple[str, ...] = ()
+
+
+def by_alpha(views: tuple[View, ...]) -> Shown:
+    """Outlines where the alpha of photos cuts out what they show; without, their alpha is that of a mask, or
+    says nothing (View.alpha)."""
+    having = [view for view in views if view.alpha and view.image_path is not None]
+    if not having:
+        return Shown(views)
+    looked_at = sampled(having)
+    found = outlines(looked_at, alpha_outline)
+    telling = [outline for outline in found if outline.box]  # others show nothing at all
+    transparent = [outline for outline in telling if outline.clear >= TRANSPARENT]
+    share = len(transparent) / max(len(telling), 1)
+    name = having[0].image_path.name
+    channel = f"the alpha channel of {len(having)} of {len(views)} photos, such as {name},"
+    most = share * len(having) >= 0.5 * len(views)
+    if not most or _is_frame(transparent, looked_at):
+        note = f"{channel} says nothing and is not used"
+        if transparent:
+            what = "frames them" if most else "is transparent in too few to cut an object out"
+            note = f"{channel} {what}: photos show surroundings, and pixels that are transparent are ignored"
+        return Shown(tuple(_opaque(view, bool(transparent)) for view in views), notes=(note,))
+    notes = []
+    if bare := len(views) - len(having):
+        notes.append(
+            f"{bare} of {len(views)} photos have no alpha and are left out, since it cuts out the others"
+        )
+    if share < 1:
+        whole = round((1 - share) * len(having))
+        notes.append(
+            f"{whole} of {len(views)} photos show no transparency where that cuts out the others: all that "
+            "they show is learnt; cut them out too, or remove them"
+        )
+    return Shown(tuple(having), tuple(looked_at), tuple(found), tuple(notes))
+
+
+def _opaque(view: View, ignoring: bool) -> View:
+    """A view whose alpha does not say where nothing is, but may say what to ignore."""
+    own = view.image_path if ignoring and view.alpha and view.mask_path is None else view.mask_path
+    return replace(view, alpha=False, mask_path=own)
+
+
+def _is_frame(transparent: Sequence[Outline], views: Sequence[View]) -> bool:
+    """Whether alpha leaves out what lies around all photos, as the corners that a lens does not show, and not
+    what lies around an object."""
+    keys = ("border", "middle", "soft")
+    border, middle, soft = (float(np.mean([getattr(found, key) for found in transparent])) for key in keys)
+    around = border > BORDER_KEPT or soft > SOFT or _barred(transparent, views) or views[0].fisheye
+    return middle > 0.995 and around
+
+
+def _barred(found: Sequence[Outline], views: Sequence[View]) -> bool:
+    """Whether all outlines are one and the same rectangle, nearly."""
+    boxes = np.array([outline.box or (0.0,) * 4 for outline in found])
+    sides = max(max(view.width, view.height) for view in views)
+    alike = len(boxes) > 1 and float(np.ptp(boxes, axis=0).max()) <= 0.02 * sides
+    return alike and float(np.mean([outline.filled for outline in found])) > BARS
+
+
+# --- grounds ------------------------------------------------------------------------------------------------
+
+
+def by_ground(views: tuple[View, ...]) -> Shown:
+    """Outlines where photos show an object on white. Borders of another colour are taken as surroundings,
+    since nothing tells a black ground from the night."""
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
+    lowest, highest = np.full(3, 255), np.zeros(3, int)
+    for view in chosen:
+        picture = decoded(view)[..., :3]
+        border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+        lowest, highest = np.minimum(lowest, border.min(0)), np.maximum(highest, border.max(0))
+        if (highest - lowest > PLAIN).any() and lowest.min() < WHITE:
+            return Shown(views)
+    colour = ", ".join(map(str, lowest))
+    surroundings = (
+        f"the borders of photos have one colour ({colour}) and are taken as surroundings; of an object "
+        "before nothing give photos with alpha or masks, or --bounded; crop bars and frames away"
+    )
+    if lowest.min() < WHITE:
+        return Shown(views, notes=(surroundings,))
+    looked_at = sampled(views)
+    found = outlines(looked_at, ground_outline)
+    free = np.mean([outline.border == 0 for outline in found]) > 0.9
+    if not free or _barred(found, looked_at) or not any(outline.box for outline in found):
+        return Shown(views, notes=(surroundings,))
+    note = (
+        "photos show an object on white, which is taken as nothing, so that a box around it is learnt; "
+        "--unbounded learns the white as well"
+    )
+    return Shown(views, tuple(looked_at), tuple(found), (note,))
+
+
+# --- masks --------------------------------------------------------------------------------------------------
+
+
+def by_masks(views: tuple[View, ...]) -> Shown:
+    """Outlines where masks cut an object out of at least half of the photos, without the other photos."""
+    masked = tuple(view for view in views if view.mask_path not in (None, view.image_path))
+    bare = len(views) - len(masked)
+    if 2 * len(masked) < len(views):
+        note = f"{bare} of {len(views)} photos have no mask and are used as they are"
+        return Shown(views, notes=(note,) if masked else ())
+    found = outlines(masked, mask_outline)
+    seen = [outline for outline in found if outline.box]
+    notes = []
+    if len(seen) < len(found):
+        notes.append(f"the masks of {len(found) - len(seen)} of {len(views)} photos exclude all of the photo")
+    cut_out = bool(seen) and float(np.mean([outline.border for outline in seen])) <= BORDER_KEPT
+    if bare:
+        what = "left out, since masks cut an object out of the others" if cut_out else "used as they are"
+        notes.append(f"{bare} of {len(views)} photos have no mask and are {what}")
+    if not cut_out:
+        return Shown(views, notes=tuple(notes))
+    return Shown(masked, masked, tuple(found), tuple(notes))
+
+
+# --- the box ------------------------------------------------------------------------------------------------
+
+
+def outline_box(shown: Shown, amiss: float = AMISS) -> np.ndarray:
+    """(6,) box of what all but `amiss` of the outlines leave room for an object in, in world units; a cube
+    around what they show where they leave nothing. A view says nothing of what its picture does not reach."""
+    pairs = [(v, o) for v, o in zip(shown.looked_at, shown.outlines, strict=True) if o.box is not None]
+    views, boxes = [view for view, _ in pairs], [outline.box for _, outline in pairs]
+    box = _around(views, boxes)
+    for _ in range(2):  # a coarse look, and a finer one into what that leaves
+        box = _narrowed(box, views, boxes, amiss)
+    return box
+
+
+def _around(views: Sequence[View], boxes: Sequence[tuple]) -> np.ndarray:
+    """(6,) cube that holds what the outlines show, as those tell that their photos do not cut off; without
+    any, as far as the cameras."""
+    sizes = np.array([(view.width, view.height) for view in views])
+    whole = (np.array(boxes)[:, :2] > 1).all(1) & (np.array(boxes)[:, 2:] < sizes - 1).all(1)
+    told = whole if whole.sum() >= LEAST_WHOLE else np.ones(len(views), bool)
+    eyes = np.array([view.camera_to_world[:3, 3] for view in views])[told]
+    corners = [view.corners(1.0, box) for view, box, tells in zip(views, boxes, told, strict=True) if tells]
+    rays = np.array(corners) - eyes[:, None]
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    middles = rays.mean(1) / np.linalg.norm(rays.mean(1), axis=1, keepdims=True)
+    centre = nearest_point(eyes, middles)
+    away = np.linalg.norm(np.cross(centre - eyes[:, None], rays), axis=2).max(1)
+    half = MARGIN * float(np.quantile(away, 1 - AMISS / 2))
+    if told is not whole:
+        half = max(half, float(np.median(np.linalg.norm(eyes - centre, axis=1))))
+    return np.concatenate([centre - half, centre + half])
+
+
+def _narrowed(box: np.ndarray, views: Sequence[View], boxes: Sequence[tuple], amiss: float) -> np.ndarray:
+    """The box (6,) of those of CELLS³ cells of a box that most outlines leave; all where none is left."""
+    low, cell = box[:3], (box[3:] - box[:3]) / CELLS
+    steps = np.stack(np.meshgrid(*[np.arange(CELLS)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points, reach = low + (steps + 0.5) * cell, float(np.linalg.norm(cell)) / 2
+    seen, excluded = np.zeros((2, len(points)), np.int32)
+    for view, (left, top, right, bottom) in zip(views, boxes, strict=True):
+        column, row, away, inside = view.shown(points)
+        slack = reach * max(view.fl_x, view.fl_y) / np.maximum(away, 1e-9)
+        beside = np.maximum(np.maximum(left - column, column - right), np.maximum(top - row, row - bottom))
+        seen += inside
+        excluded += inside & (beside > slack)
+    left = (seen > 0) & (excluded <= amiss * seen)
+    kept = steps[left & (seen >= RARELY * np.median(seen[left]))] if left.any() else steps
+    return np.concatenate([low + kept.min(0) * cell, low + (kept.max(0) + 1) * cell])

@@ -1,0 +1,77 @@
+"""`info` of captures, photos and meshes: what `train` would read of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from formats.errors import NotACapture
+from formats.overview import overview
+from tests.formats.test_captures import frame, photo, write
+from tests.formats.test_masks import keep
+from tests.formats.test_readers import noisy, ring
+
+
+def poses() -> list:
+    return ring(9, 4, np.array([3.0, -2, 1]))
+
+
+def capture(folder, **keys) -> None:
+    for i in range(9):
+        noisy(folder / f"images/{i}.png")
+    frames = [frame(f"images/{i}.png", transform_matrix=pose) for i, pose in enumerate(poses())]
+    write(folder, frames=[*frames, frame("images/gone.png")], fl_x=80, w=10, h=8, **keys)
+
+
+def test_a_capture(tmp_path):
+    capture(tmp_path, k1=0.1)
+    told = overview(tmp_path)
+    assert json.loads(json.dumps(told)) == told
+    assert (told["format"], told["kind"], told["space"], told["box"]) == (
+        "capture",
+        "transforms",
+        "unbounded",
+        None,
+    )
+    assert told["photos"] == {"to_learn_from": 9, "held_out": 0}
+    assert [row["photo"] for row in told["left_out"]] == ["images/gone.png"]
+    assert told["sizes"] == [{"size": "10x8", "photos": 9}]
+    (lens,) = told["lenses"]
+    assert (lens["lens"], lens["focal"], lens["distortion"][0]) == ("pinhole", [80, 80], 0.1)
+    assert told["looks_at"] == pytest.approx([3, -2, 1]) and told["up"] == pytest.approx([0, 0, 1])
+    assert (told["masks"], told["points"], told["transparent"]) == (0, 0, False)
+
+
+def test_masks_and_trouble(tmp_path):
+    capture(tmp_path)
+    keep(tmp_path / "masks/0.png", np.full((8, 10), 255, np.uint8))
+    told = overview(tmp_path)
+    assert told["masks"] == 1 and "8 of 9 photos have no mask" in " ".join(told["notes"])
+    write(tmp_path, frames=[frame("images/0.png")], fl_x=80)
+    assert "3 or more" in overview(tmp_path)["notes"][-1]
+
+
+def test_photos_without_poses(tmp_path):
+    for i in range(3):
+        photo(tmp_path / f"{i}.png", (100, 80) if i else (80, 100))
+    told = overview(tmp_path)
+    assert (told["format"], told["photos"]) == ("photos", {"to_pose": 3})
+    assert told["sizes"] == [{"size": "100x80", "photos": 2}, {"size": "80x100", "photos": 1}]
+    assert "no poses" in told["notes"][0]
+
+
+def test_a_mesh(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.box((2, 4, 6)).export(tmp_path / "box.ply")
+    told = overview(tmp_path / "box.ply")
+    assert (told["format"], told["kind"], told["surfaces"], told["triangles"]) == ("mesh", "ply", 1, 12)
+    assert told["aabb"] == pytest.approx(np.array([-1, -2, -3, 1, 2, 3]), abs=0.13)
+
+
+def test_what_is_none_of_them(tmp_path):
+    (tmp_path / "walk.mp4").write_bytes(b"\0\0\0\x20ftypisom")
+    with pytest.raises(NotACapture, match=r"walk\.mp4: is a film"):
+        overview(tmp_path / "walk.mp4")
+    (tmp_path / "scene.json").write_text('{"format": "rfpack", "nodes": []}')
+    assert overview(tmp_path / "scene.json") is None
+    assert overview(tmp_path / "nowhere") is None
