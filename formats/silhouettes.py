@@ -88,8 +88,10 @@ class Outline:
 def alpha_outline(view: View) -> Outline:
     """What the alpha of a view's photo keeps."""
     alpha = oriented(read_alpha(view.image_path), view.orientation)
-    clear, soft = float((alpha < OPAQUE).mean()), float(((alpha >= FAINT) & (alpha < 255 - FAINT)).mean())
-    if alpha.min() == alpha.max():  # which says nothing
+    levels = np.bincount(alpha.ravel(), minlength=256) / alpha.size
+    clear, soft = float(levels[:OPAQUE].sum()), float(levels[FAINT : 255 - FAINT].sum())
+    most = int(levels.argmax())
+    if levels[most] == 1 or most >= FAINT and levels[most] > 1 - TRANSPARENT:  # the same all over
         clear = soft = 0.0
     return Outline.of(alpha >= FAINT, 1 / view.reduction, alpha >= OPAQUE, clear=clear, soft=soft)
 

@@ -72,6 +72,7 @@ SILENT = {
     "one of many": lambda i: with_alpha(room(i), 255) if i == 3 else room(i),
     "stray pixels": stray,
     "nearly opaque all over": lambda i: with_alpha(room(i), 254),
+    "half transparent all over": lambda i: np.dstack([room(i), np.minimum(stray(i)[..., 3], 100)]),
     "transparent all over": lambda i: with_alpha(room(i), 0),
 }
 
