@@ -3,13 +3,14 @@
 import io
 import json
 import math
+import sys
 from urllib.parse import quote
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from formats.errors import BadMesh, FormatError, LimitExceeded, MissingFile
+from formats.errors import BadMesh, FormatError, LimitExceeded, MissingExtra, MissingFile
 from formats.meshes import _load, mesh_capture
 from tests.formats.gltf import CORNERS, FACES, UV, Gltf, front, notes_of
 
@@ -417,6 +418,22 @@ def test_broken_compression_is_named(tmp_path, extension):
         packed = {"buffer": 0, "byteLength": 64, "byteStride": 12, "count": 4, "mode": "ATTRIBUTES"}
         view["extensions"] = {extension: packed}
     with pytest.raises(BadMesh, match=extension):
+        _load(gltf.write(tmp_path / "a.glb"))
+
+
+@pytest.mark.parametrize("library, extra", [("DracoPy", "draco"), ("meshopt", "meshopt")])
+def test_a_missing_library_is_named(tmp_path, monkeypatch, library, extra):
+    monkeypatch.setitem(sys.modules, library, None)
+    gltf = Gltf()
+    if extra == "draco":
+        packed = {"bufferView": gltf.view(bytes(64)), "attributes": {"POSITION": 0}}
+        gltf.primitive["extensions"] = {"KHR_draco_mesh_compression": packed}
+        assert (front(gltf.write(tmp_path / "a.glb")) == 255).all()  # by its plain numbers
+        del gltf.doc["accessors"][0]["bufferView"]
+    else:
+        packed = {"buffer": 0, "byteLength": 64, "byteStride": 12, "count": 4, "mode": "ATTRIBUTES"}
+        gltf.doc["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": packed}
+    with pytest.raises(MissingExtra, match=rf"fusedrf\[{extra}\]"):
         _load(gltf.write(tmp_path / "a.glb"))
 
 
