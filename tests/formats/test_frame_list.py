@@ -103,7 +103,8 @@ def test_a_broken_photo_or_lens_leaves_its_frame_out(tmp_path):
     (tmp_path / "0.png").write_text("<html>")
     read = read_capture(tmp_path)
     assert len(read.train) == 10
-    assert "0.png: the picture cannot be decoded" in said(read) and "fl_x is the text '80'" in said(read)
+    assert re.search(r"/0\.png: .* \(its frame is left out\)", said(read))
+    assert "fl_x is the text '80'" in said(read)
 
 
 def test_frames_that_are_listed_again(tmp_path):
@@ -303,7 +304,7 @@ def test_the_largest_model_is_read(tmp_path):
     assert len(read.train) == 7
     assert "sparse/1, a model of 7 photos, is read, and not sparse/10 of 3, sparse/0 of 2" in said(read)
     assert len(read_capture(tmp_path / "sparse/10").train) == 3
-    assert "sparse/10" not in said(read_capture(tmp_path / "sparse/10"))
+    assert "and not" not in said(read_capture(tmp_path / "sparse/10"))
     assert len(read_capture(tmp_path / "sparse").train) == 7
 
 

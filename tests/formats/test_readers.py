@@ -205,7 +205,7 @@ def test_colmap_without_the_full_size_photos(tmp_path):
         read_capture(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
     capture = read_capture(tmp_path)
-    assert capture.kind == "llff" and "by the order of their names" in capture.notes[0]
+    assert capture.kind == "llff" and "by the order of their names" in capture.notes[1]
 
 
 def test_colmap_photos_that_are_missing(tmp_path):
