@@ -146,9 +146,9 @@ def not_a_capture(path: Path) -> FormatError:
 
 
 def _of_file(path: Path) -> FormatError:
-    found = _identified(path)
-    if found is None and (sentence := unreadable_mesh(path)):
+    if sentence := unreadable_mesh(path):
         return NotACapture(sentence)
+    found = _identified(path)
     if found is None:
         text = b"\0" not in _head(path)
         found = Foreign(*KINDS["text" if text else "other"])
