@@ -166,7 +166,8 @@ def test_no_more_bytes_than_allowed(report, run, folder, kind):
     assert said["psnr"]["stored"] > 20 and iou(folder, "object.rfpack") > 0.75
     kept = (folder / "object.rfpack").read_bytes()
     result = run(*words, "--max-size", "1200")
-    assert result.exit_code == 2 and "--max-size is too small: the file takes" in result.stderr
+    assert result.exit_code == 2, result.stderr
+    assert "--max-size is too small: the file takes" in result.stderr
     assert (folder / "object.rfpack").read_bytes() == kept
 
 

@@ -429,15 +429,16 @@ def test_it_stays_small_where_it_is_put(folder, report, cut):
     """Fused beside itself and added to that again, its numbers are there once; out of it comes what went
     in."""
     nodes = [make_node(n, source="ball.rfpack", translation=(x, 0, 0)) for n, x in (("a", 0), ("b", 3))]
-    write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
-    said = report("fuse", "two.json", "-o", "two.rfpack", "--no-rgb", "--precision", "int8")
+    write_scene(folder / "balls.json", SceneGraph(tuple(nodes)))
+    said = report("fuse", "balls.json", "-o", "balls.rfpack", "--no-rgb", "--precision", "int8")
     assert said["bytes"] < 1.1 * cut["bytes"] + 4000
-    report("add", "two.rfpack", "ball.rfpack", "--name", "c", "--translate", "0,3,0", "-o", "three.rfpack")
-    three = (folder / "three.rfpack").stat().st_size
+    words = ("--name", "c", "--translate", "0,3,0", "-o", "three_balls.rfpack")
+    report("add", "balls.rfpack", "ball.rfpack", *words)
+    three = (folder / "three_balls.rfpack").stat().st_size
     assert three < 1.2 * cut["bytes"] + 8000
-    report("delete", "three.rfpack", "a", "-o", "left.rfpack")
-    assert (folder / "left.rfpack").stat().st_size <= three
-    said = report("extract", "three.rfpack", "--name", "b", "-o", "b.rfpack")
+    report("delete", "three_balls.rfpack", "a", "-o", "left_balls.rfpack")
+    assert (folder / "left_balls.rfpack").stat().st_size <= three
+    said = report("extract", "three_balls.rfpack", "--name", "b", "-o", "b.rfpack")
     (ball, _), (b, _) = (load_scene(str(folder / n)).lone() for n in ("ball.rfpack", "b.rfpack"))
     assert said["precision"] == "int8" and torch.equal(b.sections(0)["detail"], ball.sections(0)["detail"])
 

@@ -193,6 +193,8 @@ class SparseStudent(MadeStudent):
         numbers = self.numbers_within(limit, way.precision)
         per_brick = BYTES_PER_BRICK / self.request.sizes.per_number(way.precision)
         for _ in range(TRIES):
+            if numbers < 1:
+                return None
             try:
                 field = resampled(self.seen, SparseShape(way.sh_degree), numbers, per_brick)
             except TooFewNumbers:
