@@ -6,8 +6,9 @@ PIP_FLAGS ?=
 EXTRAS ?= dev
 VENV := $(filter .venv/bin/python,$(PYTHON))
 
-# What `make fuzz` does: mutated packs against every reader, and kills of every writer at random moments.
+# What `make fuzz` does: mutated packs against every reader and whole command, and kills of every writer at random moments.
 PACKS ?= 10000
+RUNS ?= 1000
 KILLS ?= 200
 SEED ?= 0
 
@@ -32,8 +33,9 @@ test: $(VENV)  ## the quick tests
 test-slow: $(VENV)  ## every test
 	$(PYTHON) -m pytest -q
 
-fuzz: $(VENV)  ## 10,000 hostile packs and 200 kills of every command; PACKS=, KILLS=, SEED=
+fuzz: $(VENV)  ## 10,000 hostile packs, 1,000 of them by whole commands, and 200 kills of every command; PACKS=, RUNS=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.commands --count $(RUNS) --seed $(SEED)
 	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
 
 lint: $(VENV)  ## ruff

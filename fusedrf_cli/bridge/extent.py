@@ -43,6 +43,11 @@ BOX_CELLS = 64
 """Along the longest axis of the hull that only gives the box of what alpha shows."""
 
 
+FLATTEST = 1000.0
+"""How many times as long as its shortest side a box's longest may be: readers refuse a field whose rays would
+take too many samples (engine/fields/base.py)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Extent:
     """Where a field lies in the world."""
@@ -81,6 +86,16 @@ class Extent:
         if self.unbounded:
             return {"space": "unbounded", "centre": self.centre.tolist(), "radius": self.unit}
         return {"space": "bounded", "aabb": placed_box(self.box, self.origin).tolist()}
+
+
+def check_flatness(extent: Extent) -> None:
+    """UsageProblem, before work begins, for a box so flat that no reader would take the field."""
+    sides = extent.box[3:] - extent.box[:3]
+    if not sides.max() <= FLATTEST * sides.min():
+        raise UsageProblem(
+            f"the box {extent.box.tolist()} is more than {FLATTEST:,.0f} times as long as it is thin; give a "
+            "thicker --aabb"
+        )
 
 
 def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:

@@ -13,7 +13,7 @@ from formats.meshes import mesh_capture
 from formats.photos import loading_bytes
 from formats.views import Capture, check_parallax
 from fusedrf_cli.bridge.depths import known_points
-from fusedrf_cli.bridge.extent import Extent, extent_of
+from fusedrf_cli.bridge.extent import Extent, check_flatness, extent_of
 from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
@@ -98,6 +98,7 @@ def train(request: TrainRequest, progress) -> dict:
         capture = read_views(request, progress)
         cut_out = cuts_out(request, capture)
         extent = extent_of(request, capture, cut_out)
+        check_flatness(extent)
         suits = PLACE_PRECISION if extent.unbounded else "float16"
         request = replace(request, precision=request.precision or suits)
         kept = cameras_of_capture(capture, cut_out, progress)

@@ -66,9 +66,14 @@ def _check(path: str, allow_outside: bool, seen: set[str]) -> None:
 
 def _scene(path: str):
     """The scene at `path`; of a bundle every array and checksum is read as well."""
-    from formats.bundle import FORMAT, read_bundle, read_summary
+    from formats.bundle import OpenBundle, is_bundle
     from formats.scene import read_scene
 
     if path == options.STDIO:
         return options.stdin_scene()[0]
-    return read_bundle(path).scene if read_summary(path)["format"] == FORMAT else read_scene(path)
+    if not is_bundle(path):
+        return read_scene(path)
+    bundle = OpenBundle(path)
+    for member in bundle.headers:  # one at a time is in memory
+        bundle.field(member)
+    return bundle.scene

@@ -252,6 +252,13 @@ def test_a_thousand_bytes_that_say_gigabytes_are_refused(run, folder, verb):
     assert result.exit_code == 5 and "needs about" in result.stderr, result.stderr
 
 
+def test_a_box_that_no_reader_would_take_is_refused_before_work(run, folder):
+    before = sorted(folder.iterdir())
+    result = run("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,0,0.5,0.5,0.0005")
+    assert result.exit_code == 2 and "times as long as it is thin" in result.stderr, result.stderr
+    assert sorted(folder.iterdir()) == before
+
+
 # -- against real processes ----------------------------------------------------------------------------------
 
 BIG = {

@@ -1,8 +1,12 @@
 """No byte of a pack can change without notice, and no pack, however hostile, makes a reader stumble."""
 
+import os
 import random
+import subprocess
+import sys
 import zlib
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +15,8 @@ from formats.bundle import parse_bundle, read_bundle, read_summary
 from tests.promises.fuzz import VERBS, Crashed, fuzz, judged
 from tests.promises.mutations import DAMAGES, HOSTILITIES
 from tests.promises.packs import GOLDEN
+
+ROOT = Path(__file__).parents[2]
 
 PAIR = (GOLDEN / "pair.rfpack").read_bytes()
 
@@ -194,3 +200,12 @@ def test_good_packs_are_taken_by_every_verb(monkeypatch):
 
     monkeypatch.setattr(vm, "OWNERSHIP_CELLS", 16)
     assert all(verb(str(GOLDEN / "pair.rfpack")) for verb in VERBS.values())
+
+
+@pytest.mark.slow
+def test_whole_commands_over_hostile_packs(tmp_path):
+    """P14, P18: some runs of what `make fuzz` does at length, in a process that forks with one thread."""
+    words = [sys.executable, "-m", "tests.promises.commands", "--count", "12"]
+    environment = os.environ | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "TMPDIR": str(tmp_path)}
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,21 +1,25 @@
 """Readers and writers of one pack at the same time, and edits that wait for each other."""
 
 import contextlib
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from formats.bundle import read_bundle
 from formats.errors import FormatWarning, ResourceError
 from formats.locks import ENDING, output_lock, temporary_folder
-from tests.promises.packs import generation_of, write_generation
+from fusedrf_cli.main import cli
+from tests.promises.packs import GOLDEN, generation_of, write_generation
 
 ROOT = Path(__file__).parents[2]
 PACKS = (sys.executable, "-m", "tests.promises.packs")
@@ -271,3 +275,28 @@ def test_temporary_folders_of_killed_processes_are_removed_and_those_of_others_n
         living.stdin.close()
         living.wait()
         assert not alive.exists()
+
+
+@pytest.mark.slow
+def test_a_render_shows_the_version_that_it_opened(tmp_path):
+    """P7: by the command itself, while other versions take the name again and again."""
+    path, stop = tmp_path / "pack.rfpack", threading.Event()
+    versions = [(GOLDEN / name).read_bytes() for name in ("ring.rfpack", "pair.rfpack", "coded-8.rfpack")]
+
+    def replace_on_and_on():
+        for turn in itertools.count():
+            if stop.is_set():
+                return
+            (tmp_path / "other").write_bytes(versions[turn % len(versions)])
+            os.replace(tmp_path / "other", path)
+
+    path.write_bytes(versions[0])
+    writer = threading.Thread(target=replace_on_and_on)
+    writer.start()
+    try:
+        words = "render", str(path), "-o", str(tmp_path / "out.png"), "--size", "8x8", "-w", "--threads", "1"
+        results = [CliRunner().invoke(cli, words) for _ in range(8)]
+    finally:
+        stop.set()
+        writer.join()
+    assert [result.exit_code for result in results] == [0] * 8, [result.stderr for result in results]

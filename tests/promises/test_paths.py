@@ -114,7 +114,7 @@ def test_a_history_cannot_send_an_edit_outside(folder, source, monkeypatch):
     def opened(*_):
         raise AssertionError("a file outside was read")
 
-    monkeypatch.setattr(deleting, "sha256_of", opened)
+    monkeypatch.setattr(deleting, "unchanged", opened)
     node = {"source": source, "sha256": "0" * 64, "field": "f"}
     try:
         assert deleting.record_from_file(node, folder / "fused.rfpack", False) is None

@@ -373,8 +373,8 @@ class Lattice:
 
 
 def table_entries(nodes: np.ndarray, top: int) -> tuple[int, int]:
-    """How many entries the tables of `top` top cells have, at most, as their nodes' codes tell (`packed`), and
-    how deep these go."""
+    """How many entries the tables of `top` top cells have, at most, and how deep these go, as their nodes'
+    codes tell (`packed`)."""
     code = np.unpackbits(nodes).reshape(-1, 2)
     split = (code[:, 0] == 1) & (code[:, 1] == 0)
     level, start, count, cells = 0, 0, top, 0
