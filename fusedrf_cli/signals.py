@@ -19,8 +19,8 @@ ECHO = 0.3
 """Seconds in which a second signal is the same one: `timeout` sends to a process and then to its group."""
 
 _obeying = False
-_first: float | None = None
-"""When the first signal came, in a process that obeys."""
+_raised = False
+"""Whether a signal was raised in the main thread."""
 _saving = 0
 """How many are in `unhurried` now."""
 _said = False
@@ -49,18 +49,15 @@ def obey() -> None:
 
 def interrupt(number: int, frame: object) -> None:
     """The handler of both signals."""
-    if not seen_to():
+    global _raised
+    if not (_obeying and _raised):
+        _raised = True
         raise Interrupted(number)
 
 
-def seen_to() -> bool:
-    """Note that a signal came; whether it is a later one of a process that obeys, which ends that process (or
-    is an echo) without more being done here."""
-    global _first
-    if _obeying and _first is not None:
-        return True
-    _first = time.monotonic()
-    return False
+def obeying() -> bool:
+    """Whether a second signal needs nobody's doing: it ends this process, or is an echo."""
+    return _obeying
 
 
 def leave() -> None:
@@ -68,7 +65,7 @@ def leave() -> None:
     done so already."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is interrupt:
-            signal.signal(number, signal.SIG_DFL if _first is None else signal.SIG_IGN)
+            signal.signal(number, signal.SIG_IGN if _raised else signal.SIG_DFL)
 
 
 @contextlib.contextmanager
@@ -115,9 +112,9 @@ def _next(reader: int, seconds: float | None) -> int | None:
 
 def _end(number: int) -> None:
     """End the process as it is, without the temporary files that it was writing."""
-    with contextlib.suppress(Exception):
-        remove_unfinished()
-        if last is not None:
+    remove_unfinished()
+    if last is not None:
+        with contextlib.suppress(Exception):
             last()
     if not _said:
         with contextlib.suppress(OSError):

@@ -98,7 +98,7 @@ class Uninterrupted:
         return self
 
     def _arrived(self, number: int, frame: object) -> None:
-        if self.waiting is not None and signals.seen_to():
+        if self.waiting is not None and signals.obeying():
             return
         self.torn = self.waiting is not None
         self.waiting = number

@@ -111,7 +111,7 @@ def test_what_cannot_be_charted(run, folder, monkeypatch):
 def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
     before = sorted(folder.iterdir())
 
-    def interrupted(request, progress, load):
+    def interrupted(request, progress, *words):
         Path(request.output).touch()
         Path(f"{request.output}.checkpoint").touch()
         interrupt(signal.SIGINT, None)

@@ -1,5 +1,7 @@
 """`render` for real: one picture, a folder, a film, depth and transparency."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -52,6 +54,33 @@ def test_depth_lies_beside(report, folder):
     report("render", "red.rfpack", "-o", "turn", "--orbit", "2", *SMALL, "--depth")
     assert len(list((folder / "turn").iterdir())) == 4
     assert 1.0 < depth[12, 16] < 3.0  # 0.92 radii / sin(fov) away, about 1.6 less half a box
+
+
+def test_two_views_of_one_name_are_two_pictures(report, folder):
+    """Nor does a depth take the place of another view's picture, on whatever disk."""
+    names = ("a", "a_depth", "A")
+    pose = np.eye(4)
+    pose[2, 3] = 3.0
+    lens = {"fl_x": 30.0, "fl_y": 30.0, "cx": 12.0, "cy": 12.0, "w": 24, "h": 24}
+    frames = []
+    for i, name in enumerate(names):
+        pose[0, 3] = 0.2 * i
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    (folder / "eyes.json").write_text(json.dumps(lens | {"frames": frames}))
+    said = report("render", "red.rfpack", "--cameras", "eyes.json", "-o", "views", "--depth")
+    assert said["files"] == ["views/a.png", "views/a_depth-2.png", "views/A-2.png"]
+    assert len(said["warnings"]) == 2 and len(list((folder / "views").iterdir())) == 6
+    report("render", "red.rfpack", "--cameras", "eyes.json", "-o", "plain")
+    for file, plain in zip(said["files"], ("a", "a_depth", "A-2"), strict=True):
+        assert (folder / file).read_bytes() == (folder / "plain" / f"{plain}.png").read_bytes()
+
+
+def test_a_depth_that_is_there_is_not_replaced_unasked(run, report, folder):
+    (folder / "red_depth.png").write_text("mine")
+    words = ("render", "red.rfpack", "-o", "red.png", *SMALL, "--depth")
+    assert run(*words).exit_code == 1 and not (folder / "red.png").exists()
+    assert (folder / "red_depth.png").read_text() == "mine"
+    report(*words, "-w")
 
 
 def test_a_film_turns(report, folder):

@@ -17,6 +17,7 @@ from formats import atomic
 from formats.bundle import read_bundle
 from formats.checkpoints import write_checkpoint
 from formats.rig import read_rig
+from fusedrf_cli import signals
 from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
 from fusedrf_cli.engine.distillation.poses import changed_each, turns
 from fusedrf_cli.engine.fields.computed import ComputedField
@@ -110,6 +111,43 @@ def test_a_second_interrupt_does_not_wait(run, folder, interrupted_in_step):
         result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 130 and "--resume" not in result.stderr
     assert not list(folder.glob("out.*"))
+
+
+def test_two_signals_at_once_are_one_to_a_process_that_obeys(run, folder, interrupted_in_step, monkeypatch):
+    """As `timeout` sends them: the state is saved all the same."""
+    monkeypatch.setattr(signals, "_obeying", True)
+    monkeypatch.setattr(signals, "_raised", False)
+    with interrupted_in_step(6, times=2):
+        result = run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert result.exit_code == 130 and "--resume" in result.stderr
+    assert (folder / "out.rfpack.checkpoint").exists()
+
+
+@pytest.mark.parametrize("at", [2, 5])
+def test_the_state_before_a_refresh_that_is_cut_off_goes_on_to_the_same_bytes(
+    report, run, folder, straight, monkeypatch, at
+):
+    """What a process that has to be ended in a long loop saves, from another thread."""
+
+    class Ended(BaseException):
+        """Nothing that anyone catches."""
+
+    refresh, calls = FitRun.refresh, []
+
+    def ended(self, share):
+        calls.append(share)
+        refresh(self, share)
+        if len(calls) == at:
+            signals.last()
+            raise Ended
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FitRun, "refresh", ended)
+        with pytest.raises(Ended):
+            run("train", "photos", "-o", "out.rfpack", *WORDS)
+    assert "--resume" in signals.remains
+    train(report, "out.rfpack", "--resume")
+    assert list(read_bundle(folder / "out.rfpack").fields) == straight
 
 
 def test_bad_steps_are_told(report, run, folder, monkeypatch):
