@@ -81,7 +81,7 @@ BROKEN = {
     "null": (lambda pose: None, "4x4 matrix"),
     "mirrored": (lambda pose: pose @ np.diag([-1, 1, 1, 1.0]), "mirrored"),
     "transposed": (np.transpose, "transposed"),
-    "far away": (lambda pose: pose + np.pad([[1e13]], ((0, 3), (3, 0))), "1e\\+13 from the world's origin"),
+    "far away": (lambda pose: pose + np.pad([[1e14]], ((0, 3), (3, 0))), "1e\\+14 from the world's origin"),
     "one decimal": (lambda pose: pose.round(1), "no rotation"),
 }
 
