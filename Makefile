@@ -6,7 +6,8 @@ PIP_FLAGS ?=
 EXTRAS ?= dev
 VENV := $(filter .venv/bin/python,$(PYTHON))
 
-# What `make fuzz` does: mutated packs against every reader and whole command, and kills of every writer at random moments.
+# What `make fuzz` does: mutated packs, captures and meshes against every reader and whole commands, and kills of every
+# writer at random moments.
 PACKS ?= 10000
 RUNS ?= 1000
 KILLS ?= 200
@@ -33,9 +34,10 @@ test: $(VENV)  ## the quick tests
 test-slow: $(VENV)  ## every test
 	$(PYTHON) -m pytest -q
 
-fuzz: $(VENV)  ## 10,000 hostile packs, 1,000 of them by whole commands, and 200 kills of every command; PACKS=, RUNS=, KILLS=, SEED=
+fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, and 200 kills of every command; PACKS=, RUNS=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.commands --count $(RUNS) --seed $(SEED)
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.fuzz_inputs --readers $(PACKS) --commands $(RUNS) --seed $(SEED)
 	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
 
 lint: $(VENV)  ## ruff

@@ -35,7 +35,7 @@ FILES = {
     "point_cloud.ply": (SPLATS, "Gaussian splats", "photos"),
     "scene.spz": (b"\x1f\x8b\x08", "Gaussian splats", "photos"),
     "scene.splat": (b"\1\2\3\4", "Gaussian splats", "photos"),
-    "cloud.ply": (b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\n", "cloud of points", "photos"),
+    "cloud.ply": (b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\n", "of points", "photos"),
     "a.fbx": (b"Kaydara FBX Binary", "FBX model", ".glb"),
     "a.blend": (b"\x28\xb5\x2f\xfd", "Blender file", ".glb"),
     "a.usda": (b"#usda 1.0", "USD", ".glb"),

@@ -104,9 +104,9 @@ def seeds(folder: Path) -> list[bytes]:
     return found
 
 
-def run(words: tuple[str, ...], folder: Path) -> tuple[int, str, float]:
-    """A command in a child of this process: its exit status as a shell tells it, what it said, and seconds of
-    computing that it took to end once it was asked to."""
+def run(words: tuple[str, ...], folder: Path, patience: float = PATIENCE) -> tuple[int, str, float]:
+    """A command in a child of this process: its exit status as a shell tells it, what it said, and the
+    seconds of computing, at least `patience`, after which it was asked to end; 0 where it was not."""
     said = folder / "said"
     child = os.fork()
     if child == 0:
@@ -131,7 +131,7 @@ def run(words: tuple[str, ...], folder: Path) -> tuple[int, str, float]:
         if done:
             break
         computed = seconds_of(child)
-        if asked is None and computed > PATIENCE:
+        if asked is None and computed > patience:
             asked = computed
             os.kill(child, signal.SIGTERM)
         elif asked is not None and computed > asked + ENDING:

@@ -1,54 +1,45 @@
 """Damaged captures, meshes, scenes and checkpoints: `python -m tests.promises.fuzz_inputs --seed 0`.
 
 `--readers N` mutates N inputs and has the readers read them in this process. `--commands N` has whole
-commands work on N of them, each in a child forked from one warm process, under limits of memory and time; one
-in five is told to end (SIGTERM) meanwhile. An input is wrong if it ended in anything but an error of the
-program's own, took too long, took too much memory, did not end when told to, or left a temporary. Every input
-follows from (seed, index).
+commands work on N of them, each in a child (commands.py). An input is wrong if it ended in anything but an
+error of the program's own, took too long or too much memory, did not end when it was asked to, or left a
+temporary. Every input follows from (seed, index).
 """
 
 import argparse
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import sys
 import tempfile
-import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import pytest
 
+from formats.bundle import is_bundle
 from formats.captures import load_photos, read_capture
 from formats.errors import FormatError
 from formats.meshes import is_mesh, mesh_capture
-from fusedrf_cli import bridge  # noqa: F401  (imported before the first fork)
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
-from tests.bridge.conftest import make_tiny, stock_fields
-from tests.promises.fuzz import Hung, patience
+from tests.bridge.conftest import stock_fields
+from tests.promises.commands import PATIENCE, QUICK, judged, run
+from tests.promises.fuzz import Hung
+from tests.promises.fuzz import patience as patiently
 from tests.promises.inputs import CAPTURES, MESHES
-from tests.promises.kills import HIDDEN, forked
+from tests.promises.kills import forked
 from tests.promises.mutations import DAMAGES, EDGES, TOKENS, spoilt_json
 
-MEMORY = 4 << 30
-"""Bytes that a child may map beside what the warm process has."""
-SECONDS = 60.0
-"""Until a command is hung; other processes slow it down."""
-ENDING = 10.0
-"""Seconds from SIGTERM to the end."""
+EARLY = 0.2
+"""Share of the commands that are asked to end after a moment."""
 TEXTS = (".json", ".gltf", ".obj", ".mtl", ".txt")
 NUMBERS = ("nan", "inf", "-1", "0", "1e300", "-1e300", "1e-300", "4294967296", "9" * 400, "x", "", "1e999")
-FINE = {0, 3, 4, 5, 6, 7}
-"""Exit codes that tell of an input; 2 is a fault of the command line."""
 
 
 # --- mutations ----------------------------------------------------------------------------------------------
@@ -136,17 +127,17 @@ def readers(count: int, seed: int, folder: Path) -> dict:
         for index in range(count):
             rng = random.Random(f"readers/{seed}/{index}")
             name, source, done = damaged(folder, sound, rng)
-            outcome, problem = judged(source)
+            outcome, problem = reading(source)
             found[f"{name}: {outcome}"] += 1
             if problem:
                 wrong.append({"index": index, "kind": name, "done": done, "problem": problem})
     return {"inputs": count, "wrong": wrong, "counts": dict(sorted(found.items()))}
 
 
-def judged(source: Path) -> tuple[str, str | None]:
+def reading(source: Path) -> tuple[str, str | None]:
     """How reading ended, and what is wrong with that."""
     try:
-        with patience():
+        with patiently():
             read(source)
     except (FormatError, FusedRFError) as error:
         return "refused", None if str(error).isprintable() else f"prints {error}"
@@ -178,134 +169,67 @@ def damaged(folder: Path, sound: dict[str, Path], rng: random.Random) -> tuple[s
 # --- commands -----------------------------------------------------------------------------------------------
 
 
-def command(words: list[str], errors: Path, folder: Path) -> Callable[[], None]:
-    """A child's work: one command in a folder, under limits, with stderr in a file."""
-
-    def work() -> None:
-        os.chdir(folder)
-        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY, mapped + MEMORY))
-        stream = os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        os.dup2(stream, 2)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        cli.main(words)
-
-    return work
-
-
 def commands(count: int, seed: int, folder: Path) -> dict:
-    """`count` mutated inputs through whole commands; what went wrong."""
+    """`count` mutated inputs through whole commands, each in a child; what went wrong."""
     found, wrong = Counter(), []
-    with pytest.MonkeyPatch.context() as patch:
-        make_tiny(patch)
-        sound = laid_out(folder)
-        assert forked(lambda: prepare(folder)) == 0
-        for index in range(count):
-            rng = random.Random(f"commands/{seed}/{index}")
-            words, name, done = line(folder, sound, rng)
-            outcome, problem = run(words, folder, rng)
-            found[f"{words[0]} {name}: {outcome}"] += 1
-            if problem:
-                case = {"index": index, "words": words, "kind": name, "done": done, "problem": problem}
-                wrong.append(case)
+    sound = laid_out(folder)
+    assert forked(lambda: prepare(folder)) == 0  # kernels must not have run before a fork
+    for index in range(count):
+        rng = random.Random(f"commands/{seed}/{index}")
+        words, name, done = line(folder, sound, rng)
+        early = rng.random() < EARLY
+        code, said, asked = run(words, folder, rng.uniform(0.0, 2.0) if early else PATIENCE)
+        found[f"{words[0]} {name}: exit {code}"] += 1
+        found["asked to end"] += bool(asked)
+        if problem := judged_run(code, said, early, folder):
+            case = {"index": index, "words": words, "kind": name, "done": done, "problem": problem}
+            wrong.append(case | {"said": said[-2000:]})
     return {"commands": count, "wrong": wrong, "counts": dict(sorted(found.items()))}
 
 
+def judged_run(code: int, said: str, early: bool, folder: Path) -> str | None:
+    """What is wrong with how a command ended, which may have been asked to end before it began."""
+    if early and code == -signal.SIGTERM:
+        return None
+    if not early and code in (-signal.SIGTERM, 128 + signal.SIGTERM):
+        return "took too long"
+    return judged(code, said, False, folder)
+
+
 def prepare(folder: Path) -> None:
-    """Fields, scenes and a checkpoint, in a child: kernels must not have run before a fork."""
-    stock_fields(folder)
+    """Fields, scenes and a fused bundle."""
     os.chdir(folder)
-    for words in (
-        ["train", "sound/blender", "-o", "warm.rfpack", *QUIET],
-        ["fuse", "pair.json", "-o", "fused.rfpack", *QUIET],
-        ["render", "pair.json", "--size", "16x16", "-o", "warm.png", *QUIET],
-    ):
-        with suppress(SystemExit):
-            cli.main(words)
-    assert Path("warm.rfpack").exists() and Path("fused.rfpack").exists() and Path("warm.png").exists()
+    stock_fields(folder)
+    with suppress(SystemExit):
+        cli.main(["fuse", "pair.json", "-o", "good.rfpack", *QUICK])
+    assert is_bundle(Path("good.rfpack"))
 
 
-QUIET = ("-w", "-q", "--threads", "1")
+SCENE = "damaged.json"
+OVER_SCENES = (
+    ("render", SCENE, "--size", "16x16", "-o", "out.png", *QUICK),
+    ("fuse", SCENE, "-o", "out.rfpack", "--time-budget", "1", *QUICK),
+    ("eval", "good.rfpack", "--against", SCENE, *QUICK[1:]),
+    ("compose", SCENE, "-o", "out.json", "-w", "-q"),
+    ("info", SCENE),
+    ("validate", SCENE),
+)
+OVER_CAPTURES = (
+    ("train", "SOURCE", "-o", "out.rfpack", "--views", "4", "--size", "16", "--time-budget", "1", *QUICK),
+    ("info", "SOURCE"),
+)
 
 
-def line(folder: Path, sound: dict[str, Path], rng: random.Random) -> tuple[list[str], str, str]:
+def line(folder: Path, sound: dict[str, Path], rng: random.Random) -> tuple[tuple[str, ...], str, str]:
     """A command line over a damaged input, which kind of input it is, and what was done to it."""
-    what = rng.choice(("train", "train", "train", "info", "scene", "scene"))
-    if what == "scene":
-        scene = folder / "scene-damaged.json"
-        shutil.copy(folder / "pair.json", scene)
-        done = f"scene: {spoil(scene, rng)}"
-        verb = rng.choice(("render", "fuse", "info", "validate", "eval", "compose"))
-        tail = {
-            "render": ["--size", "16x16", "-o", "out.png", *QUIET],
-            "fuse": ["-o", "out.rfpack", *QUIET],
-            "eval": ["fused.rfpack", "--threads", "1"],
-            "compose": ["-o", "out.json", "-w", "-q"],
-        }
-        words = [verb, scene.name] if verb != "eval" else ["eval", "fused.rfpack", "--against", scene.name]
-        extra = tail.get(verb, []) if verb != "eval" else ["--threads", "1"]
-        return words + extra, "scene", done
+    if rng.random() < 0.4:
+        shutil.copy(folder / "pair.json", folder / SCENE)
+        done = f"scene: {spoil(folder / SCENE, rng)}"
+        return rng.choice(OVER_SCENES), "scene", done
     name, source, done = damaged(folder, sound, rng)
+    words = rng.choice(OVER_CAPTURES)
     source = str(source.relative_to(folder))
-    words = ["info", source] if what == "info" else ["train", source, "-o", "out.rfpack", "--views", "4"]
-    return words + ([] if what == "info" else ["--size", "16", *QUIET]), name, done
-
-
-def run(words: list[str], folder: Path, rng: random.Random) -> tuple[str, str | None]:
-    """How a command in a child ended, and what is wrong with that."""
-    errors = folder / "stderr.txt"
-    told = rng.random() < 0.2
-    before = {path.name for path in folder.iterdir()} | {"out.rfpack", "out.png", "out.json", errors.name}
-    child = os.fork()
-    if child == 0:
-        os._exit(silent(command(words, errors, folder)))
-    status, waited = awaited(child, rng.uniform(0, 1.5) if told else SECONDS)
-    if status is None and not told:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        return "hung", f"not done after {SECONDS:g} s"
-    if status is None:
-        os.kill(child, signal.SIGTERM)
-        status, waited = awaited(child, ENDING)
-        if status is None:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return "deaf", f"did not end {ENDING:g} s after SIGTERM"
-        return "ended", None
-    code = os.waitstatus_to_exitcode(status)
-    said = errors.read_text(errors="replace") if errors.exists() else ""
-    left = {path.name for path in folder.iterdir()} - before
-    if code not in FINE or "internal error" in said or "Traceback" in said:
-        return f"exit {code}", said[-2000:] or f"exit {code} in silence"
-    if hidden := [path for path in left if HIDDEN.fullmatch(path)]:
-        return f"exit {code}", f"left {hidden}"
-    return f"exit {code}", None
-
-
-def silent(work: Callable[[], None]) -> int:
-    """The exit code of a child's work, which prints nothing."""
-    null = os.open(os.devnull, os.O_RDWR)
-    for stream in range(3):
-        os.dup2(null, stream)
-    try:
-        work()
-    except SystemExit as done:
-        return done.code or 0
-    except BaseException:
-        traceback.print_exc()
-        return 70
-    return 0
-
-
-def awaited(child: int, seconds: float) -> tuple[int | None, float]:
-    """The status of a child that ends within some seconds, or None; and how long it took."""
-    began = time.monotonic()
-    while (passed := time.monotonic() - began) < seconds:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return status, passed
-        time.sleep(0.005)
-    return None, passed
+    return tuple(source if word == "SOURCE" else word for word in words), name, done
 
 
 def main() -> int:

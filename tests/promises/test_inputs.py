@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.parametrize("make", CAPTURES + MESHES, ids=lambda make: make.__name__)
 def test_the_sound_inputs_are_read(make, tmp_path):
     """Else the fuzzer would only see refusals."""
-    assert fuzz_inputs.judged(make(tmp_path / "sound")) == ("read", None)
+    assert fuzz_inputs.reading(make(tmp_path / "sound")) == ("read", None)
 
 
 def test_damaged_captures_and_meshes_are_read_or_refused(tmp_path):
