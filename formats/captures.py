@@ -164,9 +164,9 @@ def _read_transforms(path: Path, downscale: int | None, base: Path | None = None
 
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     model = colmap.read_model(folder)
-    base = colmap.capture_folder(folder) if path == folder or path.name in colmap.MODELS_IN else path
+    base = colmap.capture_folder(path) if path == folder or path.name in colmap.MODELS_IN else path
     files = {image.name: image.name.replace("\\", "/") for image in model.images}
-    matched = match_photos(folder, base, files.values(), downscale, ("images", "input", ""))
+    matched = match_photos(folder, base, files.values(), downscale, (*colmap.PHOTOS_IN, ""))
     if not matched.photos:
         raise MissingFile(
             f"{folder}: names {len(files)} photos such as {min(files, key=natural)}, but none of them is "

@@ -72,6 +72,8 @@ NUMBERS = [
 """Names of the models by their number in binary files."""
 MODELS_IN = ("sparse", "colmap")
 """Folders that models lie in, in the folder of their capture."""
+PHOTOS_IN = ("images", "input")
+"""Folders that its photos lie in."""
 NO_POINT = 2**64 - 1
 SMALLEST_IMAGE = 73
 """Bytes of an image without a name or observations."""
@@ -159,9 +161,11 @@ def image_count(folder: Path) -> int:
 
 
 def capture_folder(model: Path) -> Path:
-    """The folder above a model, in which the photos lie: `x` of `x/sparse/0` and of `x/colmap/sparse/0`."""
+    """The folder above a model, in which the photos lie: `x` of `x/sparse/0` and of `x/colmap/sparse/0`. A
+    capture may itself be called so."""
     for _ in range(3):
-        if model.name.isdecimal() or model.name in MODELS_IN:
+        holds_photos = any((model / name).is_dir() for name in PHOTOS_IN)
+        if not holds_photos and (model.name.isdecimal() or model.name in MODELS_IN):
             model = model.resolve().parent
     return model
 

@@ -862,3 +862,14 @@ def test_sceaux():
     assert is_capture(real("sceaux"))
     with pytest.raises(NoPoses, match="COLMAP"):
         read_capture(real("sceaux"))
+
+
+@pytest.mark.parametrize("name", ["colmap", "sparse", "7"])
+def test_a_capture_may_be_called_as_models_folders_are(tmp_path, name):
+    """Its own photos are taken, not those of a capture beside it."""
+    for capture in (name, "other"):
+        binary_model(tmp_path / capture / "sparse/0", ("a.png", "b.png"), apart=1.0)
+        photos(tmp_path / capture / "images", ("a.png", "b.png"))
+    read = read_capture(tmp_path / name)
+    assert all(view.image_path.parent == tmp_path / name / "images" for view in read.train) and len(read.train) == 2
+    assert len(read_capture(tmp_path / name / "sparse/0").train) == 2
