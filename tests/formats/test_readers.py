@@ -871,5 +871,5 @@ def test_a_capture_may_be_called_as_models_folders_are(tmp_path, name):
         binary_model(tmp_path / capture / "sparse/0", ("a.png", "b.png"), apart=1.0)
         photos(tmp_path / capture / "images", ("a.png", "b.png"))
     read = read_capture(tmp_path / name)
-    assert all(view.image_path.parent == tmp_path / name / "images" for view in read.train) and len(read.train) == 2
+    assert [view.image_path.parent for view in read.train] == [tmp_path / name / "images"] * 2
     assert len(read_capture(tmp_path / name / "sparse/0").train) == 2
