@@ -210,12 +210,10 @@ def read_views(request: TrainRequest, progress) -> Capture:
         if is_mesh(source)
         else posed_capture(source, request.downscale, request.threads, progress)
     )
-    if capture.missing:
-        progress.warn(f"{source}: {len(capture.missing)} frames have no photo and were left out")
-    for note in capture.notes:
-        progress.tell(note)
     capture = hold_out(capture, request.holdout) if request.holdout else capture
     check_parallax(capture)
+    for note in capture.notes:
+        progress.tell(note)
     return capture
 
 

@@ -148,7 +148,7 @@ def test_far_bundles_keep_their_cameras_and_tell_older_readers(worlds, name):
 
 @pytest.mark.parametrize(
     ("unit", "at", "words"),
-    [(1e3, (1e14, 0, 0), "beyond 1e+13"), (1e-13, (0, 0, 0), "scales by")],
+    [(1e3, (1e14, 0, 0), "1e+13"), (1e-13, (0, 0, 0), "scales by")],
 )
 def test_what_could_not_be_written_is_refused_before_anything_is_learnt(folder, monkeypatch, unit, at, words):
     world = World(folder, unit, at)

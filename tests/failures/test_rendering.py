@@ -379,7 +379,7 @@ POSE = np.eye(4) + [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 3], [0, 0, 0, 0]]
 BAD = {
     "NaN": {"transform_matrix": np.where(np.eye(4) == 1, np.nan, 0.0).tolist()},
     "infinite": {"transform_matrix": np.where(POSE == 3, np.inf, POSE).tolist()},
-    "no rotation": {"transform_matrix": (POSE * [2, 1, 1, 1]).tolist()},
+    "no rotation": {"transform_matrix": (POSE @ (np.eye(4) + 0.3 * np.eye(4, k=1))).tolist()},
     "all zero": {"transform_matrix": np.zeros((4, 4)).tolist()},
     "focal 0": {"fl_x": 0.0},
     "focal NaN": {"fl_x": float("nan")},

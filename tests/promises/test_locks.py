@@ -244,7 +244,7 @@ def test_a_pack_that_was_edited_says_so_in_one_generation(tmp_path):
 
 # --- temporary folders --------------------------------------------------------------------------------------
 
-HOLDING = """
+HOLDING_A_FOLDER = """
 import sys
 from formats.locks import temporary_folder
 with temporary_folder("fusedrf-poses-") as folder:
@@ -257,7 +257,7 @@ def test_temporary_folders_of_killed_processes_are_removed_and_those_of_others_n
     """P2: whoever lives holds a lock on its folder."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     environment = os.environ | {"TMPDIR": str(tmp_path)}
-    words = [sys.executable, "-c", HOLDING]
+    words = [sys.executable, "-c", HOLDING_A_FOLDER]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with (
         subprocess.Popen(words, cwd=ROOT, env=environment, **pipes) as killed,
