@@ -45,6 +45,9 @@ def _lines(facts: dict, indent: str) -> Iterator[str]:
         if _is_table(value):
             yield f"{label}:"
             yield from (f"{indent}  {row}" for row in _table(value))
+        elif _are_sentences(value):
+            yield f"{label}:"
+            yield from (f"{indent}  {sentence}" for sentence in value)
         elif isinstance(value, dict) and any(isinstance(part, dict | list) for part in value.values()):
             yield f"{label}:"
             yield from _lines(value, indent + "  ")
@@ -87,6 +90,11 @@ def readable_size(count: int) -> str:
 
 def _is_table(value: object) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(row, dict) for row in value)
+
+
+def _are_sentences(value: object) -> bool:
+    """Whether this is a list of notes, which stand on lines of their own."""
+    return isinstance(value, list) and bool(value) and all(isinstance(v, str) and " " in v for v in value)
 
 
 def _table(rows: list[dict]) -> Iterator[str]:

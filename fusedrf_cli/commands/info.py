@@ -43,7 +43,7 @@ def _brief_overview(facts: dict) -> dict:
     for key, noun in (("left_out", "photo"), ("sizes", "size"), ("lenses", "lens")):
         if (more := len(facts.get(key, [])) - MOST_ROWS) > 0:
             brief[key] = [*facts[key][:MOST_ROWS], {noun: f"{more} more"}]
-    return brief | {"notes": [{"note": note} for note in facts["notes"]]}
+    return brief
 
 
 def _cameras(cameras: dict) -> dict:

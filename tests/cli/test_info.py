@@ -88,6 +88,8 @@ def test_info_of_a_capture_and_of_a_film(run, folder):
     assert not any(line.startswith("masks") for line in lines)
     told = json.loads(run("info", "garden", "--json").stdout)
     assert len(told["lenses"]) == 9 and told["masks"] == 0 and "one point" in told["notes"][-1]
+    notes = lines[lines.index("notes:") + 1 :]
+    assert notes == [f"  {note}" for note in told["notes"]]
     (folder / "walk.mp4").write_bytes(b"\0\0\0\x20ftypisom")
     result = run("info", "walk.mp4")
     assert result.exit_code == 3 and "a film" in result.stderr and result.stderr.count("\n") == 1
