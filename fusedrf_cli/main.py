@@ -65,7 +65,7 @@ def _report_error(error: BaseException) -> int:
     if isinstance(error, BrokenPipeError):  # the reader (`head`, for example) has closed the pipe
         return 128 + signal.SIGPIPE  # as a shell reports a process that this signal ended
     sentence, code = _sentence(error)
-    if isinstance(error, KeyboardInterrupt):
+    if isinstance(error, KeyboardInterrupt) or signals.raised():
         signals.said()
     with contextlib.suppress(OSError):  # stderr may be full, or nobody may read it
         click.echo(f"Error: {printable(sentence)}", err=True)
@@ -88,6 +88,8 @@ def _sentence(error: BaseException) -> tuple[str, int]:
         case OSError():
             where = f"{error.filename}: " if error.filename is not None else ""
             return f"{where}{error.strerror or error}", 3 if isinstance(error, _MISSING_INPUT) else 5
+    if (interrupt := signals.raised()) is not None:
+        return _sentence(interrupt)
     return f"internal error: {type(error).__name__}: {error}; run again with --debug for the traceback", 1
 
 

@@ -19,8 +19,8 @@ ECHO = 0.3
 """Seconds in which a second signal is the same one: `timeout` sends to a process and then to its group."""
 
 _obeying = False
-_raised = False
-"""Whether a signal was raised in the main thread."""
+_raised: int | None = None
+"""The signal that was raised in the main thread."""
 _saving = 0
 """How many are in `unhurried` now."""
 _said = False
@@ -51,8 +51,14 @@ def interrupt(number: int, frame: object) -> None:
     """The handler of both signals."""
     global _raised
     if not (_obeying and _raised):
-        _raised = True
+        _raised = number
         raise Interrupted(number)
+
+
+def raised() -> Interrupted | None:
+    """The interrupt of this process, if there was one. A library that it broke off, such as a compiler, may end
+    with an error of its own."""
+    return Interrupted(_raised) if _raised else None
 
 
 def obeying() -> bool:

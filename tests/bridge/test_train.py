@@ -116,7 +116,7 @@ def test_a_second_interrupt_does_not_wait(run, folder, interrupted_in_step):
 def test_two_signals_at_once_are_one_to_a_process_that_obeys(run, folder, interrupted_in_step, monkeypatch):
     """As `timeout` sends them: the state is saved all the same."""
     monkeypatch.setattr(signals, "_obeying", True)
-    monkeypatch.setattr(signals, "_raised", False)
+    monkeypatch.setattr(signals, "_raised", None)
     with interrupted_in_step(6, times=2):
         result = run("train", "photos", "-o", "out.rfpack", *WORDS)
     assert result.exit_code == 130 and "--resume" in result.stderr

@@ -78,3 +78,24 @@ def test_two_signals_at_once_are_one(caught, folder):
     running.send_signal(signal.SIGTERM)
     assert running.communicate(timeout=30)[1] == "Error: interrupted\n" and running.returncode == 143
     assert not list(folder.glob(".out*"))
+
+
+BROKEN_OFF = """
+import os, signal, sys, types
+def train(request, progress):
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        while True:
+            pass
+    finally:  # as a compiler that was broken off
+        raise RuntimeError("finalize not done yet")
+import fusedrf_cli
+fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
+from fusedrf_cli.main import main
+main()
+"""
+
+
+def test_an_error_that_an_interrupt_caused_is_the_interrupt(process):
+    running = process(BROKEN_OFF, *WORDS)
+    assert (running.communicate(timeout=30)[1], running.returncode) == ("Error: interrupted\n", 143)
