@@ -56,8 +56,8 @@ def interrupt(number: int, frame: object) -> None:
 
 
 def raised() -> Interrupted | None:
-    """The interrupt of this process, if there was one. A library that it broke off, such as a compiler, may end
-    with an error of its own."""
+    """The interrupt of this process, if there was one. A library that it broke off, such as a compiler, may
+    end with an error of its own."""
     return Interrupted(_raised) if _raised else None
 
 
