@@ -48,7 +48,7 @@ class Buffers:
 
     def _content(self, index: int, entry: schema.Buffer) -> bytes:
         if entry.uri is not None:
-            if entry.uri.startswith("data:"):
+            if is_data(entry.uri):
                 return data_uri(entry.uri, f"{self.path}: buffer {index}")
             try:
                 return self.beside.read(entry.uri, uri=True)[0]
@@ -181,12 +181,17 @@ def normalised(rows: np.ndarray) -> np.ndarray:
     return np.maximum(rows.astype(np.float32) / np.iinfo(rows.dtype).max, -1)
 
 
+def is_data(uri: str) -> bool:
+    """Whether a URI holds its bytes itself."""
+    return uri[:5].lower() == "data:"
+
+
 def data_uri(uri: str, where: str) -> bytes:
     """The bytes of `data:`. Raises BadMesh."""
     head, comma, body = uri.partition(",")
     if not comma:
         raise BadMesh(f"{where}: a data URI without data")
-    if not head.endswith(";base64"):
+    if not head.rstrip().lower().endswith(";base64"):
         return unquote_to_bytes(body)
     try:
         if "%" in body:

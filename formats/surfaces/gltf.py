@@ -112,7 +112,10 @@ def _check_extensions(document: schema.Document, path: Path | str, notes: Notes)
         raise BadMesh(
             f"{path}: requires {listed(required)}, which is not known here; export the mesh without it"
         )
-    if used := unknown(document.extensions_used):
+    places = [document, *document.nodes, *document.meshes]
+    places += [primitive for mesh in document.meshes for primitive in mesh.primitives]
+    there = [name for place in places for name in place.extensions]
+    if used := unknown(dict.fromkeys([*document.extensions_used, *document.extensions_required, *there])):
         notes.add(f"uses {listed(used)}, which is not shown")
 
 
@@ -148,7 +151,7 @@ class _Reader:
         hidden = [mesh.name or f"mesh {i}" for i, mesh in enumerate(document.meshes) if i not in placed]
         if hidden:
             self.notes.add(f"meshes that are not in the shown scene: {listed(hidden)}")
-        self.materials.tell_unused_images()
+        self.materials.tell_unused()
 
     # --- nodes ----------------------------------------------------------------------------------------------
 
@@ -293,6 +296,9 @@ class _Shape:
         rows = self.buffers.rows(self.primitive.indices, (1,))
         if rows.dtype.kind != "u":
             raise BadMesh(f"{self.where}: its indices are {rows.dtype}, expected whole numbers without sign")
+        if len(rows) and rows.max() == np.iinfo(rows.dtype).max:
+            reserved = "counts up to the index that glTF reserves; it is shown as a vertex like others"
+            self.reader.notes.add(reserved, self.where.removeprefix(f"{self.reader.path}: "))
         return rows[:, 0].astype(np.int64)
 
     def _draco(self) -> dict[str, np.ndarray]:
@@ -358,7 +364,14 @@ class _Shape:
         points = self._morphed("POSITION", (3,), weights).astype(np.float64)
         if skin is not None and "JOINTS_0" in self.primitive.attributes:
             return [Surface(self._skinned(points, skin), **rest)]
-        return [Surface(points @ world[:3, :3].T + world[:3, 3], **rest) for world in worlds]
+        mirrored = rest | {"faces": self.faces[:, [0, 2, 1]]}  # their fronts stay fronts
+        return [
+            Surface(
+                points @ world[:3, :3].T + world[:3, 3],
+                **(mirrored if np.linalg.det(world[:3, :3]) < 0 else rest),
+            )
+            for world in worlds
+        ]
 
     def _paint(self, slot: Slot, weights: list[float]) -> Paint:
         if slot.texture is None:

@@ -20,6 +20,7 @@ ONE_WORD = ("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", 
 ARGUMENTS = {**dict.fromkeys(ONE_WORD, 1), "-mm": 2}
 """Options of a map and how many words follow; -o, -s and -t take one to three numbers."""
 PLACING = ("-o", "-s", "-t")
+WITHOUT_LOOKS = ("-blendu", "-blendv", "-bm", "-boost", "-texres", "-type", "-colorspace")
 
 MAPS = re.compile(r"(map_\w+|norm|bump|disp|decal|refl)$")
 SHOWN = ("map_kd", "map_ka", "map_d", "map_ke")
@@ -110,8 +111,10 @@ def _map(rest: str) -> Map:
             values = re.match(r"(?:[-+]?[\d.]+(?:[eE][-+]?\d+)?\s+){1,3}", rest[match.end() :])
         elif option in ARGUMENTS:
             values = re.match(rf"(?:\S+\s+){{{ARGUMENTS[option]}}}", rest[match.end() :])
-        else:
-            break
+        else:  # not known: with one word, unless nothing would be left
+            values = re.match(r"\S+\s+(?=\S)", rest[match.end() :])
+            if values is None:
+                break
         if values is None:
             raise ValueError
         options[option] = values[0].split()
@@ -199,7 +202,8 @@ class Looks:
         return None if pixels is None else Texture(pixels, (wrap, wrap))
 
     def _tell_unused(self, material: Material, base: Map | None, called: str) -> None:
-        shown = {"map_kd", "map_d", "map_ke"} if "ke" in material.colours else {"map_kd", "map_d"}
+        glows = max(material.colours.get("ke", (0,))) > 0
+        shown = {"map_kd", "map_d", "map_ke"} if glows else {"map_kd", "map_d"}
         unused = [f"{word} {m.name}" for word, m in material.maps.items() if word not in shown]
         unused = [text for text in unused if base is None or not text.endswith(f" {base.name}")]
         if unused:
@@ -208,7 +212,7 @@ class Looks:
             option
             for word, m in material.maps.items()
             for option in m.options
-            if word in shown and option in ("-t", "-mm", "-imfchan", "-cc")
+            if word in SHOWN and option not in ("-o", "-s", "-clamp", *WITHOUT_LOOKS)
         }
         if odd:
             self.notes.add(f"has pictures with {listed(sorted(odd))}, which is not honoured", called)

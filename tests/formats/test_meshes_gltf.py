@@ -266,6 +266,16 @@ def test_backs_are_shown_and_told(tmp_path):
     assert "from both sides" not in notes_of(gltf.write(tmp_path / "a.glb"))
 
 
+def test_mirrored_fronts_stay_fronts(tmp_path):
+    """A node that mirrors turns the winding, which its determinant undoes."""
+    gltf = Gltf()
+    gltf.doc["nodes"][0]["scale"] = [-1, 1, 1]
+    (surface,) = _load(gltf.write(tmp_path / "a.glb")).surfaces
+    points = CORNERS[:, [0, 2, 1]] * [-1, 1, 1]
+    a, b, c = (points[surface.faces[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 1] < 0).all()  # +z, which is turned to -y
+
+
 # --- nodes --------------------------------------------------------------------------------------------------
 
 
@@ -381,6 +391,32 @@ def test_lost_and_unused_pictures_are_named(tmp_path):
     gltf.doc["materials"][0]["normalTexture"] = {"index": 0}
     notes = notes_of(gltf.write(tmp_path / "a.gltf"))
     assert "lost.png" in notes and "spare.png" in notes and "normalTexture" in notes
+
+
+def test_unused_materials_are_named(tmp_path):
+    gltf = textured()
+    gltf.list("materials", {"name": "spare"})
+    assert "materials that nothing shown has: spare" in notes_of(gltf.write(tmp_path / "a.glb"))
+
+
+@pytest.mark.parametrize("name", ["nodes", "meshes", "primitives", "root", "required"])
+def test_extensions_that_are_not_declared_are_named(tmp_path, name):
+    gltf, there = Gltf(), {"KHR_materials_variants": {}}
+    places = {"nodes": gltf.doc["nodes"][0], "meshes": gltf.doc["meshes"][0], "primitives": gltf.primitive}
+    if name == "required":
+        gltf.doc["extensionsRequired"] = list(there)
+    else:
+        places.get(name, gltf.doc)["extensions"] = there
+    assert "KHR_materials_variants" in notes_of(gltf.write(tmp_path / "a.glb"))
+
+
+def test_reserved_index_is_told(tmp_path):
+    gltf = Gltf()
+    corners = np.concatenate([np.zeros((252, 3), np.float32), CORNERS])
+    gltf.attribute("POSITION", corners)
+    gltf.primitive["indices"] = gltf.accessor((FACES + 252).astype(np.uint8))
+    path = gltf.write(tmp_path / "a.glb")
+    assert (front(path) == 255).all() and "reserves" in notes_of(path)
 
 
 def test_extensions(tmp_path):
