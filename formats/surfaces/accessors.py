@@ -160,9 +160,15 @@ class Buffers:
         patched[places] = values
         return patched
 
-    def numbers(self, index: int, widths: tuple[int, ...] = (), chosen: np.ndarray | None = None):
-        """(count, n) float32, integers divided by their largest where the accessor is normalised; of the
-        elements `chosen` alone, where that is given."""
+    def numbers(
+        self,
+        index: int,
+        widths: tuple[int, ...] = (),
+        chosen: np.ndarray | None = None,
+        scaled: bool = False,
+    ) -> np.ndarray:
+        """(count, n) float32, integers divided by their largest where the accessor is normalised or they are
+        `scaled` in any case; of the elements `chosen` alone, where that is given."""
         rows, accessor = self.rows(index, widths), self.item("accessors", index)
         if chosen is not None:
             if len(chosen) and chosen[-1] >= len(rows):
@@ -171,7 +177,7 @@ class Buffers:
                     "export the file again"
                 )
             rows = rows[chosen]
-        return normalised(rows) if accessor.normalized else rows.astype(np.float32)
+        return normalised(rows) if scaled or accessor.normalized else rows.astype(np.float32)
 
 
 def normalised(rows: np.ndarray) -> np.ndarray:

@@ -318,14 +318,15 @@ class _Shape:
     def _attribute(self, name: str, widths: tuple[int, ...]) -> np.ndarray | None:
         """(used vertices, n) float32 of an attribute, None where there is none."""
         index = self.primitive.attributes.get(name)
+        colour = name.startswith("COLOR_")  # some exporters forget that its integers are normalised
         if name in self.unpacked:
             rows = self.unpacked[name]
             if rows.ndim != 2 or rows.shape[1] not in widths:
                 raise BadMesh(f"{self.where}: {name} has {rows.shape[1:]} numbers a vertex")
-            scaled = index is not None and self.buffers.item("accessors", index).normalized
+            scaled = colour or index is not None and self.buffers.item("accessors", index).normalized
             rows = rows[self.chosen]
             return normalised(rows) if scaled else rows.astype(np.float32)
-        return None if index is None else self.buffers.numbers(index, widths, self.chosen)
+        return None if index is None else self.buffers.numbers(index, widths, self.chosen, colour)
 
     def _morphed(self, name: str, widths: tuple[int, ...], weights: list[float]) -> np.ndarray | None:
         """An attribute with its morph targets added by their weights."""

@@ -23,6 +23,8 @@ PLACING = ("-o", "-s", "-t")
 WITHOUT_LOOKS = ("-blendu", "-blendv", "-bm", "-boost", "-texres", "-type", "-colorspace")
 
 MAPS = re.compile(r"(map_\w+|norm|bump|disp|decal|refl)$")
+PICTURE = re.compile(r"\.(png|jpe?g|tga|bmp|tiff?|exr|hdr|dds|webp|gif|psd)$", re.IGNORECASE)
+"""What a word that is not known names."""
 SHOWN = ("map_kd", "map_ka", "map_d", "map_ke")
 GREY = 1 / 512
 MAX_MATERIALS = 100_000
@@ -98,7 +100,7 @@ def _set(material: Material, word: str, rest: str) -> None:
             material.alpha = value
         elif value < 1 and material.alpha == 1:  # Tr 1 is written for opaque, too
             material.alpha = 1 - value
-    elif MAPS.match(word):
+    elif MAPS.match(word) or PICTURE.search(rest):
         material.maps[word] = _map(rest)
 
 

@@ -31,6 +31,7 @@ LEFT_OUT = {
     **dict.fromkeys(FREE_FORM, "free-form curves and surfaces"),
     "call": "other files that are called",
 }
+FEW = "faces of fewer than three corners"
 POLYPAINT = re.compile(rb"^#MRGB +([0-9a-fA-F]+)", re.MULTILINE)
 """ZBrush's colours of vertices: eight digits each, two of them a mask."""
 
@@ -91,6 +92,7 @@ class _Text:
     def _face(self, rest: str, material: int) -> None:
         tokens = rest.partition("#")[0].split() if "#" in rest else rest.split()
         if len(tokens) < 3:
+            self.left_out[FEW] = self.left_out.get(FEW, 0) + 1
             return
         self.tokens += tokens
         self.relative += [(len(self.points), len(self.uvs))] * len(tokens)

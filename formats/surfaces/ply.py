@@ -375,7 +375,12 @@ def _colours(columns: dict, notes: Notes) -> np.ndarray | None:
     values = [columns[name] for name in names]
     whole = values[0].dtype.kind in "ui"
     rgb = np.stack([value.astype(np.float64) for value in values], 1)
-    most = np.iinfo(values[0].dtype).max if whole else 255 if np.nanmax(rgb, initial=0) > 1 else 1
+    largest = np.nanmax(rgb, initial=0)
+    if whole:  # wide integers hold colours of 8 or 16 bits
+        width = values[0].dtype.itemsize
+        most = 255 if width == 1 or width > 2 and largest < 256 else 65535
+    else:
+        most = 255 if largest > 1 else 1
     return sound_colours(rgb / most)
 
 

@@ -22,6 +22,9 @@ def read_stl(path: Path | str, notes: Notes) -> list[Surface]:
     """All triangles. Raises BadMesh, LimitExceeded, MissingFile."""
     data = read_input(path, MAX_FILE)
     count, colours = int.from_bytes(data[80:84], "little"), None
+    if count == 0 and len(data) > HEADER and (len(data) - HEADER) % RECORD.itemsize == 0:
+        count = (len(data) - HEADER) // RECORD.itemsize
+        notes.add(f"counts no triangles, but holds {count:,}, which are shown")
     beginning = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()
     if len(data) >= HEADER and HEADER + RECORD.itemsize * count == len(data):
         corners, colours = _binary(data, count, notes)

@@ -1,5 +1,6 @@
 """glTF as its specification says: a square whose every pixel is known, written in each of many ways."""
 
+import base64
 import io
 import json
 import math
@@ -613,3 +614,36 @@ def places(value):
         yield value, key
         if isinstance(inner, dict | list):
             yield from places(inner)
+
+
+def test_nulls_and_whole_numbers_with_a_point(tmp_path):
+    gltf = textured()
+    gltf.doc |= {"skins": None, "animations": None}
+    gltf.doc["nodes"][0] |= {"mesh": 0.0, "children": None, "name": None, "translation": None}
+    gltf.doc["materials"][0] |= {"alphaMode": None, "extensions": None, "alphaCutoff": 1}
+    gltf.doc["accessors"][0] |= {"componentType": 5126.0, "count": 4.0}
+    gltf.doc["bufferViews"][0]["byteStride"] = None
+    gltf.doc["textures"][0]["extensions"] = {"EXT_texture_webp": {"source": None}}
+    assert shows(gltf.write(tmp_path / "a.glb"), noise())
+
+
+@pytest.mark.parametrize("head", ["DATA:image/png;base64,", "data:image/png;BASE64,", "data:;base64,"])
+def test_data_uris_as_people_write_them(tmp_path, head):
+    gltf = textured()
+    gltf.doc["images"] = [{"uri": head + base64.b64encode(png(noise())).decode()}]
+    assert shows(gltf.write(tmp_path / "a.glb"), noise())
+
+
+@pytest.mark.parametrize("uri", ["file:///C:/work/wood.png", "wood.png?v=2", "./tex/wood.png#a"])
+def test_addresses_of_local_files(tmp_path, uri):
+    gltf = textured()
+    gltf.doc["images"] = [{"uri": uri}]
+    (tmp_path / "wood.png").write_bytes(png(noise()))
+    assert shows(gltf.write(tmp_path / "a.glb"), noise())
+
+
+def test_integer_colours_are_normalised_though_not_said(tmp_path):
+    gltf = Gltf()
+    gltf.attribute("COLOR_0", np.tile(np.array([51, 102, 153, 255], np.uint8), (4, 1)))
+    wanted = [encoded(part / 255) for part in (51, 102, 153)]
+    assert np.abs(front(gltf.write(tmp_path / "a.glb"))[..., :3].astype(int) - wanted).max() <= 1

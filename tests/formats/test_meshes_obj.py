@@ -289,3 +289,9 @@ def test_polypaint(folder):
     assert (facing(path)[..., :3] == [51, 102, 153]).all()
     path.write_text(f"{SQUARE}#MRGB ff336699\nf 1 2 3 4\n")
     assert (facing(path)[..., :3] == 255).all() and "ZBrush" in notes_of(path)
+
+
+def test_pictures_of_unknown_words_and_small_faces_are_named(folder):
+    path = written(folder, "map_Kd wood.png\nalbedo oak.png", faces="f 1/1 2/2 3/3 4/4\nf 1,2,3")
+    notes = notes_of(path)
+    assert shows(path) and "albedo oak.png" in notes and "fewer than three" in notes

@@ -235,3 +235,9 @@ def test_colours_of_vertices_and_of_faces(tmp_path):
 def test_coordinates_without_a_picture_are_told(tmp_path):
     path = ply(tmp_path / "a.ply", "ascii", square(s=("float", [0] * 4), t=("float", [0] * 4)), QUAD)
     assert "names none" in notes_of(path)
+
+
+def test_wide_integers_hold_colours_of_8_bits(tmp_path):
+    hues = {hue: ("int", [part] * 4) for hue, part in (("red", 51), ("green", 102), ("blue", 153))}
+    path = ply(tmp_path / "a.ply", "binary_big_endian", square(**hues), QUAD)
+    assert (facing(path)[..., :3] == [51, 102, 153]).all()

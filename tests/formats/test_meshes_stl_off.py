@@ -110,3 +110,9 @@ def test_broken_off(tmp_path, data):
     path.write_text(data)
     with pytest.raises(BadMesh, match=r"a\.off"):
         _load(path)
+
+
+def test_stl_that_counts_none(tmp_path):
+    path = binary(tmp_path / "a.stl")
+    path.write_bytes(path.read_bytes()[:80] + bytes(4) + path.read_bytes()[84:])
+    assert (facing(path) == 255).all() and "counts no triangles" in notes_of(path)
