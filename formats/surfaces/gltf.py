@@ -125,7 +125,7 @@ class _Reader:
     def __init__(self, document: schema.Document, path: Path | str, buffers: Buffers, notes: Notes):
         self.document, self.path, self.buffers, self.notes = document, path, buffers, notes
         self.materials = Materials(document, buffers, notes)
-        self.left_out = 0
+        self.left_out = self.hidden = 0
         self.worlds: list[np.ndarray] = []
         self.triangles = 0
         self.shapes: dict[tuple[int, int], _Shape] = {}
@@ -149,6 +149,11 @@ class _Reader:
             )
         placed = {document.nodes[index].mesh for index in shown}
         hidden = [mesh.name or f"mesh {i}" for i, mesh in enumerate(document.meshes) if i not in placed]
+        stray = sum(node.mesh in placed for node in document.nodes) - sum(
+            document.nodes[index].mesh is not None for index in shown
+        )
+        if stray and len(document.scenes) < 2 and not self.hidden:
+            self.notes.add(f"{stray} nodes with meshes that are shown elsewhere are not in the shown scene")
         if hidden:
             self.notes.add(f"meshes that are not in the shown scene: {listed(hidden)}")
         self.materials.tell_unused()
@@ -194,7 +199,6 @@ class _Reader:
         for root in roots:
             self.buffers.item("nodes", root)
         within, shown = set(roots), []
-        hidden = 0
         for index in order:
             if index not in within:
                 continue
@@ -202,12 +206,12 @@ class _Reader:
             if VISIBILITY in node.extensions:
                 raw = node.extensions[VISIBILITY]
                 if not schema.typed(raw, schema.Visibility, f"{self.path}: {VISIBILITY}").visible:
-                    hidden += 1
+                    self.hidden += 1
                     continue
             within.update(node.children)
             shown.append(index)
-        if hidden:
-            self.notes.add(f"{hidden} nodes are hidden by {VISIBILITY} and left out")
+        if self.hidden:
+            self.notes.add(f"{self.hidden} nodes are hidden by {VISIBILITY} and left out")
         return shown
 
     def _node(self, index: int) -> list[Surface]:
@@ -275,7 +279,11 @@ class _Shape:
             reader.notes.add("has no positions and is left out", where.removeprefix(f"{reader.path}: "))
             return
         count = self._count()
-        faces = _triangles(self._indices(count), TRIANGLES if self.unpacked else primitive.mode)
+        indices, mode = self._indices(count), TRIANGLES if self.unpacked else primitive.mode
+        if mode == TRIANGLES and len(indices) % 3:
+            left = "counts corners that are no whole triangles; the last ones are left out"
+            reader.notes.add(left, where.removeprefix(f"{reader.path}: "))
+        faces = _triangles(indices, mode)
         check_indices(where, faces.reshape(-1), count)
         used = np.zeros(count, bool)
         used[faces.reshape(-1)] = True
@@ -363,9 +371,10 @@ class _Shape:
         ]:
             self.reader.notes.add(f"vertex colours {listed(more)} are not used, COLOR_0 is")
         points = self._morphed("POSITION", (3,), weights).astype(np.float64)
-        if skin is not None and "JOINTS_0" in self.primitive.attributes:
-            return [Surface(self._skinned(points, skin), **rest)]
         mirrored = rest | {"faces": self.faces[:, [0, 2, 1]]}  # their fronts stay fronts
+        if skin is not None and "JOINTS_0" in self.primitive.attributes:
+            points, turned = self._skinned(points, skin)
+            return [Surface(points, **(mirrored if turned else rest))]
         return [
             Surface(
                 points @ world[:3, :3].T + world[:3, 3],
@@ -386,8 +395,9 @@ class _Shape:
             uv = uv @ slot.transform[:, :2].T + slot.transform[:, 2]
         return laid(Paint(slot.factor, slot.texture), uv)
 
-    def _skinned(self, points: np.ndarray, skin: int) -> np.ndarray:
-        """Points moved by the joints that hold them; the node's own place does not count."""
+    def _skinned(self, points: np.ndarray, skin: int) -> tuple[np.ndarray, bool]:
+        """Points moved by the joints that hold them, and whether those mirror; the node's own place does not
+        count."""
         joints = self.reader.joints(skin)[:, :3]
         sets = [i for i in range(8) if f"JOINTS_{i}" in self.primitive.attributes]
         holds = [self._attribute(f"JOINTS_{i}", (4,)).astype(np.int64) for i in sets]
@@ -395,6 +405,7 @@ class _Shape:
         if any(rows is None for rows in weights):
             raise BadMesh(f"{self.where}: has joints without weights; export the file again")
         hold, weight = np.concatenate(holds, 1), np.concatenate(weights, 1).astype(np.float64)
+        weight[~weight.any(1), 0] = 1  # held by nothing: by its first joint, as other viewers show it
         hold = np.where(weight == 0, 0, hold)
         check_indices(f"{self.where}: skin {skin}", hold.reshape(-1), len(joints))
         total = weight.sum(1, keepdims=True)
@@ -404,7 +415,7 @@ class _Shape:
             part = slice(start, start + SKINNED_AT_ONCE)
             moves = np.einsum("vk,vkij->vij", weight[part], joints[hold[part]])
             out[part] = np.einsum("vij,vj->vi", moves[:, :, :3], points[part]) + moves[:, :, 3]
-        return out
+        return out, bool((np.linalg.det(joints[np.unique(hold), :, :3]) < 0).all())
 
 
 def draco_arrays(data: bytes, names: dict[str, int], where: str) -> dict[str, np.ndarray]:

@@ -73,6 +73,7 @@ class _Text:
         material, points, uvs = 0, self.points, self.uvs
         for line in lines_of(data):
             word, _, rest = line.partition(" ")
+            word = word.lower()
             if word == "v":
                 points.append(rest)
             elif word == "vt":

@@ -647,3 +647,37 @@ def test_integer_colours_are_normalised_though_not_said(tmp_path):
     gltf.attribute("COLOR_0", np.tile(np.array([51, 102, 153, 255], np.uint8), (4, 1)))
     wanted = [encoded(part / 255) for part in (51, 102, 153)]
     assert np.abs(front(gltf.write(tmp_path / "a.glb"))[..., :3].astype(int) - wanted).max() <= 1
+
+
+def test_nodes_outside_the_scene_and_corners_left_over_are_told(tmp_path):
+    gltf = Gltf()
+    gltf.list("nodes", {"mesh": 0, "translation": [9, 0, 0]})
+    gltf.doc["accessors"][gltf.primitive["indices"]]["count"] = 5
+    path = gltf.write(tmp_path / "a.glb")
+    assert box(path)[3] == 1 and "not in the shown scene" in notes_of(path) and "left out" in notes_of(path)
+
+
+def skinned(weights: list[float], **joint) -> Gltf:
+    gltf = Gltf()
+    gltf.doc["nodes"] = [{"mesh": 0, "skin": 0}, joint]
+    gltf.doc["skins"] = [{"joints": [1]}]
+    gltf.attribute("JOINTS_0", np.zeros((4, 4), np.uint8))
+    gltf.attribute("WEIGHTS_0", np.tile(np.array(weights, np.float32), (4, 1)))
+    return gltf
+
+
+def test_joints_that_mirror_and_vertices_that_nothing_holds(tmp_path):
+    plain, turned = (
+        _load(skinned([1, 0, 0, 0], scale=[x, 1, 1]).write(tmp_path / "a.glb")).triangles[1] for x in (1, -1)
+    )
+    assert (turned == plain[:, [0, 2, 1]]).all()
+    path = skinned([0, 0, 0, 0], translation=[5, 0, 0]).write(tmp_path / "a.glb")
+    assert box(path) == pytest.approx([4, -1, 0, 6, 1, 0])
+
+
+def test_a_camera_beside_a_mesh_is_no_note(tmp_path):
+    gltf = Gltf()
+    gltf.doc["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}]
+    gltf.doc["nodes"] += [{"camera": 0}, {}]
+    gltf.doc["scenes"][0]["nodes"] = [0, 1]
+    assert "scene" not in notes_of(gltf.write(tmp_path / "a.glb"))

@@ -295,3 +295,8 @@ def test_pictures_of_unknown_words_and_small_faces_are_named(folder):
     path = written(folder, "map_Kd wood.png\nalbedo oak.png", faces="f 1/1 2/2 3/3 4/4\nf 1,2,3")
     notes = notes_of(path)
     assert shows(path) and "albedo oak.png" in notes and "fewer than three" in notes
+
+
+def test_capitals(folder):
+    path = written(folder, "MAP_KD WOOD.PNG", "MTLLIB a.mtl", "USEMTL wood", "F 1/1 2/2 3/3 4/4")
+    assert shows(path)
