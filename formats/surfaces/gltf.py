@@ -147,11 +147,10 @@ class _Reader:
             self.notes.add(
                 f"{len(document.animations)} animations are not played; nodes and weights are as stored"
             )
-        placed = {document.nodes[index].mesh for index in shown}
+        meshes = [document.nodes[index].mesh for index in shown if document.nodes[index].mesh is not None]
+        placed = set(meshes)
         hidden = [mesh.name or f"mesh {i}" for i, mesh in enumerate(document.meshes) if i not in placed]
-        stray = sum(node.mesh in placed for node in document.nodes) - sum(
-            document.nodes[index].mesh is not None for index in shown
-        )
+        stray = sum(node.mesh in placed for node in document.nodes) - len(meshes)
         if stray and len(document.scenes) < 2 and not self.hidden:
             self.notes.add(f"{stray} nodes with meshes that are shown elsewhere are not in the shown scene")
         if hidden:
@@ -415,7 +414,7 @@ class _Shape:
             part = slice(start, start + SKINNED_AT_ONCE)
             moves = np.einsum("vk,vkij->vij", weight[part], joints[hold[part]])
             out[part] = np.einsum("vij,vj->vi", moves[:, :, :3], points[part]) + moves[:, :, 3]
-        return out, bool((np.linalg.det(joints[np.unique(hold), :, :3]) < 0).all())
+        return out, bool((np.linalg.det(joints[np.unique(hold[weight != 0]), :, :3]) < 0).all())
 
 
 def draco_arrays(data: bytes, names: dict[str, int], where: str) -> dict[str, np.ndarray]:
