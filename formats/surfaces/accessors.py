@@ -48,7 +48,7 @@ class Buffers:
 
     def _content(self, index: int, entry: schema.Buffer) -> bytes:
         if entry.uri is not None:
-            if entry.uri.startswith("data:"):
+            if is_data(entry.uri):
                 return data_uri(entry.uri, f"{self.path}: buffer {index}")
             try:
                 return self.beside.read(entry.uri, uri=True)[0]
@@ -160,9 +160,15 @@ class Buffers:
         patched[places] = values
         return patched
 
-    def numbers(self, index: int, widths: tuple[int, ...] = (), chosen: np.ndarray | None = None):
-        """(count, n) float32, integers divided by their largest where the accessor is normalised; of the
-        elements `chosen` alone, where that is given."""
+    def numbers(
+        self,
+        index: int,
+        widths: tuple[int, ...] = (),
+        chosen: np.ndarray | None = None,
+        scaled: bool = False,
+    ) -> np.ndarray:
+        """(count, n) float32, integers divided by their largest where the accessor is normalised or they are
+        `scaled` in any case; of the elements `chosen` alone, where that is given."""
         rows, accessor = self.rows(index, widths), self.item("accessors", index)
         if chosen is not None:
             if len(chosen) and chosen[-1] >= len(rows):
@@ -171,7 +177,7 @@ class Buffers:
                     "export the file again"
                 )
             rows = rows[chosen]
-        return normalised(rows) if accessor.normalized else rows.astype(np.float32)
+        return normalised(rows) if scaled or accessor.normalized else rows.astype(np.float32)
 
 
 def normalised(rows: np.ndarray) -> np.ndarray:
@@ -181,12 +187,17 @@ def normalised(rows: np.ndarray) -> np.ndarray:
     return np.maximum(rows.astype(np.float32) / np.iinfo(rows.dtype).max, -1)
 
 
+def is_data(uri: str) -> bool:
+    """Whether a URI holds its bytes itself."""
+    return uri[:5].lower() == "data:"
+
+
 def data_uri(uri: str, where: str) -> bytes:
     """The bytes of `data:`. Raises BadMesh."""
     head, comma, body = uri.partition(",")
     if not comma:
         raise BadMesh(f"{where}: a data URI without data")
-    if not head.endswith(";base64"):
+    if not head.rstrip().lower().endswith(";base64"):
         return unquote_to_bytes(body)
     try:
         if "%" in body:

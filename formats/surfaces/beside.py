@@ -8,9 +8,11 @@ from urllib.parse import unquote
 
 from formats.errors import FormatError, LimitExceeded, MissingFile, OutsideFolder
 from formats.inputs import read_input
+from formats.surfaces.lines import western, without_comment
 
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 """One letter alone is a drive of Windows."""
+LOCAL = re.compile(r"file:(?=/)", re.IGNORECASE)
 ABSOLUTE = re.compile(r"[A-Za-z]:|/|\\")
 MAX_FILE = 2**31
 MAX_NAME = 1024
@@ -44,9 +46,13 @@ class Beside:
     def find(self, name: str, *, uri: bool = False) -> Path:
         if len(name) > MAX_NAME:
             raise MissingFile(f"{name[:80]}…: no such file beside the mesh")
+        name = LOCAL.sub("", name)
         if SCHEME.match(name):
             raise OutsideFolder(f"{name}: an address, and only files beside the mesh are read; put it there")
-        spellings = dict.fromkeys([unquote(name), name] if uri else [name, _western(name)])
+        if uri:
+            spellings = dict.fromkeys([unquote(name), name, unquote(re.split("[?#]", name)[0])])
+        else:
+            spellings = dict.fromkeys([name, western(name), without_comment(name)])
         refused = None
         for spelling in spellings:
             parts = [part for part in re.split(r"[\\/]+", spelling) if part not in ("", ".")]
@@ -90,11 +96,6 @@ class Beside:
 def _key(name: str) -> str:
     """Equal for names that differ in case, or in how accents are put together."""
     return unicodedata.normalize("NFC", name).casefold()
-
-
-def _western(name: str) -> str:
-    """Bytes that are no UTF-8 taken for the letters of Windows."""
-    return name.encode("utf-8", "surrogateescape").decode("cp1252", "replace")
 
 
 def _entries(folder: Path) -> list[str]:

@@ -112,7 +112,10 @@ def _check_extensions(document: schema.Document, path: Path | str, notes: Notes)
         raise BadMesh(
             f"{path}: requires {listed(required)}, which is not known here; export the mesh without it"
         )
-    if used := unknown(document.extensions_used):
+    places = [document, *document.nodes, *document.meshes]
+    places += [primitive for mesh in document.meshes for primitive in mesh.primitives]
+    there = [name for place in places for name in place.extensions]
+    if used := unknown(dict.fromkeys([*document.extensions_used, *document.extensions_required, *there])):
         notes.add(f"uses {listed(used)}, which is not shown")
 
 
@@ -122,7 +125,7 @@ class _Reader:
     def __init__(self, document: schema.Document, path: Path | str, buffers: Buffers, notes: Notes):
         self.document, self.path, self.buffers, self.notes = document, path, buffers, notes
         self.materials = Materials(document, buffers, notes)
-        self.left_out = 0
+        self.left_out = self.hidden = 0
         self.worlds: list[np.ndarray] = []
         self.triangles = 0
         self.shapes: dict[tuple[int, int], _Shape] = {}
@@ -144,11 +147,15 @@ class _Reader:
             self.notes.add(
                 f"{len(document.animations)} animations are not played; nodes and weights are as stored"
             )
-        placed = {document.nodes[index].mesh for index in shown}
+        meshes = [document.nodes[index].mesh for index in shown if document.nodes[index].mesh is not None]
+        placed = set(meshes)
         hidden = [mesh.name or f"mesh {i}" for i, mesh in enumerate(document.meshes) if i not in placed]
+        stray = sum(node.mesh in placed for node in document.nodes) - len(meshes)
+        if stray and len(document.scenes) < 2 and not self.hidden:
+            self.notes.add(f"{stray} nodes with meshes that are shown elsewhere are not in the shown scene")
         if hidden:
             self.notes.add(f"meshes that are not in the shown scene: {listed(hidden)}")
-        self.materials.tell_unused_images()
+        self.materials.tell_unused()
 
     # --- nodes ----------------------------------------------------------------------------------------------
 
@@ -191,7 +198,6 @@ class _Reader:
         for root in roots:
             self.buffers.item("nodes", root)
         within, shown = set(roots), []
-        hidden = 0
         for index in order:
             if index not in within:
                 continue
@@ -199,12 +205,12 @@ class _Reader:
             if VISIBILITY in node.extensions:
                 raw = node.extensions[VISIBILITY]
                 if not schema.typed(raw, schema.Visibility, f"{self.path}: {VISIBILITY}").visible:
-                    hidden += 1
+                    self.hidden += 1
                     continue
             within.update(node.children)
             shown.append(index)
-        if hidden:
-            self.notes.add(f"{hidden} nodes are hidden by {VISIBILITY} and left out")
+        if self.hidden:
+            self.notes.add(f"{self.hidden} nodes are hidden by {VISIBILITY} and left out")
         return shown
 
     def _node(self, index: int) -> list[Surface]:
@@ -272,7 +278,11 @@ class _Shape:
             reader.notes.add("has no positions and is left out", where.removeprefix(f"{reader.path}: "))
             return
         count = self._count()
-        faces = _triangles(self._indices(count), TRIANGLES if self.unpacked else primitive.mode)
+        indices, mode = self._indices(count), TRIANGLES if self.unpacked else primitive.mode
+        if mode == TRIANGLES and len(indices) % 3:
+            left = "counts corners that are no whole triangles; the last ones are left out"
+            reader.notes.add(left, where.removeprefix(f"{reader.path}: "))
+        faces = _triangles(indices, mode)
         check_indices(where, faces.reshape(-1), count)
         used = np.zeros(count, bool)
         used[faces.reshape(-1)] = True
@@ -293,6 +303,9 @@ class _Shape:
         rows = self.buffers.rows(self.primitive.indices, (1,))
         if rows.dtype.kind != "u":
             raise BadMesh(f"{self.where}: its indices are {rows.dtype}, expected whole numbers without sign")
+        if len(rows) and rows.max() == np.iinfo(rows.dtype).max:
+            reserved = "counts up to the index that glTF reserves; it is shown as a vertex like others"
+            self.reader.notes.add(reserved, self.where.removeprefix(f"{self.reader.path}: "))
         return rows[:, 0].astype(np.int64)
 
     def _draco(self) -> dict[str, np.ndarray]:
@@ -312,14 +325,15 @@ class _Shape:
     def _attribute(self, name: str, widths: tuple[int, ...]) -> np.ndarray | None:
         """(used vertices, n) float32 of an attribute, None where there is none."""
         index = self.primitive.attributes.get(name)
+        colour = name.startswith("COLOR_")  # some exporters forget that its integers are normalised
         if name in self.unpacked:
             rows = self.unpacked[name]
             if rows.ndim != 2 or rows.shape[1] not in widths:
                 raise BadMesh(f"{self.where}: {name} has {rows.shape[1:]} numbers a vertex")
-            scaled = index is not None and self.buffers.item("accessors", index).normalized
+            scaled = colour or index is not None and self.buffers.item("accessors", index).normalized
             rows = rows[self.chosen]
             return normalised(rows) if scaled else rows.astype(np.float32)
-        return None if index is None else self.buffers.numbers(index, widths, self.chosen)
+        return None if index is None else self.buffers.numbers(index, widths, self.chosen, colour)
 
     def _morphed(self, name: str, widths: tuple[int, ...], weights: list[float]) -> np.ndarray | None:
         """An attribute with its morph targets added by their weights."""
@@ -356,9 +370,17 @@ class _Shape:
         ]:
             self.reader.notes.add(f"vertex colours {listed(more)} are not used, COLOR_0 is")
         points = self._morphed("POSITION", (3,), weights).astype(np.float64)
+        mirrored = rest | {"faces": self.faces[:, [0, 2, 1]]}  # their fronts stay fronts
         if skin is not None and "JOINTS_0" in self.primitive.attributes:
-            return [Surface(self._skinned(points, skin), **rest)]
-        return [Surface(points @ world[:3, :3].T + world[:3, 3], **rest) for world in worlds]
+            points, turned = self._skinned(points, skin)
+            return [Surface(points, **(mirrored if turned else rest))]
+        return [
+            Surface(
+                points @ world[:3, :3].T + world[:3, 3],
+                **(mirrored if np.linalg.det(world[:3, :3]) < 0 else rest),
+            )
+            for world in worlds
+        ]
 
     def _paint(self, slot: Slot, weights: list[float]) -> Paint:
         if slot.texture is None:
@@ -372,8 +394,9 @@ class _Shape:
             uv = uv @ slot.transform[:, :2].T + slot.transform[:, 2]
         return laid(Paint(slot.factor, slot.texture), uv)
 
-    def _skinned(self, points: np.ndarray, skin: int) -> np.ndarray:
-        """Points moved by the joints that hold them; the node's own place does not count."""
+    def _skinned(self, points: np.ndarray, skin: int) -> tuple[np.ndarray, bool]:
+        """Points moved by the joints that hold them, and whether those mirror; the node's own place does not
+        count."""
         joints = self.reader.joints(skin)[:, :3]
         sets = [i for i in range(8) if f"JOINTS_{i}" in self.primitive.attributes]
         holds = [self._attribute(f"JOINTS_{i}", (4,)).astype(np.int64) for i in sets]
@@ -381,6 +404,7 @@ class _Shape:
         if any(rows is None for rows in weights):
             raise BadMesh(f"{self.where}: has joints without weights; export the file again")
         hold, weight = np.concatenate(holds, 1), np.concatenate(weights, 1).astype(np.float64)
+        weight[~weight.any(1), 0] = 1  # held by nothing: by its first joint, as other viewers show it
         hold = np.where(weight == 0, 0, hold)
         check_indices(f"{self.where}: skin {skin}", hold.reshape(-1), len(joints))
         total = weight.sum(1, keepdims=True)
@@ -390,7 +414,7 @@ class _Shape:
             part = slice(start, start + SKINNED_AT_ONCE)
             moves = np.einsum("vk,vkij->vij", weight[part], joints[hold[part]])
             out[part] = np.einsum("vij,vj->vi", moves[:, :, :3], points[part]) + moves[:, :, 3]
-        return out
+        return out, bool((np.linalg.det(joints[np.unique(hold[weight != 0]), :, :3]) < 0).all())
 
 
 def draco_arrays(data: bytes, names: dict[str, int], where: str) -> dict[str, np.ndarray]:

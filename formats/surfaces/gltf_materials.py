@@ -8,7 +8,7 @@ import numpy as np
 
 from formats.errors import FormatError
 from formats.surfaces import gltf_schema as schema
-from formats.surfaces.accessors import Buffers, data_uri
+from formats.surfaces.accessors import Buffers, data_uri, is_data
 from formats.surfaces.pictures import read_picture, share_of
 from formats.surfaces.surface import Notes, Texture, listed
 
@@ -154,7 +154,7 @@ class Materials:
             return bytes(self.buffers.view(image.buffer_view)), label
         if image.uri is None:
             return b"", label
-        if image.uri.startswith("data:"):
+        if is_data(image.uri):
             return data_uri(image.uri, label), label
         data, found = self.buffers.beside.read(image.uri, uri=True)
         return data, found.name
@@ -178,8 +178,12 @@ class Materials:
         if unused:
             self.notes.add(f"shown unlit, by colour alone; not used: {listed(unused)}", name)
 
-    def tell_unused_images(self) -> None:
-        """A note on pictures that no shown material uses."""
+    def tell_unused(self) -> None:
+        """A note on materials that nothing shown has, and on pictures that no shown material uses."""
+        materials = enumerate(self.document.materials)
+        unused = [material.name or f"material {i}" for i, material in materials if i not in self.looks]
+        if unused:
+            self.notes.add(f"materials that nothing shown has: {listed(unused)}")
         tried = self.used | {index for index, pixels in self.pictures.items() if pixels is None}
         unused = [image_label(i, n) for n, i in enumerate(self.document.images) if n not in tried]
         if unused:
@@ -187,7 +191,7 @@ class Materials:
 
 
 def image_label(image: schema.Image, index: int) -> str:
-    if image.uri is not None and not image.uri.startswith("data:"):
+    if image.uri is not None and not is_data(image.uri):
         return image.uri[:200]
     return f"image {index}" + (f" ({image.name[:60]})" if image.name else "")
 

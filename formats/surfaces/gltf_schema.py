@@ -7,6 +7,8 @@ import msgspec
 from formats.errors import BadJson, BadMesh, LimitExceeded
 
 MAX_JSON = 1 << 30
+MAX_LOOSE = 64 << 20
+"""Larger ones are read in one way alone, not mended."""
 MAX_VALUES = 3_000_000
 MAX_OBJECTS = 500_000
 """Commas and brackets of a document, and its objects: what bounds the memory of parsing it."""
@@ -232,11 +234,25 @@ def decode(data: bytes, where: str) -> Document:
 def typed(data: bytes | msgspec.Raw, kind: type[Kind], where: str) -> Kind:
     """JSON as a struct. Raises BadJson, BadMesh."""
     try:
-        return msgspec.json.decode(data, type=kind)
+        try:
+            return msgspec.json.decode(data, type=kind)
+        except msgspec.ValidationError:
+            if len(bytes(data)) > MAX_LOOSE:
+                raise
+            return msgspec.json.decode(msgspec.json.encode(_plain(msgspec.json.decode(data))), type=kind)
     except msgspec.ValidationError as error:
         raise BadMesh(f"{where}: not valid glTF: {error}; export it again") from error
     except (msgspec.DecodeError, RecursionError, ValueError) as error:
         raise BadJson(f"{where}: not strict JSON: {error}") from error
+
+
+def _plain(value):
+    """JSON as exporters should write it: without nulls, and whole numbers without a point."""
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items() if entry is not None}
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _check_limits(data: bytes, where: str) -> None:

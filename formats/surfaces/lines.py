@@ -5,12 +5,16 @@ import warnings
 
 import numpy as np
 
+COMMENT = re.compile(r"^ *#[^\r\n]*|(?<=\r) *#[^\r\n]*", re.MULTILINE)
+CONTINUED = re.compile(r"\\ *(\r\n|\n|\r)")
+
 
 def lines_of(data: bytes) -> list[str]:
-    """Lines without marks, comments and outer spaces; a backslash at the end goes on in the next."""
+    """Lines without marks, comments and outer spaces; a backslash at the end goes on in the next, but for
+    comments, which may end in a folder of Windows."""
     text = data.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape").replace("\t", " ")
     if "\\" in text:
-        text = re.sub(r"\\ *(\r\n|\n|\r)", " ", text)
+        text = CONTINUED.sub(" ", COMMENT.sub("", text))
     stripped = (line.strip() for line in re.split(r"\r\n|\n|\r", text))
     return [line for line in stripped if line and line[0] != "#"]
 
@@ -24,6 +28,18 @@ def numbers_in(text: str, kind: type = np.float64) -> np.ndarray:
         except (DeprecationWarning, ValueError):
             word = next((word for word in text.split() if not _is_number(word)), text)
             raise ValueError(f"{word[:40]!r} in place of a number") from None
+
+
+def western(name: str) -> str:
+    """Bytes that are no UTF-8 taken for the letters of Windows."""
+    if name.isascii() or not any("\ud800" <= letter <= "\udfff" for letter in name):
+        return name
+    return name.encode("utf-8", "surrogateescape").decode("cp1252", "replace")
+
+
+def without_comment(text: str) -> str:
+    """A name without quotes and what follows " #"; names may hold that and are tried as written first."""
+    return text.partition(" #")[0].strip().strip('"')
 
 
 def _is_number(word: str) -> bool:

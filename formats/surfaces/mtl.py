@@ -20,8 +20,11 @@ ONE_WORD = ("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", 
 ARGUMENTS = {**dict.fromkeys(ONE_WORD, 1), "-mm": 2}
 """Options of a map and how many words follow; -o, -s and -t take one to three numbers."""
 PLACING = ("-o", "-s", "-t")
+WITHOUT_LOOKS = ("-blendu", "-blendv", "-bm", "-boost", "-texres", "-type", "-colorspace")
 
 MAPS = re.compile(r"(map_\w+|norm|bump|disp|decal|refl)$")
+PICTURE = re.compile(r"\.(png|jpe?g|tga|bmp|tiff?|exr|hdr|dds|webp|gif|psd)$", re.IGNORECASE)
+"""What a word that is not known names."""
 SHOWN = ("map_kd", "map_ka", "map_d", "map_ke")
 GREY = 1 / 512
 MAX_MATERIALS = 100_000
@@ -97,7 +100,7 @@ def _set(material: Material, word: str, rest: str) -> None:
             material.alpha = value
         elif value < 1 and material.alpha == 1:  # Tr 1 is written for opaque, too
             material.alpha = 1 - value
-    elif MAPS.match(word):
+    elif MAPS.match(word) or PICTURE.search(rest):
         material.maps[word] = _map(rest)
 
 
@@ -110,8 +113,10 @@ def _map(rest: str) -> Map:
             values = re.match(r"(?:[-+]?[\d.]+(?:[eE][-+]?\d+)?\s+){1,3}", rest[match.end() :])
         elif option in ARGUMENTS:
             values = re.match(rf"(?:\S+\s+){{{ARGUMENTS[option]}}}", rest[match.end() :])
-        else:
-            break
+        else:  # not known: with one word, unless nothing would be left
+            values = re.match(r"\S+\s+(?=\S)", rest[match.end() :])
+            if values is None:
+                break
         if values is None:
             raise ValueError
         options[option] = values[0].split()
@@ -199,7 +204,8 @@ class Looks:
         return None if pixels is None else Texture(pixels, (wrap, wrap))
 
     def _tell_unused(self, material: Material, base: Map | None, called: str) -> None:
-        shown = {"map_kd", "map_d", "map_ke"} if "ke" in material.colours else {"map_kd", "map_d"}
+        glows = max(material.colours.get("ke", (0,))) > 0
+        shown = {"map_kd", "map_d", "map_ke"} if glows else {"map_kd", "map_d"}
         unused = [f"{word} {m.name}" for word, m in material.maps.items() if word not in shown]
         unused = [text for text in unused if base is None or not text.endswith(f" {base.name}")]
         if unused:
@@ -208,7 +214,7 @@ class Looks:
             option
             for word, m in material.maps.items()
             for option in m.options
-            if word in shown and option in ("-t", "-mm", "-imfchan", "-cc")
+            if word in SHOWN and option not in ("-o", "-s", "-clamp", *WITHOUT_LOOKS)
         }
         if odd:
             self.notes.add(f"has pictures with {listed(sorted(odd))}, which is not honoured", called)

@@ -1,5 +1,6 @@
 """Wavefront .obj: polygons with texture coordinates, vertex colours and materials."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from formats.errors import BadMesh, FormatError
 from formats.inputs import read_input
 from formats.surfaces.beside import Beside
-from formats.surfaces.lines import lines_of, numbers_in
+from formats.surfaces.lines import lines_of, numbers_in, western, without_comment
 from formats.surfaces.mtl import Looks, parse_mtl
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
@@ -24,7 +25,15 @@ from formats.surfaces.surface import (
 MAX_FILE = 2**31
 AT_ONCE = 1 << 18
 """Corners of faces that are kept as text."""
-FREE_FORM = ("curv", "curv2", "surf", "cstype", "parm")
+FREE_FORM = ("curv", "curv2", "surf", "cstype", "parm", "bzp", "bsp", "cdc", "cdp")
+LEFT_OUT = {
+    **dict.fromkeys(("l", "p"), "points and lines"),
+    **dict.fromkeys(FREE_FORM, "free-form curves and surfaces"),
+    "call": "other files that are called",
+}
+FEW = "faces of fewer than three corners"
+POLYPAINT = re.compile(rb"^#MRGB +([0-9a-fA-F]+)", re.MULTILINE)
+"""ZBrush's colours of vertices: eight digits each, two of them a mask."""
 
 
 def read_obj(path: Path | str, notes: Notes) -> list[Surface]:
@@ -37,7 +46,8 @@ def read_obj(path: Path | str, notes: Notes) -> list[Surface]:
         text.read(data)
     except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: holds {error}; export the mesh again") from error
-    return _surfaces(text, path, len(data), notes)
+    painted = b"".join(POLYPAINT.findall(data))
+    return _surfaces(text, path, len(data), painted, notes)
 
 
 class _Text:
@@ -63,6 +73,7 @@ class _Text:
         material, points, uvs = 0, self.points, self.uvs
         for line in lines_of(data):
             word, _, rest = line.partition(" ")
+            word = word.lower()
             if word == "v":
                 points.append(rest)
             elif word == "vt":
@@ -73,9 +84,8 @@ class _Text:
                 material = self.materials.setdefault(rest.strip(), len(self.materials))
             elif word == "mtllib":
                 self.libraries.append(rest.strip())
-            elif word in ("l", "p", *FREE_FORM):
-                kind = "free-form curves and surfaces" if word in FREE_FORM else "points and lines"
-                self.left_out[kind] = self.left_out.get(kind, 0) + 1
+            elif word in LEFT_OUT:
+                self.left_out[LEFT_OUT[word]] = self.left_out.get(LEFT_OUT[word], 0) + 1
         self._flush()
         for kind, count in self.left_out.items():
             self.notes.add(f"{kind} are left out ({count} lines)")
@@ -83,6 +93,7 @@ class _Text:
     def _face(self, rest: str, material: int) -> None:
         tokens = rest.partition("#")[0].split() if "#" in rest else rest.split()
         if len(tokens) < 3:
+            self.left_out[FEW] = self.left_out.get(FEW, 0) + 1
             return
         self.tokens += tokens
         self.relative += [(len(self.points), len(self.uvs))] * len(tokens)
@@ -147,6 +158,15 @@ def _points(lines: list[str], path: Path | str) -> tuple[np.ndarray, np.ndarray 
     return np.ascontiguousarray(positions), colours
 
 
+def _polypaint(digits: bytes, count: int, notes: Notes) -> np.ndarray | None:
+    """(V, 4) colours of ZBrush's mask, red, green and blue."""
+    if len(digits) != 8 * count:
+        notes.add("has colours of ZBrush for other vertices than it has, which are not shown")
+        return None
+    rows = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8).reshape(-1, 4)
+    return sound_colours(rows[:, 1:] / 255)
+
+
 def _uvs(lines: list[str]) -> np.ndarray:
     """(n, 2), v up; v is 0 where it is not given."""
     rows = _table(lines) if lines else np.empty((0, 2))
@@ -155,7 +175,7 @@ def _uvs(lines: list[str]) -> np.ndarray:
     return np.array([[*row[:2], 0, 0][:2] for row in rows], np.float64).reshape(-1, 2)
 
 
-def _surfaces(text: _Text, path: Path | str, n_bytes: int, notes: Notes) -> list[Surface]:
+def _surfaces(text: _Text, path: Path | str, n_bytes: int, painted: bytes, notes: Notes) -> list[Surface]:
     if not text.counts:
         return []
     counts, used = np.array(text.counts), np.array(text.used)
@@ -165,6 +185,8 @@ def _surfaces(text: _Text, path: Path | str, n_bytes: int, notes: Notes) -> list
         uvs = _uvs(text.uvs)
     except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: holds {error}; export the mesh again") from error
+    if painted and colours is None:
+        colours = _polypaint(painted, len(positions), notes)
     corners = np.concatenate(text.corners)
     check_indices(path, corners[:, 0], len(positions))
     places, polygon = triangulated(counts, corners[:, 0], positions)
@@ -225,30 +247,38 @@ def _coordinates(coordinate: np.ndarray, uvs: np.ndarray, look, name: str, notes
 def _looks(text: _Text, path: Path | str, notes: Notes) -> tuple[Looks, dict[str | None, str | None]]:
     """All materials, and which of them each name that faces use stands for."""
     beside, materials = Beside(path), {}
-    for library in text.libraries:
+    libraries = text.libraries or ([""] if len(text.materials) > 1 else [])
+    for library in libraries:
         for data, file in _libraries(library, beside, path, notes):
             materials |= {
                 name: m for name, m in parse_mtl(data, notes, file).items() if name not in materials
             }
     looks = Looks(materials, beside, notes)
-    folded = {name.casefold(): name for name in materials}
+    folded = {_key(name): name for name in materials}
     chosen: dict[str | None, str | None] = {}
     for name in text.materials:
         if name is None:
             chosen[name] = next(iter(materials)) if len(materials) == 1 else None
         else:
-            chosen[name] = name if name in materials else folded.get(name.casefold())
+            alike = folded.get(_key(name), folded.get(_key(without_comment(name))))
+            chosen[name] = name if name in materials else alike
     lost = [name for name, found in chosen.items() if name is not None and found is None]
     if lost:
         notes.add(f"materials that no library holds: {listed(lost)}; their faces are shown white")
     return looks, chosen
 
 
+def _key(name: str) -> str:
+    """Equal for names that differ in case, in quotes, or in how the two files write their letters."""
+    return western(name).strip('"').casefold()
+
+
 def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> list[tuple[bytes, str]]:
     """The files of one `mtllib`: one name that may hold spaces, or several; quotes are dropped. Where none is
     there, the library that is called as the mesh is."""
-    found = []
-    for names in ([named.strip('"')], named.replace('"', " ").split()):
+    found, lost = [], []
+    plain = without_comment(named)
+    for names in ([named.strip('"')], [plain], plain.replace('"', " ").split()) if named else []:
         lost = []
         for name in names:
             try:
@@ -265,6 +295,6 @@ def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> li
             data, file = beside.read(Path(path).with_suffix(".mtl").name)
         except FormatError:
             return []
-        notes.add(f"{file.name} is taken in its place")
+        notes.add(f"{file.name} is taken for its materials")
         found.append((data, file.name))
     return found

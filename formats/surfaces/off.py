@@ -1,30 +1,91 @@
-""".off: polygons without colours, as text, by trimesh."""
+""".off: polygons as text, with colours of vertices and faces (Geomview's OFF and COFF)."""
 
-import io
+import re
 from pathlib import Path
 
 import numpy as np
 
 from formats.errors import BadMesh
 from formats.inputs import read_input
-from formats.surfaces.surface import Notes, Surface, check_budget
+from formats.surfaces.lines import numbers_in
+from formats.surfaces.polygons import triangulated
+from formats.surfaces.surface import Notes, Surface, check_budget, check_indices, sound_colours
 
 MAX_FILE = 2**30
+KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF$")
+OTHER = re.compile(r"(ST)?C?N?(4|4?n)OFF$")
 
 
 def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     """All faces. Raises BadMesh, LimitExceeded, MissingFile."""
-    from trimesh.exchange.off import load_off
-
     data = read_input(path, MAX_FILE)
+    rows = (line.partition("#")[0].strip() for line in data.decode("latin-1").splitlines())
+    lines = [row for row in rows if row]
+    normals, n_points, n_faces, at = _header(path, lines)
+    if n_points + n_faces > len(lines) - at:
+        raise BadMesh(
+            f"{path}: ends before the last of {n_points + n_faces:,} lines; copy or export it again"
+        )
     try:
-        loaded = load_off(io.BytesIO(data))
-        positions = np.asarray(loaded["vertices"], np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded["faces"], np.int32).reshape(-1, 3)
-        last = data.rstrip().rsplit(b"\n", 1)[-1].split()
-    except Exception as error:  # the loader raises errors of any class on broken files
+        numbers, widths, starts = _table(lines[at : at + n_points])
+        if (widths < 3).any():
+            raise ValueError("a vertex of fewer than three numbers")
+        positions = numbers[starts[:, None] + np.arange(3)]
+        first = 6 if normals else 3
+        colours = _colours(numbers, starts + first, widths - first, lines[at : at + n_points])
+        lines = lines[at + n_points : at + n_points + n_faces]
+        numbers, widths, starts = _table(lines)
+        counts = numbers[starts].astype(np.int64)
+        if (counts < 0).any() or (counts + 1 > widths).any():
+            raise ValueError("a face of fewer corners than it counts")
+    except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: the mesh cannot be loaded ({error}); export it again") from error
-    check_budget(path, len(faces), len(data))
-    if data.lstrip().startswith(b"COFF") or last[0].isdigit() and len(last) > int(last[0]) + 1:
-        notes.add("its colours are not shown")
-    return [Surface(positions, faces)]
+    face_colours = _colours(numbers, starts + counts + 1, widths - counts - 1, lines)
+    if (widths - counts == 2).any():
+        notes.add("colours that are numbers of a palette are not shown")
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    corners = numbers[np.repeat(starts + 1, counts) + within].astype(np.int64)
+    check_budget(path, int(np.maximum(counts - 2, 0).sum()), len(data))
+    check_indices(path, corners, len(positions))
+    places, polygon = triangulated(counts, corners, positions)
+    faces = corners[places].astype(np.int32).reshape(-1, 3)
+    face_colours = None if face_colours is None else face_colours[polygon]
+    return [Surface(positions, faces, colours=colours, face_colours=face_colours)]
+
+
+def _header(path: Path | str, lines: list[str]) -> tuple[bool, int, int, int]:
+    """Whether vertices have normals, counts of vertices and faces, and the first line behind them."""
+    words, at = (lines[0].split() if lines else []), 1
+    keyword = KEYWORD.match(words[0]) if words else None
+    if words and OTHER.match(words[0]) or "BINARY" in words:
+        raise BadMesh(f"{path}: an .off file in binary or of more dimensions; save it as plain OFF")
+    if keyword:
+        words = words[1:]
+        if not words and len(lines) > 1:
+            words, at = lines[1].split(), 2
+    if not 2 <= len(words) <= 3 or not all(word.isdecimal() and len(word) < 16 for word in words):
+        raise BadMesh(f"{path}: does not begin with OFF and counts of vertices and faces; export it again")
+    return bool(keyword and keyword[3]), int(words[0]), int(words[1]), at
+
+
+def _table(lines: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All numbers, and how many each line has and where they begin."""
+    widths = np.array([len(line.split()) for line in lines], np.int64)
+    numbers = numbers_in(" ".join(lines))
+    if len(numbers) != widths.sum() or not np.isfinite(numbers).all():
+        raise ValueError("words that are no numbers")
+    return numbers, widths, np.cumsum(widths) - widths
+
+
+def _colours(numbers, starts, widths, lines: list[str]) -> np.ndarray | None:
+    """(n, 4) of lines whose last `widths` numbers are a colour, white where they are none; whole numbers
+    count to 255, others to 1."""
+    coloured = np.isin(widths, (3, 4))
+    if not coloured.any():
+        return None
+    colours = np.ones((len(widths), 3))
+    found = numbers[starts[coloured, None] + np.arange(3)]
+    words = lines[int(np.argmax(coloured))].split()[-int(widths[coloured][0]) :]
+    whole = all(word.isdecimal() for word in words) or found.max(initial=0) > 1
+    colours[coloured] = found / (255 if whole else 1)
+    return sound_colours(colours)

@@ -8,7 +8,7 @@ import numpy as np
 
 from formats.errors import BadMesh, FormatError
 from formats.inputs import read_input
-from formats.points import ENDS, MAX_HEADER, TYPES
+from formats.points import MAX_HEADER, TYPES
 from formats.surfaces.beside import Beside
 from formats.surfaces.lines import numbers_in
 from formats.surfaces.pictures import read_picture, share_of
@@ -27,6 +27,7 @@ from formats.surfaces.surface import (
 )
 
 MAX_FILE = 2**31
+ENDS = re.compile(rb"(\r\n|\n|\r)end_header[ \t]*(?:\1|\r?\n)")
 TEXTURE = re.compile(r"comment +texturefile:? +(.+)", re.IGNORECASE)
 AXES = ("x", "y", "z")
 HUES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -64,13 +65,16 @@ def read_ply(path: Path | str, notes: Notes) -> list[Surface]:
     end = ENDS.search(data, 0, MAX_HEADER)
     if end is None:
         raise BadMesh(f"{path}: not a .ply file with a complete header; export the mesh again")
-    lines = data[: end.start()].decode("utf-8", "replace").replace("\r\n", "\n").split("\n")
+    lines = (
+        data[: end.start()].decode("utf-8", "replace").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    )
     coding, elements = _header(path, lines)
     body = memoryview(data)[end.end() :]
     tables = _Text(path, bytes(body)) if coding == "ascii" else _Binary(path, body, coding)
     read = {}
     for element in elements:
-        read.setdefault(element.name, tables.read(element))
+        columns = tables.read(element)
+        read.setdefault(element.name, {name.lower(): column for name, column in columns.items()} | columns)
     textures = [
         match[1].strip() for line in lines if (match := TEXTURE.match(line.replace("\t", " ").strip()))
     ]
@@ -200,7 +204,7 @@ class _Text:
 
     def __init__(self, path: Path | str, data: bytes):
         self.path, self.left = path, data
-        self.rows = data.decode("latin-1").splitlines()
+        self.rows = [row for row in data.decode("latin-1").splitlines() if row.strip()]
         self.at = 0
 
     def read(self, element: _Element) -> dict:
@@ -264,31 +268,47 @@ def _surfaces(path, read: dict[str, dict], textures: list[str], n_bytes: int, no
     if not set(AXES) <= set(vertices):
         raise BadMesh(f"{path}: its vertices lack x, y or z; export the mesh again")
     positions = np.stack([vertices[axis].astype(np.float64) for axis in AXES], 1)
-    faces = read.get("face", {})
-    lists = next((faces[name] for name in CORNERS if isinstance(faces.get(name), _List)), None)
-    if lists is None:
-        corners, polygon, places = _strips(read.get("tristrips", {}))
-        check_budget(path, len(corners), n_bytes)
-        check_indices(path, corners.reshape(-1), len(positions))
-    else:
-        check_budget(path, int(np.maximum(lists.counts - 2, 0).sum()), n_bytes)
+    colours, found = _colours(vertices, notes), []
+    for name, cut in (("face", _polygons), ("tristrips", _strips)):
+        faces = read.get(name, {})
+        lists = next((faces[key] for key in CORNERS if isinstance(faces.get(key), _List)), None)
+        if lists is None:
+            continue
         values = _whole(path, lists.values)
-        check_indices(path, values, len(positions))
-        places, polygon = triangulated(lists.counts, values, positions)
-        corners = values[places]
-    if not len(corners):
-        return []
-    colours, face_colours = _colours(vertices, notes), _colours(faces, notes)
-    rest = {
-        "colours": colours,
-        "face_colours": None if face_colours is None else face_colours[polygon],
-    }
-    uv = _coordinates(path, vertices, faces, lists, places, polygon, corners, notes)
-    if uv is None or not textures:
+        corners, polygon, places = cut(path, _List(lists.counts, values), positions, n_bytes)
+        if not len(corners):
+            continue
+        rest = _one_colour(colours, _colours(faces, notes), polygon, notes)
+        uv = _coordinates(path, vertices, faces, lists, places, corners, notes)
+        if uv is not None and textures:
+            numbers = _numbers_of(faces, polygon)
+            found += _textured(path, positions, corners, uv, numbers, textures, rest, notes)
+            continue
         if textures:
             notes.add(f"its pictures are not shown, since it has no coordinates: {listed(textures)}")
-        return [Surface(positions, corners.astype(np.int32), **rest)]
-    return _textured(path, positions, corners, uv, _numbers_of(faces, polygon), textures, rest, notes)
+        elif uv is not None:
+            notes.add("has coordinates for a picture, but names none (comment TextureFile)")
+        found.append(Surface(positions.copy() if found else positions, corners.astype(np.int32), **rest))
+    return found
+
+
+def _polygons(path, lists: _List, positions, n_bytes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(F, 3) vertices of triangles, which polygon each is of, and places of its corners in the lists."""
+    check_budget(path, int(np.maximum(lists.counts - 2, 0).sum()), n_bytes)
+    check_indices(path, lists.values, len(positions))
+    places, polygon = triangulated(lists.counts, lists.values, positions)
+    return lists.values[places], polygon, places
+
+
+def _one_colour(colours, face_colours, polygon, notes: Notes) -> dict:
+    """Colours of vertices, or where those are all the same, of faces."""
+    if face_colours is not None and colours is not None:
+        plain = len(colours) and (colours == colours[0]).all()
+        notes.add(
+            f"has colours of vertices and of faces; those of {'faces' if plain else 'vertices'} are shown"
+        )
+        colours, face_colours = (None, face_colours) if plain else (colours, None)
+    return {"colours": colours, "face_colours": None if face_colours is None else face_colours[polygon]}
 
 
 def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Notes) -> list[Surface]:
@@ -320,11 +340,11 @@ def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Note
     return found
 
 
-def _coordinates(path, vertices, faces, lists, places, polygon, corners, notes) -> np.ndarray | None:
+def _coordinates(path, vertices, faces, lists, places, corners, notes) -> np.ndarray | None:
     """(F, 3, 2) of the corners of triangles, v down: each corner's own (MeshLab's `texcoord`), else its
     vertex's."""
     wedges = faces.get("texcoord")
-    if isinstance(wedges, _List) and lists is not None and (wedges.counts == 2 * lists.counts).all():
+    if isinstance(wedges, _List) and places is not None and (wedges.counts == 2 * lists.counts).all():
         uv = wedges.values.astype(np.float64).reshape(-1, 2)[places]
     else:
         if isinstance(wedges, _List) and len(wedges.values):
@@ -355,7 +375,12 @@ def _colours(columns: dict, notes: Notes) -> np.ndarray | None:
     values = [columns[name] for name in names]
     whole = values[0].dtype.kind in "ui"
     rgb = np.stack([value.astype(np.float64) for value in values], 1)
-    most = np.iinfo(values[0].dtype).max if whole else 255 if np.nanmax(rgb, initial=0) > 1 else 1
+    largest = np.nanmax(rgb, initial=0)
+    if whole:  # wide integers hold colours of 8 or 16 bits
+        width = values[0].dtype.itemsize
+        most = 255 if width == 1 or width > 2 and largest < 256 else 65535
+    else:
+        most = 255 if largest > 1 else 1
     return sound_colours(rgb / most)
 
 
@@ -368,12 +393,9 @@ def _whole(path: Path | str, values: np.ndarray) -> np.ndarray:
     return values.astype(np.int64)
 
 
-def _strips(columns: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(F, 3) corners of strips that -1 ends, which strip each is of, and no places."""
-    lists = next((columns[name] for name in CORNERS if isinstance(columns.get(name), _List)), None)
-    if lists is None:
-        return np.empty((0, 3), np.int64), np.empty(0, int), np.empty((0, 3), int)
-    values = lists.values.astype(np.int64)
+def _strips(path, lists: _List, positions, n_bytes: int) -> tuple[np.ndarray, np.ndarray, None]:
+    """(F, 3) corners of strips that -1 ends, and which strip each is of."""
+    values = lists.values
     ends = np.repeat(np.arange(len(lists.counts)), lists.counts)
     number = np.arange(len(values))
     breaks = (values < 0) | np.concatenate([[True], ends[1:] != ends[:-1]])[: len(values)]
@@ -382,4 +404,7 @@ def _strips(columns: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     odd = (number - first)[: len(faces)] % 2 == 1
     faces[odd] = faces[odd][:, [0, 2, 1]]
     sound = (faces >= 0).all(1) & (first[2:][: len(faces)] <= number[: len(faces)])
-    return faces[sound], ends[: len(faces)][sound], np.empty((0, 3), int)
+    faces = faces[sound]
+    check_budget(path, len(faces), n_bytes)
+    check_indices(path, faces.reshape(-1), len(positions))
+    return faces, ends[: len(sound)][sound], None

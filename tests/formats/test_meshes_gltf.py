@@ -1,5 +1,6 @@
 """glTF as its specification says: a square whose every pixel is known, written in each of many ways."""
 
+import base64
 import io
 import json
 import math
@@ -266,6 +267,16 @@ def test_backs_are_shown_and_told(tmp_path):
     assert "from both sides" not in notes_of(gltf.write(tmp_path / "a.glb"))
 
 
+def test_mirrored_fronts_stay_fronts(tmp_path):
+    """A node that mirrors turns the winding, which its determinant undoes."""
+    gltf = Gltf()
+    gltf.doc["nodes"][0]["scale"] = [-1, 1, 1]
+    (surface,) = _load(gltf.write(tmp_path / "a.glb")).surfaces
+    points = CORNERS[:, [0, 2, 1]] * [-1, 1, 1]
+    a, b, c = (points[surface.faces[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 1] < 0).all()  # +z, which is turned to -y
+
+
 # --- nodes --------------------------------------------------------------------------------------------------
 
 
@@ -381,6 +392,32 @@ def test_lost_and_unused_pictures_are_named(tmp_path):
     gltf.doc["materials"][0]["normalTexture"] = {"index": 0}
     notes = notes_of(gltf.write(tmp_path / "a.gltf"))
     assert "lost.png" in notes and "spare.png" in notes and "normalTexture" in notes
+
+
+def test_unused_materials_are_named(tmp_path):
+    gltf = textured()
+    gltf.list("materials", {"name": "spare"})
+    assert "materials that nothing shown has: spare" in notes_of(gltf.write(tmp_path / "a.glb"))
+
+
+@pytest.mark.parametrize("name", ["nodes", "meshes", "primitives", "root", "required"])
+def test_extensions_that_are_not_declared_are_named(tmp_path, name):
+    gltf, there = Gltf(), {"KHR_materials_variants": {}}
+    places = {"nodes": gltf.doc["nodes"][0], "meshes": gltf.doc["meshes"][0], "primitives": gltf.primitive}
+    if name == "required":
+        gltf.doc["extensionsRequired"] = list(there)
+    else:
+        places.get(name, gltf.doc)["extensions"] = there
+    assert "KHR_materials_variants" in notes_of(gltf.write(tmp_path / "a.glb"))
+
+
+def test_reserved_index_is_told(tmp_path):
+    gltf = Gltf()
+    corners = np.concatenate([np.zeros((252, 3), np.float32), CORNERS])
+    gltf.attribute("POSITION", corners)
+    gltf.primitive["indices"] = gltf.accessor((FACES + 252).astype(np.uint8))
+    path = gltf.write(tmp_path / "a.glb")
+    assert (front(path) == 255).all() and "reserves" in notes_of(path)
 
 
 def test_extensions(tmp_path):
@@ -577,3 +614,70 @@ def places(value):
         yield value, key
         if isinstance(inner, dict | list):
             yield from places(inner)
+
+
+def test_nulls_and_whole_numbers_with_a_point(tmp_path):
+    gltf = textured()
+    gltf.doc |= {"skins": None, "animations": None}
+    gltf.doc["nodes"][0] |= {"mesh": 0.0, "children": None, "name": None, "translation": None}
+    gltf.doc["materials"][0] |= {"alphaMode": None, "extensions": None, "alphaCutoff": 1}
+    gltf.doc["accessors"][0] |= {"componentType": 5126.0, "count": 4.0}
+    gltf.doc["bufferViews"][0]["byteStride"] = None
+    gltf.doc["textures"][0]["extensions"] = {"EXT_texture_webp": {"source": None}}
+    assert shows(gltf.write(tmp_path / "a.glb"), noise())
+
+
+@pytest.mark.parametrize("head", ["DATA:image/png;base64,", "data:image/png;BASE64,", "data:;base64,"])
+def test_data_uris_as_people_write_them(tmp_path, head):
+    gltf = textured()
+    gltf.doc["images"] = [{"uri": head + base64.b64encode(png(noise())).decode()}]
+    assert shows(gltf.write(tmp_path / "a.glb"), noise())
+
+
+@pytest.mark.parametrize("uri", ["file:///C:/work/wood.png", "wood.png?v=2", "./tex/wood.png#a"])
+def test_addresses_of_local_files(tmp_path, uri):
+    gltf = textured()
+    gltf.doc["images"] = [{"uri": uri}]
+    (tmp_path / "wood.png").write_bytes(png(noise()))
+    assert shows(gltf.write(tmp_path / "a.glb"), noise())
+
+
+def test_integer_colours_are_normalised_though_not_said(tmp_path):
+    gltf = Gltf()
+    gltf.attribute("COLOR_0", np.tile(np.array([51, 102, 153, 255], np.uint8), (4, 1)))
+    wanted = [encoded(part / 255) for part in (51, 102, 153)]
+    assert np.abs(front(gltf.write(tmp_path / "a.glb"))[..., :3].astype(int) - wanted).max() <= 1
+
+
+def test_nodes_outside_the_scene_and_corners_left_over_are_told(tmp_path):
+    gltf = Gltf()
+    gltf.list("nodes", {"mesh": 0, "translation": [9, 0, 0]})
+    gltf.doc["accessors"][gltf.primitive["indices"]]["count"] = 5
+    path = gltf.write(tmp_path / "a.glb")
+    assert box(path)[3] == 1 and "not in the shown scene" in notes_of(path) and "left out" in notes_of(path)
+
+
+def skinned(weights: list[float], **joint) -> Gltf:
+    gltf = Gltf()
+    gltf.doc["nodes"] = [{"mesh": 0, "skin": 0}, joint]
+    gltf.doc["skins"] = [{"joints": [1]}]
+    gltf.attribute("JOINTS_0", np.zeros((4, 4), np.uint8))
+    gltf.attribute("WEIGHTS_0", np.tile(np.array(weights, np.float32), (4, 1)))
+    return gltf
+
+
+def test_joints_that_mirror_and_vertices_that_nothing_holds(tmp_path):
+    plain, turned = (
+        _load(skinned([1, 0, 0, 0], scale=[x, 1, 1]).write(tmp_path / "a.glb")).triangles[1] for x in (1, -1)
+    )
+    assert (turned == plain[:, [0, 2, 1]]).all()
+    path = skinned([0, 0, 0, 0], translation=[5, 0, 0]).write(tmp_path / "a.glb")
+    assert box(path) == pytest.approx([4, -1, 0, 6, 1, 0])
+
+
+def test_a_camera_beside_a_mesh_is_no_note(tmp_path):
+    gltf = Gltf()
+    gltf.doc["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 0.1}}]
+    gltf.doc["nodes"] += [{"camera": 0}, {}]
+    gltf.doc["scenes"][0]["nodes"] = [0, 1]
+    assert "scene" not in notes_of(gltf.write(tmp_path / "a.glb"))

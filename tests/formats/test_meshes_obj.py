@@ -244,3 +244,59 @@ def test_a_picture_beyond_memory_is_told(folder, monkeypatch):
     monkeypatch.setattr("formats.surfaces.pictures.FREE_BYTES", 100)
     monkeypatch.setattr("formats.surfaces.pictures.BYTES_PER_BYTE", 0)
     assert "too large" in notes_of(written(folder))
+
+
+@pytest.mark.parametrize(
+    "lib, use, material",
+    [
+        ("# from C:\\work\\\nmtllib a.mtl", "usemtl wood", "map_Kd wood.png"),
+        ("mtllib a.mtl # materials", "usemtl wood # oak", "map_Kd wood.png # oak"),
+        ("mtllib a.mtl", 'usemtl "Wood"', "map_Kd file:///home/me/wood.png"),
+        ("mtllib a.mtl", "usemtl wood", "map_Kd -colorspace sRGB wood.png"),
+        ("", "usemtl wood", "map_Kd wood.png"),
+    ],
+)
+def test_comments_quotes_addresses_and_unknown_options(folder, lib, use, material):
+    path = written(folder, material, lib, use)
+    assert shows(path) and bool(notes_of(path)) == (lib == "")
+
+
+def test_comments_that_end_in_a_backslash_take_no_vertex(folder):
+    path = written(folder)
+    path.write_text(path.read_text().replace("v 1 1 0", "# C:\\tmp\\\nv 1 1 0"))
+    assert shows(path)
+
+
+def test_materials_in_other_encodings(folder):
+    path = written(folder)
+    path.write_text(f"mtllib a.mtl\n{SQUARE}usemtl Wände\nf 1/1 2/2 3/3 4/4\n")
+    (folder / "a.mtl").write_bytes("newmtl Wände\nmap_Kd wood.png\n".encode("cp1252"))
+    assert shows(path) and notes_of(path) == ""
+
+
+def test_glow_of_black_is_named(folder):
+    assert "map_ke wood.png" in notes_of(written(folder, "Ke 0 0 0\nmap_Ke wood.png"))
+
+
+def test_other_files_that_are_called_are_named(folder):
+    assert "other files" in notes_of(written(folder, faces="f 1/1 2/2 3/3 4/4\ncall b.obj"))
+
+
+def test_polypaint(folder):
+    """ZBrush's comments: mask, red, green and blue of each vertex."""
+    path = folder / "a.obj"
+    path.write_text(f"{SQUARE}#MRGB ff336699ff336699\n#MRGB ff336699ff336699\nf 1 2 3 4\n")
+    assert (facing(path)[..., :3] == [51, 102, 153]).all()
+    path.write_text(f"{SQUARE}#MRGB ff336699\nf 1 2 3 4\n")
+    assert (facing(path)[..., :3] == 255).all() and "ZBrush" in notes_of(path)
+
+
+def test_pictures_of_unknown_words_and_small_faces_are_named(folder):
+    path = written(folder, "map_Kd wood.png\nalbedo oak.png", faces="f 1/1 2/2 3/3 4/4\nf 1,2,3")
+    notes = notes_of(path)
+    assert shows(path) and "albedo oak.png" in notes and "fewer than three" in notes
+
+
+def test_capitals(folder):
+    path = written(folder, "MAP_KD WOOD.PNG", "MTLLIB a.mtl", "USEMTL wood", "F 1/1 2/2 3/3 4/4")
+    assert shows(path)

@@ -192,3 +192,52 @@ def test_other_files_are_called_what_they_are(tmp_path, name, data, what):
     for read in (read_capture, _load):
         with pytest.raises(FormatError, match=what):
             read(tmp_path / name)
+
+
+def test_headers_as_people_write_them(tmp_path):
+    """Line ends of old Macs, spaces behind the end, capitals, empty lines."""
+    hues = {hue: ("uchar", [part] * 4) for hue, part in (("Red", 51), ("Green", 102), ("Blue", 153))}
+    vertex = {name.upper(): column for name, column in square().items()} | hues
+    path = ply(tmp_path / "a.ply", "ascii", vertex, QUAD)
+    plain = path.read_bytes()
+    for written in (
+        plain,
+        plain.replace(b"\n", b"\r"),
+        plain.replace(b"end_header\n", b"end_header \n"),
+        plain.replace(b"end_header\n", b"end_header\n\n"),
+    ):
+        path.write_bytes(written)
+        assert (facing(path)[..., :3] == [51, 102, 153]).all()
+
+
+def test_strips_beside_faces(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    lists = "property list int int vertex_indices\n"
+    head += f"element face {{}}\n{lists}element tristrips 1\n{lists}end_header\n"
+    rows = "\n".join(f"{x} {y} 0" for x, y in ((-1, -1), (1, -1), (-1, 1), (1, 1)))
+    path = tmp_path / "a.ply"
+    for n, lines in ((1, "3 0 1 2\n3 2 1 3\n"), (0, "4 0 1 2 3\n")):
+        path.write_text(f"{head.format(n)}{rows}\n{lines}")
+        assert (facing(path) == 255).all()
+
+
+def test_colours_of_vertices_and_of_faces(tmp_path):
+    """One of both is shown, which is said: those that differ."""
+    for reds, shown in (([0] * 4, 255), ([102, 102, 102, 103], 102)):
+        vertex = square(red=("uchar", reds), green=("uchar", [0] * 4), blue=("uchar", [0] * 4))
+        faces = QUAD | {hue: ("", "uchar", [part]) for hue, part in (("red", 255), ("green", 0), ("blue", 0))}
+        path = ply(tmp_path / "a.ply", "binary_little_endian", vertex, faces)
+        assert (facing(path)[16, 16, :3] == [shown, 0, 0]).all() and "of vertices and of faces" in notes_of(
+            path
+        )
+
+
+def test_coordinates_without_a_picture_are_told(tmp_path):
+    path = ply(tmp_path / "a.ply", "ascii", square(s=("float", [0] * 4), t=("float", [0] * 4)), QUAD)
+    assert "names none" in notes_of(path)
+
+
+def test_wide_integers_hold_colours_of_8_bits(tmp_path):
+    hues = {hue: ("int", [part] * 4) for hue, part in (("red", 51), ("green", 102), ("blue", 153))}
+    path = ply(tmp_path / "a.ply", "binary_big_endian", square(**hues), QUAD)
+    assert (facing(path)[..., :3] == [51, 102, 153]).all()
