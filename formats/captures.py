@@ -16,7 +16,7 @@ import numpy as np
 from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
-from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
+from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
 from formats.foreign import is_json, not_a_capture
 from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
@@ -29,6 +29,7 @@ from formats.photos import (
     alike_turned,
     chosen_copy,
     copies,
+    folders,
     has_pictures,
     is_file,
     load_ignored,
@@ -51,6 +52,9 @@ from formats.transforms import (
 from formats.upright import upward_doubt
 from formats.views import LEAST_VIEWS, Capture, View, hold_out
 
+LEVELS, MAX_FOLDERS = 3, 500
+"""How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
+
 __all__ = [
     "Capture",
     "View",
@@ -71,17 +75,32 @@ def is_capture(path: Path | str) -> bool:
     """Does this look like posed photos? A folder without poses does too: reading it says what lacks."""
     path = Path(path)
     if path.is_dir():
-        return (
-            any(path.glob("transforms*.json"))
-            or colmap.model_folder(path) is not None
-            or is_file(path / llff.NAME)
-            or polycam.keyframes(path) is not None
-            or has_pictures(path)
-        )
+        return _has_poses(path) or has_pictures(path) or bool(_captures_below(path))
     try:
         return path.name == llff.NAME or (path.suffix.lower() == ".json" and "frames" in read_document(path))
     except FormatError:
         return False
+
+
+def _has_poses(path: Path) -> bool:
+    """Whether cameras lie in a folder as one of the layouts has them."""
+    return (
+        any(path.glob("transforms*.json"))
+        or colmap.model_folder(path) is not None
+        or is_file(path / llff.NAME)
+        or polycam.keyframes(path) is not None
+    )
+
+
+def _captures_below(path: Path) -> list[Path]:
+    """Folders with poses in a folder without any, up to LEVELS deep and none inside another, by path."""
+    found, level = [], [path]
+    for _ in range(LEVELS):
+        inner = [folder for above in level for folder in folders(above)][:MAX_FOLDERS]
+        level = []
+        for folder in inner:
+            (found if _has_poses(folder) else level).append(folder)
+    return sorted(found, key=lambda folder: natural(str(folder)))
 
 
 def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
@@ -132,16 +151,30 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
             return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
     if is_file(path / llff.NAME):
         return _read_llff(path / llff.NAME, downscale)
-    if (folders := polycam.keyframes(path)) is not None:
-        return _read_polycam(path, *folders, downscale)
+    if (places := polycam.keyframes(path)) is not None:
+        return _read_polycam(path, *places, downscale)
     if len(below := list(path.glob("*/transforms.json"))) == 1:
         return _read_transforms(below[0], downscale, path)
+    below = _captures_below(path)
+    if len(below) == 1:
+        capture = _read_below(path, below[0], downscale)
+        note = f"{path}: has no poses itself, so {below[0].relative_to(path)} is read, which has some"
+        return replace(capture, notes=(printable(note), *capture.notes))
     if not has_pictures(path):
+        if below:
+            named = " and ".join(str(folder.relative_to(path)) for folder in below[:2])
+            raise NotACapture(f"{path}: holds {len(below)} captures, such as {named}; give one of them")
         raise not_a_capture(path)
     raise NoPoses(
         f"{path}: found pictures but no camera poses (transforms.json, transforms_train.json, COLMAP's "
         "sparse/0, LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
     )
+
+
+def _read_below(path: Path, below: Path, downscale: int | None) -> Capture:
+    """The capture in a folder below `path`; a model without photos there is of those in `path`."""
+    model = None if has_pictures(below) else colmap.model_folder(below)
+    return _read_folder(below, downscale) if model is None else _read_colmap(path, model, downscale)
 
 
 # --- one reader per layout ----------------------------------------------------------------------------------

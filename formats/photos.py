@@ -114,6 +114,15 @@ def pictures(folder: Path) -> list[Path]:
     return [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
 
 
+def folders(path: Path) -> list[Path]:
+    """The visible folders in a folder, in natural order; none where it cannot be read."""
+    try:
+        found = [entry for entry in path.iterdir() if not is_hidden(entry.name) and entry.is_dir()]
+    except OSError:
+        return []
+    return sorted(found, key=lambda entry: natural(entry.name))
+
+
 def find_photo(folder: Path, name: str) -> Path | None:
     """The photo `name` of a folder, with the extension it has on disk; None where there is none."""
     exact = folder / name

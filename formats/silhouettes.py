@@ -198,8 +198,8 @@ def _opaque(view: View, ignoring: bool) -> View:
 
 
 def _is_frame(transparent: Sequence[Outline], views: Sequence[View]) -> bool:
-    """Whether alpha leaves out what lies around all photos, as the corners that a lens does not show, or parts
-    of what they show, and not what lies around an object."""
+    """Whether alpha leaves out what lies around all photos, as the corners that a lens does not show, or
+    parts of what they show, and not what lies around an object."""
     keys = ("border", "middle", "soft")
     border, middle, soft = (float(np.mean([getattr(found, key) for found in transparent])) for key in keys)
     if border > BORDER_SHOWN or views[0].fisheye and _alike(transparent, views):
@@ -241,8 +241,8 @@ def by_ground(views: tuple[View, ...]) -> Shown:
     seen, white, alike = [], True, True
     for view in chosen:
         seen.append(_border_colours(view))
-        lowest, highest = np.array(seen).swapaxes(0, 1)
-        white = int((lowest.min(1) < WHITE).sum()) <= (1 - MOSTLY) * len(chosen)
+        lowest, mostly, highest = np.array(seen).swapaxes(0, 1)
+        white = int((mostly.min(1) < WHITE).sum()) <= (1 - MOSTLY) * len(chosen)
         alike = (highest.max(0) - lowest.min(0) <= PLAIN).all()
         if not (white or alike):
             return Shown(views)
@@ -259,17 +259,17 @@ def by_ground(views: tuple[View, ...]) -> Shown:
     if free < MOSTLY or _barred(found, looked_at) or not any(outline.box for outline in found):
         return Shown(views, notes=(surroundings,))
     note = (
-        f"{'' if free > 0.9 else 'most '}photos show an object on white, which is taken as nothing, so that a "
-        "box around it is learnt; --unbounded learns the white as well"
+        f"{'' if free > 0.9 else 'most '}photos show an object on white, which is taken as nothing, so that "
+        "a box around it is learnt; --unbounded learns the white as well"
     )
     return Shown(views, tuple(looked_at), tuple(found), (note,))
 
 
 def _border_colours(view: View) -> np.ndarray:
-    """(2, 3) the lowest and the highest levels along the borders of a photo, but for stray ones."""
+    """(3, 3) the lowest levels along the borders of a photo, the same but for stray pixels, the highest."""
     picture = decoded(view)[..., :3]
     border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
-    return np.quantile(border, (STRAY, 1 - STRAY), axis=0)
+    return np.quantile(border, (0.0, STRAY, 1.0), axis=0)
 
 
 # --- masks --------------------------------------------------------------------------------------------------

@@ -509,6 +509,9 @@ WRITTEN = {
 def test_written_captures_come_back(tmp_path, lenses):
     random = np.random.default_rng(1)
     pixels = random.integers(0, 256, (3, 8, 10, 4), np.uint8)
+    pixels[:, [0, -1], :, 3] = 0  # they show something that stands free
+    for i in range(3):
+        pixels[i, :, : 1 + 2 * i, 3] = 0
     poses = np.array([POSE] * 3, float)
     poses[:, :3, 3] = random.normal(size=(3, 3))
     views = [

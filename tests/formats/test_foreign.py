@@ -121,6 +121,10 @@ FOLDERS = {
         {"DCIM__100APPLE__a_DOT_png": None},
         r"1 folder below it, 1 of them in DCIM/100APPLE; give",
     ),
+    "captures": (
+        {f"{name}__transforms_DOT_json": b"{}" for name in ("chair", "lego")},
+        "holds 2 captures, such as chair and lego; give one",
+    ),
     "a film": ({"walk_DOT_MOV": FTYP + b"qt  "}, r"walk\.MOV, a film; take pictures"),
     "a mesh": ({"a_DOT_obj": b"v 0 0 0\n", "a_DOT_mtl": b""}, r"a\.obj, a mesh; give that file itself"),
     "splats": ({"a__point_cloud_DOT_ply": SPLATS}, r"point_cloud\.ply, a scene of Gaussian splats"),
@@ -132,7 +136,7 @@ FOLDERS = {
 @pytest.mark.parametrize("files, said", FOLDERS.values(), ids=FOLDERS)
 def test_folders(tmp_path, files, said):
     folder(tmp_path, **files)
-    for read in (read_capture, photos_to_pose):
+    for read in (read_capture, *[photos_to_pose] * ("captures" not in said)):
         with pytest.raises(NotACapture, match=said):
             read(tmp_path)
 
