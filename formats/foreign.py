@@ -181,11 +181,16 @@ def foreign_json(path: Path) -> FormatError | None:
         what, cure = "a scene of fields", "see it with `fusedrf render`, or fuse it with `fusedrf fuse`"
     elif head.startswith(b"[") and b'"rotation"' in head and b'"position"' in head:
         what, cure = "the list of cameras of a splat scene", "give its photos with their COLMAP model"
+    elif re.search(rb'"(sfm_data_version|shots)"|"version"\s*:\s*\[', head):
+        what, cure = KINDS["cameras"]
     elif head.startswith(b"["):
         what = "a JSON list of frames, as Luma and `ns-export cameras` write it"
         cure = 'give the transforms.json of the photos, an object with "frames" and the lens of the cameras'
     elif b'"camera_path"' in head or b'"keyframes"' in head:
         what, cure = "a path of cameras without photos", "give it to `fusedrf render --path`"
+    elif re.match(rb'\{\s*"(transform|scale)"\s*:', head):
+        what = "what nerfstudio did to the poses of a capture"
+        cure = "give the folder of that capture, with its photos and transforms.json"
     elif b'"asset"' in head and b'"version"' in head:
         what, cure = "a glTF file", "name it .gltf"
     else:
@@ -202,6 +207,9 @@ def _of_folder(path: Path) -> FormatError:
     if not files:
         return NotACapture(f"{path}: the folder is empty; give the folder that the photos lie in")
     photos = [file for file in files if BY_ENDING.get(file.suffix.lower()) in ("photo", "heif")]
+    if any((path / name).is_file() for name in ("metadata", "metadata.json")) and (path / "rgbd").is_dir():
+        what, cure = KINDS["record3d"]
+        return NotACapture(f"{path}: is {what}, no capture; {cure}")
     if nested := sorted({file.parent for file in photos} - {path}):
         counts = [sum(file.parent == folder for file in photos) for folder in nested]
         most = nested[counts.index(max(counts))]

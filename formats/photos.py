@@ -162,7 +162,9 @@ def _escaped(name: str) -> str:
 def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:
     """Of folders in the order of their factors, each with one of its photos: the one with the largest photos
     of at most LONGEST a side, or else with the smallest; where `downscale` is given, the one with the
-    smallest photos out of which that can be made, or else with the largest."""
+    smallest photos out of which that can be made, or else with the largest. Copies of another shape than the
+    full-size photos are of others."""
+    places = [(place, photo) for place, photo in places if _of_one_shape(places[0], (place, photo))]
     if downscale is not None:
         whole = [place for place, _ in places if downscale % place.factor == 0]
         return whole[-1] if whole else places[0][0] if places else None
@@ -174,6 +176,18 @@ def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Fol
         if max(header.width, header.height) <= LONGEST:
             return place
     return places[-1][0] if places else None
+
+
+def _of_one_shape(whole: tuple[Folder, Path], other: tuple[Folder, Path]) -> bool:
+    """Whether two photos have one shape, if turned by EXIF, or whether nobody knows."""
+    if whole[0].factor > 1 or whole is other:
+        return True
+    try:
+        sizes = [sorted(read_image_header(photo)[:2]) for _, photo in (whole, other)]
+    except FormatError:  # which its frame tells
+        return True
+    slack = 1 + 1 / sizes[1][0]  # a side is rounded
+    return _shape_error(*sizes) <= slack * (1 + MAX_ASPECT_ERROR)
 
 
 # --- fitting to cameras -------------------------------------------------------------------------------------

@@ -96,6 +96,21 @@ def test_copies_go_before_making_smaller(tmp_path, kind, downscale, folder, redu
     assert project(view, POINT) == pytest.approx((1400 / factor, 400 / factor))
 
 
+@pytest.mark.parametrize("kind", ["transforms", "llff"])
+def test_copies_of_another_shape_are_of_other_photos(tmp_path, kind):
+    """As they are left from before the photos were cropped."""
+    names = ["a.png", "b.png", "c.png"]
+    photos(tmp_path / "images", names, (2000, 1600))
+    photos(tmp_path / "images_2", names, (1000, 500))
+    photos(tmp_path / "images_4", names, (500, 400))
+    if kind == "llff":
+        np.save(tmp_path / "poses_bounds.npy", llff_rows(3, (2000, 1600), 1600.0))
+    else:
+        write(tmp_path, frames=[frame(f"images/{name}") for name in names], fl_x=1600, w=2000, h=1600)
+    view = read_capture(tmp_path).train[0]
+    assert (view.image_path.parent.name, view.width) == ("images_4", 500)
+
+
 def test_a_copy_that_is_smaller_than_asked(tmp_path):
     photo(tmp_path / "images_8/a.png", (250, 200))
     write(tmp_path, frames=[frame("images/a.png")], fl_x=1600, w=2000, h=1600)

@@ -88,6 +88,9 @@ JSONS = {
     "a scene": ({"format": "rfpack", "nodes": []}, "a scene of fields"),
     "Luma's list": ([{"file_path": "a.png", "transform": []}], "a JSON list of frames"),
     "splats' list": ([{"id": 0, "position": [], "rotation": []}], "splat scene"),
+    "Meshroom": ({"version": ["1", "2"], "views": [], "poses": []}, "another program's list of cameras"),
+    "OpenSfM": ([{"cameras": {}, "shots": {}}], "another program's list of cameras"),
+    "nerfstudio's own": ({"transform": [], "scale": 1.0}, "what nerfstudio did"),
     "a path of cameras": ({"camera_path": []}, "path of cameras"),
 }
 
@@ -124,6 +127,10 @@ FOLDERS = {
     "captures": (
         {f"{name}__transforms_DOT_json": b"{}" for name in ("chair", "lego")},
         "holds 2 captures, such as chair and lego; give one",
+    ),
+    "Record3D": (
+        {"metadata": b"{}", "rgbd__0_DOT_png": None},
+        "is a Record3D export, no capture; convert",
     ),
     "a film": ({"walk_DOT_MOV": FTYP + b"qt  "}, r"walk\.MOV, a film; take pictures"),
     "a mesh": ({"a_DOT_obj": b"v 0 0 0\n", "a_DOT_mtl": b""}, r"a\.obj, a mesh; give that file itself"),
