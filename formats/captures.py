@@ -183,9 +183,17 @@ def _read_below(path: Path, below: Path, downscale: int | None) -> Capture:
 def _read_blender(
     path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
 ) -> Capture:
-    parts = [read_part(file, downscale) if file else Part() for file in (train, test)]
     first = train or test
-    return _capture(path, "blender", *parts, stated=stated_aabb(first, read_document(first)))
+    parts, notes = [read_part(first, downscale)], ()
+    if train and test:
+        try:
+            parts.append(read_part(test, downscale))
+        except NoViews as error:
+            parts.append(Part())
+            notes = (f"{error}; none are held out by it",)
+    parts = [*parts, Part()] if train else [Part(), *parts]
+    stated = stated_aabb(first, read_document(first))
+    return _capture(path, "blender", *parts[:2], stated=stated, notes=notes)
 
 
 def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:

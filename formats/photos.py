@@ -53,6 +53,14 @@ OPAQUE = 128
 """Alpha from which on a pixel of a photo counts where its transparent ones are ignored."""
 MOVING = "dynamic_mask_"
 """instant-ngp's masks begin so, and are white where the photo must be ignored."""
+MAP = re.compile(
+    r"(.+?)[._-](?:masks?|depths?|normals?|disp|disparity|alpha|seg|segmentation|semantics?|confidence)"
+    r"(?:[._-]?\d+)?",
+    re.IGNORECASE,
+)
+"""Names, without the ending, of pictures that are no photos but belong to one: depths, normals, masks."""
+COLOUR = re.compile(r"[._-](?:colou?r|rgb)$", re.IGNORECASE)
+"""What such photos may be called themselves, beside them."""
 DIGITS = re.compile(r"(\d+)")
 
 
@@ -106,12 +114,15 @@ def has_pictures(folder: Path) -> bool:
 
 def pictures(folder: Path) -> list[Path]:
     """The pictures of a folder by name, as LLFF counts them; none where there is no folder. A phone's HEIC
-    photo beside the same one in another format is left out."""
+    photo beside the same one in another format is left out, and so are maps of depth and masks of a photo."""
     if not folder.is_dir():
         return []
     files = sorted(file for file in folder.iterdir() if is_picture(file.name) and is_file(file))
     stems = {file.stem for file in files if file.suffix.lower() not in HEIF}
-    return [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
+    files = [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
+    known = {COLOUR.sub("", file.stem) for file in files}
+    told = [MAP.fullmatch(file.stem) for file in files]
+    return [file for file, of in zip(files, told, strict=True) if of is None or of[1] not in known]
 
 
 def folders(path: Path) -> list[Path]:

@@ -529,6 +529,22 @@ def test_written_captures_come_back(tmp_path, lenses):
             assert getattr(back, key) == getattr(view, key)
 
 
+def test_a_centre_in_shares_of_the_picture(tmp_path):
+    photo(tmp_path / "a.png")
+    write(tmp_path, fl_x=0.8, fl_y=1.0, cx=0.5, cy=0.5)
+    with pytest.raises(BadIntrinsics, match=r"cx and cy are 0\.5 and 0\.5.*in pixels"):
+        read_capture(tmp_path)
+
+
+def test_photos_to_test_with_that_are_not_there(tmp_path):
+    """As where only the training photos were downloaded."""
+    photo(tmp_path / "train/a.png")
+    for split in ("train", "test"):
+        write(tmp_path, f"transforms_{split}.json", [frame(f"{split}/a")], fl_x=80)
+    capture = read_capture(tmp_path)
+    assert (len(capture.train), len(capture.test)) == (1, 0) and "none are held out" in capture.notes[0]
+
+
 # --- real captures ------------------------------------------------------------------------------------------
 
 DATA = Path(os.environ.get("FUSEDRF_DATA", Path(__file__).parents[3] / "shared/data"))

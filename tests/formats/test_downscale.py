@@ -7,7 +7,7 @@ from PIL import Image as Pillow
 from formats.captures import load_ignored, load_images, read_capture
 from formats.errors import BadIntrinsics
 from formats.images import read_image, write_png
-from formats.photos import LONGEST
+from formats.photos import LONGEST, pictures
 from tests.formats.test_captures import PIXEL, POINT, frame, photo, project, real, write
 from tests.formats.test_readers import NAMES, binary_model, llff, llff_rows, photos, polycam, turned_photo
 
@@ -146,6 +146,17 @@ def test_photos_that_are_too_small_for_it(tmp_path):
     photos(tmp_path / "images", NAMES)
     with pytest.raises(BadIntrinsics, match=r"10\.png is 100x80 and cannot be made 81 times.*--downscale"):
         read_capture(tmp_path, 81)
+
+
+def test_maps_beside_photos_are_no_photos(tmp_path):
+    llff(tmp_path)
+    for name in ("image000_depth", "image001_depth_0001", "image002-mask", "image000.normal"):
+        photo(tmp_path / f"images_4/{name}.png", (100, 80))
+    assert [view.name for view in read_capture(tmp_path).train] == [f"image{i:03d}" for i in range(3)]
+    scans = [f"frame-{i}.{what}.png" for i in range(3) for what in ("color", "depth")]
+    photos(tmp_path / "scan", [*scans, "the_depth.png"])
+    named = [file.name for file in pictures(tmp_path / "scan")]
+    assert named == [*scans[::2], "the_depth.png"]
 
 
 def test_llff_without_any_photos_says_where_it_looked(tmp_path):
