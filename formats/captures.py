@@ -17,7 +17,7 @@ from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
-from formats.foreign import is_json, not_a_capture
+from formats.foreign import is_json, not_a_capture, other_cameras
 from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
@@ -32,6 +32,8 @@ from formats.photos import (
     folders,
     has_pictures,
     is_file,
+    is_hidden,
+    is_picture,
     load_ignored,
     load_images,
     load_photos,
@@ -101,6 +103,22 @@ def _captures_below(path: Path) -> list[Path]:
         for folder in inner:
             (found if _has_poses(folder) else level).append(folder)
     return sorted(found, key=lambda folder: natural(str(folder)))
+
+
+def poses_elsewhere(path: Path) -> str | None:
+    """A sentence about poses that are not used of a folder of photos: in the folder above, in a JSON file of
+    another name, or another program's; None without any."""
+    above = path.resolve().parent
+    if _has_poses(above):
+        return f"{path}: {above}, the folder above it, has poses, which are not used; give that folder"
+    for file in sorted(path.iterdir()):
+        if not is_file(file) or is_hidden(file.name) or is_picture(file.name):
+            continue
+        if is_capture(file):
+            return f"{path}: {file.name} has poses, which are not used; give that file"
+        if (found := other_cameras(file)) is not None:
+            return f"{path}: {file.name}, {found.what}, is not used; {found.cure}"
+    return None
 
 
 def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
@@ -336,7 +354,7 @@ def _capture(
     if frame is not None and len(seen.views) >= LEAST_VIEWS:
         said.append(upward_doubt(poses))
     notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in said if note))
-    notes = (*notes, *_smaller(path, seen.views))
+    notes = (*notes, *_off_centre(path, seen.views), *_smaller(path, seen.views))
     notes = tuple(dict.fromkeys(map(printable, notes)))  # they have names from the file
     parts = seen.views[:first_test], seen.views[first_test:]
     return Capture(path, kind, *parts, box, opaque, cut_out, missing, points, frame, notes)
@@ -345,6 +363,18 @@ def _capture(
 def _left(before: tuple[View, ...], after: tuple[View, ...], first: int) -> int:
     """How many of the first views are there still."""
     return first if len(after) == len(before) else sum(view in after for view in before[:first])
+
+
+def _off_centre(path: Path, views: tuple[View, ...]) -> Iterator[str]:
+    """A sentence about photos beside which their cameras look, as where their size was changed alone."""
+    off = [v for v in views if not (0 <= v.cx <= v.width and 0 <= v.cy <= v.height)]
+    if off:
+        one = off[0]
+        yield (
+            f"{path}: the centres of {len(off)} of {len(views)} photos lie outside of them, such as "
+            f"{one.cx:g}, {one.cy:g} of {one.name}, which is {one.width}x{one.height}; check that cx, cy, "
+            "fl_x and fl_y are for photos of w and h"
+        )
 
 
 def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:

@@ -113,6 +113,8 @@ ENDINGS = {
     "text": "txt md rtf doc docx html htm yaml yml log ini toml json",
 }
 BY_ENDING = {f".{ending}": kind for kind, endings in ENDINGS.items() for ending in endings.split()}
+MODEL_FILES = [f"{name}.bin" for name in ("cameras", "images", "points3D", "frames", "rigs")]
+"""Files of a COLMAP model, which do not begin in any way."""
 CONTAINERS = (b"PK\x03\x04", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
 """Beginnings of archives, which many kinds of files are inside: those are told by their endings."""
 
@@ -156,7 +158,16 @@ def _of_file(path: Path) -> FormatError:
     return kind(f"{path}: is {found.what}, no capture; {found.cure}")
 
 
+def other_cameras(path: Path) -> Foreign | None:
+    """What a file of cameras is that is not read, by its first bytes; None for others."""
+    found = identify(_head(path), "")
+    kinds = ("metashape", "realitycapture", "cameras")
+    return found if found is not None and found[:2] in [KINDS[kind] for kind in kinds] else None
+
+
 def _identified(path: Path) -> Foreign | None:
+    if path.name in MODEL_FILES:
+        return Foreign(*KINDS["colmap"])
     return identify(_head(path), path.suffix)
 
 

@@ -222,12 +222,8 @@ def _framed(found: Sequence[Outline], views: Sequence[View]) -> bool:
     return _alike(found, views) and (_filled(found) or min(spans) >= SPANNED * shorter)
 
 
-def _barred(found: Sequence[Outline], views: Sequence[View]) -> bool:
-    """Whether all outlines are one and the same rectangle, nearly."""
-    return _alike(found, views) and _filled(found)
-
-
 def _filled(found: Sequence[Outline]) -> bool:
+    """Whether outlines are rectangles, nearly."""
     return float(np.mean([outline.filled for outline in found])) > BARS
 
 
@@ -256,7 +252,8 @@ def by_ground(views: tuple[View, ...]) -> Shown:
     looked_at = sampled(views)
     found = outlines(looked_at, ground_outline)
     free = float(np.mean([outline.border <= STRAY for outline in found]))
-    if free < MOSTLY or _barred(found, looked_at) or not any(outline.box for outline in found):
+    told = [outline for outline in found if outline.box]
+    if free < MOSTLY or not told or len(told) >= LEAST_WHOLE and _filled(told):
         return Shown(views, notes=(surroundings,))
     note = (
         f"{'' if free > 0.9 else 'most '}photos show an object on white, which is taken as nothing, so that "

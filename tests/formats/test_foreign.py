@@ -31,6 +31,7 @@ FILES = {
     "cameras.xml": (b'<?xml version="1.0"?>\n<document version="2.0.0">\n <chunk', "Metashape", "COLMAP"),
     "cameras.csv": (b"#name,x,y,alt,heading\n", "RealityCapture", "COLMAP"),
     "scene.nvm": (b"NVM_V3 \n", "list of cameras", "COLMAP"),
+    "images.bin": (b"\x0c\0\0\0\0\0\0\0", "COLMAP", "folder above"),
     "images.txt": (b"# Image list with two lines\n", "COLMAP", "folder above"),
     "point_cloud.ply": (SPLATS, "Gaussian splats", "photos"),
     "scene.spz": (b"\x1f\x8b\x08", "Gaussian splats", "photos"),

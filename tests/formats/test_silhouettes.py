@@ -238,7 +238,15 @@ def framed(level: int) -> Callable:
     return photo
 
 
+def scanned(i: int) -> np.ndarray:
+    """Prints of two shapes on a white sheet."""
+    pixels, across = np.full((HIGH, WIDE, 3), 255, np.uint8), 6 + 20 * (i % 2)
+    pixels[6:-6, across:-across] = room(i)[6:-6, across:-across]
+    return pixels
+
+
 SURROUNDED = {
+    "prints of two shapes": scanned,
     "black ground": on(0),
     "grey ground": on(128),
     "black frame": framed(0),
