@@ -25,6 +25,8 @@ RATIONAL = "FULL_OPENCV"
 FISHEYE = {"FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
 BENDS = ("k1", "k2", "k3", "p1", "p2")
 RATIONAL_BENDS = ("k4", "k5", "k6")
+SMALL = 16
+"""Pixels a side of pictures so small that a centre of less than one pixel may be meant."""
 LEAST_PIXELS, MOST_PIXELS = 1e-3, 1e8
 """Of a focal length; a principal point and distortion are within the latter."""
 MAX_VALUES = 20_000_000
@@ -140,14 +142,20 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
         raise BadIntrinsics(
             f"{where}: no focal length; expected fl_x, x_fov or camera_angle_x here or in the file"
         )
+    cx, cy = _number(sources, "cx", where, width / 2), _number(sources, "cy", where, height / 2)
+    if min(width, height) > SMALL and 0 < cx <= 1 and 0 < cy <= 1:
+        raise BadIntrinsics(
+            f"{where}: cx and cy are {cx:g} and {cy:g}, shares of the picture; give cx, cy, fl_x and fl_y in "
+            "pixels"
+        )
     pose, repair = checked_pose(frame.get("transform_matrix"), where)
     return View(
         name=name,
         camera_to_world=pose,
         fl_x=x or y,
         fl_y=y or x,
-        cx=_number(sources, "cx", where, width / 2),
-        cy=_number(sources, "cy", where, height / 2),
+        cx=cx,
+        cy=cy,
         width=width,
         height=height,
         distortion=distortion,
@@ -203,7 +211,8 @@ def fov_focal(radians: float, side: int, where: str) -> float:
     """Focal length in pixels of a field of view across `side` pixels; BadIntrinsics if outside (0, pi)."""
     if not 0 < radians < math.pi:
         raise BadIntrinsics(
-            f"{where}: field of view of {math.degrees(radians):g} degrees, expected within 0 to 180"
+            f"{where}: field of view of {math.degrees(radians):g} degrees, expected within 0 to 180 "
+            "(camera_angle_x is in radians, x_fov in degrees)"
         )
     return checked_focal(0.5 * side / math.tan(0.5 * radians), where)
 

@@ -16,8 +16,8 @@ import numpy as np
 from formats import colmap, llff, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
-from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NoViews, printable
-from formats.foreign import is_json, not_a_capture
+from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
+from formats.foreign import is_json, not_a_capture, other_cameras
 from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
@@ -29,8 +29,11 @@ from formats.photos import (
     alike_turned,
     chosen_copy,
     copies,
+    folders,
     has_pictures,
     is_file,
+    is_hidden,
+    is_picture,
     load_ignored,
     load_images,
     load_photos,
@@ -50,6 +53,9 @@ from formats.transforms import (
 )
 from formats.upright import upward_doubt
 from formats.views import LEAST_VIEWS, Capture, View, hold_out
+
+LEVELS, MAX_FOLDERS = 3, 500
+"""How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
 
 __all__ = [
     "Capture",
@@ -71,17 +77,48 @@ def is_capture(path: Path | str) -> bool:
     """Does this look like posed photos? A folder without poses does too: reading it says what lacks."""
     path = Path(path)
     if path.is_dir():
-        return (
-            any(path.glob("transforms*.json"))
-            or colmap.model_folder(path) is not None
-            or is_file(path / llff.NAME)
-            or polycam.keyframes(path) is not None
-            or has_pictures(path)
-        )
+        return _has_poses(path) or has_pictures(path) or bool(_captures_below(path))
     try:
         return path.name == llff.NAME or (path.suffix.lower() == ".json" and "frames" in read_document(path))
     except FormatError:
         return False
+
+
+def _has_poses(path: Path) -> bool:
+    """Whether cameras lie in a folder as one of the layouts has them."""
+    return (
+        any(path.glob("transforms*.json"))
+        or colmap.model_folder(path) is not None
+        or is_file(path / llff.NAME)
+        or polycam.keyframes(path) is not None
+    )
+
+
+def _captures_below(path: Path) -> list[Path]:
+    """Folders with poses in a folder without any, up to LEVELS deep and none inside another, by path."""
+    found, level = [], [path]
+    for _ in range(LEVELS):
+        inner = [folder for above in level for folder in folders(above)][:MAX_FOLDERS]
+        level = []
+        for folder in inner:
+            (found if _has_poses(folder) else level).append(folder)
+    return sorted(found, key=lambda folder: natural(str(folder)))
+
+
+def poses_elsewhere(path: Path) -> str | None:
+    """A sentence about poses that are not used of a folder of photos: in the folder above, in a JSON file of
+    another name, or another program's; None without any."""
+    above = path.resolve().parent
+    if _has_poses(above):
+        return f"{path}: {above}, the folder above it, has poses, which are not used; give that folder"
+    for file in sorted(path.iterdir()):
+        if not is_file(file) or is_hidden(file.name) or is_picture(file.name):
+            continue
+        if is_capture(file):
+            return f"{path}: {file.name} has poses, which are not used; give that file"
+        if (found := other_cameras(file)) is not None:
+            return f"{path}: {file.name}, {found.what}, is not used; {found.cure}"
+    return None
 
 
 def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
@@ -132,16 +169,30 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
             return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
     if is_file(path / llff.NAME):
         return _read_llff(path / llff.NAME, downscale)
-    if (folders := polycam.keyframes(path)) is not None:
-        return _read_polycam(path, *folders, downscale)
+    if (places := polycam.keyframes(path)) is not None:
+        return _read_polycam(path, *places, downscale)
     if len(below := list(path.glob("*/transforms.json"))) == 1:
         return _read_transforms(below[0], downscale, path)
+    below = _captures_below(path)
+    if len(below) == 1:
+        capture = _read_below(path, below[0], downscale)
+        note = f"{path}: has no poses itself, so {below[0].relative_to(path)} is read, which has some"
+        return replace(capture, notes=(printable(note), *capture.notes))
     if not has_pictures(path):
+        if below:
+            named = " and ".join(str(folder.relative_to(path)) for folder in below[:2])
+            raise NotACapture(f"{path}: holds {len(below)} captures, such as {named}; give one of them")
         raise not_a_capture(path)
     raise NoPoses(
         f"{path}: found pictures but no camera poses (transforms.json, transforms_train.json, COLMAP's "
         "sparse/0, LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
     )
+
+
+def _read_below(path: Path, below: Path, downscale: int | None) -> Capture:
+    """The capture in a folder below `path`; a model without photos there is of those in `path`."""
+    model = None if has_pictures(below) else colmap.model_folder(below)
+    return _read_folder(below, downscale) if model is None else _read_colmap(path, model, downscale)
 
 
 # --- one reader per layout ----------------------------------------------------------------------------------
@@ -150,9 +201,17 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
 def _read_blender(
     path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
 ) -> Capture:
-    parts = [read_part(file, downscale) if file else Part() for file in (train, test)]
     first = train or test
-    return _capture(path, "blender", *parts, stated=stated_aabb(first, read_document(first)))
+    parts, notes = [read_part(first, downscale)], ()
+    if train and test:
+        try:
+            parts.append(read_part(test, downscale))
+        except NoViews as error:
+            parts.append(Part())
+            notes = (f"{error}; none are held out by it",)
+    parts = [*parts, Part()] if train else [Part(), *parts]
+    stated = stated_aabb(first, read_document(first))
+    return _capture(path, "blender", *parts[:2], stated=stated, notes=notes)
 
 
 def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:
@@ -295,7 +354,7 @@ def _capture(
     if frame is not None and len(seen.views) >= LEAST_VIEWS:
         said.append(upward_doubt(poses))
     notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in said if note))
-    notes = (*notes, *_smaller(path, seen.views))
+    notes = (*notes, *_off_centre(path, seen.views), *_smaller(path, seen.views))
     notes = tuple(dict.fromkeys(map(printable, notes)))  # they have names from the file
     parts = seen.views[:first_test], seen.views[first_test:]
     return Capture(path, kind, *parts, box, opaque, cut_out, missing, points, frame, notes)
@@ -304,6 +363,18 @@ def _capture(
 def _left(before: tuple[View, ...], after: tuple[View, ...], first: int) -> int:
     """How many of the first views are there still."""
     return first if len(after) == len(before) else sum(view in after for view in before[:first])
+
+
+def _off_centre(path: Path, views: tuple[View, ...]) -> Iterator[str]:
+    """A sentence about photos beside which their cameras look, as where their size was changed alone."""
+    off = [v for v in views if not (0 <= v.cx <= v.width and 0 <= v.cy <= v.height)]
+    if off:
+        one = off[0]
+        yield (
+            f"{path}: the centres of {len(off)} of {len(views)} photos lie outside of them, such as "
+            f"{one.cx:g}, {one.cy:g} of {one.name}, which is {one.width}x{one.height}; check that cx, cy, "
+            "fl_x and fl_y are for photos of w and h"
+        )
 
 
 def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:

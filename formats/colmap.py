@@ -29,7 +29,7 @@ from formats.frame import depth_range
 from formats.frame_list import once, read_sound
 from formats.inputs import decoded, open_input, read_input
 from formats.matching import stem_key
-from formats.photos import natural
+from formats.photos import folders
 from formats.points import Points, stride, thinned_notes
 from formats.rotations import matrices
 from formats.views import FARTHEST, View
@@ -72,6 +72,9 @@ NUMBERS = [
 """Names of the models by their number in binary files."""
 MODELS_IN = ("sparse", "colmap")
 """Folders that models lie in, in the folder of their capture."""
+MODELS_BELOW = ("sparse", "colmap/sparse", "distorted/sparse")
+"""Where COLMAP, nerfstudio and scripts of Gaussian splatting store models; the last, of the photos as taken,
+in `input`, where the others are not."""
 PHOTOS_IN = ("images", "input")
 """Folders that its photos lie in."""
 NO_POINT = 2**64 - 1
@@ -131,20 +134,13 @@ def model_folder(path: Path) -> Path | None:
 
 def model_folders(path: Path) -> list[Path]:
     """The folder at `path` where that is a model's, or those below it, by how many images they have."""
-    for place in (path, path / "sparse", path / "colmap/sparse"):
+    for place in (path, *(path / inner for inner in MODELS_BELOW)):
         below = [place]
         if place != path or path.name == "sparse":
-            below += sorted(_folders(place), key=lambda folder: natural(folder.name))
+            below += folders(place)
         if models := [folder for folder in below if _has(folder, "cameras") and _has(folder, "images")]:
             return sorted(models, key=image_count, reverse=True)
     return []
-
-
-def _folders(path: Path) -> list[Path]:
-    try:
-        return [folder for folder in path.iterdir() if folder.is_dir()]
-    except OSError:
-        return []
 
 
 def image_count(folder: Path) -> int:

@@ -113,6 +113,8 @@ ENDINGS = {
     "text": "txt md rtf doc docx html htm yaml yml log ini toml json",
 }
 BY_ENDING = {f".{ending}": kind for kind, endings in ENDINGS.items() for ending in endings.split()}
+MODEL_FILES = [f"{name}.bin" for name in ("cameras", "images", "points3D", "frames", "rigs")]
+"""Files of a COLMAP model, which do not begin in any way."""
 CONTAINERS = (b"PK\x03\x04", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
 """Beginnings of archives, which many kinds of files are inside: those are told by their endings."""
 
@@ -156,7 +158,16 @@ def _of_file(path: Path) -> FormatError:
     return kind(f"{path}: is {found.what}, no capture; {found.cure}")
 
 
+def other_cameras(path: Path) -> Foreign | None:
+    """What a file of cameras is that is not read, by its first bytes; None for others."""
+    found = identify(_head(path), "")
+    kinds = ("metashape", "realitycapture", "cameras")
+    return found if found is not None and found[:2] in [KINDS[kind] for kind in kinds] else None
+
+
 def _identified(path: Path) -> Foreign | None:
+    if path.name in MODEL_FILES:
+        return Foreign(*KINDS["colmap"])
     return identify(_head(path), path.suffix)
 
 
@@ -181,11 +192,16 @@ def foreign_json(path: Path) -> FormatError | None:
         what, cure = "a scene of fields", "see it with `fusedrf render`, or fuse it with `fusedrf fuse`"
     elif head.startswith(b"[") and b'"rotation"' in head and b'"position"' in head:
         what, cure = "the list of cameras of a splat scene", "give its photos with their COLMAP model"
+    elif re.search(rb'"(sfm_data_version|shots)"|"version"\s*:\s*\[', head):
+        what, cure = KINDS["cameras"]
     elif head.startswith(b"["):
         what = "a JSON list of frames, as Luma and `ns-export cameras` write it"
         cure = 'give the transforms.json of the photos, an object with "frames" and the lens of the cameras'
     elif b'"camera_path"' in head or b'"keyframes"' in head:
         what, cure = "a path of cameras without photos", "give it to `fusedrf render --path`"
+    elif re.match(rb'\{\s*"(transform|scale)"\s*:', head):
+        what = "what nerfstudio did to the poses of a capture"
+        cure = "give the folder of that capture, with its photos and transforms.json"
     elif b'"asset"' in head and b'"version"' in head:
         what, cure = "a glTF file", "name it .gltf"
     else:
@@ -202,6 +218,9 @@ def _of_folder(path: Path) -> FormatError:
     if not files:
         return NotACapture(f"{path}: the folder is empty; give the folder that the photos lie in")
     photos = [file for file in files if BY_ENDING.get(file.suffix.lower()) in ("photo", "heif")]
+    if any((path / name).is_file() for name in ("metadata", "metadata.json")) and (path / "rgbd").is_dir():
+        what, cure = KINDS["record3d"]
+        return NotACapture(f"{path}: is {what}, no capture; {cure}")
     if nested := sorted({file.parent for file in photos} - {path}):
         counts = [sum(file.parent == folder for file in photos) for folder in nested]
         most = nested[counts.index(max(counts))]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.bundle import is_bundle
-from formats.captures import is_capture, is_mesh, read_capture
+from formats.captures import is_capture, is_mesh, poses_elsewhere, read_capture
 from formats.errors import FormatError, NoPoses
 from formats.foreign import is_json, not_a_capture
 from formats.images import read_focal, read_image_header
@@ -87,7 +87,7 @@ def photo_facts(path: Path) -> dict:
         "sizes": _sizes((header.width, header.height) for header in headers),
         "turned": sum(header.orientation != 1 for header in headers),
         "focal_lengths": sum(read_focal(photo) is not None for photo in photos),
-        "notes": [note],
+        "notes": [note, *filter(None, [poses_elsewhere(path)])],
     }
 
 

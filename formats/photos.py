@@ -53,6 +53,14 @@ OPAQUE = 128
 """Alpha from which on a pixel of a photo counts where its transparent ones are ignored."""
 MOVING = "dynamic_mask_"
 """instant-ngp's masks begin so, and are white where the photo must be ignored."""
+MAP = re.compile(
+    r"(.+?)[._-](?:masks?|depths?|normals?|disp|disparity|alpha|seg|segmentation|semantics?|confidence)"
+    r"(?:[._-]?\d+)?",
+    re.IGNORECASE,
+)
+"""Names, without the ending, of pictures that are no photos but belong to one: depths, normals, masks."""
+COLOUR = re.compile(r"[._-](?:colou?r|rgb)$", re.IGNORECASE)
+"""What such photos may be called themselves, beside them."""
 DIGITS = re.compile(r"(\d+)")
 
 
@@ -106,12 +114,24 @@ def has_pictures(folder: Path) -> bool:
 
 def pictures(folder: Path) -> list[Path]:
     """The pictures of a folder by name, as LLFF counts them; none where there is no folder. A phone's HEIC
-    photo beside the same one in another format is left out."""
+    photo beside the same one in another format is left out, and so are maps of depth and masks of a photo."""
     if not folder.is_dir():
         return []
     files = sorted(file for file in folder.iterdir() if is_picture(file.name) and is_file(file))
     stems = {file.stem for file in files if file.suffix.lower() not in HEIF}
-    return [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
+    files = [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
+    known = {COLOUR.sub("", file.stem) for file in files}
+    told = [MAP.fullmatch(file.stem) for file in files]
+    return [file for file, of in zip(files, told, strict=True) if of is None or of[1] not in known]
+
+
+def folders(path: Path) -> list[Path]:
+    """The visible folders in a folder, in natural order; none where it cannot be read."""
+    try:
+        found = [entry for entry in path.iterdir() if not is_hidden(entry.name) and entry.is_dir()]
+    except OSError:
+        return []
+    return sorted(found, key=lambda entry: natural(entry.name))
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
@@ -153,7 +173,9 @@ def _escaped(name: str) -> str:
 def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:
     """Of folders in the order of their factors, each with one of its photos: the one with the largest photos
     of at most LONGEST a side, or else with the smallest; where `downscale` is given, the one with the
-    smallest photos out of which that can be made, or else with the largest."""
+    smallest photos out of which that can be made, or else with the largest. Copies of another shape than the
+    full-size photos are of others."""
+    places = [(place, photo) for place, photo in places if _of_one_shape(places[0], (place, photo))]
     if downscale is not None:
         whole = [place for place, _ in places if downscale % place.factor == 0]
         return whole[-1] if whole else places[0][0] if places else None
@@ -165,6 +187,18 @@ def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Fol
         if max(header.width, header.height) <= LONGEST:
             return place
     return places[-1][0] if places else None
+
+
+def _of_one_shape(whole: tuple[Folder, Path], other: tuple[Folder, Path]) -> bool:
+    """Whether two photos have one shape, if turned by EXIF, or whether nobody knows."""
+    if whole[0].factor > 1 or whole is other:
+        return True
+    try:
+        sizes = [sorted(read_image_header(photo)[:2]) for _, photo in (whole, other)]
+    except FormatError:  # which its frame tells
+        return True
+    slack = 1 + 1 / sizes[1][0]  # a side is rounded
+    return _shape_error(*sizes) <= slack * (1 + MAX_ASPECT_ERROR)
 
 
 # --- fitting to cameras -------------------------------------------------------------------------------------

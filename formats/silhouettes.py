@@ -25,12 +25,21 @@ SOFT = 0.15
 """Share of half transparent pixels from which alpha is a vignette, not the outline of a thing."""
 BORDER_KEPT = 0.3
 """What keeps less than this share of the photos' borders cuts out an object; other masks hide passers-by."""
-SAMPLED = 6
+BORDER_SHOWN = 0.4
+"""Alpha that keeps more than this share of the borders cuts out no object, whatever it leaves out inside: the
+sky, passers-by, a sign in a corner."""
+SPANNED = 0.9
+"""Share of a photo's shorter side that the picture of a lens spans at least."""
+SAMPLED = 12
 """Photos whose borders are looked at for a ground of one colour, before more are."""
 WHITE, PLAIN = 250, 3
 """The least level of a white ground, and levels by which the colour of a ground may vary."""
 GROUND = 8
 """Levels by which a pixel of an object differs from the white ground."""
+STRAY = 0.02
+"""Share of a border that may have another colour than a white ground, as around an object in a JPEG."""
+MOSTLY = 0.65
+"""Share of photos that show an object on white all around, at least, if the others cut it off."""
 BARS = 0.97
 """Share of the box around it that a picture between bars fills; hardly any outline of an object does."""
 CELLS = 32
@@ -161,8 +170,12 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
     if not most or _is_frame(transparent, looked_at):
         note = f"{channel} says nothing and is not used"
         if transparent:
-            what = "frames them" if most else "is transparent in too few to cut an object out"
-            note = f"{channel} {what}: photos show surroundings, and pixels that are transparent are ignored"
+            what = (
+                "frames them or hides parts of what they show"
+                if most
+                else "is transparent in too few to cut an object out"
+            )
+            note = f"{channel} {what}: photos show surroundings; pixels that are transparent are ignored"
         return Shown(tuple(_opaque(view, bool(transparent)) for view in views), notes=(note,))
     notes = []
     if bare := len(views) - len(having):
@@ -185,20 +198,33 @@ def _opaque(view: View, ignoring: bool) -> View:
 
 
 def _is_frame(transparent: Sequence[Outline], views: Sequence[View]) -> bool:
-    """Whether alpha leaves out what lies around all photos, as the corners that a lens does not show, and not
-    what lies around an object."""
+    """Whether alpha leaves out what lies around all photos, as the corners that a lens does not show, or
+    parts of what they show, and not what lies around an object."""
     keys = ("border", "middle", "soft")
     border, middle, soft = (float(np.mean([getattr(found, key) for found in transparent])) for key in keys)
-    around = border > BORDER_KEPT or soft > SOFT or _barred(transparent, views) or views[0].fisheye
+    if border > BORDER_SHOWN or views[0].fisheye and _alike(transparent, views):
+        return True
+    around = border > BORDER_KEPT or soft > SOFT or _framed(transparent, views) or views[0].fisheye
     return middle > 0.995 and around
 
 
-def _barred(found: Sequence[Outline], views: Sequence[View]) -> bool:
-    """Whether all outlines are one and the same rectangle, nearly."""
+def _alike(found: Sequence[Outline], views: Sequence[View]) -> bool:
+    """Whether all outlines have one and the same box, nearly."""
     boxes = np.array([outline.box or (0.0,) * 4 for outline in found])
     sides = max(max(view.width, view.height) for view in views)
-    alike = len(boxes) > 1 and float(np.ptp(boxes, axis=0).max()) <= 0.02 * sides
-    return alike and float(np.mean([outline.filled for outline in found])) > BARS
+    return len(boxes) > 1 and float(np.ptp(boxes, axis=0).max()) <= 0.02 * sides
+
+
+def _framed(found: Sequence[Outline], views: Sequence[View]) -> bool:
+    """Whether all outlines are one rectangle, or the round picture of a lens, nearly."""
+    spans = [min(o.box[2] - o.box[0], o.box[3] - o.box[1]) if o.box else 0.0 for o in found]
+    shorter = min(min(view.width, view.height) for view in views)
+    return _alike(found, views) and (_filled(found) or min(spans) >= SPANNED * shorter)
+
+
+def _filled(found: Sequence[Outline]) -> bool:
+    """Whether outlines are rectangles, nearly."""
+    return float(np.mean([outline.filled for outline in found])) > BARS
 
 
 # --- grounds ------------------------------------------------------------------------------------------------
@@ -208,30 +234,39 @@ def by_ground(views: tuple[View, ...]) -> Shown:
     """Outlines where photos show an object on white. Borders of another colour are taken as surroundings,
     since nothing tells a black ground from the night."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
-    lowest, highest = np.full(3, 255), np.zeros(3, int)
+    seen, white, alike = [], True, True
     for view in chosen:
-        picture = decoded(view)[..., :3]
-        border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
-        lowest, highest = np.minimum(lowest, border.min(0)), np.maximum(highest, border.max(0))
-        if (highest - lowest > PLAIN).any() and lowest.min() < WHITE:
+        seen.append(_border_colours(view))
+        lowest, mostly, highest = np.array(seen).swapaxes(0, 1)
+        white = int((mostly.min(1) < WHITE).sum()) <= (1 - MOSTLY) * len(chosen)
+        alike = (highest.max(0) - lowest.min(0) <= PLAIN).all()
+        if not (white or alike):
             return Shown(views)
-    colour = ", ".join(map(str, lowest))
+    colour = ", ".join(f"{level:.0f}" for level in np.median(lowest, axis=0))
     surroundings = (
         f"the borders of photos have one colour ({colour}) and are taken as surroundings; of an object "
         "before nothing give photos with alpha or masks, or --bounded; crop bars and frames away"
     )
-    if lowest.min() < WHITE:
+    if not white:
         return Shown(views, notes=(surroundings,))
     looked_at = sampled(views)
     found = outlines(looked_at, ground_outline)
-    free = np.mean([outline.border == 0 for outline in found]) > 0.9
-    if not free or _barred(found, looked_at) or not any(outline.box for outline in found):
+    free = float(np.mean([outline.border <= STRAY for outline in found]))
+    told = [outline for outline in found if outline.box]
+    if free < MOSTLY or not told or len(told) >= LEAST_WHOLE and _filled(told):
         return Shown(views, notes=(surroundings,))
     note = (
-        "photos show an object on white, which is taken as nothing, so that a box around it is learnt; "
-        "--unbounded learns the white as well"
+        f"{'' if free > 0.9 else 'most '}photos show an object on white, which is taken as nothing, so that "
+        "a box around it is learnt; --unbounded learns the white as well"
     )
     return Shown(views, tuple(looked_at), tuple(found), (note,))
+
+
+def _border_colours(view: View) -> np.ndarray:
+    """(3, 3) the lowest levels along the borders of a photo, the same but for stray pixels, the highest."""
+    picture = decoded(view)[..., :3]
+    border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+    return np.quantile(border, (0.0, STRAY, 1.0), axis=0)
 
 
 # --- masks --------------------------------------------------------------------------------------------------

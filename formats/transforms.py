@@ -22,7 +22,7 @@ from formats.cameras import (
 from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError, counted
 from formats.frame import depth_range
 from formats.frame_list import once, read_sound, repair_notes
-from formats.images import read_image_header
+from formats.images import Header, read_image_header
 from formats.matching import Matched, find_file, match_photos, stem_key
 from formats.photos import natural, on_photo
 from formats.points import MAX_POINTS, Points, read_ply_points, thinned_notes
@@ -106,21 +106,44 @@ def _part(
 
     found = [item for item in frames if _file(item) in matched.photos]
     found, notes = once(path, found, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
+    unsure = []
     names = dict(zip((i for i, _ in found), frame_names([frame for _, frame in found]), strict=True))
 
     def read(item: Numbered) -> View:
         (i, frame), where = item, frame_where(path, *item)
         photo, folder = matched.photos[_file(item)]
         header = read_image_header(photo)
-        view = frame_view(where, document, frame, names[i], header[:2])
+        size, sure = _unstated_size(header, frame, document)
+        if not sure:
+            unsure.append(photo.name)
+        view = frame_view(where, document, frame, names[i], size)
         mask = _mask(path, folder.factor, frame, where)
         view = replace(view, seen=_stated_points(where, frame))
         return on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
 
     views, broken = read_sound(path, found, read, photo_of)
     missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
-    notes = (*notes, *broken, *repair_notes(path, views))
+    turned = [
+        f"{path}: EXIF turns {counted(len(unsure), 'photo', 'photos')}, such as {name}, and without w and h "
+        "nothing tells whether the poses are of them so: they are read as stored"
+        for name in unsure[:1]
+    ]
+    notes = (*notes, *broken, *turned, *repair_notes(path, views))
     return Part(tuple(views), missing, notes)
+
+
+def _unstated_size(header: Header, frame: dict, document: dict) -> tuple[tuple[int, int], bool]:
+    """The width and height of a photo that a camera is of which states none: as stored or as EXIF turns it,
+    as its centre says; and whether that, or something else, tells."""
+    stored = (header.width, header.height)
+    keys = {key: frame.get(key, document.get(key)) for key in ("w", "h", "cx", "cy")}
+    if header.orientation < 5 or stored[0] == stored[1] or None not in (keys["w"], keys["h"]):
+        return stored, True
+    centre = [keys[key] for key in ("cx", "cy")]
+    if not all(isinstance(side, int | float) for side in centre):
+        return stored, False
+    off = [abs(centre[0] - wide / 2) + abs(centre[1] - high / 2) for wide, high in (stored, stored[::-1])]
+    return stored if off[0] <= off[1] else stored[::-1], True
 
 
 def _file(item: Numbered) -> str:

@@ -19,6 +19,14 @@ much in it: where all look one way, the hand's roll alone spreads y axes, in a p
 SIGNED = 0.1
 """Least length, along a direction, of the mean of axes that tells which of its two ends is up."""
 
+TOGETHER, EACH = 0.02, 0.15
+"""Where some photos were held upright and others sideways, the mean square of level axes along up is at most
+that, and each kind is this share of them at least."""
+SEVERAL = 8
+"""Cameras that tell it at least: for fewer there is such a direction by chance."""
+GRID = 1000
+"""Directions that are tried for it, about, and cameras that they are tried on."""
+
 UNKNOWN = (
     "which way is up does not follow from these cameras, which all face one way or were held any way: the "
     "mean of their upward axes is taken; --up says otherwise when rendering"
@@ -43,9 +51,12 @@ def vertical(rights: np.ndarray, ups: np.ndarray, backs: np.ndarray) -> tuple[np
     """(3,) unit vector up, and a sentence where it is a guess, of the cameras' axes in the world, (N, 3).
 
     Photos that lie on their side, stored as a camera that was turned by a quarter left them, have level y
-    axes; up is then on the side from which the cameras look down. Without any plane of level axes it is the
+    axes; up is then on the side from which the cameras look down. Where some lie on their side and others do
+    not, up is square to one of both axes of each. Without any plane of level axes it is the
     mean of the ups, square to the cameras' common sideways axis where there is one; +z where they cancel.
     """
+    if (both := _held_both_ways(rights, ups)) is not None:
+        return both, None
     across, x_axes = np.linalg.eigh(rights.T @ rights / len(rights))
     along, y_axes = np.linalg.eigh(ups.T @ ups / len(ups))
     if along[0] < SIDEWAYS * across[0] and along[0] < APART * along[1] > APART * SIDEWAYS_SPREAD:
@@ -62,3 +73,25 @@ def vertical(rights: np.ndarray, ups: np.ndarray, backs: np.ndarray) -> tuple[np
         mean = mean - (mean @ x_axes[:, 2]) * x_axes[:, 2]
     length = float(np.linalg.norm(mean))
     return mean / length if length > 1e-6 else np.array([0.0, 0.0, 1.0]), UNKNOWN
+
+
+def _held_both_ways(rights: np.ndarray, ups: np.ndarray) -> np.ndarray | None:
+    """(3,) up where some photos were held upright and others on their side: the direction to which one of the
+    two axes of each camera, (N, 3) each, is square. None where there is none, or not both kinds of photos."""
+    if len(rights) < SEVERAL:
+        return None
+    heights = (np.arange(GRID) + 0.5) / GRID  # of a hemisphere, evenly spaced on a spiral
+    turns, radii = np.arange(GRID) * np.pi * (3 - 5**0.5), np.sqrt(1 - heights**2)
+    grid = np.stack([radii * np.cos(turns), radii * np.sin(turns), heights])
+    few = slice(None, None, -(-len(rights) // GRID))
+    up = grid[:, np.minimum((rights[few] @ grid) ** 2, (ups[few] @ grid) ** 2).mean(0).argmin()]
+    for _ in range(5):
+        upright = (rights @ up) ** 2 < (ups @ up) ** 2
+        axes = np.where(upright[:, None], rights, ups)
+        spread, directions = np.linalg.eigh(axes.T @ axes / len(axes))
+        up = directions[:, 0]
+    both = EACH <= upright.mean() <= 1 - EACH
+    if not both or spread[0] > TOGETHER or spread[1] < SIDEWAYS_SPREAD:
+        return None
+    sign = float((ups[upright] @ up).mean())
+    return up * np.sign(sign) if abs(sign) > SIGNED else None

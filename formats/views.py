@@ -220,6 +220,8 @@ def checked_pose(matrix: object, where: str) -> tuple[np.ndarray, str]:
     """A rigid (4,4) float64 pose from 16 or 12 numbers in rows of four, and what was mended of it (`repair`
     of a View). Scaled axes are brought to length 1, and axes that are not quite square, as rounding leaves
     them, to the nearest rotation. Raises BadPose led by `where`."""
+    if matrix is None:
+        raise BadPose(f"{where}: has no camera pose, expected 4x4 numbers, camera-to-world; export it again")
     try:
         pose = np.array(matrix, dtype=np.float64).reshape(-1, 4)
     except (TypeError, ValueError, OverflowError):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-from formats.captures import read_capture
+from formats.captures import poses_elsewhere, read_capture
 from formats.errors import NoPoses, ResourceError
 from formats.locks import temporary_folder
 from formats.photos import has_pictures
@@ -75,7 +75,8 @@ def posed_capture(source: str, downscale: int | None, threads: int | None, progr
         f"{source}: where {len(photos) - len(unposed)} of {len(photos)} photos were taken is estimated from "
         f"them: {WORLD}; it is kept in {folder}"
     )
-    return replace(capture, path=Path(source), notes=(note, *capture.notes))
+    elsewhere = filter(None, [poses_elsewhere(Path(source))])
+    return replace(capture, path=Path(source), notes=(*elsewhere, note, *capture.notes))
 
 
 def _cached(source: str, photos: Sequence[Path]) -> Path:

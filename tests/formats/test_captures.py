@@ -509,6 +509,9 @@ WRITTEN = {
 def test_written_captures_come_back(tmp_path, lenses):
     random = np.random.default_rng(1)
     pixels = random.integers(0, 256, (3, 8, 10, 4), np.uint8)
+    pixels[:, [0, -1], :, 3] = 0  # they show something that stands free
+    for i in range(3):
+        pixels[i, :, : 1 + 2 * i, 3] = 0
     poses = np.array([POSE] * 3, float)
     poses[:, :3, 3] = random.normal(size=(3, 3))
     views = [
@@ -524,6 +527,22 @@ def test_written_captures_come_back(tmp_path, lenses):
         assert (back.camera_to_world == view.camera_to_world).all()
         for key in ("name", "fl_x", "fl_y", "cx", "cy", "width", "height", "distortion", "fisheye"):
             assert getattr(back, key) == getattr(view, key)
+
+
+def test_a_centre_in_shares_of_the_picture(tmp_path):
+    photo(tmp_path / "a.png")
+    write(tmp_path, fl_x=0.8, fl_y=1.0, cx=0.5, cy=0.5)
+    with pytest.raises(BadIntrinsics, match=r"cx and cy are 0\.5 and 0\.5.*in pixels"):
+        read_capture(tmp_path)
+
+
+def test_photos_to_test_with_that_are_not_there(tmp_path):
+    """As where only the training photos were downloaded."""
+    photo(tmp_path / "train/a.png")
+    for split in ("train", "test"):
+        write(tmp_path, f"transforms_{split}.json", [frame(f"{split}/a")], fl_x=80)
+    capture = read_capture(tmp_path)
+    assert (len(capture.train), len(capture.test)) == (1, 0) and "none are held out" in capture.notes[0]
 
 
 # --- real captures ------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from PIL import Image as Pillow
 from formats.captures import load_ignored, load_images, read_capture
 from formats.errors import BadIntrinsics
 from formats.images import read_image, write_png
-from formats.photos import LONGEST
+from formats.photos import LONGEST, pictures
 from tests.formats.test_captures import PIXEL, POINT, frame, photo, project, real, write
 from tests.formats.test_readers import NAMES, binary_model, llff, llff_rows, photos, polycam, turned_photo
 
@@ -96,6 +96,21 @@ def test_copies_go_before_making_smaller(tmp_path, kind, downscale, folder, redu
     assert project(view, POINT) == pytest.approx((1400 / factor, 400 / factor))
 
 
+@pytest.mark.parametrize("kind", ["transforms", "llff"])
+def test_copies_of_another_shape_are_of_other_photos(tmp_path, kind):
+    """As they are left from before the photos were cropped."""
+    names = ["a.png", "b.png", "c.png"]
+    photos(tmp_path / "images", names, (2000, 1600))
+    photos(tmp_path / "images_2", names, (1000, 500))
+    photos(tmp_path / "images_4", names, (500, 400))
+    if kind == "llff":
+        np.save(tmp_path / "poses_bounds.npy", llff_rows(3, (2000, 1600), 1600.0))
+    else:
+        write(tmp_path, frames=[frame(f"images/{name}") for name in names], fl_x=1600, w=2000, h=1600)
+    view = read_capture(tmp_path).train[0]
+    assert (view.image_path.parent.name, view.width) == ("images_4", 500)
+
+
 def test_a_copy_that_is_smaller_than_asked(tmp_path):
     photo(tmp_path / "images_8/a.png", (250, 200))
     write(tmp_path, frames=[frame("images/a.png")], fl_x=1600, w=2000, h=1600)
@@ -131,6 +146,17 @@ def test_photos_that_are_too_small_for_it(tmp_path):
     photos(tmp_path / "images", NAMES)
     with pytest.raises(BadIntrinsics, match=r"10\.png is 100x80 and cannot be made 81 times.*--downscale"):
         read_capture(tmp_path, 81)
+
+
+def test_maps_beside_photos_are_no_photos(tmp_path):
+    llff(tmp_path)
+    for name in ("image000_depth", "image001_depth_0001", "image002-mask", "image000.normal"):
+        photo(tmp_path / f"images_4/{name}.png", (100, 80))
+    assert [view.name for view in read_capture(tmp_path).train] == [f"image{i:03d}" for i in range(3)]
+    scans = [f"frame-{i}.{what}.png" for i in range(3) for what in ("color", "depth")]
+    photos(tmp_path / "scan", [*scans, "the_depth.png"])
+    named = [file.name for file in pictures(tmp_path / "scan")]
+    assert named == [*scans[::2], "the_depth.png"]
 
 
 def test_llff_without_any_photos_says_where_it_looked(tmp_path):

@@ -31,6 +31,7 @@ FILES = {
     "cameras.xml": (b'<?xml version="1.0"?>\n<document version="2.0.0">\n <chunk', "Metashape", "COLMAP"),
     "cameras.csv": (b"#name,x,y,alt,heading\n", "RealityCapture", "COLMAP"),
     "scene.nvm": (b"NVM_V3 \n", "list of cameras", "COLMAP"),
+    "images.bin": (b"\x0c\0\0\0\0\0\0\0", "COLMAP", "folder above"),
     "images.txt": (b"# Image list with two lines\n", "COLMAP", "folder above"),
     "point_cloud.ply": (SPLATS, "Gaussian splats", "photos"),
     "scene.spz": (b"\x1f\x8b\x08", "Gaussian splats", "photos"),
@@ -88,6 +89,9 @@ JSONS = {
     "a scene": ({"format": "rfpack", "nodes": []}, "a scene of fields"),
     "Luma's list": ([{"file_path": "a.png", "transform": []}], "a JSON list of frames"),
     "splats' list": ([{"id": 0, "position": [], "rotation": []}], "splat scene"),
+    "Meshroom": ({"version": ["1", "2"], "views": [], "poses": []}, "another program's list of cameras"),
+    "OpenSfM": ([{"cameras": {}, "shots": {}}], "another program's list of cameras"),
+    "nerfstudio's own": ({"transform": [], "scale": 1.0}, "what nerfstudio did"),
     "a path of cameras": ({"camera_path": []}, "path of cameras"),
 }
 
@@ -121,6 +125,14 @@ FOLDERS = {
         {"DCIM__100APPLE__a_DOT_png": None},
         r"1 folder below it, 1 of them in DCIM/100APPLE; give",
     ),
+    "captures": (
+        {f"{name}__transforms_DOT_json": b"{}" for name in ("chair", "lego")},
+        "holds 2 captures, such as chair and lego; give one",
+    ),
+    "Record3D": (
+        {"metadata": b"{}", "rgbd__0_DOT_png": None},
+        "is a Record3D export, no capture; convert",
+    ),
     "a film": ({"walk_DOT_MOV": FTYP + b"qt  "}, r"walk\.MOV, a film; take pictures"),
     "a mesh": ({"a_DOT_obj": b"v 0 0 0\n", "a_DOT_mtl": b""}, r"a\.obj, a mesh; give that file itself"),
     "splats": ({"a__point_cloud_DOT_ply": SPLATS}, r"point_cloud\.ply, a scene of Gaussian splats"),
@@ -132,7 +144,7 @@ FOLDERS = {
 @pytest.mark.parametrize("files, said", FOLDERS.values(), ids=FOLDERS)
 def test_folders(tmp_path, files, said):
     folder(tmp_path, **files)
-    for read in (read_capture, photos_to_pose):
+    for read in (read_capture, *[photos_to_pose] * ("captures" not in said)):
         with pytest.raises(NotACapture, match=said):
             read(tmp_path)
 

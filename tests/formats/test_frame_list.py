@@ -78,7 +78,7 @@ def test_poses_that_are_mended(tmp_path, change, within, note):
 
 BROKEN = {
     "NaN": (lambda pose: pose * np.nan, "NaN"),
-    "null": (lambda pose: None, "4x4 matrix"),
+    "null": (lambda pose: None, "no camera pose"),
     "mirrored": (lambda pose: pose @ np.diag([-1, 1, 1, 1.0]), "mirrored"),
     "transposed": (np.transpose, "transposed"),
     "far away": (lambda pose: pose + np.pad([[1e14]], ((0, 3), (3, 0))), "1e\\+14 from the world's origin"),

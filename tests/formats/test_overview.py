@@ -60,6 +60,26 @@ def test_photos_without_poses(tmp_path):
     assert "no poses" in told["notes"][0]
 
 
+@pytest.mark.parametrize("name", ["Transforms.JSON", "cameras.xml", "above"])
+def test_poses_that_are_not_used(tmp_path, name):
+    """Of photos whose poses would be estimated."""
+    capture(tmp_path)
+    if name == "above":
+        (note,) = overview(tmp_path / "images")["notes"][1:]
+        assert "the folder above it, has poses" in note and "give that folder" in note
+        return
+    (tmp_path / "transforms.json").rename(tmp_path / name)
+    if name == "cameras.xml":
+        (tmp_path / name).write_text('<?xml version="1.0"?>\n<document version="2.0.0">\n <chunk>')
+    (note,) = overview(tmp_path)["notes"][1:]
+    assert name in note and "not used" in note and "; " in note
+
+
+def test_a_centre_beside_the_picture(tmp_path):
+    capture(tmp_path, cx=20.0, cy=16.0)
+    assert "centres of 9 of 9 photos lie outside" in " ".join(overview(tmp_path)["notes"])
+
+
 def test_a_mesh(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     trimesh.creation.box((2, 4, 6)).export(tmp_path / "box.ply")

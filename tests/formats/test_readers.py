@@ -666,6 +666,28 @@ def test_bad_applied_transform(tmp_path, matrix, scale):
         read_capture(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "photos_in, model",
+    [
+        ("dense/images", "dense/sparse"),
+        ("scans/cup/input", "scans/cup/distorted/sparse/0"),
+        ("images", "out/model/0"),
+    ],
+)
+def test_the_only_capture_below_a_folder(tmp_path, photos_in, model):
+    photos(tmp_path / photos_in)
+    binary_model(tmp_path / model)
+    capture = read_capture(tmp_path)
+    assert is_capture(tmp_path) and len(capture.train) == len(NAMES)
+    assert capture.train[0].image_path.parent == tmp_path / photos_in
+    assert "has no poses itself" in capture.notes[0]
+
+
+def test_an_export_of_polycam_in_a_folder(tmp_path):
+    polycam(tmp_path / "my scan")
+    assert read_capture(tmp_path).kind == "polycam"
+
+
 # --- orientation --------------------------------------------------------------------------------------------
 
 
@@ -676,6 +698,16 @@ def turned_photo(path: Path, orientation: int) -> tuple[np.ndarray, np.ndarray]:
     exif[0x0112] = orientation
     Pillow.fromarray(stored).save(path, exif=exif)
     return stored, np.asarray(ImageOps.exif_transpose(Pillow.open(path)))
+
+
+@pytest.mark.parametrize("centre, shown", [((40, 50), "upright"), ((50, 40), "stored"), (None, "stored")])
+def test_the_orientation_whose_centre_is_the_cameras(tmp_path, centre, shown):
+    """Where the file states no size; where it states no centre either, a note says what is taken."""
+    pictures = dict(zip(("stored", "upright"), turned_photo(tmp_path / "a.png", 6), strict=True))
+    write(tmp_path, fl_x=80, **({} if centre is None else {"cx": centre[0], "cy": centre[1]}))
+    capture = read_capture(tmp_path)
+    assert (load_images(capture.train)[0, ..., :3] == pictures[shown]).all()
+    assert ("read as stored" in " ".join(capture.notes)) == (centre is None)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

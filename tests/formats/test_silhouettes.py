@@ -1,5 +1,6 @@
 """What photos show of nothing: alpha, grounds and masks of a ball and of a room, whose outlines are known."""
 
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -102,7 +103,28 @@ def bars(i: int) -> np.ndarray:
     return with_alpha(room(i), alpha)
 
 
-@pytest.mark.parametrize("photo", [corners, vignette, bars])
+def lens(i: int) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(WIDE) + 0.5 - WIDE / 2, np.arange(HIGH) + 0.5 - HIGH / 2)
+    return with_alpha(room(i), 255 * (np.hypot(x, y) < 31))
+
+
+def sign(i: int) -> np.ndarray:
+    alpha = np.full((HIGH, WIDE), 255)
+    alpha[40:, :30] = 0
+    return with_alpha(room(i), alpha)
+
+
+def sky(i: int) -> np.ndarray:
+    alpha = np.full((HIGH, WIDE), 255)
+    alpha[: 20 + i] = 0
+    return with_alpha(room(i), alpha)
+
+
+def hidden_ball(i: int) -> np.ndarray:
+    return with_alpha(room(i), 255 * ~ball(i))
+
+
+@pytest.mark.parametrize("photo", [corners, vignette, bars, lens, sign, sky, hidden_ball])
 def test_alpha_around_photos_is_a_mask(tmp_path, photo):
     read = capture(tmp_path, photo)
     assert read.opaque and read.frame is not None and "ignored" in read.notes[0]
@@ -176,6 +198,32 @@ def test_an_object_on_white_is_learnt_in_a_box(tmp_path, jitter):
     assert (low <= -1).all() and (high >= 1).all() and low.min() > -4.5 and high.max() < 4.5
 
 
+def test_white_photos_that_were_compressed(tmp_path):
+    """JPEG rings around the object, up to a border that is near."""
+
+    def photo(i: int) -> np.ndarray:
+        file = io.BytesIO()
+        pixels = np.where(ball(i)[..., None], np.array([210, 60, 50]), 255).astype(np.uint8)
+        pixels[:2, 40:44] = 240
+        Image.fromarray(pixels).save(file, "JPEG", quality=60)
+        return np.array(Image.open(file))
+
+    read = capture(tmp_path, photo)
+    assert read.frame is None and "on white" in read.notes[0]
+
+
+def test_some_photos_on_white_cut_the_object_off(tmp_path):
+    def photo(i: int) -> np.ndarray:
+        pixels = on(255)(i)
+        pixels[40:] = room(i)[40:] if i in (0, 4, 8) else pixels[40:]
+        return pixels
+
+    read = capture(tmp_path, photo)
+    assert read.frame is None and "most photos show an object on white" in read.notes[0]
+    low, high = (read.aabb.reshape(2, 3) - CENTRE) / RADIUS
+    assert (low <= -1).all() and (high >= 1).all() and low.min() > -6 and high.max() < 6
+
+
 def test_aabb_scale_is_the_box_of_an_object_on_white(tmp_path):
     read = capture(tmp_path, on(255), "transforms_train.json", aabb_scale=4)
     assert read.kind == "blender" and read.aabb == pytest.approx(np.repeat([-1, 1], 3) * 4 / 0.66)
@@ -190,7 +238,15 @@ def framed(level: int) -> Callable:
     return photo
 
 
+def scanned(i: int) -> np.ndarray:
+    """Prints of two shapes on a white sheet."""
+    pixels, across = np.full((HIGH, WIDE, 3), 255, np.uint8), 6 + 20 * (i % 2)
+    pixels[6:-6, across:-across] = room(i)[6:-6, across:-across]
+    return pixels
+
+
 SURROUNDED = {
+    "prints of two shapes": scanned,
     "black ground": on(0),
     "grey ground": on(128),
     "black frame": framed(0),

@@ -62,6 +62,16 @@ def test_up_is_square_to_what_people_hold_level(held, within):
     assert upward_doubt(poses) is None
 
 
+@pytest.mark.parametrize("azimuths", [(0, 345), (-60, 60), (-35, 35)])
+@pytest.mark.parametrize("every", [2, 5])
+def test_photos_that_were_held_both_ways(azimuths, every):
+    """Some upright and some on their side."""
+    poses = arc(*azimuths, 50, 2.0)
+    poses[::every] = arc(*azimuths, 50, 2.0, 1)[::every]
+    found = upward(turned(poses))
+    assert np.degrees(np.arccos(np.clip(found @ TURN[:, 2], -1, 1))) < 4 and upward_doubt(poses) is None
+
+
 def test_photos_that_look_straight_down():
     """As drones take them, turning: their ups cancel out, but not what is behind them."""
     spin = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in range(9)]
