@@ -21,7 +21,6 @@ PICTURE_EXTENSIONS = ("KHR_texture_basisu", "EXT_texture_webp", "EXT_texture_avi
 WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 NEAREST = 9728
 MODES = ("OPAQUE", "MASK", "BLEND")
-USED_SLOTS = ("baseColorTexture", "emissiveTexture", "diffuseTexture")
 
 
 class Slot(NamedTuple):

@@ -28,7 +28,6 @@ from fusedrf_cli.engine.kernels.loops import (
 from fusedrf_cli.engine.kernels.specialise import TINTED
 from fusedrf_cli.engine.kernels.tinting import with_tints
 
-CELLS_PER_TASK = 256
 CELLS_AT_ONCE = 1 << 18
 BRICK = 4  # cells a side
 FEW_CELLS, MOST_CELLS = 1 << 22, 1 << 26
