@@ -130,7 +130,7 @@ class Node:
     node_to_parent: np.ndarray = dataclasses.field(init=False, compare=False, repr=False)
 
     def __post_init__(self):
-        _check_name(self.name)
+        check_name(self.name)
         if self.field is not None and self.source is not None:
             raise BadSchema(f"node {self.name!r}: has both a field and a source, expected one of them")
         matrix = _placement_matrix(self.placement, self.name)
@@ -493,7 +493,7 @@ def _outside(scene_path: Path | str, source: str) -> OutsideFolder:
     return OutsideFolder(f"{what}; move the file in, or give --allow-outside")
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
     if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
         raise BadName(f"node name {str(name)[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes")
     if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in BIDIRECTIONAL for c in name):

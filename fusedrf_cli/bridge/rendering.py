@@ -18,8 +18,8 @@ from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
+from fusedrf_cli.engine.fields.occupancy import enclosing
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.editing import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.engine.spaces.unbounded import WHOLE

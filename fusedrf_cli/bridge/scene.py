@@ -11,10 +11,12 @@ import numpy as np
 
 from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
+from formats.graph import free_name, placement_of, with_nodes
 from formats.records import FieldRecord, as_stored, reading_size
 from formats.scene import (
     WHITE,
     Leaf,
+    Node,
     SceneGraph,
     check_affine,
     dump_scene,
@@ -30,6 +32,7 @@ from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
+from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
@@ -178,6 +181,13 @@ def load_scene(
     return _Loader(Path(path), budget, place).load(expand_scene(path, allow_outside), allow_outside)
 
 
+def load_bundle(
+    bundle: OpenBundle, graph: SceneGraph, budget: Memory | None = None, place: str = "cpu"
+) -> LoadedScene:
+    """As `load_scene`, of a bundle that is open, by its graph or another one over its fields."""
+    return _Loader(bundle.path, budget, place).load(graph, False, bundle)
+
+
 def load_found(
     path: Path, graph: SceneGraph, found: Sequence[FoundField], budget: Memory | None, place: str = "cpu"
 ) -> LoadedScene:
@@ -221,9 +231,7 @@ class _Loader:
             self.shelf.resize(self.budget.room(reading))
             self.budget.expect(sources(sizes, self.shelf.room) | reading, advice="use smaller sources")
         fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in found)
-        return LoadedScene(
-            fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle
-        )
+        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle)
 
     def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
@@ -337,18 +345,25 @@ def write_field(
     extras: dict | None = None,
     framing: Sequence[float] | None = None,
     cameras: dict | None = None,
+    beside: Sequence[Placed] = (),
 ) -> int:
     """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
-    node is placed at `origin`: a position (3,), or a placement (4, 4). Returns the bytes written. `extras`
-    are the scene's keys that this version does not know; framing (6,) and cameras are what pictures of it
-    show (bridge/rigs.py).
+    node is placed at `origin`: a position (3,), or a placement (4, 4). Of a field that holds several objects
+    each becomes a node. Returns the bytes written. `extras` are the scene's keys that this version does not
+    know; framing (6,) and cameras are what pictures of it show (bridge/rigs.py). beside: fields placed in its
+    frame that are nodes of their own.
     """
     writer = BundleWriter()
-    for member, bundle in (kept or {}).items():
-        writer.copy_field(bundle, member)
-    arrays, metadata = field.state()
-    member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
+    member = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
     graph = replace(graph_of(member, name, origin, framing, cameras), history=history, extras=extras or {})
+    taken, at = {name}, placement(np.zeros(3) if origin is None else origin)
+    for one in beside:
+        own = writer.add_field(FieldRecord(one.field.kind, *one.field.state()), precision)
+        place = placement_of(at @ one.object_to_world)
+        graph = with_nodes(graph, [Node(free_name(one.name, taken), own, None, place)])
+    graph = writer.unfolded(graph)
+    for kept_member, bundle in (kept or {}).items():
+        writer.copy_field(bundle, kept_member)
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
 
@@ -362,7 +377,7 @@ def graph_of(
 ) -> SceneGraph:
     """The scene of a bundle of one field; see `write_field`."""
     return SceneGraph(
-        nodes=(make_node(name, field=member, **placement_of(origin)),),
+        nodes=(make_node(name, field=member, **({} if origin is None else placement_of(placement(origin)))),),
         generator=f"fusedrf {__version__}",
         framing=None if framing is None else tuple(float(number) for number in framing),
         cameras=cameras,
@@ -388,15 +403,3 @@ def short_origin(object_to_world: np.ndarray) -> np.ndarray:
     """A placement (4, 4), or, where it only moves, the position (3,)."""
     moves = np.array_equal(object_to_world[:3, :3], np.eye(3))
     return object_to_world[:3, 3] if moves else object_to_world
-
-
-def placement_of(origin: np.ndarray | None) -> dict:
-    """What a node says of where it lies, as `make_node` takes it: a position (3,), or a placement (4, 4)."""
-    if origin is None or not np.any(origin) or np.array_equal(origin, np.eye(4)):
-        return {}
-    if origin.shape == (3,):
-        return {"translation": [float(v) for v in origin]}
-    unit = float(origin[0, 0])
-    if not np.array_equal(origin[:3, :3], unit * np.eye(3)):
-        return {"matrix": origin}
-    return placement_of(origin[:3, 3]) | ({} if unit == 1 else {"scale": [unit] * 3})
