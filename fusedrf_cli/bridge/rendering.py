@@ -44,7 +44,7 @@ def render(request: RenderRequest, progress) -> dict:
         progress.phase("reading", None)
         budget = Memory(request.memory)
         loaded = load_scene(request.scene, request.allow_outside, budget, place)
-        field, origin = renderable(loaded)
+        field, origin = renderable(loaded, reference=True)
         views = choose_views(request, loaded, field, origin)
         if suffix in FILMS:
             check_sizes(output, views)
@@ -97,14 +97,15 @@ def rays_of(views: list[Camera]) -> int:
     return sum(view.width * view.height for view in views)
 
 
-def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
+def renderable(loaded: LoadedScene, reference: bool = False) -> tuple[object, np.ndarray]:
     """The field to march, and where its frame lies in the world (see `render_image`): a lone field is taken
-    as it is.
+    as it is; the nodes of a bundle are put together, but for a reference, where they can be.
     """
     if (lone := loaded.lone()) is not None:
         return lone
     composed = loaded.composed()
-    return composed, composed.origin
+    whole = None if reference or loaded.bundle is None else registry.joined(composed)
+    return composed if whole is None else whole, composed.origin
 
 
 def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: Memory, place: str):
