@@ -18,6 +18,7 @@ from formats.scene import WHITE, Box, Matrix4, Node, SceneGraph
 KIND = "vm"
 UNNAMED = ("", "fused", "restored")
 """Names of blocks that stand for no object; one whose object goes by such a name is named `NAME/NAME`."""
+RULE = "max"  # by which blocks are one field
 ARRAY = re.compile(r"tensor_([0-9]{1,4})\.(.+)")
 NEEDS = {"held": (".detail_held", ".occupancy.bricks"), "runs": (".runs",)}
 """Ends of names of arrays that ask for what a reader must know (SPEC, 2.1 and 2.5)."""
@@ -180,11 +181,13 @@ def with_nodes(scene: SceneGraph, instances: dict[str, tuple[Instance, ...]]) ->
         children = [one for child in node.children for one in nodes_for(child)]
         if node.field not in instances:
             return [replace(node, children=tuple(children))]
-        if not (node.showing or node.extras or children):
+        several = scene.composition != RULE and len(instances[node.field]) > 1
+        if not (node.showing or node.extras or children or several):
             return placed(node, node.node_to_parent)
         taken.add(node.name)  # what it says holds for all of them
         own = (*placed(node, np.eye(4)), *children)
-        return [replace(node, field=None, background=False, children=own)]
+        rule = RULE if several else node.composition
+        return [replace(node, field=None, background=False, children=own, composition=rule)]
 
     nodes = tuple(one for node in scene.nodes for one in nodes_for(node))
     return replace(scene, nodes=nodes, history=told_by_graph(scene.history, members))

@@ -29,7 +29,8 @@ class Embedding:
             scene = self.bundle(path).scene
         else:
             scene = expand_scene(path, self.allow_outside)
-        return replace(scene, nodes=tuple(self.node(node, path, "") for node in scene.nodes))
+        nodes = tuple(self.node(node, path, "", scene.composition) for node in scene.nodes)
+        return replace(scene, nodes=nodes)
 
     def bundle(self, path: Path) -> OpenBundle:
         """The bundle at a path, opened once."""
@@ -39,9 +40,10 @@ class Embedding:
             self.bundles[path] = OpenBundle(path)
         return self.bundles[path]
 
-    def node(self, node: Node, path: Path, prefix: str) -> Node:
-        """A node of the scene at a path, its name led by a prefix."""
-        children = tuple(self.node(child, path, prefix) for child in node.children)
+    def node(self, node: Node, path: Path, prefix: str, rule: str) -> Node:
+        """A node of the scene at a path, its name led by a prefix, among nodes that are one by a rule."""
+        rule = node.composition or rule
+        children = tuple(self.node(child, path, prefix, rule) for child in node.children)
         node = replace(node, name=prefix + node.name, children=children)
         if node.field is not None:
             return replace(node, field=self.member(self.bundle(path), node.field))
@@ -49,8 +51,8 @@ class Embedding:
             return node
         target = resolve_source(path, node.source, self.allow_outside)
         inner = self.bundle(target).scene
-        own = tuple(self.node(child, target, f"{node.name}/") for child in inner.nodes)
-        return in_place_of(node, own)
+        own = tuple(self.node(child, target, f"{node.name}/", inner.composition) for child in inner.nodes)
+        return in_place_of(node, own, rule, inner.composition)
 
     def member(self, bundle: OpenBundle, member: str) -> str:
         """The member of the writer that holds a bundle's field."""
@@ -62,9 +64,9 @@ class Embedding:
         return self.members[key]
 
 
-def in_place_of(node: Node, nodes: tuple[Node, ...]) -> Node:
+def in_place_of(node: Node, nodes: tuple[Node, ...], rule: str, own_rule: str) -> Node:
     """A node that holds what its source is: itself with the field of the only node that there is, else a
-    group of them."""
+    group of them, which are one by a rule of their own."""
     if len(nodes) == 1 and not node.children:
         (only,) = nodes
         at_rest = np.array_equal(only.node_to_parent, np.eye(4))
@@ -76,13 +78,18 @@ def in_place_of(node: Node, nodes: tuple[Node, ...]) -> Node:
                 return replace(node, source=None, field=only.field, placement=place)
     if node.background:
         nodes = tuple(replace(one, background=True) for one in nodes)
+    if own_rule != rule and node.children:
+        raise BadSchema(f"node '{node.name}' has children and a source of another composition; part them")
+    node = node if own_rule == rule else replace(node, composition=own_rule)
     return replace(node, source=None, background=False, children=(*nodes, *node.children))
 
 
-def as_one(scene: SceneGraph, name: str, matrix: np.ndarray, background: bool = False) -> Node:
-    """A scene as one node of another, placed by a (4, 4): the name leads those of the nodes in it."""
+def as_one(scene: SceneGraph, name: str, matrix: np.ndarray, rule: str, background: bool = False) -> Node:
+    """A scene as one node of another one of a rule, placed by a (4, 4): the name leads those of the nodes in
+    it."""
     nodes = tuple(with_prefix(node, f"{name}/") for node in scene.nodes)
-    return in_place_of(Node(name, placement=placement_of(matrix), background=background), nodes)
+    node = Node(name, placement=placement_of(matrix), background=background)
+    return in_place_of(node, nodes, rule, scene.composition)
 
 
 def with_prefix(node: Node, prefix: str) -> Node:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.bridge.saving import save_scene
-from fusedrf_cli.bridge.scene import LoadedScene, load_scene, short_origin
+from fusedrf_cli.bridge.scene import LoadedScene, grouped, load_scene, short_origin
 from fusedrf_cli.engine.composition.affine import Placed, rigid_motion
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.differentiable import Poses, numbers, query
@@ -161,6 +161,7 @@ class Scene:
         known = self._composed and {p.name: p.object_to_world for p in self._composed[0]}
         if not known or any(not np.array_equal(known[name], pose) for name, pose in now.items()):
             placed = [Placed(name, self.fields[name], pose) for name, pose in now.items()]
-            self._composed = placed, ComposedField(placed, self.rule)
+            parts = grouped(placed, [source.groups for source in self._loaded.fields], self.rule)
+            self._composed = placed, ComposedField(parts, self.rule)
         field = self._composed[1]
         return field, field.origin, shifted(learnt, field.origin)

@@ -286,7 +286,7 @@ def brought(
     source = request.source
     embedding = Embedding(draft.writer, precision=request.precision)
     scene = embedding.scene(source)
-    node = as_one(scene, name, matrix, background)
+    node = as_one(scene, name, matrix, draft.graph.composition, background)
     if not leaf_names([node]):
         raise InvalidInput(f"{source}: it holds no field; choose another source")
     return node

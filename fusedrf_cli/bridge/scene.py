@@ -58,6 +58,9 @@ class SourceField:
     needs: FieldNeeds
     whole: bool = True
     """Whether it is shown as the bundle has it."""
+    groups: tuple[tuple[str, str], ...] = ()
+    """The groups of nodes that it is in which have a rule of their own, from the root down, and their
+    rules."""
 
 
 FoundField = tuple[Leaf, OpenBundle, str]
@@ -103,7 +106,9 @@ class LoadedScene:
 
     def composed(self) -> ComposedField:
         """The scene as one field."""
-        return ComposedField(self.placed, self.composition)
+        return ComposedField(
+            grouped(self.placed, [f.groups for f in self.fields], self.composition), self.composition
+        )
 
     def lone(self) -> tuple[StoredField, np.ndarray] | None:
         """The field of a scene that is one field, and where its frame lies in the world: a position (3,)
@@ -112,6 +117,28 @@ class LoadedScene:
             placed = self.fields[0].placed
             return opened(placed.field), short_origin(placed.object_to_world)
         return None
+
+
+def grouped(placed: Sequence[Placed], groups: Sequence[tuple], rule: str, depth: int = 0) -> list[Placed]:
+    """Placed fields, in groups of nodes, as what is composed by a rule: groups of another rule are fields of
+    their own, placed where their frames lie."""
+    found, start = [], 0
+    while start < len(placed):
+        group = groups[start][depth] if len(groups[start]) > depth else None
+        end = start + 1
+        while group is not None and end < len(placed) and groups[end][depth : depth + 1] == (group,):
+            end += 1
+        if group is None:
+            found.append(placed[start])
+        else:
+            own = grouped(placed[start:end], groups[start:end], group[1], depth + 1)
+            if group[1] == rule or len(own) == 1:
+                found += own
+            else:
+                inner = ComposedField(own, group[1])
+                found.append(Placed(group[0], inner, placement(inner.origin)))
+        start = end
+    return found
 
 
 def make_field(record: FieldRecord, where: str) -> StoredField:
@@ -252,6 +279,7 @@ class _Loader:
         if scene.cameras is not None:
             self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
+        leaf = replace(leaf, groups=(*leaf.groups, (leaf.name, scene.composition)))
         return [
             (replace(node.inside(leaf), name=name), self.bundles[path], node.field)
             for name, node in zip(named, inner, strict=True)
@@ -273,7 +301,7 @@ class _Loader:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
-        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole)
+        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole, leaf.groups)
 
 
 def key_of(leaf: Leaf, member: str) -> str:
