@@ -106,7 +106,7 @@ def filled(world: World) -> World:
     report("move", "three.rfpack", "blue", "-t", world.lengths(-0.1, 0.3, 0), "-o", "moved.rfpack")
     report("delete", "moved.rfpack", "red", "-o", "less.rfpack")
     report("extract", "three.rfpack", "--name", "blue", "-o", "alone.rfpack")
-    report("add", "box.rfpack", "blue.rfpack", *blue, "--no-rgb", "-o", "both.rfpack")
+    report("add", "box.rfpack", "blue.rfpack", *blue, "-o", "both.rfpack")
     for name in ("box", "all", "pair", "three", "moved", "less", "alone", "both"):
         report("validate", f"{name}.rfpack")
         report("info", f"{name}.rfpack")
