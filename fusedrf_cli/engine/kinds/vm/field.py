@@ -63,6 +63,7 @@ from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 ROUNDING = 1e-6  # share of a ball's radius by which it is larger
+CELLS_PER_NUMBER = 4  # of a tensor, from which on its cells are stored in bricks where these are smaller
 PER_OWNED_CELL = 8  # bytes of a cell of several blocks: owners, distances, strides
 PER_OWNED_CELL_MADE = 16  # more while they are found
 PER_PLACED_CELL = 110  # of a tensor's cell while it is placed in the field
@@ -505,7 +506,8 @@ class VMField(ComputedField):
                 needs |= {"held", "runs"}
                 arrays |= {detail: arrays[detail][held.rows], runs_of(detail): held.lengths}
                 arrays |= {f"{detail}_{name}": bits for name, bits in held.state().items()}
-            cells = packed_bits(f"tensor_{t}.occupancy", grid, FEW_CELLS if held is None else 0)
+            few = min(FEW_CELLS, CELLS_PER_NUMBER * self.tensors[t].size(self.shape))
+            cells = packed_bits(f"tensor_{t}.occupancy", grid, few if held is None else 0)
             needs |= {"held"} if len(cells) > 1 else set()
             arrays |= cells
         metadata = ({"needs": sorted(needs)} if needs else {}) | {
