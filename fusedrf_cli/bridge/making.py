@@ -102,8 +102,7 @@ class Maker:
         """What the report says of the views of a try as it will be read back: how many there are, the PSNR of
         what the scene covers of them, and the object that is shown worst in a view of its own."""
         found = self.judge.verdict(stored(kept.field, kept.tried.way.precision).to(self.place))
-        covered = found.covered if found.share else None  # of no pixel
-        said = {"views": len(self.looks), "covered": covered, "covered_share": found.share}
+        said = {"views": len(self.looks), "covered": found.covered, "covered_share": found.share}
         objects = [(v, look.of) for v, look in zip(found.views, self.looks, strict=True) if look.of]
         if not objects:
             return said
