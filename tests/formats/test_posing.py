@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -420,11 +419,9 @@ def test_the_process_ends_with_its_parent(tmp_path):
 @with_pycolmap
 def test_sceaux():
     """All of 11 photos of a castle."""
-    started = time.monotonic()
     photos = photos_to_pose(real("sceaux"))
     posed = estimate(real("sceaux"), photos, 2, NullProgress())
     assert len(posed.views) == 11 and posed.models == (11,)
-    assert time.monotonic() - started < 180
 
 
 @pytest.mark.slow
