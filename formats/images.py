@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, MixedSizes
-from formats.foreign import HEAD, KINDS, identify
+from formats.foreign import HEAD, identify
 from formats.inputs import open_input
 from formats.png import png_writer
 
@@ -265,7 +265,7 @@ def _unidentified(error: Exception) -> bool:
 def _unread(path: Path | str, head: bytes) -> FormatError:
     """The error for a file that is no picture of a known format."""
     found = identify(head, Path(path).suffix)
-    if found is None or not found.extra and found.what in (KINDS["photo"][0], KINDS["heif"][0]):
+    if found is None or not found.extra and found.kind in ("photo", "heif"):
         return BadImage(
             f"{path}: the picture cannot be decoded (damaged, or in no known format); replace or remove it"
         )
