@@ -17,6 +17,7 @@ from formats.posing import photos_to_pose
 from formats.rig import upward
 from formats.views import Capture, View, check_parallax
 
+ROUNDING = 1e-12
 LENSES = {False: "pinhole", True: "fisheye"}
 
 
@@ -63,11 +64,11 @@ def capture_facts(capture: Capture) -> dict:
         "turned": sum(view.orientation != 1 for view in views),
         "lenses": _lenses(views),
         "space": "unbounded" if unbounded else "bounded",
-        "box": None if unbounded else (capture.object_aabb if cut_out else capture.aabb).tolist(),
+        "box": None if unbounded else _plain(capture.object_aabb if cut_out else capture.aabb),
         "layout": frame and frame.layout,
-        "looks_at": frame and frame.focus.tolist(),
+        "looks_at": frame and _plain(frame.focus),
         "from_distance": frame and frame.distance,
-        "up": upward(poses).tolist(),
+        "up": _plain(upward(poses)),
         "transparent": not capture.opaque,
         "masks": sum(view.mask_path is not None for view in views),
         "masks_cut_out_an_object": cut_out,
@@ -89,6 +90,11 @@ def photo_facts(path: Path) -> dict:
         "focal_lengths": sum(read_focal(photo) is not None for photo in photos),
         "notes": [note, *filter(None, [poses_elsewhere(path)])],
     }
+
+
+def _plain(numbers: np.ndarray) -> list[float]:
+    """Numbers of one unit, with 0 for what is only rounding beside the others."""
+    return np.where(np.abs(numbers) > ROUNDING * np.abs(numbers).max(), numbers, 0.0).tolist()
 
 
 def _sizes(sizes) -> list[dict]:
