@@ -23,7 +23,7 @@ from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
 from formats.masks import with_masks_beside
-from formats.matching import gone, match_photos
+from formats.matching import PHOTO_FOLDERS, gone, match_photos
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
@@ -83,7 +83,7 @@ def is_capture(path: Path | str) -> bool:
     try:
         if path.name == llff.NAME or path.name == opensfm.NAME and opensfm.is_reconstruction(path):
             return True
-        return path.suffix.lower() == ".json" and "frames" in read_document(path)
+        return (path.suffix.lower() == ".json" or is_json(path)) and "frames" in read_document(path)
     except FormatError:
         return False
 
@@ -113,11 +113,12 @@ def _captures_below(path: Path) -> list[Path]:
 
 def poses_elsewhere(path: Path) -> str | None:
     """A sentence about poses that are not used of a folder of photos: in the folder above, in a JSON file of
-    another name, or another program's; None without any."""
+    another name, or another program's in either; None without any."""
     above = path.resolve().parent
     if _has_poses(above):
         return f"{path}: {above}, the folder above it, has poses, which are not used; give that folder"
-    for file in sorted(path.iterdir()):
+    beside = sorted(above.iterdir()) if path.name.lower() in PHOTO_FOLDERS else []
+    for file in sorted(path.iterdir()) + beside:
         if not is_file(file) or is_hidden(file.name) or is_picture(file.name):
             continue
         if is_capture(file):
@@ -236,8 +237,12 @@ def _read_transforms(path: Path, downscale: int | None, base: Path | None = None
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     model = colmap.read_model(folder)
     base = colmap.capture_folder(path) if path == folder or path.name in colmap.MODELS_IN else path
-    notes = (*_other_models(path, folder), *model.notes)
-    return _read_model(path, "colmap", model, base, (*colmap.PHOTOS_IN, ""), downscale, notes)
+    others = _other_models(path, folder)
+    try:
+        notes = (*others, *model.notes)
+        return _read_model(path, "colmap", model, base, (*colmap.PHOTOS_IN, ""), downscale, notes)
+    except MissingFile as error:
+        raise MissingFile("; ".join([str(error), *others])) from error
 
 
 def _read_model(
@@ -291,15 +296,16 @@ def _read_listed(
     return Part(tuple(views), matched.missing, notes)
 
 
-def _other_models(path: Path, folder: Path) -> Iterator[str]:
+def _other_models(path: Path, folder: Path) -> list[str]:
     """A sentence about the models beside the one that is read."""
     others = [other for other in colmap.model_folders(path) if other != folder]
-    if others:
-        named = ", ".join(f"{other.relative_to(path)} of {colmap.image_count(other)}" for other in others[:5])
-        yield (
-            f"{path}: {folder.relative_to(path)}, a model of {colmap.image_count(folder)} photos, is read, "
-            f"and not {named}; give the folder {others[0]} to read that one"
-        )
+    if not others:
+        return []
+    named = ", ".join(f"{other.relative_to(path)} of {colmap.image_count(other)}" for other in others[:5])
+    return [
+        f"{path}: {folder.relative_to(path)}, a model of {colmap.image_count(folder)} photos, is read, "
+        f"and not {named}; give the folder {others[0]} to read that one"
+    ]
 
 
 def _read_llff(path: Path, downscale: int | None) -> Capture:

@@ -142,7 +142,8 @@ KINDS = {  # the first whose pattern fits counts
         "another program's list of cameras",
         "export a COLMAP model, and give its folder",
         "nvm out lst rcproj xmp csv xml",
-        rb"NVM_V3|# Bundle file|.{0,400}<BlocksExchange",
+        rb"NVM_V3|# Bundle file|.{0,400}<BlocksExchange|(#[^\n]*\n)*# *timestamp tx ty tz|"
+        rb'\s*[\[{].{0,400}"(sfm_data_version|shots)"',
     ),
     "colmap": Kind(
         "one file of a COLMAP model or its database",
@@ -203,6 +204,11 @@ def not_a_mesh(path: Path) -> BadMesh:
     found = _named(path)
     cure = MESHES if found.kind in ("text", "other") else found.cure
     return BadMesh(f"{path}: is {found.what}, no mesh; {cure}")
+
+
+def kind_of(path: Path) -> str:
+    """What a file is, of KINDS."""
+    return _named(path).kind
 
 
 def other_cameras(path: Path) -> Foreign | None:

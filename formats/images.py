@@ -218,8 +218,8 @@ def _flipped(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def _rgba(image, alpha: bool):
     """A decoded picture of any mode as RGBA, opaque where `alpha` is False."""
-    image = _eight_bits(image)
-    return (image if alpha else image.convert("RGB")).convert("RGBA")
+    picture = _eight_bits(image).convert("RGBA")  # first, since palettes lose transparency with a warning
+    return picture if alpha else picture.convert("RGB").convert("RGBA")
 
 
 def _straight(image):

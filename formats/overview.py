@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import is_bundle
 from formats.captures import is_capture, is_mesh, poses_elsewhere, read_capture
 from formats.errors import FormatError, NoPoses
-from formats.foreign import is_json, not_a_capture
+from formats.foreign import is_json, kind_of, not_a_capture
 from formats.images import read_focal, read_image_header
 from formats.meshes import mesh_facts
 from formats.photos import has_pictures
@@ -32,7 +31,7 @@ def overview(path: Path | str) -> dict | None:
     if is_mesh(path):
         return {"path": str(path), "format": "mesh", **mesh_facts(path)}
     if path.is_file() and not is_capture(path):
-        if is_bundle(path) or is_json(path) or path.suffix == ".rfpack":
+        if is_json(path) or path.suffix == ".rfpack" or kind_of(path) == "bundle":
             return None
         raise not_a_capture(path)
     try:

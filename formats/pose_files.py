@@ -143,10 +143,9 @@ def splits(names: Sequence[str]) -> tuple[list[str], list[str], str | None]:
         return list(names), [], None
     by_split = {part: [name for name, match in found.items() if match[1] == part] for part in "012"}
     train, validating, test = by_split.values()
-    if not test:
-        return train, validating, None
-    unused = f"{len(validating)} photos to validate with, such as {validating[0]}, are not used"
-    return train, test, unused if validating else None
+    if not (test and validating):
+        return train, test or validating, None
+    return train, test, f"{len(validating)} photos to validate with, such as {validating[0]}, are not used"
 
 
 def _numbers(path: Path) -> np.ndarray:

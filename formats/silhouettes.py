@@ -30,15 +30,16 @@ BORDER_SHOWN = 0.4
 sky, passers-by, a sign in a corner."""
 SPANNED = 0.9
 """Share of a photo's shorter side that the picture of a lens spans at least."""
-SOFT_LEVELS, BETWEEN = (26, 230), 8
-"""Alpha of pixels whose colour tells whether it was multiplied by that, in every so many of the photos."""
-LEAST_SOFT, DARK, ABOVE = 500, 0.2, 0.001
+SOFT_LEVELS = 26, 230
+"""Alpha of pixels whose colour tells whether it was multiplied by that."""
+LEAST_SOFT, DARK, ABOVE = 100, 0.3, 0.001
 """How many of these tell it, at least; the share of their alpha that their colour is at least, halfway, since
 black ones do not; and the share of them that may have a brighter colour than alpha, if it was."""
 SAMPLED = 12
-"""Photos whose borders are looked at for a ground of one colour, before more are."""
-WHITE, PLAIN = 250, 3
-"""The least level of a white ground, and levels by which the colour of a ground may vary."""
+"""Photos whose borders are looked at for a ground of one colour, or colours for alpha in them, before more
+are."""
+WHITE, PLAIN, BARS_PLAIN = 250, 3, 12
+"""The least level of a white ground, and levels by which its colour may vary, and that of a film's bars."""
 GROUND = 8
 """Levels by which a pixel of an object differs from the white ground."""
 STRAY = 0.02
@@ -149,6 +150,11 @@ def sampled(views: Sequence[View]) -> list[View]:
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
 
 
+def few(views: Sequence[View]) -> list[View]:
+    """SAMPLED of the views, evenly spaced in the list."""
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
+
+
 # --- alpha --------------------------------------------------------------------------------------------------
 
 
@@ -207,13 +213,14 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
 def _premultiplied(views: Sequence[View]) -> bool:
     """Whether no colour of photos is brighter than its alpha, as where that is in it already."""
     ratios = [np.empty(0)]
-    for view in sampled(views)[::BETWEEN]:
+    for view in few(views):
         alpha = (picture := read_image(view.image_path))[..., 3]
         soft = picture[(alpha >= SOFT_LEVELS[0]) & (alpha < SOFT_LEVELS[1])].astype(float)
         ratios.append((soft[:, :3].max(1) - 2) / soft[:, 3])
     ratios = np.concatenate(ratios)
-    few = len(ratios) < LEAST_SOFT or np.median(ratios) < DARK
-    return not few and bool((ratios > 1).mean() < ABOVE)
+    if len(ratios) < LEAST_SOFT or np.median(ratios) < DARK:
+        return False
+    return bool((ratios > 1).mean() < ABOVE)
 
 
 def _opaque(view: View, ignoring: bool) -> View:
@@ -258,19 +265,20 @@ def _filled(found: Sequence[Outline]) -> bool:
 def by_ground(views: tuple[View, ...]) -> Shown:
     """Outlines where photos show an object on white. Borders of another colour are taken as surroundings,
     since nothing tells a black ground from the night."""
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
+    chosen = few(views)
     seen, white, alike = [], True, True
     for view in chosen:
         seen.append(_border_colours(view))
         lowest, mostly, highest = np.moveaxis(seen, 2, 0)
         white = int((mostly[:, 0].min(1) < WHITE).sum()) <= (1 - MOSTLY) * len(chosen)
-        alike = (highest.max(0) - lowest.min(0) <= PLAIN).all(1)
+        alike = (highest.max(0) - lowest.min(0)).max(1) <= (PLAIN, BARS_PLAIN, BARS_PLAIN)
         if not (white or alike.any()):
             return Shown(views)
     part = 0 if white else int(alike.argmax())
     colour = ", ".join(f"{level:.0f}" for level in np.median(lowest[:, part], axis=0))
     if part:
-        return Shown(views, notes=(BARS_NOTE.format(BESIDE[part - 1], colour),))
+        bars = BARS_NOTE.format(BESIDE[part - 1], colour)
+        return Shown(views, notes=() if alike[1:].all() else (bars,))
     surroundings = (
         f"the borders of photos have one colour ({colour}) and are taken as surroundings; of an object "
         "before nothing give photos with alpha or masks, or --bounded; crop bars and frames away"
