@@ -12,7 +12,7 @@ from formats.foreign import is_json, kind_of, not_a_capture
 from formats.images import read_focal, read_image_header
 from formats.meshes import mesh_facts
 from formats.photos import has_pictures
-from formats.posing import photos_to_pose
+from formats.posing import photos_to_pose, whole_photos
 from formats.rig import upward
 from formats.views import Capture, View, check_parallax
 
@@ -78,7 +78,7 @@ def capture_facts(capture: Capture) -> dict:
 
 def photo_facts(path: Path) -> dict:
     """The same, as far as it is known, of photos whose poses are to be estimated."""
-    photos = photos_to_pose(path)
+    photos, broken = whole_photos(path, photos_to_pose(path))
     headers = [read_image_header(photo) for photo in photos]
     note = f"{path}: its photos have no poses; `train` estimates them first, as `fusedrf pose` does"
     return {
@@ -87,7 +87,7 @@ def photo_facts(path: Path) -> dict:
         "sizes": _sizes((header.width, header.height) for header in headers),
         "turned": sum(header.orientation != 1 for header in headers),
         "focal_lengths": sum(read_focal(photo) is not None for photo in photos),
-        "notes": [note, *filter(None, [poses_elsewhere(path)])],
+        "notes": [note, *broken, *filter(None, [poses_elsewhere(path)])],
     }
 
 
