@@ -59,6 +59,9 @@ from formats.views import LEAST_VIEWS, Capture, View, hold_out
 LEVELS, MAX_FOLDERS = 3, 500
 """How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
 
+CAMERAS = "cams"
+"""A folder of cameras that are not read, as MVSNet has one."""
+
 __all__ = [
     "Capture",
     "View",
@@ -117,8 +120,9 @@ def poses_elsewhere(path: Path) -> str | None:
     above = path.resolve().parent
     if _has_poses(above):
         return f"{path}: {above}, the folder above it, has poses, which are not used; give that folder"
-    beside = sorted(above.iterdir()) if path.name.lower() in PHOTO_FOLDERS else []
-    for file in sorted(path.iterdir()) + beside:
+    places = [path, above] if path.name.lower() in PHOTO_FOLDERS else [path]
+    places += [at / CAMERAS for at in places]
+    for file in (file for at in places for file in sorted(at.glob("*"))):
         if not is_file(file) or is_hidden(file.name) or is_picture(file.name):
             continue
         if is_capture(file):

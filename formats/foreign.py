@@ -166,6 +166,9 @@ KINDS = {  # the first whose pattern fits counts
 BY_ENDING = {f".{ending}": name for name, kind in KINDS.items() for ending in kind.endings.split()}
 MODEL_FILES = [f"{name}.bin" for name in ("cameras", "images", "points3D", "frames", "rigs")]
 """Files of a COLMAP model, which do not begin in any way."""
+CAMERA_FILE = re.compile(r"cameras(_\w+)?\.npz|traj(ectory)?\.(txt|log)|\d+_cam\.txt")
+"""Names of lists of cameras that do not begin in any way: NeuS's, Replica's, those of Tanks and Temples and
+MVSNet's."""
 CONTAINERS = (b"PK\x03\x04", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
 """Beginnings of archives, which many kinds of files are inside: those are told by their endings."""
 
@@ -212,8 +215,8 @@ def kind_of(path: Path) -> str:
 
 
 def other_cameras(path: Path) -> Foreign | None:
-    """What a file of cameras is that is not read, by its first bytes; None for others."""
-    found = identify(_head(path), "")
+    """What a file of cameras is that is not read, by its name or its first bytes; None for others."""
+    found = _foreign("cameras") if CAMERA_FILE.fullmatch(path.name) else identify(_head(path), "")
     return found if found and found.kind in ("metashape", "realitycapture", "cameras") else None
 
 
@@ -278,10 +281,12 @@ def _of_folder(path: Path) -> FormatError:
     if nested := sorted({file.parent for file in photos} - {path}):
         counts = [sum(file.parent == folder for file in photos) for folder in nested]
         most = nested[counts.index(max(counts))]
+        unused = [file for file in files if file not in photos and other_cameras(file)]
+        more = f"; {unused[0].name}, {other_cameras(unused[0]).what}, is not used" if unused else ""
         cure = "give that folder" if len(nested) == 1 else "give that folder, or put all photos into one"
         return NotACapture(
             f"{path}: its photos lie in {_counted(len(nested), 'folder')} below it, {max(counts)} of them in "
-            f"{most.relative_to(path)}; {cure}"
+            f"{most.relative_to(path)}; {cure}{more}"
         )
     if (beside := beside_photos(path)) is None:
         return NotACapture(

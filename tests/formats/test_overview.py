@@ -1,6 +1,7 @@
 """`info` of captures, photos and meshes: what `train` would read of them."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,6 +80,9 @@ OTHERS = {
     "groundtruth.txt": "# timestamp tx ty tz qx qy qz qw\n",
     "sfm_data.json": '{"sfm_data_version": "0.3", "views": []}',
     "bundle.out": "# Bundle file v0.3\n",
+    "cameras_sphere.npz": "",
+    "traj.txt": "1 0 0 0\n",
+    "cams/00000000_cam.txt": "extrinsic\n",
 }
 
 
@@ -87,9 +91,14 @@ OTHERS = {
 def test_cameras_of_other_programs_are_told(tmp_path, name, where):
     for i in range(3):
         noisy(tmp_path / where / f"{i}.png")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(OTHERS[name])
     notes = " ".join(overview(tmp_path / where)["notes"])
-    assert f"{name}, another program's list of cameras, is not used; export a COLMAP model" in notes
+    said = f"{Path(name).name}, another program's list of cameras, is not used"
+    assert f"{said}; export a COLMAP model" in notes
+    if where == "rgb":
+        with pytest.raises(NotACapture, match=f"in rgb; give that folder; {said}"):
+            overview(tmp_path)
 
 
 def test_a_transforms_json_under_another_ending_is_told(tmp_path):
