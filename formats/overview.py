@@ -65,7 +65,7 @@ def capture_facts(capture: Capture) -> dict:
         "space": "unbounded" if unbounded else "bounded",
         "box": None if unbounded else _plain(capture.object_aabb if cut_out else capture.aabb),
         "layout": frame and frame.layout,
-        "looks_at": frame and _plain(frame.focus),
+        "looks_at": frame and _plain(frame.focus, frame.distance),
         "from_distance": frame and frame.distance,
         "up": _plain(upward(poses)),
         "transparent": not capture.opaque,
@@ -91,9 +91,10 @@ def photo_facts(path: Path) -> dict:
     }
 
 
-def _plain(numbers: np.ndarray) -> list[float]:
-    """Numbers of one unit, with 0 for what is only rounding beside the others."""
-    return np.where(np.abs(numbers) > ROUNDING * np.abs(numbers).max(), numbers, 0.0).tolist()
+def _plain(numbers: np.ndarray, size: float = 0.0) -> list[float]:
+    """Numbers of one unit, with 0 for what is only rounding beside the others, or beside a size."""
+    least = ROUNDING * max(size, np.abs(numbers).max())
+    return np.where(np.abs(numbers) > least, numbers, 0.0).tolist()
 
 
 def _sizes(sizes) -> list[dict]:

@@ -43,6 +43,16 @@ def test_a_capture(tmp_path):
     assert (told["masks"], told["points"], told["transparent"]) == (0, 0, False)
 
 
+def test_numbers_that_are_zero_are_told_so(tmp_path):
+    """Cameras around the origin, whose axes meet there but for rounding."""
+    around = ring(9, 4, np.zeros(3))
+    for i in range(9):
+        noisy(tmp_path / f"{i}.png")
+    frames = [frame(f"{i}.png", transform_matrix=pose) for i, pose in enumerate(around)]
+    write(tmp_path, frames=frames, fl_x=80)
+    assert overview(tmp_path)["looks_at"] == [0, 0, 0]
+
+
 def test_masks_and_trouble(tmp_path):
     capture(tmp_path)
     keep(tmp_path / "masks/0.png", np.full((8, 10), 255, np.uint8))
