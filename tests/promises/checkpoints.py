@@ -48,7 +48,10 @@ def interrupted(folder: Path, words: tuple[str, ...], steps: int = 6) -> bytes:
 def checkpoint(folder: Path) -> Path:
     """A small one, as `train` may leave it."""
     folder.mkdir(parents=True)
-    arrays = {"params": np.arange(60, dtype=np.float32).reshape(20, 3), "random": np.arange(9, dtype=np.uint8)}
+    arrays = {
+        "params": np.arange(60, dtype=np.float32).reshape(20, 3),
+        "random": np.arange(9, dtype=np.uint8),
+    }
     state = {"command": "train", "kind": "vm", "steps": 7, "elapsed": 1.5, "found": [True, False]}
     write_checkpoint(folder / NAME, arrays, state | {"guard": {"rate": 1.0, "recent": [0, 1]}})
     return folder / NAME
