@@ -190,7 +190,8 @@ class Looks:
             coverage = Texture(_as_alpha(coverage.pixels), coverage.wrap)
         colour = self._colour(material, base, texture, called)
         if material.alpha < 1:
-            self.notes.add("see-through, which is blended", called)
+            gone = "wholly see-through (d 0 or Tr 1), so that it is not shown"
+            self.notes.add("see-through, which is blended" if material.alpha > 0 else gone, called)
         if texture is not None and coverage is None and (texture.pixels[..., 3] < 255).any():
             self.notes.add(
                 f"the transparency of {base.name} is not shown, since no map_d asks for it", called

@@ -132,6 +132,10 @@ def test_see_through(folder, line, alpha):
     assert np.abs(facing(written(folder, f"Kd 1 0 0\n{line}"))[..., 3].astype(int) - alpha).max() <= 1
 
 
+def test_what_is_not_seen_is_named(folder):
+    assert "not shown" in notes_of(written(folder, "d 0\nmap_Kd wood.png"))
+
+
 def test_coverage(folder):
     """map_d covers by its alpha channel, or else by its brightness; map_Kd's alpha alone does not count."""
     grey = np.zeros((2, 2), np.uint8)
