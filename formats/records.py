@@ -116,7 +116,9 @@ class FieldHeader:
     @property
     def decoded_size(self) -> int:
         """Bytes of its arrays once decoded: floats as float32."""
-        return sum(math.prod(shape) * (1 if dtype == "uint8" else 4) for dtype, shape in self.arrays.values())
+        return sum(
+            math.prod(shape) * (1 if dtype == "uint8" else 4) for dtype, shape in self.arrays.values()
+        )
 
 
 def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:

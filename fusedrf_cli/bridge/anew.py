@@ -68,7 +68,9 @@ def sources_of(fused: OpenBundle, request: FuseRequest) -> tuple[list[FoundField
     return found, missing
 
 
-def source_bundle(node: dict, path: Path, elsewhere: "Elsewhere", request: FuseRequest) -> OpenBundle | None:
+def source_bundle(
+    node: dict, path: Path, elsewhere: "Elsewhere", request: FuseRequest
+) -> OpenBundle | None:
     """The bundle that a node of a history names by its checksum: where it was, else in the folder given."""
     if not node.get("sha256"):
         return None

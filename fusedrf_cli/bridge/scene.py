@@ -221,7 +221,9 @@ class _Loader:
             self.shelf.resize(self.budget.room(reading))
             self.budget.expect(sources(sizes, self.shelf.room) | reading, advice="use smaller sources")
         fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in found)
-        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle)
+        return LoadedScene(
+            fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle
+        )
 
     def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""

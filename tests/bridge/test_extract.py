@@ -215,6 +215,7 @@ def test_bad_words_get_one_sentence(run, folder, what):
     assert not (folder / "look").exists()
 
 
+
 def test_previews_replace_no_other_pictures(report, run, folder):
     words = ("extract", "blocks.rfpack", "--name", "red", "-o", "object.rfpack", "-w", "--preview")
     kept = sorted((folder / "masks").iterdir())

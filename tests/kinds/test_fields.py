@@ -112,7 +112,9 @@ def test_as_stored_is_as_it_comes_back(field):
     single = field.with_params(field.params.float())
     points, dirs = asked(field)
     for precision in ("float32", "float16", "int8", "int4"):
-        told = single.stored(lambda array, name, runs, p=precision: as_stored(array, p, name, runs))
+        told = single.stored(
+            lambda array, name, runs, p=precision: as_stored(array, p, name, runs)
+        )
         data = encode_field(FieldRecord(field.kind, *single.state()), precision)
         read = make_field(decode_field(data, "bundle"), "bundle")
         for found, wanted in zip(*(answers(one, points, dirs) for one in (told, read)), strict=True):

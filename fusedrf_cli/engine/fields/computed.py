@@ -434,7 +434,9 @@ def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> n
     return np.unpackbits(packed, count=count).reshape(shape).view(bool)
 
 
-def unpacked_bricks(marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]) -> np.ndarray:
+def unpacked_bricks(
+    marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]
+) -> np.ndarray:
     """(X, Y, Z) bool of the bricks of a grid. Raises ValueError where they are not its."""
     if np.prod(shape, dtype=float) > MOST_CELLS:
         raise ValueError(f"array '{name}' is of {shape} cells, but at most {MOST_CELLS:,} are read")

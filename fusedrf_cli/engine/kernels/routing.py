@@ -161,7 +161,9 @@ def first_two(rays_o, rays_d, to_unit, apart, apart_at, balls, everywhere, threa
     for turn in prange(each_has * threads):
         part = turn % each_has * threads + turn // each_has
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
-        first_two_task(rays_o, rays_d, to_unit, apart, apart_at, balls, everywhere, low, high, first, second)
+        first_two_task(
+            rays_o, rays_d, to_unit, apart, apart_at, balls, everywhere, low, high, first, second
+        )
 
 
 @task

@@ -107,9 +107,9 @@ def lattice_of(scene: ComposedField) -> Lattice | None:
 class AskedStudent(MadeStudent, GridStudent):
     """A field whose vertices can be given densities and colours: its class has
 
-    fill_vertices(index, features, colours)
-                        set vertices (V,), counted z first, to density features (V,), σ = scale
-                        softplus(f), and harmonics of their colours' logits (V, 3 coefficients)
+        fill_vertices(index, features, colours)
+                            set vertices (V,), counted z first, to density features (V,), σ = scale
+                            softplus(f), and harmonics of their colours' logits (V, 3 coefficients)
     """
 
     lesson = DistillSettings(rays=400_000, steps=0, rgb_steps=1000, rgb_rate=0.0006)

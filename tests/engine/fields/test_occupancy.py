@@ -21,7 +21,6 @@ from tests.engine.conftest import BOX, points_in
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
 
-
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 9, 2), (6, 5, 7)])
 @pytest.mark.parametrize("share", [0.02, 0.3])
 def test_skip_is_the_chebyshev_distance(shape, share):

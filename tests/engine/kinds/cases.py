@@ -45,7 +45,9 @@ def random_detailed_blocks():
     return blocks_of([Placed("rough", rough, affine(turn(30))), Placed("plain", plain, np.eye(4))])
 
 
-def random_vm_mlp(dtype=torch.float64, seed=0, cells=None, matrix=None, width=8) -> VMMLPField:
+def random_vm_mlp(
+    dtype=torch.float64, seed=0, cells=None, matrix=None, width=8
+) -> VMMLPField:
     """A vm-mlp field of random numbers whose colours differ; one shape for each type, since each is
     compiled."""
     shape = replace(SIXTY_FOUR if dtype == torch.float64 else THIRTY_TWO, sh_degree=2)
