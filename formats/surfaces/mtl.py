@@ -156,6 +156,8 @@ def _map(rest: str) -> Map:
         if values is None:
             raise ValueError
         options[option] = values[0].split()
+        if option in PLACING:
+            list(map(float, options[option]))  # ValueError here, where it becomes a note
         rest = rest[match.end() + values.end() :]
     return Map(rest.strip().strip('"'), options)
 

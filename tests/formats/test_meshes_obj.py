@@ -313,6 +313,11 @@ def test_options_behind_a_picture(folder, text):
     assert shows(written(folder, f"map_Kd {text}"))
 
 
+@pytest.mark.parametrize("text", ["-o 1.2.3 wood.png", "-s . wood.png", "wood.png -o x"])
+def test_options_that_are_no_numbers_are_named(folder, text):
+    assert "not understood" in notes_of(written(folder, f"map_Kd {text}"))
+
+
 def test_a_picture_whose_name_looks_like_options(folder):
     Image.fromarray(PICTURE).save(folder / "a.png -s b.png")
     assert shows(written(folder, "map_Kd a.png -s b.png"))
