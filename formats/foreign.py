@@ -112,7 +112,7 @@ KINDS = {  # the first whose pattern fits counts
     "fbx": Kind("an FBX model", BLENDER, "fbx", rb"Kaydara FBX|\s*;.{0,199}FBX"),
     "usd": Kind("a USD scene", BLENDER, "usd usda usdc usdz", rb"#usda|PXR-USDC"),
     "blender": Kind("a Blender file", BLENDER, "blend", rb"BLENDER"),
-    "collada": Kind("a COLLADA scene", BLENDER, "dae", rb".{0,200}<COLLADA"),
+    "collada": Kind("a COLLADA scene", "convert it to glTF (.glb) with assimp, or Blender 4.5 or older", "dae", rb".{0,200}<COLLADA"),
     "vrml": Kind("an X3D or VRML scene", BLENDER, "x3d wrl vrml", rb"#(VRML|X3D)"),
     "printing": Kind("a model for printing", BLENDER, "3mf amf"),
     "alembic": Kind("an Alembic scene", BLENDER, "abc"),
