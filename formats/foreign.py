@@ -14,6 +14,7 @@ HEAD = 1 << 14
 MAX_FILES = 2000
 """At most so many entries of a folder, and of the folders in it, are looked at."""
 HEIF = 'install the extra that reads it: pip install "fusedrf[heif]", or convert it to JPEG'
+OLDER_BLENDER = "convert it to glTF (.glb) with assimp or Blender 4.5 or older"
 BLENDER = "open it in Blender and export glTF (.glb)"
 EXPORT = "export glTF (.glb) from "
 CAD = "export a mesh (.glb or .stl) of it"
@@ -112,9 +113,9 @@ KINDS = {  # the first whose pattern fits counts
     "fbx": Kind("an FBX model", BLENDER, "fbx", rb"Kaydara FBX|\s*;.{0,199}FBX"),
     "usd": Kind("a USD scene", BLENDER, "usd usda usdc usdz", rb"#usda|PXR-USDC"),
     "blender": Kind("a Blender file", BLENDER, "blend", rb"BLENDER"),
-    "collada": Kind("a COLLADA scene", "convert it to glTF (.glb) with assimp, or Blender 4.5 or older", "dae", rb".{0,200}<COLLADA"),
+    "collada": Kind("a COLLADA scene", OLDER_BLENDER, "dae", rb".{0,200}<COLLADA"),
     "vrml": Kind("an X3D or VRML scene", BLENDER, "x3d wrl vrml", rb"#(VRML|X3D)"),
-    "printing": Kind("a model for printing", BLENDER, "3mf amf"),
+    "printing": Kind("a model for printing", "save it as .obj or .stl", "3mf amf"),
     "alembic": Kind("an Alembic scene", BLENDER, "abc"),
     "model": Kind("a 3D model in a format that is not read", BLENDER, "3ds x lwo ac b3d md2 md5mesh vrm"),
     "max": Kind("a 3ds Max scene", EXPORT + "3ds Max", "max"),
