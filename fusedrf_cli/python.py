@@ -51,16 +51,17 @@ class Scene:
 
     def __init__(self, loaded: LoadedScene):
         self._loaded = loaded
-        read: dict[str, RadianceField] = {}
+        read: dict[int, RadianceField] = {}
         self.fields: dict[str, RadianceField] = {}
         """Each node's field by name; nodes that show the same one share it."""
         self.placements: dict[str, torch.Tensor] = {}
         """Where each node stands: (4, 4) float64, object to world. Another tensor may be put in place of one,
         and may require a gradient."""
         for source in loaded.fields:
-            if source.member not in read:
-                read[source.member] = opened(source.placed.field)
-            self.fields[source.placed.name] = read[source.member]
+            key = id(source.placed.field)
+            if key not in read:
+                read[key] = opened(source.placed.field)
+            self.fields[source.placed.name] = read[key]
             self.placements[source.placed.name] = torch.from_numpy(source.placed.object_to_world.copy())
         self._composed = None
 

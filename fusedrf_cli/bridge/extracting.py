@@ -43,11 +43,11 @@ from fusedrf_cli.bridge.scene import (
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, graph_bytes
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing, placed_box, placement
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
@@ -263,13 +263,14 @@ def read_whole(path: str, memory: Memory) -> Whole:
         field, origin = scene.lone()
         return Whole(draft, field, origin, leaves[0].name, True)
     composed = scene.composed()
-    field = registry.joined(composed)
-    if field is None:
+    try:
+        field = blocks_of(composed.placed)
+    except ValueError as error:
         kinds = ", ".join(sorted({p.field.kind for p in composed.placed}))
         raise InvalidInput(
             f"{path}: its nodes are fields of the kinds {kinds}, which cannot be taken apart together; "
             "delete nodes by name, or fuse it to one field first"
-        )
+        ) from error
     return Whole(draft, field, composed.origin, FUSED, False)
 
 
@@ -486,8 +487,10 @@ def with_fillings(rest: StoredField, fillings: list[Placed]) -> tuple[StoredFiel
     """What is left of a field with what fills its hole, and of that what has to be a field of its own."""
     if not fillings:
         return rest, []
-    whole = registry.joined(ComposedField([Placed("", rest, np.eye(4)), *fillings], origin=np.eye(4)))
-    return (rest, fillings) if whole is None else (whole, [])
+    try:
+        return blocks_of([Placed("", rest, np.eye(4)), *fillings]), []
+    except ValueError:
+        return rest, fillings
 
 
 def seen_share(fused: Whole, rig: dict[str, View], found: StoredField | None) -> float | None:
