@@ -109,7 +109,7 @@ def test_every_function_carries_the_name():
     for function in ("density", "colour", "query_point", "train_ray", "piece", "march"):
         assert names[function].py_func.__qualname__ == f"{function}_{name}"
     runs = specialise.Loops(vm, SIZES, bounded)
-    runs = [runs._over("each", item) for item in ("query_point", "render_ray")]
+    runs = [runs._over("each", item) for item in ("query_point", "show_ray")]
     assert len({run.py_func.__qualname__ for run in runs}) == 2
 
 
