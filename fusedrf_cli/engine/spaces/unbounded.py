@@ -25,10 +25,10 @@ STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (DESIGN, 
 FAR = 1e3  # n at which rays end
 ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
-SIDE = 2.0  # coordinates lie between -SIDE and SIDE
+REACH = 2.0  # coordinates lie between -REACH and REACH
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
 LEARN_FROM, LENT_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
-WHOLE = np.array([-SIDE] * 3 + [SIDE] * 3)
+WHOLE = np.array([-REACH] * 3 + [REACH] * 3)
 SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
 
 
