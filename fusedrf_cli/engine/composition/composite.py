@@ -70,6 +70,15 @@ def groups_of(placed: Iterable[Placed], rule: str) -> list[tuple[list[Placed], s
     return groups
 
 
+def as_composite(scene: ComposedField) -> ComposedField:
+    """A scene as a Composite in the same frame, where it can be one; else as it is."""
+    if isinstance(scene, Composite) or not can_be_composite(scene.placed, scene.rule):
+        return scene
+    other = Composite.__new__(Composite)
+    other.__dict__.update(scene.__dict__)
+    return other
+
+
 class Composite(ComposedField):
     """A scene of any kinds of field, mixed, that is answered as `ComposedField` answers it, and in far less
     time.
