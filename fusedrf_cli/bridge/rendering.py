@@ -18,13 +18,15 @@ from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite, can_be_composite
-from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
+MANY_RAYS, MANY_SAMPLES, MUCH_WORK = 1 << 28, 1 << 14, 1 << 32
+"""From so many rays on, or so many samples of a ray and of all, a command says that it takes long."""
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
@@ -56,9 +58,10 @@ def render(request: RenderRequest, progress) -> dict:
         held = isinstance(field, Composite)
         loaded.shelf.resize(sum(loaded.sizes) if held else budget.room(needed))
         advice = "use --naive" if held else "give a smaller --size"
-        budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice=advice)
+        budget.expect(sources(loaded.resident, loaded.shelf.room) | needed, advice=advice)
         if hasattr(field, "for_pictures"):
             field = field.for_pictures(rays_of(views))
+        tell_of_work(request.scene, field, rays_of(views), progress)
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
         shooting = _Shooting(field, how, request.background, request.depth, progress)
@@ -91,6 +94,19 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
 
 
+def tell_of_work(scene: str, field, rays: int, progress) -> None:
+    """A warning where so many rays through a field may take much longer than people expect."""
+    sampled = field.fields if isinstance(field, Composite) else [field]
+    samples = max(f.occupancy.most_samples(sampling_step(f)) for f in sampled)
+    if rays >= MANY_RAYS:
+        progress.warn(f"{scene}: {rays:,} pixels may take long; give a smaller --size")
+    elif samples >= MANY_SAMPLES and rays * samples >= MUCH_WORK:
+        progress.warn(
+            f"{scene}: a ray takes up to {samples:,} samples, since something is that much finer than the "
+            "whole is wide, and this may take long; leave out what is smallest, or farthest away"
+        )
+
+
 def rays_of(views: list[Camera]) -> int:
     """How many rays all the pictures take."""
     return sum(view.width * view.height for view in views)
@@ -109,7 +125,7 @@ def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
 def in_memory(loaded: LoadedScene, field: RadianceField, needed: dict, budget: Memory) -> RadianceField:
     """A composed scene as a Composite, whose fields are all in memory, where compiled loops compute all of
     them and there is room; else the field as it is. needed: for its pictures."""
-    if not isinstance(field, ComposedField) or budget.room(sources(loaded.sizes) | needed) < 0:
+    if not isinstance(field, ComposedField) or budget.room(sources(loaded.resident) | needed) < 0:
         return field
     loaded.shelf.resize(sum(loaded.sizes))
     if not can_be_composite(field.placed, field.rule):
