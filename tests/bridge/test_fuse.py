@@ -60,8 +60,13 @@ def test_the_file_is_no_larger_than_asked(report, folder, kind):
 def test_add_composition_is_distilled(report, run, folder):
     write_scene_of(folder, "floor", "red", file="fog.json", composition="add")
     assert report("fuse", "fog.json", "-o", "fog.rfpack", "--no-rgb")["kind"] == "vm"
-    result = run("fuse", "fog.json", "-o", "blocks.rfpack", "--kind", "blocks")
-    assert result.exit_code == 3 and "--kind vm" in result.stderr
+    report("fuse", "fog.json", "-o", "nodes.rfpack", "--kind", "blocks")  # which learns nothing
+    scene, sources = read_bundle(folder / "nodes.rfpack").scene, ("floor", "red")
+    assert scene.composition == "add" and [node.name for node in scene.nodes] == list(sources)
+    own = set().union(*(read_bundle(folder / f"{name}.rfpack").fields for name in sources))
+    assert read_bundle(folder / "nodes.rfpack").fields.keys() == own
+    result = run("fuse", "fog.json", "-o", "x.rfpack", "--kind", "blocks", "--max-size", "2kB")
+    assert result.exit_code == 2 and "--max-size is too small" in result.stderr
 
 
 def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):
