@@ -15,16 +15,16 @@ VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
 
 def test_a_scene_becomes_blocks_that_look_the_same(report, folder, picture):
     said = report("fuse", "scene.json", "-o", "fused.rfpack")
-    assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] > 45
+    assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] > 40  # as made, on another lattice
     assert said["bytes"] == (folder / "fused.rfpack").stat().st_size
     assert psnr(picture("fused.rfpack"), picture("scene.json")) > 45
     scene = read_bundle(folder / "fused.rfpack").scene
     (entry,) = scene.history
-    assert entry["event"] == "fused" and [n["name"] for n in entry["nodes"]] == ["floor", "red", "blue"]
-    assert [n["source"] for n in entry["nodes"]] == ["floor.rfpack", "red.rfpack", "blue.rfpack"]
-    assert (
-        not any(n["kept"] for n in entry["nodes"]) and len(read_bundle(folder / "fused.rfpack").fields) == 1
-    )
+    names = ["floor", "red", "blue"]
+    assert entry["event"] == "fused" and entry["objects"] == names and "nodes" not in entry
+    assert [node.name for node in scene.nodes] == names and scene.nodes[0].background
+    own = set().union(*(read_bundle(folder / f"{name}.rfpack").fields for name in names))
+    assert read_bundle(folder / "fused.rfpack").fields.keys() == own  # their very bytes
 
 
 def test_the_same_scene_gives_the_same_bytes(report, folder):
