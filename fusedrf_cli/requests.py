@@ -174,8 +174,6 @@ class ShowRequest(EditRequest):
     """An object that is shown otherwise."""
 
     name: str
-    event: str
-    """Of the history."""
     showing: dict
     """Words of a node (formats/scene.py: SHOWING_KEYS); None takes one away."""
 

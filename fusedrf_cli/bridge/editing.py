@@ -214,14 +214,24 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
         return edit.done(event, [new_name], chosen(draft.graph, {new_name}), before, renamed_from)
 
 
-def show(request: ShowRequest, progress) -> dict:
-    """Show an object otherwise: cropped, tinted, thinner, or not at all."""
+def crop(request: ShowRequest, progress) -> dict:
+    """Show what of an object lies in a box or a sphere."""
+    return show(request, "cropped", progress)
+
+
+def tint(request: ShowRequest, progress) -> dict:
+    """Show an object in other colours, or thinner."""
+    return show(request, "tinted", progress)
+
+
+def show(request: ShowRequest, event: str, progress) -> dict:
+    """Show an object otherwise."""
     with engine("cpu", None, progress):
         edit = Edit(request, progress)
         draft, name = edit.draft, request.name
         draft.check_node(name)
         draft.graph = changed(draft.graph, {name}, lambda node, _: (shown(node, request.showing),))
-        return edit.done(request.event, [name], chosen(draft.graph, {name}))
+        return edit.done(event, [name], chosen(draft.graph, {name}))
 
 
 class Edit:

@@ -27,5 +27,5 @@ def command(fused, name, shape, progress, **words):
     from fusedrf_cli import bridge
 
     showing = {"crop": None if shape is None else list(shape)}
-    request = ShowRequest(fused=fused, name=name, event="cropped", showing=showing, **words)
-    return bridge.show(request, progress)
+    request = ShowRequest(fused=fused, name=name, showing=showing, **words)
+    return bridge.crop(request, progress)

@@ -28,5 +28,5 @@ def command(fused, name, colour, opacity, progress, **words):
     from fusedrf_cli import bridge
 
     showing = {"tint": None if colour is None else list(colour), "opacity": opacity}
-    request = ShowRequest(fused=fused, name=name, event="tinted", showing=showing, **words)
-    return bridge.show(request, progress)
+    request = ShowRequest(fused=fused, name=name, showing=showing, **words)
+    return bridge.tint(request, progress)
