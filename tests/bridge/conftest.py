@@ -178,15 +178,16 @@ def report(folder):
 
 @pytest.fixture
 def picture(folder, report):
-    """picture("fused.rfpack") -> (H, W, 3) in [0, 1] of a scene from one camera over white."""
+    """picture("fused.rfpack", …) -> (H, W, 3) in [0, 1] of a scene from one camera over white, with more
+    words for `render`."""
     transforms = folder / "eye.json"
     c = orbit(np.array([-1.4, -0.8, -0.9, 1.4, 0.8, 0.4]), 1, 48, 48)[0]
     content = {"fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "w": 48, "h": 48}
     frame = {"file_path": "eye", "transform_matrix": c.camera_to_world.tolist()}
     transforms.write_text(json.dumps({**content, "frames": [frame]}))
 
-    def picture(scene: str) -> np.ndarray:
-        report("render", scene, "--cameras", "eye.json", "-o", "eye.png", "-w")
+    def picture(scene: str, *words: str) -> np.ndarray:
+        report("render", scene, "--cameras", "eye.json", "-o", "eye.png", "-w", *words)
         return read_image(folder / "eye.png")[..., :3] / 255
 
     return picture
