@@ -1,0 +1,171 @@
+"""Device functions of fields that are assembled of encodings and decoders.
+
+A field has four *slots*: `density` and `colour` hold encodings, `sigma` and `rgb` the decoders that read
+them. Each is filled by a module of scalar functions (engine/encodings, engine/decoders). `assemble` makes of
+four of them what kernels/loops.py expects of a kind: one flat namespace, in which the names of a slot have
+its prefix. That is done by replacing names in the code of its functions, so that one module can fill two
+slots and numba sees plain functions, which it can keep on disk and which kernels/cuda.py can bind again.
+
+In a slot's functions these names get the prefix of the slot: its own functions, names in capitals (the
+constants of its `sizes`, and of its module), and the fields of its `Arrays`, read as `field.NAME`.
+`features_NAME` means NAME of the slot that is read: sigma reads density, rgb reads colour, and colour may
+read sigma, whose outputs can be the features of the colour.
+"""
+
+from functools import cache
+from types import FunctionType, ModuleType
+from typing import NamedTuple
+
+READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
+"""Every slot, in the order of a field's numbers, and the slot that it reads."""
+HOOKS = "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward"
+"""What the loops below and other slots call; the rest of a module is reached from there."""
+BASE = "params", "lo", "side"  # fields of every assembly's Arrays: numbers (P,), corner (3,) and sides (3,)
+NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
+EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
+
+
+# -- what the loops ask of a kind ----------------------------------------------------------------------------
+
+
+def unit_of(field, p):
+    """The coordinates of a point in the unit cube of the field's box, and whether it lies inside."""
+    u, v = (p[0] - field.lo[0]) / field.side[0], (p[1] - field.lo[1]) / field.side[1]
+    w = (p[2] - field.lo[2]) / field.side[2]
+    return (u, v, w), min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE
+
+
+def density(field, grid, k, p, d, scratch):
+    """See loops.py; what the other functions need to know of a point are its unit coordinates."""
+    unit, inside = unit_of(field, p)
+    if not inside:
+        return 0.0, 0.0, 0, unit
+    sigma, pre = sigma_forward(field, unit, scratch)
+    return sigma, pre, 1, unit
+
+
+def again(field, held, p):
+    """See loops.py."""
+    return unit_of(field, p)[0]
+
+
+def begin(field, frame, d, scratch):
+    """See loops.py."""
+    rgb_ray_setup(field, d, scratch)
+
+
+def end(field, frame, d, scratch, grad):
+    """See loops.py."""
+    rgb_ray_backward(field, d, scratch, grad)
+
+
+def colour(field, unit, p, d, scratch, memory, at):
+    """See loops.py."""
+    return rgb_forward(field, unit, d, scratch, memory, at)
+
+
+def backward(field, unit, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
+    """See loops.py; colour first, since it may send back to what sigma hands on."""
+    if shaded:
+        rgb_backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad)
+    sigma_backward(field, unit, pre, d_sigma, scratch, grad)
+
+
+def ahead_density(field, array, held, p):
+    """See loops.py."""
+    density_prefetch_at(field, array, unit_of(field, p)[0])
+
+
+def ahead_colour(field, array, held, p):
+    """See loops.py."""
+    colour_prefetch_at(field, array, unit_of(field, p)[0])
+
+
+TEMPLATES = (
+    unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
+)  # fmt: skip
+
+
+# -- one namespace of four slots -----------------------------------------------------------------------------
+
+
+@cache
+def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: ModuleType) -> ModuleType:
+    """A module as kinds' `bodies.py`, with functions, `Arrays` and `sizes`, of these encodings and decoders.
+    Raises ValueError where a slot reads what another lacks, or two slots give one name two meanings."""
+    slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
+    label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
+    made = ModuleType(f"{__name__}.{label}.bodies")
+    names = vars(made) | {"EDGE": EDGE} | {f.__name__: renamed(f, f.__name__, made, {}) for f in TEMPLATES}
+    for slot, module in slots.items():
+        for name, value in slot_names(slot, module, slots.get(READS[slot]), made).items():
+            if names.setdefault(name, value) is not value:
+                raise ValueError(f"'{name}' of '{module.__name__}' has another meaning in another slot")
+    vars(made).update(names, Arrays=arrays_type(slots), sizes=lambda field: constants(field.slots))
+    return made
+
+
+def slot_names(slot: str, module: ModuleType, read: ModuleType | None, made: ModuleType) -> dict[str, object]:
+    """What the functions of a slot need, by the name that it has in the one namespace."""
+    own, found = vars(module), {}
+    fields = set(module.Arrays._fields)
+    if fields & NOT_PREFIXED:
+        raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
+    pending = [name for name in HOOKS if isinstance(own.get(name), FunctionType)]
+    while pending:
+        function, new = own[name := pending.pop()], {}
+        found[f"{slot}_{name}"] = None
+        for used in function.__code__.co_names:
+            value = own.get(used)
+            if used.startswith("features_"):
+                wanted = used.removeprefix("features_")
+                if not isinstance(getattr(read, wanted, None), FunctionType):
+                    raise ValueError(f"'{module.__name__}' reads '{wanted}', which '{read.__name__}' lacks")
+                new[used] = f"{READS[slot]}_{wanted}"
+            elif isinstance(value, FunctionType) or used.isupper() or used in fields:
+                new[used] = f"{slot}_{used}"
+                if isinstance(value, FunctionType) and new[used] not in found:
+                    pending.append(used)
+                elif used.isupper() and used in own:
+                    found[new[used]] = value
+            elif used in own:
+                found[used] = value  # numpy, math, and functions of kernels/parts.py
+        found[f"{slot}_{name}"] = renamed(function, f"{slot}_{name}", made, new)
+    return found
+
+
+def renamed(function: FunctionType, name: str, made: ModuleType, new: dict[str, str]) -> FunctionType:
+    """A function of an assembly under a name, in whose code globals and attributes have `new` names."""
+    code = function.__code__
+    code = code.replace(co_names=tuple(new.get(n, n) for n in code.co_names))
+    other = FunctionType(code, vars(made), name, function.__defaults__)
+    other.__module__, other.__doc__ = made.__name__, function.__doc__
+    return other
+
+
+def arrays_type(slots: dict[str, ModuleType]) -> type:
+    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
+    that is kept by its types must find it (kernels/tinting.py)."""
+    name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
+    if name not in globals():
+        prefixed = [f"{slot}_{field}" for slot, module in slots.items() for field in module.Arrays._fields]
+        made = NamedTuple(name, [(field, object) for field in (*BASE, *prefixed)])
+        made.__module__ = __name__
+        globals()[name] = made
+    return globals()[name]
+
+
+def constants(slots: dict) -> dict[str, int | float]:
+    """The constants of a field's namespace by name: those of each slot (engine/fields/assembled.py) with its
+    prefix, and AT, where its ROOM numbers of scratch begin."""
+    found, start = {}, 0
+    for name, slot in slots.items():
+        own = dict(slot.sizes)
+        room, kept = own.pop("ROOM"), own.pop("KEPT", 0)
+        for shared in own.keys() & {"LEARN_FROM", "SHADING_COST", "COLOUR_FROM"}:
+            found[shared] = own.pop(shared)
+        found |= {f"{name}_{constant}": value for constant, value in own.items()} | {f"{name}_AT": start}
+        start += room
+        if name == "rgb":
+            found["KEPT"] = kept
+    return found | {"SCRATCH": start}
