@@ -34,9 +34,8 @@ def arrays(field, starts: np.ndarray, width: int, coefficients: int) -> Arrays:
 
 
 def reference(
-    field, sections: dict[str, torch.Tensor], features: torch.Tensor, dirs: torch.Tensor, width: int,
-    coefficients: int,
-) -> torch.Tensor:  # fmt: skip
+    field, sections: dict, features: torch.Tensor, dirs: torch.Tensor, width: int, coefficients: int
+) -> torch.Tensor:
     """See decoders."""
     shown = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
     return torch.einsum("nk,ckr,nr->nc", shown, sections["basis"], features).sigmoid()

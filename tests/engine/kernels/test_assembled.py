@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.decoders import sh_basis, softplus_sum
-from fusedrf_cli.engine.encodings import line
+from fusedrf_cli.engine.decoders import sh, sh_basis, sh_mlp, softplus_sum, tensorf_mlp
+from fusedrf_cli.engine.encodings import grid, line, plane_line
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.kernels import loops, parts, specialise
 from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
@@ -18,9 +18,19 @@ from fusedrf_cli.engine.spaces import bounded, unbounded
 from ..conftest import BOX, points_in, unit
 from .interpreted import interpreted
 
-ENCODINGS = {"line": (line, {"rank": 8})}
+DENSITIES = {
+    "line": (line, {"rank": 8}),
+    "plane_line": (plane_line, {"rank": 8}),
+    "grid": (grid, {"numbers": 1}),
+}
+FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
 SIGMAS = {"softplus_sum": (softplus_sum, {})}
-COLOURS = {"sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4})}
+COLOURS = {
+    "sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4}),
+    "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
+    "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
+    "tensorf_mlp": lambda width: (tensorf_mlp, {"width": width, "rows": 5, "hidden": 11}),
+}
 
 
 @dataclass(frozen=True)
@@ -40,7 +50,7 @@ class Product(AssembledField):
 
     @classmethod
     def slots_of(cls, shape: Recipe) -> dict[str, Slot]:
-        density, colour = ENCODINGS[shape.density], ENCODINGS[shape.colour]
+        density, colour = DENSITIES[shape.density], FEATURES[shape.colour]
         width = colour[0].sizes(**colour[1])["WIDTH"]
         return {
             "density": Slot(*density, "density_"),
@@ -50,7 +60,8 @@ class Product(AssembledField):
         }
 
 
-PRODUCTS = [Recipe(e, e, "softplus_sum", c) for e in ENCODINGS for c in COLOURS]
+PRODUCTS = [Recipe(e, e, "softplus_sum", c) for e in DENSITIES for c in COLOURS]
+PRODUCTS += [Recipe("line", "grid", "softplus_sum", "sh_basis")]
 
 
 @pytest.fixture(params=PRODUCTS, ids=lambda recipe: "-".join(vars(recipe).values()))
@@ -150,8 +161,8 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     space or of kernels/parts.py would be called in its place. Hooks of loops.py are there to be hidden."""
     bodies = vars(field.bodies)
     own = {name for name in {*bodies, *field.bodies.sizes(field)} if not name.startswith("__")}
-    hooks = {template.__name__ for template in TEMPLATES} | {"LEARN_FROM", "SHADING_COST"}
-    for module, allowed in ((loops, hooks), (space, set()), (parts, set())):
+    hooks, settings = {template.__name__ for template in TEMPLATES}, {"LEARN_FROM", "SHADING_COST"}
+    for module, allowed in ((loops, hooks | settings), (space, settings), (parts, set())):
         others = {name for name in own & set(vars(module)) if bodies.get(name) is not vars(module)[name]}
         assert others <= allowed
 
