@@ -26,7 +26,7 @@ class Arrays(NamedTuple):
 
 
 def layer_shapes(rows: int, hidden: int) -> list[tuple[int, int]]:
-    """(inputs, outputs) of each layer in memory: outputs are filled up to runs of eight with lasting zeros."""
+    """(inputs, outputs) of each layer in memory: outputs are filled up to runs of eight with zeros."""
     wide = -(-hidden // 8) * 8
     return [(5 * (rows + 3), wide), (wide, wide), (wide, OUTPUTS)]
 
@@ -50,11 +50,11 @@ def sizes(width: int, rows: int, hidden: int) -> dict[str, int | float]:
 
 
 def sections(resolution: tuple[int, int, int], width: int, rows: int, hidden: int) -> list[Part]:
-    """See decoders; a layer's bias is the last row of its array."""
-    layers = layer_shapes(rows, hidden)
+    """See decoders; a layer's bias is the last row of its array. Layers learn slower than B."""
+    named = enumerate(layer_shapes(rows, hidden))
     return [
         Part("basis", (rows, width)),
-        *(Part(f"layer_{i}", (inputs + 1, outputs)) for i, (inputs, outputs) in enumerate(layers)),
+        *(Part(f"layer_{i}", (inputs + 1, outputs), rate=1 / 3) for i, (inputs, outputs) in named),
     ]
 
 

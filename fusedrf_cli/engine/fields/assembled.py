@@ -23,7 +23,7 @@ class Slot:
     prefix: str = ""
     """In front of the names of its sections, in files."""
     rate: float = 1.0
-    """What its numbers learn at, relative to the optimiser's rate."""
+    """What its numbers learn at, relative to the optimiser's rate and to what the module says."""
     spread: float | None = None
     """Standard deviation of an untrained field's numbers; None: what the module says."""
 
@@ -38,7 +38,7 @@ class Slot:
             replace(
                 part,
                 name=self.prefix + part.name,
-                rate=self.rate,
+                rate=self.rate * part.rate,
                 spread=part.spread if self.spread is None else self.spread,
             )
             for part in self.module.sections(resolution, **self.options)
@@ -80,6 +80,11 @@ class AssembledField(BoxField):
             values += slot.module.arrays(self, self.starts[first:last], **slot.options)
             first = last
         return self.bodies.Arrays(*values)
+
+    def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
+        """See ComputedField."""
+        sections = self.with_params(numbers).sections()
+        return [sections[part.name] for part in self.parts if len(part.axes) == 2]
 
     def slot_sections(self) -> dict[str, dict[str, torch.Tensor]]:
         """Views of the numbers of each slot, by the names that its module gives them."""

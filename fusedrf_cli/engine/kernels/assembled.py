@@ -100,23 +100,22 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), made).items():
             if names.setdefault(name, value) is not value:
-                raise ValueError(f"'{name}' of '{module.__name__}' has another meaning in another slot")
+                raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
     vars(made).update(names, Arrays=arrays_type(slots), sizes=lambda field: constants(field.slots))
     return made
 
 
 def slot_names(slot: str, module: ModuleType, read: ModuleType | None, made: ModuleType) -> dict[str, object]:
     """What the functions of a slot need, by the name that it has in the one namespace."""
-    own, found = vars(module), {}
-    fields = set(module.Arrays._fields)
+    found, fields = {}, set(module.Arrays._fields)
     if fields & NOT_PREFIXED:
         raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
-    pending = [name for name in HOOKS if isinstance(own.get(name), FunctionType)]
+    pending = {name: f for name in HOOKS if isinstance(f := getattr(module, name, None), FunctionType)}
     while pending:
-        function, new = own[name := pending.pop()], {}
-        found[f"{slot}_{name}"] = None
+        name, function = pending.popitem()
+        new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
         for used in function.__code__.co_names:
-            value = own.get(used)
+            value = known.get(used)
             if used.startswith("features_"):
                 wanted = used.removeprefix("features_")
                 if not isinstance(getattr(read, wanted, None), FunctionType):
@@ -125,11 +124,11 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, made: Mod
             elif isinstance(value, FunctionType) or used.isupper() or used in fields:
                 new[used] = f"{slot}_{used}"
                 if isinstance(value, FunctionType) and new[used] not in found:
-                    pending.append(used)
-                elif used.isupper() and used in own:
+                    pending[used] = value
+                elif used.isupper() and used in known:
                     found[new[used]] = value
-            elif used in own:
-                found[used] = value  # numpy, math, and functions of kernels/parts.py
+            elif used in known and found.setdefault(used, value) is not value:  # numpy, kernels/parts.py
+                raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
         found[f"{slot}_{name}"] = renamed(function, f"{slot}_{name}", made, new)
     return found
 

@@ -4,27 +4,35 @@ The loops' functions are run by Python, so that nothing is compiled."""
 from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.decoders import sh, sh_basis, sh_mlp, softplus_sum, tensorf_mlp
-from fusedrf_cli.engine.encodings import grid, line, plane_line
+from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
+from fusedrf_cli.engine.encodings import grid, hash_grid, line, plane_line, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.kernels import loops, parts, specialise
 from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-from ..conftest import BOX, points_in, unit
-from .interpreted import interpreted
+from ..conftest import BOX, points_in
+from .interpreted import asked, assert_answers, assert_gradients, interpreted
 
+HASHED = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
 DENSITIES = {
     "line": (line, {"rank": 8}),
     "plane_line": (plane_line, {"rank": 8}),
     "grid": (grid, {"numbers": 1}),
+    "hash_grid": (hash_grid, HASHED),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
-SIGMAS = {"softplus_sum": (softplus_sum, {})}
+FEATURES |= {name: (trunk_features, {"outputs": count}) for name, count in (("of 16", 16), ("of 8", 8))}
+SIGMAS = {
+    "density_sum": lambda width: (density_sum, {}),
+    "exp": lambda width: (density_sum, {"activation": "exp"}),
+    "relu": lambda width: (density_sum, {"activation": "relu"}),
+    "trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 16}),
+    "exp_trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 8, "activation": "exp"}),
+}
 COLOURS = {
     "sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4}),
     "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
@@ -52,77 +60,42 @@ class Product(AssembledField):
     def slots_of(cls, shape: Recipe) -> dict[str, Slot]:
         density, colour = DENSITIES[shape.density], FEATURES[shape.colour]
         width = colour[0].sizes(**colour[1])["WIDTH"]
+        sigma = SIGMAS[shape.sigma](density[0].sizes(**density[1])["WIDTH"])
         return {
             "density": Slot(*density, "density_"),
             "colour": Slot(*colour, "colour_"),
-            "sigma": Slot(*SIGMAS[shape.sigma], "sigma_"),
+            "sigma": Slot(*sigma, "sigma_"),
             "rgb": Slot(*COLOURS[shape.rgb](width), "rgb_"),
         }
 
 
-PRODUCTS = [Recipe(e, e, "softplus_sum", c) for e in DENSITIES for c in COLOURS]
-PRODUCTS += [Recipe("line", "grid", "softplus_sum", "sh_basis")]
+PRODUCTS = [Recipe(e, e, "density_sum", c) for e in ("line", "plane_line", "grid") for c in COLOURS]
+PRODUCTS += [
+    Recipe("line", "grid", "exp", "sh_basis"),
+    Recipe("grid", "line", "relu", "sh"),
+    Recipe("hash_grid", "of 16", "trunk", "sh_mlp"),
+    Recipe("hash_grid", "hash_grid", "exp_trunk", "sh_mlp"),
+]
 
 
 @pytest.fixture(params=PRODUCTS, ids=lambda recipe: "-".join(vars(recipe).values()))
 def field(request):
-    made = Product(request.param, BOX, (5, 8, 7), 3.0, -0.5)
+    made = Product(request.param, BOX, (5, 8, 7), 3.0, 0.3)
     generator = torch.Generator().manual_seed(0)
     return made.with_params(0.5 * torch.randn(len(made.params), generator=generator, dtype=torch.float64))
 
 
-def asked(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points in the box and unit directions."""
-    return points_in(BOX, count), unit(np.random.default_rng(1).normal(size=(count, 3)))
-
-
-def answer(names, field, p, d):
-    """(σ, rgb) of the device functions at a point."""
-    scratch, memory = np.zeros(names["SCRATCH"]), np.empty(max(names["KEPT"], 1))
-    sigma, _, steps, at = names["density"](field.arrays, field.grid, 0, p, d, scratch)
-    assert steps == 1
-    names["begin"](field.arrays, 0, d, scratch)
-    return sigma, names["colour"](field.arrays, at, p, d, scratch, memory, 0)
-
-
 def test_device_functions_answer_as_the_references_of_their_parts(field):
-    names, (points, dirs) = interpreted(field), asked(12)
-    wanted = field.reference(field.params, torch.from_numpy(points), torch.from_numpy(dirs))
-    for i, (p, d) in enumerate(zip(points.tolist(), dirs.tolist(), strict=True)):
-        sigma, rgb = answer(names, field, tuple(p), tuple(d))
-        assert sigma == pytest.approx(float(wanted[0][i]), rel=1e-9)
-        np.testing.assert_allclose(rgb, wanted[1][i], atol=1e-10)
+    assert_answers(field)
 
 
 @pytest.mark.parametrize("shaded", [True, False])
 def test_device_functions_send_back_what_autograd_does(field, shaded):
-    """Two samples of each ray, so that what a ray gathers is sent once; a sample that is not shaded sends
-    back by its density alone."""
-    names, (points, dirs) = interpreted(field), asked(6)
-    arrays, grid = field.arrays, field.grid
-    grad = np.zeros(len(field.params))
-    rng = np.random.default_rng(2)
-    d_sigma, d_rgb = rng.normal(size=6), rng.normal(size=(6, 3)) * shaded
-    dirs = dirs[[0, 0, 1, 1, 2, 2]]
-    for i in range(0, 6, 2):
-        d, scratch = tuple(dirs[i]), np.zeros(names["SCRATCH"])
-        names["begin"](arrays, 0, d, scratch)
-        for k in (i, i + 1):
-            p, memory = tuple(points[k]), np.empty(max(names["KEPT"], 1))
-            _, pre, _, at = names["density"](arrays, grid, 0, p, d, scratch)
-            rgb = names["colour"](arrays, at, p, d, scratch, memory, 0) if shaded else (0.0, 0.0, 0.0)
-            sent = d_sigma[k], shaded, rgb, tuple(d_rgb[k])
-            names["backward"](arrays, at, p, d, pre, *sent, scratch, memory, 0, grad)
-        names["end"](arrays, 0, d, scratch, grad)
-    params = field.params.clone().requires_grad_()
-    answers = field.reference(params, torch.from_numpy(points), torch.from_numpy(dirs))
-    torch.autograd.backward(answers, (torch.from_numpy(d_sigma), torch.from_numpy(d_rgb)))
-    assert (params.grad != 0).sum() > 20
-    np.testing.assert_allclose(grad, params.grad, atol=1e-10)
+    assert_gradients(field, shaded)
 
 
 def test_references_are_differentiable_in_numbers_points_and_directions(field):
-    points, dirs = (torch.from_numpy(values).requires_grad_() for values in asked(8))
+    points, dirs = (torch.from_numpy(values).requires_grad_() for values in asked(field, 8))
     leaves = field.params.clone().requires_grad_(), points, dirs
     assert torch.autograd.gradcheck(field.reference, leaves, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-5)
 
@@ -135,11 +108,12 @@ def test_no_answer_is_beyond_the_bound(field):
         lambda most: said.update(density=most), lambda most: said.update(logit=most)
     )  # fmt: skip
     field.check_answers()
-    points, dirs = (torch.from_numpy(values) for values in asked(500))
+    points, dirs = (torch.from_numpy(values) for values in asked(field, 500))
     sigma, rgb = field.reference(field.params, points, dirs)
-    raw = torch.expm1(sigma / field.scale).log() - field.shift
-    assert raw.abs().max() <= said["density"] < 1e4
-    assert rgb.logit().abs().max() <= said["logit"] < 1e6
+    if field.slots["sigma"].sizes["ACTIVATION"] == 0:
+        raw = torch.expm1(sigma / field.scale).log() - field.shift
+        assert raw.abs().max() <= said["density"] < 1e4
+    assert rgb[sigma > 0].logit().abs().max() <= said["logit"] < 1e6
 
 
 def test_what_is_prefetched_lies_in_the_numbers(field):
@@ -168,11 +142,12 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
 
 
 def test_names_get_the_prefix_of_their_slot(field):
-    names, _ = specialise.namespace(field.bodies, bounded)
+    names, functions = specialise.namespace(field.bodies, bounded)
     for slot in READS:
         assert f"{slot}_forward" in names
-    code = names["sigma_forward"].__code__
-    assert "density_summed" in code.co_names and "sigma_activation" in code.co_names
+    assert "sigma_activation" in functions["sigma_forward"].__code__.co_names
+    for name, function in functions.items():
+        assert not [used for used in function.__code__.co_names if used.startswith("features_")], name
 
 
 def module_of(text: str, base: ModuleType) -> ModuleType:
@@ -186,12 +161,12 @@ def module_of(text: str, base: ModuleType) -> ModuleType:
 def test_what_does_not_fit_is_named():
     lacking = module_of("", line)
     del lacking.summed
-    with pytest.raises(ValueError, match="softplus_sum' reads 'summed', which 'other' lacks"):
-        assemble(lacking, line, softplus_sum, sh_basis)
+    with pytest.raises(ValueError, match="density_sum' reads 'summed', which 'other' lacks"):
+        assemble(lacking, line, density_sum, sh_basis)
     hidden = module_of("def prefetch_at(field, array, unit):\n    np.zeros(1)\nnp = 3", line)
-    with pytest.raises(ValueError, match="'np' of '.*' has another meaning in another slot"):
-        assemble(hidden, line, softplus_sum, sh_basis)
+    with pytest.raises(ValueError, match="'np' of '.*' has two meanings"):
+        assemble(hidden, line, density_sum, sh_basis)
     unreadable = module_of("", line)
     unreadable.Arrays = SimpleNamespace(_fields=("shape",))
     with pytest.raises(ValueError, match="may not call its arrays"):
-        assemble(unreadable, line, softplus_sum, sh_basis)
+        assemble(unreadable, line, density_sum, sh_basis)

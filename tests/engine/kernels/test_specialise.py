@@ -7,12 +7,15 @@ from types import ModuleType
 
 import pytest
 
+from fusedrf_cli.engine.decoders import density_sum, sh_basis
+from fusedrf_cli.engine.encodings import line
 from fusedrf_cli.engine.kernels import loops, specialise
+from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.kinds.sparse import bodies as sparse
 from fusedrf_cli.engine.kinds.vm import bodies as vm
-from fusedrf_cli.engine.kinds.vm_mlp import bodies as vm_mlp
 from fusedrf_cli.engine.spaces import bounded
 
+CP = assemble(line, line, density_sum, sh_basis)
 SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
 
 SCRIPT = """
@@ -100,7 +103,7 @@ def tag(bodies: ModuleType = vm, sizes: dict = SIZES, space: ModuleType = bounde
 def test_kinds_sizes_and_spaces_have_names_of_their_own():
     other_space = ModuleType("elsewhere")
     other_space.__dict__.update({k: v for k, v in vars(bounded).items() if k != "__name__"})
-    tags = [tag(), tag(sparse), tag(vm_mlp), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
+    tags = [tag(), tag(sparse), tag(CP), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
     assert len(set(tags)) == len(tags) and tag() == tags[0]
 
 
@@ -113,10 +116,10 @@ def test_every_function_carries_the_name():
     assert len({run.py_func.__qualname__ for run in runs}) == 2
 
 
-def test_what_a_kind_leaves_out_has_a_default_and_what_it_takes_from_another_is_that():
+def test_what_a_kind_leaves_out_has_a_default():
     _, names = specialise.specialised(sparse, SIZES, bounded)
     assert names["end"].py_func.__code__ is loops.end.__code__
     assert names["advance"].py_func.__code__ is sparse.advance.__code__
-    _, names = specialise.specialised(vm_mlp, SIZES, bounded)
-    assert names["density"].py_func.__code__ is vm.density.__code__
-    assert names["colour"].py_func.__code__ is vm_mlp.colour.__code__
+    _, names = specialise.specialised(CP, SIZES, bounded)
+    assert names["advance"].py_func.__code__ is loops.advance.__code__
+    assert names["end"].py_func.__code__ is CP.end.__code__

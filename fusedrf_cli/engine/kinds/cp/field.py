@@ -3,7 +3,7 @@ with spherical-harmonic colour. The smallest of all kinds: its numbers grow with
 
 from dataclasses import dataclass
 
-from fusedrf_cli.engine.decoders import sh_basis, softplus_sum
+from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import line
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 
@@ -47,6 +47,6 @@ class CPField(AssembledField):
         return {
             "density": Slot(line, {"rank": shape.density_rank}, "density_", spread=FACTOR_SPREAD),
             "colour": Slot(line, {"rank": shape.colour_rank}, "colour_", spread=FACTOR_SPREAD),
-            "sigma": Slot(softplus_sum),
+            "sigma": Slot(density_sum),
             "rgb": Slot(sh_basis, basis, "colour_", rate=BASIS_RATE),
         }

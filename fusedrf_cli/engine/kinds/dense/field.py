@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.decoders import sh, softplus_sum
+from fusedrf_cli.engine.decoders import density_sum, sh
 from fusedrf_cli.engine.encodings import grid
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 
@@ -53,7 +53,7 @@ class DenseField(AssembledField):
         return {
             "density": Slot(grid, {"numbers": 1}, "density", DENSITY_RATE),
             "colour": Slot(grid, {"numbers": shape.numbers}, "colour", COLOUR_RATE),
-            "sigma": Slot(softplus_sum),
+            "sigma": Slot(density_sum),
             "rgb": Slot(sh, harmonics),
         }
 

@@ -3,7 +3,7 @@ own or one that it shares with other fields (Control-NeRF, Lazova et al., WACV 2
 
 from dataclasses import dataclass, replace
 
-from fusedrf_cli.engine.decoders import sh_mlp, softplus_sum
+from fusedrf_cli.engine.decoders import density_sum, sh_mlp
 from fusedrf_cli.engine.encodings import grid
 from fusedrf_cli.engine.fields.assembled import Slot
 from fusedrf_cli.engine.kinds.dense.field import COLOUR_RATE, DENSITY_RATE, DenseField
@@ -44,7 +44,7 @@ class DenseMLPField(DenseField):
         return {
             "density": Slot(grid, {"numbers": 1}, "density", DENSITY_RATE),
             "colour": Slot(grid, {"numbers": shape.width}, "colour", COLOUR_RATE, FEATURE_SPREAD),
-            "sigma": Slot(softplus_sum),
+            "sigma": Slot(density_sum),
             "rgb": Slot(sh_mlp, layers, "decoder.", 0.0 if shape.shared else DECODER_RATE),
         }
 
