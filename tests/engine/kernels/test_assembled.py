@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
+from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
 from fusedrf_cli.engine.encodings import grid, hash_grid, line, plane_line, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.kernels import loops, parts, specialise
@@ -34,6 +34,7 @@ SIGMAS = {
     "exp_trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 8, "activation": "exp"}),
 }
 COLOURS = {
+    "rgb": lambda width: (rgb, {"width": width}),
     "sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4}),
     "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
     "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
