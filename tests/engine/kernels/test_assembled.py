@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
-from fusedrf_cli.engine.encodings import grid, hash_grid, line, plane_line, trunk_features
+from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.kernels import loops, parts, specialise
 from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
@@ -23,6 +23,7 @@ DENSITIES = {
     "plane_line": (plane_line, {"rank": 8}),
     "grid": (grid, {"numbers": 1}),
     "hash_grid": (hash_grid, HASHED),
+    "frequencies": (frequencies, {"count": 2}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
 FEATURES |= {name: (trunk_features, {"outputs": count}) for name, count in (("of 16", 16), ("of 8", 8))}
@@ -76,6 +77,8 @@ PRODUCTS += [
     Recipe("grid", "line", "relu", "sh"),
     Recipe("hash_grid", "of 16", "trunk", "sh_mlp"),
     Recipe("hash_grid", "hash_grid", "exp_trunk", "sh_mlp"),
+    Recipe("frequencies", "of 8", "exp_trunk", "sh_mlp"),
+    Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
 ]
 
 
