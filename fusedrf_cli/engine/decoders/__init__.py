@@ -1,14 +1,14 @@
 """Decoders: what turns features into density (of slot `sigma`) or into colour (of slot `rgb`); one file each.
 
 For the loops, compiled, beside what encodings have (engine/encodings):
-    of sigma   forward(field, unit, scratch) -> (σ per length of the coordinates, `pre`)
-               backward(field, unit, pre, d_sigma, scratch, grad)
+    of sigma   forward(field, cell, scratch) -> (σ per length of the coordinates, `pre`)
+               backward(field, cell, pre, d_sigma, scratch, grad)
     of rgb     ray_setup(field, d, scratch), ray_backward(field, d, scratch, grad)
                                once per ray before the first colour and after the last backward: fold the unit
                                direction d; send its gradient back, and leave 0 what has gathered it
-               forward(field, unit, d, scratch, memory, at) -> (r, g, b) in [0, 1]
+               forward(field, cell, d, scratch, memory, at) -> (r, g, b) in [0, 1]
                                leaves KEPT numbers in memory[at:]
-               backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad)
+               backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad)
 They call what they read `features_forward`, `features_backward`, `features_summed`, ...
 
 For Python: Arrays, sizes (with KEPT, for rgb, and what kernels/loops.py lets a kind say: LEARN_FROM,

@@ -47,14 +47,14 @@ def bound(field, sections: dict, features: torch.Tensor, activation: str = "soft
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def forward(field, unit, scratch):
+def forward(field, cell, scratch):
     """See decoders."""
-    f = features_summed(field, unit, scratch)
+    f = features_summed(field, cell, scratch)
     return float(field.activation[0] * activated(f + field.activation[1])), float(f)
 
 
-def backward(field, unit, pre, d_sigma, scratch, grad):
+def backward(field, cell, pre, d_sigma, scratch, grad):
     """See decoders."""
     scratch[AT] = d_sigma * field.activation[0] * activated_slope(pre + field.activation[1])
     if scratch[AT] != 0:
-        features_summed_backward(field, unit, scratch, AT, scratch, grad)
+        features_summed_backward(field, cell, scratch, AT, scratch, grad)

@@ -50,16 +50,16 @@ def ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-def forward(field, unit, d, scratch, memory, at):
+def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
-    features_forward(field, unit, scratch, memory, at)
+    features_forward(field, cell, scratch, memory, at)
     return float(sigmoid(memory[at])), float(sigmoid(memory[at + 1])), float(sigmoid(memory[at + 2]))
 
 
-def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
     """See decoders."""
     for r in range(WIDTH):
         scratch[AT + r] = 0
     for c in range(3):
         scratch[AT + c] = field.params.dtype.type(d_rgb[c] * rgb[c] * (1 - rgb[c]))
-    features_backward(field, unit, scratch, AT, scratch, grad)
+    features_backward(field, cell, scratch, AT, scratch, grad)

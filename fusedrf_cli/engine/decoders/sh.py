@@ -64,14 +64,14 @@ def logit(scratch, c):
     return total
 
 
-def forward(field, unit, d, scratch, memory, at):
+def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
-    features_forward(field, unit, scratch, scratch, AT)
+    features_forward(field, cell, scratch, scratch, AT)
     r, g, b = logit(scratch, 0), logit(scratch, 1), logit(scratch, 2)
     return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
-def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
     """See decoders."""
     for r in range(3 * COEFFICIENTS, WIDTH):
         scratch[AT + r] = 0
@@ -79,4 +79,4 @@ def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
         d_logit = d_rgb[c] * rgb[c] * (1 - rgb[c])
         for k in range(COEFFICIENTS):
             scratch[AT + c * COEFFICIENTS + k] = field.params.dtype.type(d_logit * scratch[AT + WIDTH + k])
-    features_backward(field, unit, scratch, AT, scratch, grad)
+    features_backward(field, cell, scratch, AT, scratch, grad)

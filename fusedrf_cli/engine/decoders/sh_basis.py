@@ -74,9 +74,9 @@ def ray_backward(field, d, scratch, grad):
         scratch[np.uint64(AT + 3 * WIDTH) + r] = 0
 
 
-def forward(field, unit, d, scratch, memory, at):
+def forward(field, cell, d, scratch, memory, at):
     """See decoders; the features are kept."""
-    features_forward(field, unit, scratch, memory, at)
+    features_forward(field, cell, scratch, memory, at)
     f = np.uint64(at)
     r = dot(WIDTH, scratch, np.uint64(AT), memory, f)
     g = dot(WIDTH, scratch, np.uint64(AT + WIDTH), memory, f)
@@ -84,7 +84,7 @@ def forward(field, unit, d, scratch, memory, at):
     return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
-def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
     """See decoders."""
     d_features = np.uint64(AT + 6 * WIDTH)
     for r in range(np.uint64(WIDTH)):
@@ -96,4 +96,4 @@ def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
         row = np.uint64(AT) + np.uint64(c * WIDTH)
         add_scaled(WIDTH, scratch, d_features, d_logit, scratch, row)
         add_scaled(WIDTH, scratch, row + np.uint64(3 * WIDTH), d_logit, memory, np.uint64(at))
-    features_backward(field, unit, scratch, AT + 6 * WIDTH, scratch, grad)
+    features_backward(field, cell, scratch, AT + 6 * WIDTH, scratch, grad)

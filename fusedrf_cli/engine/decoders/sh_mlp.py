@@ -79,9 +79,9 @@ def ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-def forward(field, unit, d, scratch, memory, at):
+def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
-    features_forward(field, unit, scratch, memory, at)
+    features_forward(field, cell, scratch, memory, at)
     x = np.uint64(at)
     for r in range(np.uint64(HARMONICS)):
         memory[x + np.uint64(WIDTH) + r] = scratch[np.uint64(AT) + r]
@@ -93,7 +93,7 @@ def forward(field, unit, d, scratch, memory, at):
     return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
-def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
     """See decoders."""
     x, h, real = np.uint64(at), np.uint64(at + INPUTS), field.params.dtype.type
     d_out, d_h, d_x = np.uint64(AT + D_OUT), np.uint64(AT + D_HIDDEN), np.uint64(AT + D_INPUT)
@@ -104,4 +104,4 @@ def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
     params, hidden, out = field.params, np.uint64(field.hidden), np.uint64(field.out)
     dense_backward(HIDDEN, OUTPUTS, params, out, memory, h, True, scratch, d_out, scratch, d_h, grad)
     dense_backward(INPUTS, HIDDEN, params, hidden, memory, x, False, scratch, d_h, scratch, d_x, grad)
-    features_backward(field, unit, scratch, AT + D_INPUT, scratch, grad)
+    features_backward(field, cell, scratch, AT + D_INPUT, scratch, grad)

@@ -96,9 +96,9 @@ def ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-def forward(field, unit, d, scratch, memory, at):
+def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
-    features_forward(field, unit, scratch, memory, at)
+    features_forward(field, cell, scratch, memory, at)
     base, x = np.uint64(at), np.uint64(at + INPUT)
     basis, width, params = np.uint64(field.basis), np.uint64(WIDTH), field.params
     for j in range(np.uint64(ROWS)):
@@ -127,7 +127,7 @@ def encode(memory, x):
         memory[x + np.uint64(4) * count + j] = 1 - 2 * sin * sin
 
 
-def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
     """See decoders."""
     base, x, params = np.uint64(at), np.uint64(at + INPUT), field.params
     first, second = base + np.uint64(FIRST), base + np.uint64(SECOND)
@@ -156,7 +156,7 @@ def backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad):
         d_x = scratch[np.uint64(AT + D_X) + j]
         add_scaled(WIDTH, scratch, d_features, d_x, params, basis + j * width)
         scatter(WIDTH, grad, basis + j * width, d_x, memory, base)
-    features_backward(field, unit, scratch, AT + D_ROWS, scratch, grad)
+    features_backward(field, cell, scratch, AT + D_ROWS, scratch, grad)
 
 
 def encode_backward(memory, x, scratch):

@@ -73,10 +73,10 @@ def bound(field, sections: dict, features: torch.Tensor, **options) -> tuple[flo
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def outputs_at(field, unit, scratch):
+def outputs_at(field, cell, scratch):
     """Where in scratch all outputs at a point are, computed anew."""
     x, h, out = np.uint64(AT), np.uint64(AT + H), np.uint64(AT + OUT)
-    features_forward(field, unit, scratch, scratch, AT)
+    features_forward(field, cell, scratch, scratch, AT)
     dense(WIDTH, HIDDEN, field.params, np.uint64(field.hidden), scratch, x, scratch, h)
     rectify(HIDDEN, scratch, h)
     dense(HIDDEN, OUTPUTS, field.params, np.uint64(field.out), scratch, h, scratch, out)
@@ -88,21 +88,21 @@ def pending_at(scratch):
     return np.uint64(AT + D_OUT)
 
 
-def forward(field, unit, scratch):
+def forward(field, cell, scratch):
     """See decoders."""
-    f = scratch[outputs_at(field, unit, scratch)]
+    f = scratch[outputs_at(field, cell, scratch)]
     return float(field.activation[0] * activated(f + field.activation[1])), float(f)
 
 
-def backward(field, unit, pre, d_sigma, scratch, grad):
+def backward(field, cell, pre, d_sigma, scratch, grad):
     """See decoders; with what colour sent back to the outputs."""
-    outputs_at(field, unit, scratch)
+    outputs_at(field, cell, scratch)
     x, h, params = np.uint64(AT), np.uint64(AT + H), field.params
     d_x, d_h, d_out = np.uint64(AT + D_X), np.uint64(AT + D_H), pending_at(scratch)
     scratch[d_out] += d_sigma * field.activation[0] * activated_slope(pre + field.activation[1])
     hidden, out = np.uint64(field.hidden), np.uint64(field.out)
     dense_backward(HIDDEN, OUTPUTS, params, out, scratch, h, True, scratch, d_out, scratch, d_h, grad)
     dense_backward(WIDTH, HIDDEN, params, hidden, scratch, x, False, scratch, d_h, scratch, d_x, grad)
-    features_backward(field, unit, scratch, AT + D_X, scratch, grad)
+    features_backward(field, cell, scratch, AT + D_X, scratch, grad)
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_out + r] = 0

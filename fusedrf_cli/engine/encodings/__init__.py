@@ -2,14 +2,16 @@
 
 For the loops, compiled (kernels/assembled.py says how their names are read), with `unit` the point in the
 unit cube of the box, three float64:
-    forward(field, unit, scratch, out, base)
+    locate(field, unit)        `cell`, what the others need to know of a point: the point itself, an int or a
+                               tuple
+    forward(field, cell, scratch, out, base)
                                the WIDTH features into out[base:]
-    backward(field, unit, d, base, scratch, grad)
+    backward(field, cell, d, base, scratch, grad)
                                adds to grad (P,) what d[base:], the features' gradient, sends back
-    summed(field, unit, scratch), summed_backward(field, unit, d, base, scratch, grad)
+    summed(field, cell, scratch), summed_backward(field, cell, d, base, scratch, grad)
                                the sum of the features, and its adjoint for d[base]: for decoders that need no
                                more, without a way by memory
-    prefetch_at(field, array, unit)
+    prefetch_at(field, array, cell)
                                asks for what these read of an array laid out as the field's numbers
 Points may lie a rounding outside the cube; no index may. A multiple of 8 features lets them use vectors.
 

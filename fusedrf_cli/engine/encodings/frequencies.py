@@ -45,6 +45,11 @@ def bound(sections: dict, read: None, count: int) -> torch.Tensor:
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
+def locate(field, unit):
+    """See encodings: the point."""
+    return unit
+
+
 def forward(field, unit, scratch, out, base):
     """See encodings."""
     for axis in range(3):

@@ -59,8 +59,9 @@ def below(u, n):
     return i, f - i
 
 
-def voxel_at(field, unit):
-    """The number of the lowest vertex of the voxel around a point, and the shares of the upper ones."""
+def locate(field, unit):
+    """See encodings: the number of the lowest vertex of the voxel around a point, and the shares of the upper
+    ones."""
     i, u = below(unit[0], field.counts[0])
     j, v = below(unit[1], field.counts[1])
     k, w = below(unit[2], field.counts[2])
@@ -76,26 +77,25 @@ def corner(field, voxel, q):
     return np.uint64(field.start) + vertex * np.uint64(WIDTH), weight
 
 
-def summed(field, unit, scratch):
+def summed(field, voxel, scratch):
     """See encodings; of a grid of one number."""
-    voxel, total = voxel_at(field, unit), 0.0
+    total = 0.0
     for q in range(8):
         row, weight = corner(field, voxel, q)
         total += weight * field.params[row]
     return total
 
 
-def summed_backward(field, unit, d, base, scratch, grad):
+def summed_backward(field, voxel, d, base, scratch, grad):
     """See encodings."""
-    voxel = voxel_at(field, unit)
     for q in range(8):
         row, weight = corner(field, voxel, q)
         accumulate(grad, row, field.params.dtype.type(weight * d[base]))
 
 
-def forward(field, unit, scratch, out, base):
+def forward(field, voxel, scratch, out, base):
     """See encodings; of a grid of several."""
-    voxel, start = voxel_at(field, unit), np.uint64(base)
+    start = np.uint64(base)
     for r in range(np.uint64(WIDTH)):
         out[start + r] = 0
     for q in range(8):
@@ -103,16 +103,14 @@ def forward(field, unit, scratch, out, base):
         add_scaled(WIDTH, out, start, field.params.dtype.type(weight), field.params, row)
 
 
-def backward(field, unit, d, base, scratch, grad):
+def backward(field, voxel, d, base, scratch, grad):
     """See encodings."""
-    voxel = voxel_at(field, unit)
     for q in range(8):
         row, weight = corner(field, voxel, q)
         scatter(WIDTH, grad, row, field.params.dtype.type(weight), d, np.uint64(base))
 
 
-def prefetch_at(field, array, unit):
+def prefetch_at(field, array, voxel):
     """See encodings; of one number, two neighbours share a line most often."""
-    voxel = voxel_at(field, unit)
     for q in range(0, 8, 2 if WIDTH == 1 else 1):
         prefetch(array, corner(field, voxel, q)[0])

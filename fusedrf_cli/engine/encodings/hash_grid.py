@@ -87,6 +87,11 @@ def bound(sections: dict, read: None, levels: int, features: int, **options) -> 
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
+def locate(field, unit):
+    """See encodings: the point."""
+    return unit
+
+
 def cell_at(field, level, unit):
     """The vertex (i, j, k) of a level below a point on all axes, and how far (a, b, c) it is from it."""
     s, last = field.scales[level], field.sides[level] - 1

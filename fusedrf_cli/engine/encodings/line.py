@@ -48,6 +48,11 @@ def bound(sections: dict[str, torch.Tensor], read: None, rank: int) -> torch.Ten
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
+def locate(field, unit):
+    """See encodings: the point."""
+    return unit
+
+
 def texels_around(field, axis, u):
     """Where the rows of the texels below and above a coordinate begin, and the share of the upper."""
     i, share = texel(field.params, field.params.dtype.type(u), field.texels[axis])

@@ -1,4 +1,5 @@
-"""What a trunk (decoders/trunk.py) hands on to the colour: all of its outputs, the density's included."""
+"""What a trunk (decoders/trunk.py) hands on to the colour: all of its outputs, the density's included. It
+locates nothing: the cell of the density's encoding serves it."""
 
 from typing import NamedTuple
 
@@ -40,19 +41,19 @@ def bound(sections: dict, read: torch.Tensor, outputs: int) -> torch.Tensor:
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def forward(field, unit, scratch, out, base):
+def forward(field, cell, scratch, out, base):
     """See encodings."""
-    start, source = np.uint64(base), features_outputs_at(field, unit, scratch)
+    start, source = np.uint64(base), features_outputs_at(field, cell, scratch)
     for r in range(np.uint64(WIDTH)):
         out[start + r] = scratch[source + r]
 
 
-def backward(field, unit, d, base, scratch, grad):
+def backward(field, cell, d, base, scratch, grad):
     """See encodings; the trunk sends it on."""
     start, pending = np.uint64(base), features_pending_at(scratch)
     for r in range(np.uint64(WIDTH)):
         scratch[pending + r] += d[start + r]
 
 
-def prefetch_at(field, array, unit):
+def prefetch_at(field, array, cell):
     """Nothing: the trunk's own encoding is asked for."""

@@ -18,7 +18,9 @@ from typing import NamedTuple
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
-HOOKS = "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward"
+HOOKS = (
+    "locate", "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward"
+)  # fmt: skip
 """What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"  # fields of every assembly's Arrays: numbers (P,), corner (3,) and sides (3,)
 NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
@@ -36,17 +38,29 @@ def unit_of(field, p):
 
 
 def density(field, grid, k, p, d, scratch):
-    """See loops.py; what the other functions need to know of a point are its unit coordinates."""
+    """See loops.py; a place is (unit coordinates, what the density's encoding located there)."""
     unit, inside = unit_of(field, p)
+    cell = density_locate(field, unit)
     if not inside:
-        return 0.0, 0.0, 0, unit
-    sigma, pre = sigma_forward(field, unit, scratch)
-    return sigma, pre, 1, unit
+        return 0.0, 0.0, 0, (unit, cell)
+    sigma, pre = sigma_forward(field, cell, scratch)
+    return sigma, pre, 1, (unit, cell)
 
 
 def again(field, held, p):
     """See loops.py."""
-    return unit_of(field, p)[0]
+    unit = unit_of(field, p)[0]
+    return unit, density_locate(field, unit)
+
+
+def shared_cell(field, place):
+    """What the colour's encoding located, where that is the density's as well."""
+    return place[1]
+
+
+def own_cell(field, place):
+    """The same, where it is another."""
+    return colour_locate(field, place[0])
 
 
 def begin(field, frame, d, scratch):
@@ -59,31 +73,29 @@ def end(field, frame, d, scratch, grad):
     rgb_ray_backward(field, d, scratch, grad)
 
 
-def colour(field, unit, p, d, scratch, memory, at):
+def colour(field, place, p, d, scratch, memory, at):
     """See loops.py."""
-    return rgb_forward(field, unit, d, scratch, memory, at)
+    return rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
 
 
-def backward(field, unit, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py; colour first, since it may send back to what sigma hands on."""
     if shaded:
-        rgb_backward(field, unit, d, rgb, d_rgb, scratch, memory, at, grad)
-    sigma_backward(field, unit, pre, d_sigma, scratch, grad)
+        rgb_backward(field, colour_cell(field, place), d, rgb, d_rgb, scratch, memory, at, grad)
+    sigma_backward(field, place[1], pre, d_sigma, scratch, grad)
 
 
 def ahead_density(field, array, held, p):
     """See loops.py."""
-    density_prefetch_at(field, array, unit_of(field, p)[0])
+    density_prefetch_at(field, array, density_locate(field, unit_of(field, p)[0]))
 
 
 def ahead_colour(field, array, held, p):
     """See loops.py."""
-    colour_prefetch_at(field, array, unit_of(field, p)[0])
+    colour_prefetch_at(field, array, colour_cell(field, again(field, held, p)))
 
 
-TEMPLATES = (
-    unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
-)  # fmt: skip
+TEMPLATES = unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
 
 
 # -- one namespace of four slots -----------------------------------------------------------------------------
@@ -97,6 +109,8 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
     made = ModuleType(f"{__name__}.{label}.bodies")
     names = vars(made) | {"EDGE": EDGE} | {f.__name__: renamed(f, f.__name__, made, {}) for f in TEMPLATES}
+    shared = colour is density or not hasattr(colour, "locate")
+    names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", made, {})
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), made).items():
             if names.setdefault(name, value) is not value:
