@@ -1,7 +1,6 @@
 """`--memory`: what is foretold is what is taken, and too much is refused before any of it is."""
 
 import contextlib
-import gc
 import json
 import os
 import subprocess
@@ -9,6 +8,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+import weakref
 from dataclasses import asdict
 from pathlib import Path
 
@@ -59,17 +59,22 @@ def test_too_much_is_refused_with_the_numbers(run, folder, name):
 
 def test_moments_and_gradients_are_gone_before_a_field_is_measured(run, folder, monkeypatch):
     """They are six times its numbers, and measuring makes copies of those."""
-    alive, measure = [], training.measure
+    made, alive, begin, measure = [], [], Adam.__init__, training.measure
+
+    def begun(self, *words, **more):
+        made.append(weakref.ref(self))
+        begin(self, *words, **more)
 
     def noted(*words):
-        alive.append(sum(type(held) is Adam for held in gc.get_objects()))
+        alive.append(sum(held() is not None for held in made))
         return measure(*words)
 
+    monkeypatch.setattr(Adam, "__init__", begun)
     monkeypatch.setattr(training, "measure", noted)
     words = "--holdout", "4", "--time-budget", "1"
     result = run("train", "photos", "-o", "out.rfpack", *words)
     assert result.exit_code == 0, result.stderr
-    assert alive == [0]
+    assert alive == [0] and made
 
 
 def test_a_checkpoint_is_written_without_a_copy_of_the_run(tmp_path):
