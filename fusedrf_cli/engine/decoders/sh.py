@@ -35,8 +35,8 @@ def reference(
     field, sections: dict, features: torch.Tensor, dirs: torch.Tensor, width: int, coefficients: int
 ) -> torch.Tensor:
     """See decoders."""
-    shown = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
-    return (features[:, : 3 * coefficients].view(-1, 3, coefficients) * shown[:, None]).sum(2).sigmoid()
+    harmonics = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
+    return (features[:, : 3 * coefficients].view(-1, 3, coefficients) * harmonics[:, None]).sum(2).sigmoid()
 
 
 def bound(field, sections: dict, features: torch.Tensor, width: int, coefficients: int) -> float:

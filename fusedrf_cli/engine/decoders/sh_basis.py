@@ -37,8 +37,8 @@ def reference(
     field, sections: dict, features: torch.Tensor, dirs: torch.Tensor, width: int, coefficients: int
 ) -> torch.Tensor:
     """See decoders."""
-    shown = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
-    return torch.einsum("nk,ckr,nr->nc", shown, sections["basis"], features).sigmoid()
+    harmonics = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
+    return torch.einsum("nk,ckr,nr->nc", harmonics, sections["basis"], features).sigmoid()
 
 
 def bound(field, sections: dict, features: torch.Tensor, width: int, coefficients: int) -> float:

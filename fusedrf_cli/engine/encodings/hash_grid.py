@@ -61,7 +61,7 @@ def reference(
     growth: float,
 ) -> torch.Tensor:  # fmt: skip
     """See encodings."""
-    found, first, table = [], 0, sections["rows"]
+    per_level, first, table = [], 0, sections["rows"]
     for scale, side, rows in zip(*levels_of(levels, log2_rows, base, growth), strict=True):
         at = unit * float(scale) + 0.5
         below = at.detach().floor()
@@ -74,9 +74,9 @@ def reference(
             if side**3 > rows:
                 number = x ^ (y * PRIMES[0]) ^ (z * PRIMES[1])
             total = total + weight[:, None].to(table.dtype) * table[first + number % int(rows)]
-        found.append(total)
+        per_level.append(total)
         first += int(rows)
-    return torch.cat(found, 1)
+    return torch.cat(per_level, 1)
 
 
 def bound(sections: dict, read: None, levels: int, features: int, **options) -> torch.Tensor:

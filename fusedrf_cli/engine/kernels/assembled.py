@@ -16,6 +16,8 @@ from functools import cache
 from types import FunctionType, ModuleType
 from typing import NamedTuple
 
+from fusedrf_cli.engine.kernels.parts import LINE
+
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
 HOOKS = (
@@ -23,6 +25,7 @@ HOOKS = (
 )  # fmt: skip
 """What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"  # fields of every assembly's Arrays: numbers (P,), corner (3,) and sides (3,)
+OF_LOOPS = "KEPT", "LEARN_FROM", "SHADING_COST", "COLOUR_FROM"  # constants that loops.py reads
 NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
 EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
 
@@ -107,21 +110,22 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     Raises ValueError where a slot reads what another lacks, or two slots give one name two meanings."""
     slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
-    made = ModuleType(f"{__name__}.{label}.bodies")
-    names = vars(made) | {"EDGE": EDGE} | {f.__name__: renamed(f, f.__name__, made, {}) for f in TEMPLATES}
+    assembly = ModuleType(f"{__name__}.{label}.bodies")
+    names = vars(assembly) | {"EDGE": EDGE}
+    names |= {template.__name__: renamed(template, template.__name__, assembly, {}) for template in TEMPLATES}
     shared = colour is density or not hasattr(colour, "locate")
-    names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", made, {})
+    names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", assembly, {})
     for slot, module in slots.items():
-        for name, value in slot_names(slot, module, slots.get(READS[slot]), made).items():
+        for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
             if names.setdefault(name, value) is not value:
                 raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
-    vars(made).update(names, Arrays=arrays_type(slots), sizes=lambda field: constants(field.slots))
-    return made
+    vars(assembly).update(names, Arrays=arrays_type(slots), sizes=lambda field: constants(field.slots))
+    return assembly
 
 
-def slot_names(slot: str, module: ModuleType, read: ModuleType | None, made: ModuleType) -> dict[str, object]:
+def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly: ModuleType) -> dict:
     """What the functions of a slot need, by the name that it has in the one namespace."""
-    found, fields = {}, set(module.Arrays._fields)
+    names, fields = {}, set(module.Arrays._fields)
     if fields & NOT_PREFIXED:
         raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
     pending = {name: f for name in HOOKS if isinstance(f := getattr(module, name, None), FunctionType)}
@@ -131,54 +135,50 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, made: Mod
         for used in function.__code__.co_names:
             value = known.get(used)
             if used.startswith("features_"):
-                wanted = used.removeprefix("features_")
-                if not isinstance(getattr(read, wanted, None), FunctionType):
-                    raise ValueError(f"'{module.__name__}' reads '{wanted}', which '{read.__name__}' lacks")
-                new[used] = f"{READS[slot]}_{wanted}"
+                needed = used.removeprefix("features_")
+                if not isinstance(getattr(read, needed, None), FunctionType):
+                    raise ValueError(f"'{module.__name__}' reads '{needed}', which '{read.__name__}' lacks")
+                new[used] = f"{READS[slot]}_{needed}"
             elif isinstance(value, FunctionType) or used.isupper() or used in fields:
                 new[used] = f"{slot}_{used}"
-                if isinstance(value, FunctionType) and new[used] not in found:
+                if isinstance(value, FunctionType) and new[used] not in names:
                     pending[used] = value
                 elif used.isupper() and used in known:
-                    found[new[used]] = value
-            elif used in known and found.setdefault(used, value) is not value:  # numpy, kernels/parts.py
+                    names[new[used]] = value
+            elif used in known and names.setdefault(used, value) is not value:  # numpy, kernels/parts.py
                 raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
-        found[f"{slot}_{name}"] = renamed(function, f"{slot}_{name}", made, new)
-    return found
+        names[f"{slot}_{name}"] = renamed(function, f"{slot}_{name}", assembly, new)
+    return names
 
 
-def renamed(function: FunctionType, name: str, made: ModuleType, new: dict[str, str]) -> FunctionType:
+def renamed(function: FunctionType, name: str, assembly: ModuleType, new: dict[str, str]) -> FunctionType:
     """A function of an assembly under a name, in whose code globals and attributes have `new` names."""
     code = function.__code__
     code = code.replace(co_names=tuple(new.get(n, n) for n in code.co_names))
-    other = FunctionType(code, vars(made), name, function.__defaults__)
-    other.__module__, other.__doc__ = made.__name__, function.__doc__
+    other = FunctionType(code, vars(assembly), name, function.__defaults__)
+    other.__module__, other.__doc__ = assembly.__name__, function.__doc__
     return other
 
 
 def arrays_type(slots: dict[str, ModuleType]) -> type:
-    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
+    """The type of the arrays of an assembly: one for each, names in this module by its name, as compiled code
     that is kept by its types must find it (kernels/tinting.py)."""
     name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
     if name not in globals():
         prefixed = [f"{slot}_{field}" for slot, module in slots.items() for field in module.Arrays._fields]
-        made = NamedTuple(name, [(field, object) for field in (*BASE, *prefixed)])
-        made.__module__ = __name__
-        globals()[name] = made
+        arrays = NamedTuple(name, [(field, object) for field in (*BASE, *prefixed)])
+        arrays.__module__ = __name__
+        globals()[name] = arrays
     return globals()[name]
 
 
 def constants(slots: dict) -> dict[str, int | float]:
     """The constants of a field's namespace by name: those of each slot (engine/fields/assembled.py) with its
-    prefix, and AT, where its ROOM numbers of scratch begin."""
-    found, start = {}, 0
-    for name, slot in slots.items():
-        own = dict(slot.sizes)
-        room, kept = own.pop("ROOM"), own.pop("KEPT", 0)
-        for shared in own.keys() & {"LEARN_FROM", "SHADING_COST", "COLOUR_FROM"}:
-            found[shared] = own.pop(shared)
-        found |= {f"{name}_{constant}": value for constant, value in own.items()} | {f"{name}_AT": start}
-        start += room
-        if name == "rgb":
-            found["KEPT"] = kept
-    return found | {"SCRATCH": start}
+    prefix, and AT, where its ROOM numbers of scratch begin, on a cache line."""
+    named, start = {}, 0
+    for slot, filled in slots.items():
+        own = filled.sizes
+        named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in own.items()}
+        named[f"{slot}_AT"] = start
+        start += -(-own["ROOM"] // LINE) * LINE
+    return {"KEPT": 0, **named, "SCRATCH": start}

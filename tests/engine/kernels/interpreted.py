@@ -25,7 +25,7 @@ def interpreted(field) -> dict[str, Callable]:
     return names
 
 
-def asked(field, count: int) -> tuple[np.ndarray, np.ndarray]:
+def samples(field, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points in the box and unit directions."""
     return points_in(field.box, count), unit(np.random.default_rng(1).normal(size=(count, 3)))
 
@@ -41,19 +41,19 @@ def answer(names, field, p, d):
 
 def assert_answers(field) -> None:
     """That the device functions of a field in float64 answer as its reference."""
-    names, (points, dirs) = interpreted(field), asked(field, 12)
-    wanted = field.reference(field.params, torch.from_numpy(points), torch.from_numpy(dirs))
+    names, (points, dirs) = interpreted(field), samples(field, 12)
+    expected = field.reference(field.params, torch.from_numpy(points), torch.from_numpy(dirs))
     for i, (p, d) in enumerate(zip(points.tolist(), dirs.tolist(), strict=True)):
         sigma, rgb = answer(names, field, tuple(p), tuple(d))
-        assert sigma == pytest.approx(float(wanted[0][i]), rel=1e-9)
+        assert sigma == pytest.approx(float(expected[0][i]), rel=1e-9)
         if sigma > 0:
-            np.testing.assert_allclose(rgb, wanted[1][i], atol=1e-10)
+            np.testing.assert_allclose(rgb, expected[1][i], atol=1e-10)
 
 
 def assert_gradients(field, shaded: bool) -> None:
     """That they send back what autograd does. Two samples of each ray, so that what a ray gathers is sent
     once; a sample that is not shaded sends back by its density alone."""
-    names, (points, dirs) = interpreted(field), asked(field, 6)
+    names, (points, dirs) = interpreted(field), samples(field, 6)
     arrays, grid = field.arrays, field.grid
     grad = np.zeros(len(field.params))
     rng = np.random.default_rng(2)

@@ -15,7 +15,7 @@ from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 from ..conftest import BOX, points_in
-from .interpreted import asked, assert_answers, assert_gradients, interpreted
+from .interpreted import assert_answers, assert_gradients, interpreted, samples
 
 HASHED = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
 DENSITIES = {
@@ -99,7 +99,7 @@ def test_device_functions_send_back_what_autograd_does(field, shaded):
 
 
 def test_references_are_differentiable_in_numbers_points_and_directions(field):
-    points, dirs = (torch.from_numpy(values).requires_grad_() for values in asked(field, 8))
+    points, dirs = (torch.from_numpy(values).requires_grad_() for values in samples(field, 8))
     leaves = field.params.clone().requires_grad_(), points, dirs
     assert torch.autograd.gradcheck(field.reference, leaves, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-5)
 
@@ -107,17 +107,17 @@ def test_references_are_differentiable_in_numbers_points_and_directions(field):
 def test_no_answer_is_beyond_the_bound(field):
     """`check_answers` keeps the answers of a file's numbers finite: its bounds hold at random points, and are
     not far from what is reached."""
-    said = {}
+    bounds = {}
     field.check_density, field.check_logit = (
-        lambda most: said.update(density=most), lambda most: said.update(logit=most)
+        lambda most: bounds.update(density=most), lambda most: bounds.update(logit=most)
     )  # fmt: skip
     field.check_answers()
-    points, dirs = (torch.from_numpy(values) for values in asked(field, 500))
+    points, dirs = (torch.from_numpy(values) for values in samples(field, 500))
     sigma, rgb = field.reference(field.params, points, dirs)
     if field.slots["sigma"].sizes["ACTIVATION"] == 0:
         raw = torch.expm1(sigma / field.scale).log() - field.shift
-        assert raw.abs().max() <= said["density"] < 1e4
-    assert rgb[sigma > 0].logit().abs().max() <= said["logit"] < 1e6
+        assert raw.abs().max() <= bounds["density"] < 1e4
+    assert rgb[sigma > 0].logit().abs().max() <= bounds["logit"] < 1e6
 
 
 def test_what_is_prefetched_lies_in_the_numbers(field):

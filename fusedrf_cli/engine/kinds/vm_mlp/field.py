@@ -92,11 +92,11 @@ class VMMLPField(AssembledField):
     @property
     def weights(self) -> dict[str, torch.Tensor]:
         """Views of the network's numbers by name: `<layer>.weight` (out, in) and `<layer>.bias` (out,)."""
-        found, sections = {}, self.sections()
+        views, sections = {}, self.sections()
         for name, shape in weight_shapes(self.shape.features, self.shape.width).items():
             layer = sections[f"network.layer_{name[0]}"]
-            found[name] = layer[: shape[1], : shape[0]].T if len(shape) == 2 else layer[-1, : shape[0]]
-        return found
+            views[name] = layer[: shape[1], : shape[0]].T if len(shape) == 2 else layer[-1, : shape[0]]
+        return views
 
     # -- storing ---------------------------------------------------------------------------------------------
 
@@ -178,9 +178,9 @@ def weight_shapes(features: int, width: int) -> dict[str, tuple[int, ...]]:
 
 def untrained(features: int, width: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Weights uniform as a linear layer's, the last bias 0."""
-    found = {}
+    weights = {}
     for name, shape in weight_shapes(features, width).items():
-        bound = (shape[1] if len(shape) == 2 else found[f"{name[0]}.weight"].shape[1]) ** -0.5
-        found[name] = torch.empty(shape).uniform_(-bound, bound, generator=generator)
-    found[f"{tensorf_mlp.LAYERS - 1}.bias"].zero_()
-    return found
+        bound = (shape[1] if len(shape) == 2 else weights[f"{name[0]}.weight"].shape[1]) ** -0.5
+        weights[name] = torch.empty(shape).uniform_(-bound, bound, generator=generator)
+    weights[f"{tensorf_mlp.LAYERS - 1}.bias"].zero_()
+    return weights
