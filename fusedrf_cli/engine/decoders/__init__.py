@@ -5,7 +5,8 @@ For the loops, compiled, beside what encodings have (engine/encodings):
                backward(field, cell, pre, d_sigma, scratch, grad)
     of rgb     ray_setup(field, d, scratch), ray_backward(field, d, scratch, grad)
                                once per ray before the first colour and after the last backward: fold the unit
-                               direction d; send its gradient back, and leave 0 what has gathered it
+                               direction d; send its gradient back, and leave 0 what has gathered it; may be
+                               left out
                forward(field, cell, d, scratch, memory, at) -> (r, g, b) in [0, 1]
                                leaves KEPT numbers in memory[at:]
                backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad)

@@ -8,7 +8,6 @@ import torch
 
 from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.decoders.activations import activated, activated_slope
-from fusedrf_cli.engine.fields.box import Part
 
 
 class Arrays(NamedTuple):
@@ -20,11 +19,6 @@ class Arrays(NamedTuple):
 def sizes(activation: str = "softplus") -> dict[str, int]:
     """See decoders; scratch holds the gradient of the sum."""
     return {"ACTIVATION": activations.NAMES.index(activation), "ROOM": 1}
-
-
-def sections(resolution: tuple[int, int, int], activation: str = "softplus") -> list[Part]:
-    """None: nothing is learnt."""
-    return []
 
 
 def arrays(field, starts: np.ndarray, activation: str = "softplus") -> Arrays:

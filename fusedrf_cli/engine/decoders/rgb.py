@@ -1,32 +1,14 @@
 """Colour that is the same from all sides: rgb_c = sigmoid(features_c) of the first three features (DVGO, Sun
 et al., CVPR 2022)."""
 
-from typing import NamedTuple
-
-import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part
 from fusedrf_cli.engine.kernels.parts import sigmoid
-
-
-class Arrays(NamedTuple):
-    """Nothing is read beside the features."""
 
 
 def sizes(width: int) -> dict[str, int]:
     """See decoders; scratch holds the features' gradient. They are kept."""
     return {"WIDTH": width, "ROOM": width, "KEPT": width}
-
-
-def sections(resolution: tuple[int, int, int], width: int) -> list[Part]:
-    """None: nothing is learnt."""
-    return []
-
-
-def arrays(field, starts: np.ndarray, width: int) -> Arrays:
-    """See decoders."""
-    return Arrays()
 
 
 def reference(field, sections: dict, features: torch.Tensor, dirs: torch.Tensor, width: int) -> torch.Tensor:
@@ -40,14 +22,6 @@ def bound(field, sections: dict, features: torch.Tensor, width: int) -> float:
 
 
 # -- compiled ------------------------------------------------------------------------------------------------
-
-
-def ray_setup(field, d, scratch):
-    """The direction says nothing."""
-
-
-def ray_backward(field, d, scratch, grad):
-    """Nothing is gathered for a ray."""
 
 
 def forward(field, cell, d, scratch, memory, at):

@@ -1,34 +1,16 @@
 """Colour whose features are the coefficients of spherical harmonics (Plenoxels, Fridovich-Keil et al., CVPR
 2022): rgb_c = sigmoid(Σ_k Y_k(d) features[c, k])."""
 
-from typing import NamedTuple
-
-import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part
 from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.parts import sh_basis, sigmoid
-
-
-class Arrays(NamedTuple):
-    """Nothing is read beside the features."""
 
 
 def sizes(width: int, coefficients: int) -> dict[str, int]:
     """See decoders; scratch holds the features or their gradient, and Y. Nothing is kept: Y and the gradient
     of a logit say what is sent back."""
     return {"WIDTH": width, "COEFFICIENTS": coefficients, "ROOM": width + 16}
-
-
-def sections(resolution: tuple[int, int, int], width: int, coefficients: int) -> list[Part]:
-    """None: nothing is learnt."""
-    return []
-
-
-def arrays(field, starts: np.ndarray, width: int, coefficients: int) -> Arrays:
-    """See decoders."""
-    return Arrays()
 
 
 def reference(
@@ -50,10 +32,6 @@ def bound(field, sections: dict, features: torch.Tensor, width: int, coefficient
 def ray_setup(field, d, scratch):
     """Y of the direction."""
     sh_basis(COEFFICIENTS, d, scratch, AT + WIDTH)
-
-
-def ray_backward(field, d, scratch, grad):
-    """Nothing is gathered for a ray."""
 
 
 def logit(scratch, c):

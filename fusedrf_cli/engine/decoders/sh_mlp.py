@@ -75,10 +75,6 @@ def ray_setup(field, d, scratch):
     sh_basis(HARMONICS, d, scratch, AT)
 
 
-def ray_backward(field, d, scratch, grad):
-    """Nothing is gathered for a ray."""
-
-
 def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
     features_forward(field, cell, scratch, memory, at)

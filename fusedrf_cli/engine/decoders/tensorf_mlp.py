@@ -92,10 +92,6 @@ def ray_setup(field, d, scratch):
     scratch[AT + DIRECTION], scratch[AT + DIRECTION + 1], scratch[AT + DIRECTION + 2] = d
 
 
-def ray_backward(field, d, scratch, grad):
-    """Nothing is gathered for a ray."""
-
-
 def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
     features_forward(field, cell, scratch, memory, at)

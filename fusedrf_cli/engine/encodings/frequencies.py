@@ -2,31 +2,13 @@
 Mildenhall et al., ECCV 2020, eq. 4, without its π, as its code has it), filled up to a run of eight."""
 
 import math
-from typing import NamedTuple
 
-import numpy as np
 import torch
-
-from fusedrf_cli.engine.fields.box import Part
-
-
-class Arrays(NamedTuple):
-    """Nothing is read: nothing is learnt."""
 
 
 def sizes(count: int) -> dict[str, int]:
     """See encodings."""
-    return {"COUNT": count, "NUMBERS": 3 + 6 * count, "WIDTH": -(-(3 + 6 * count) // 8) * 8, "ROOM": 0}
-
-
-def sections(resolution: tuple[int, int, int], count: int) -> list[Part]:
-    """None: nothing is learnt."""
-    return []
-
-
-def arrays(field, starts: np.ndarray, count: int) -> Arrays:
-    """See encodings."""
-    return Arrays()
+    return {"COUNT": count, "NUMBERS": 3 + 6 * count, "WIDTH": -(-(3 + 6 * count) // 8) * 8}
 
 
 def reference(sections: dict, unit: torch.Tensor, read: None, count: int) -> torch.Tensor:
@@ -45,11 +27,6 @@ def bound(sections: dict, read: None, count: int) -> torch.Tensor:
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def locate(field, unit):
-    """See encodings: the point."""
-    return unit
-
-
 def forward(field, unit, scratch, out, base):
     """See encodings."""
     for axis in range(3):
@@ -64,7 +41,3 @@ def forward(field, unit, scratch, out, base):
 
 def backward(field, unit, d, base, scratch, grad):
     """Nothing is learnt."""
-
-
-def prefetch_at(field, array, unit):
-    """Nothing is read."""

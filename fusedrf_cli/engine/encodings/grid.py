@@ -22,7 +22,7 @@ class Arrays(NamedTuple):
 
 def sizes(numbers: int) -> dict[str, int]:
     """See encodings."""
-    return {"WIDTH": numbers if numbers == 1 else -(-numbers // 8) * 8, "ROOM": 0}
+    return {"WIDTH": numbers if numbers == 1 else -(-numbers // 8) * 8}
 
 
 def sections(resolution: tuple[int, int, int], numbers: int) -> list[Part]:

@@ -37,7 +37,7 @@ def levels_of(levels: int, log2_rows: int, base: int, growth: float) -> tuple[np
 
 def sizes(levels: int, features: int, log2_rows: int, base: int, growth: float) -> dict[str, int]:
     """See encodings."""
-    return {"LEVELS": levels, "FEATURES": features, "WIDTH": levels * features, "ROOM": 0}
+    return {"LEVELS": levels, "FEATURES": features, "WIDTH": levels * features}
 
 
 def sections(
@@ -85,11 +85,6 @@ def bound(sections: dict, read: None, levels: int, features: int, **options) -> 
 
 
 # -- compiled ------------------------------------------------------------------------------------------------
-
-
-def locate(field, unit):
-    """See encodings: the point."""
-    return unit
 
 
 def cell_at(field, level, unit):

@@ -48,11 +48,6 @@ def bound(sections: dict[str, torch.Tensor], read: None, rank: int) -> torch.Ten
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
-def locate(field, unit):
-    """See encodings: the point."""
-    return unit
-
-
 def texels_around(field, axis, u):
     """Where the rows of the texels below and above a coordinate begin, and the share of the upper."""
     i, share = texel(field.params, field.params.dtype.type(u), field.texels[axis])
@@ -121,7 +116,3 @@ def backward(field, unit, d, base, scratch, grad):
 def summed_backward(field, unit, d, base, scratch, grad):
     """See encodings."""
     factors_backward(field, unit, d, base, 0, scratch, grad)
-
-
-def prefetch_at(field, array, unit):
-    """Nothing: lines are near at hand."""

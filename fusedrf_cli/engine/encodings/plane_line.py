@@ -56,11 +56,6 @@ def bound(sections: dict[str, torch.Tensor], read: None, rank: int) -> torch.Ten
 # -- compiled: one mode --------------------------------------------------------------------------------------
 
 
-def locate(field, unit):
-    """See encodings: the point."""
-    return unit
-
-
 def corners(field, mode, na, nb, nc, a, b, c):
     """Where the rows of the four texels of a mode's plane begin, their weights, where the lower row of its
     line begins, and the share of the upper."""

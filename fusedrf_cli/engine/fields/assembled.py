@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import ModuleType
 
+import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import BoxField, Part
@@ -32,8 +33,14 @@ class Slot:
         """Its constants."""
         return self.module.sizes(**self.options)
 
+    def arrays(self, field: "AssembledField", starts: np.ndarray) -> tuple:
+        """Its arrays, of a field where its numbers begin at starts in `params`."""
+        return self.module.arrays(field, starts, **self.options) if hasattr(self.module, "arrays") else ()
+
     def parts(self, resolution: tuple[int, int, int]) -> list[Part]:
         """Its numbers."""
+        if not hasattr(self.module, "sections"):
+            return []
         return [
             replace(
                 part,
@@ -77,7 +84,7 @@ class AssembledField(BoxField):
         values, first = [params, lo, side], 0
         for slot in self.slots.values():
             last = first + len(slot.parts(self.resolution))
-            values += slot.module.arrays(self, self.starts[first:last], **slot.options)
+            values += slot.arrays(self, self.starts[first:last])
             first = last
         return self.bodies.Arrays(*values)
 

@@ -101,6 +101,33 @@ def ahead_colour(field, array, held, p):
 TEMPLATES = unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
 
 
+# -- what a module may leave out -----------------------------------------------------------------------------
+
+
+class NoArrays(NamedTuple):
+    """Nothing is read beside `params`."""
+
+
+def locate(field, unit):
+    """The point itself."""
+    return unit
+
+
+def prefetch_at(field, array, cell):
+    """Nothing: what is read is near at hand."""
+
+
+def ray_setup(field, d, scratch):
+    """Nothing is known of a ray."""
+
+
+def ray_backward(field, d, scratch, grad):
+    """Nothing is gathered for a ray."""
+
+
+DEFAULTS = {f.__name__: f for f in (locate, prefetch_at, ray_setup, ray_backward)}
+
+
 # -- one namespace of four slots -----------------------------------------------------------------------------
 
 
@@ -113,7 +140,7 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     assembly = ModuleType(f"{__name__}.{label}.bodies")
     names = vars(assembly) | {"EDGE": EDGE}
     names |= {template.__name__: renamed(template, template.__name__, assembly, {}) for template in TEMPLATES}
-    shared = colour is density or not hasattr(colour, "locate")
+    shared = colour is density or getattr(colour, "locate", locate) is None
     names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", assembly, {})
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
@@ -125,10 +152,11 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
 
 def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly: ModuleType) -> dict:
     """What the functions of a slot need, by the name that it has in the one namespace."""
-    names, fields = {}, set(module.Arrays._fields)
+    names, fields = {}, set(arrays_of(module)._fields)
     if fields & NOT_PREFIXED:
         raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
-    pending = {name: f for name in HOOKS if isinstance(f := getattr(module, name, None), FunctionType)}
+    hooks = {name: getattr(module, name, DEFAULTS.get(name)) for name in HOOKS}
+    pending = {name: hook for name, hook in hooks.items() if hook is not None}
     while pending:
         name, function = pending.popitem()
         new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
@@ -160,12 +188,19 @@ def renamed(function: FunctionType, name: str, assembly: ModuleType, new: dict[s
     return other
 
 
+def arrays_of(module: ModuleType) -> type:
+    """The type of the arrays of an encoding or a decoder."""
+    return getattr(module, "Arrays", NoArrays)
+
+
 def arrays_type(slots: dict[str, ModuleType]) -> type:
-    """The type of the arrays of an assembly: one for each, names in this module by its name, as compiled code
+    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
     that is kept by its types must find it (kernels/tinting.py)."""
     name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
     if name not in globals():
-        prefixed = [f"{slot}_{field}" for slot, module in slots.items() for field in module.Arrays._fields]
+        prefixed = [
+            f"{slot}_{field}" for slot, module in slots.items() for field in arrays_of(module)._fields
+        ]
         arrays = NamedTuple(name, [(field, object) for field in (*BASE, *prefixed)])
         arrays.__module__ = __name__
         globals()[name] = arrays
@@ -180,5 +215,5 @@ def constants(slots: dict) -> dict[str, int | float]:
         own = filled.sizes
         named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in own.items()}
         named[f"{slot}_AT"] = start
-        start += -(-own["ROOM"] // LINE) * LINE
+        start += -(-own.get("ROOM", 0) // LINE) * LINE
     return {"KEPT": 0, **named, "SCRATCH": start}
