@@ -146,7 +146,8 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
             if names.setdefault(name, value) is not value:
                 raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
-    vars(assembly).update(names, Arrays=arrays_type(slots), sizes=lambda field: constants(field.slots))
+    functions = {name: value for name, value in names.items() if isinstance(value, FunctionType)}
+    vars(assembly).update(names, Arrays=arrays_type(slots), functions=functions, sizes=constants)
     return assembly
 
 
@@ -184,7 +185,10 @@ def renamed(function: FunctionType, name: str, assembly: ModuleType, new: dict[s
     code = function.__code__
     code = code.replace(co_names=tuple(new.get(n, n) for n in code.co_names))
     other = FunctionType(code, vars(assembly), name, function.__defaults__)
-    other.__module__, other.__doc__ = assembly.__name__, function.__doc__
+    other.__module__, other.__doc__ = (
+        function.__module__,
+        function.__doc__,
+    )  # which another process can import
     return other
 
 
@@ -207,11 +211,11 @@ def arrays_type(slots: dict[str, ModuleType]) -> type:
     return globals()[name]
 
 
-def constants(slots: dict) -> dict[str, int | float]:
+def constants(field) -> dict[str, int | float]:
     """The constants of a field's namespace by name: those of each slot (engine/fields/assembled.py) with its
     prefix, and AT, where its ROOM numbers of scratch begin, on a cache line."""
     named, start = {}, 0
-    for slot, filled in slots.items():
+    for slot, filled in field.slots.items():
         own = filled.sizes
         named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in own.items()}
         named[f"{slot}_AT"] = start

@@ -66,8 +66,8 @@ def ask(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
 
-    def run(*ranks: int, tinted: bool = False) -> list[str]:
-        script = SCRIPT.format(folder=str(tmp_path), tinted=tinted)
+    def run(*ranks: int, tinted: bool = False, script: str = SCRIPT) -> list[str]:
+        script = script.format(folder=str(tmp_path), tinted=tinted)
         command = [sys.executable, "-c", script, *map(str, ranks)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -87,6 +87,50 @@ def test_a_second_process_compiles_nothing_of_a_field_with_tints(ask):
     """Its arrays are of a type made while running, which is to be found again by its name."""
     assert ask(8, tinted=True) == ["8.0 0.1", "1"]
     assert ask(8, tinted=True) == ["8.0 0.1", "0"]
+
+
+PARTS = """
+import numpy as np, sys
+from types import SimpleNamespace
+from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.decoders import density_sum, rgb
+from fusedrf_cli.engine.kernels.assembled import assemble
+from fusedrf_cli.engine.kernels.loops import Answers, Points
+from fusedrf_cli.engine.kernels.specialise import Loops
+from fusedrf_cli.engine.spaces import bounded
+sys.path.insert(0, {folder!r})
+import flat
+told, bodies = [], assemble(flat, flat, density_sum, rgb)
+sizes = {{"density": flat.sizes(), "colour": flat.sizes(), "sigma": density_sum.sizes(), "rgb": rgb.sizes(3)}}
+sizes = bodies.sizes(SimpleNamespace(slots={{name: SimpleNamespace(sizes=s) for name, s in sizes.items()}}))
+field = bodies.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
+grid = kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), np.zeros(3), np.ones(3), np.ones(3))
+with kernels.telling_of_compilation(lambda: told.append(1)):
+    found, asked = Answers(np.zeros(1), np.zeros((1, 3))), Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
+    Loops(bodies, sizes, bounded).each("query_point", field, grid, asked, 1, found)
+print(found.sigma[0], round(found.rgb[0, 0], 6))
+print(len(told))
+"""
+FLAT = """
+def sizes():
+    return {"WIDTH": 3}
+def forward(field, unit, scratch, out, base):
+    out[base] = 0.0
+    out[base + 1], out[base + 2] = 0.0, 0.0
+def backward(field, unit, d, base, scratch, grad):
+    pass
+def summed(field, unit, scratch):
+    return field.params[1]
+def summed_backward(field, unit, d, base, scratch, grad):
+    pass
+"""
+
+
+def test_a_second_process_compiles_nothing_of_an_assembled_field(ask):
+    """Its module is made while running: what is kept is found by the modules of its parts."""
+    (ask.folder / "flat.py").write_text(FLAT)
+    assert ask(script=PARTS) == ["21.0 0.5", "1"]
+    assert ask(script=PARTS) == ["21.0 0.5", "0"]
 
 
 def test_a_changed_file_of_a_plug_in_is_compiled_anew(ask):
