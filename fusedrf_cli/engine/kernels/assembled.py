@@ -185,10 +185,8 @@ def renamed(function: FunctionType, name: str, assembly: ModuleType, new: dict[s
     code = function.__code__
     code = code.replace(co_names=tuple(new.get(n, n) for n in code.co_names))
     other = FunctionType(code, vars(assembly), name, function.__defaults__)
-    other.__module__, other.__doc__ = (
-        function.__module__,
-        function.__doc__,
-    )  # which another process can import
+    # code that is kept is found in another process by a module that can be imported
+    other.__module__, other.__doc__ = function.__module__, function.__doc__
     return other
 
 
