@@ -103,11 +103,6 @@ class Kind:
         """Its stand for a scene that it suits."""
         return Student(self, scene, request)
 
-    def joined(self, scene: ComposedField) -> StoredField | None:
-        """A field in a scene's frame that shows what the scene does, with the very numbers of its sources, in
-        far less time than asking each of them; None where the kind has no such field."""
-        return None
-
     def taken_over(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
     ) -> StoredField | None:

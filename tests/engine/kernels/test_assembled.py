@@ -10,7 +10,7 @@ import torch
 from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
 from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.kernels import loops, parts, specialise
+from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
 from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
@@ -140,7 +140,7 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     bodies = vars(field.bodies)
     own = {name for name in {*bodies, *field.bodies.sizes(field)} if not name.startswith("__")}
     hooks, settings = {template.__name__ for template in TEMPLATES}, {"LEARN_FROM", "SHADING_COST"}
-    for module, allowed in ((loops, hooks | settings), (space, settings), (parts, set())):
+    for module, allowed in ((loops, hooks | settings), (space, settings), (parts, set()), (instances, set())):
         others = {name for name in own & set(vars(module)) if bodies.get(name) is not vars(module)[name]}
         assert others <= allowed
 
