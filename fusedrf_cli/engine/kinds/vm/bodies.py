@@ -22,6 +22,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import literally
 
 from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, RUN, WIDTH
 from fusedrf_cli.engine.kernels.parts import (
@@ -30,14 +31,17 @@ from fusedrf_cli.engine.kernels.parts import (
     accumulate,
     add_scaled,
     along,
+    bilinear,
     cell_of,
     exit_distance,
+    linear,
     scatter,
     sh_basis,
     sigmoid,
     softplus,
+    store_8,
+    texel,
 )  # fmt: skip
-from fusedrf_cli.engine.kernels.planes import mode_backward, mode_forward, mode_sum
 from fusedrf_cli.engine.kernels.prefetch import prefetch, prefetch_plane
 
 NO_BLOCK = 255  # in the ownership grids: nobody is asked here
@@ -81,6 +85,107 @@ def sizes(field) -> dict[str, int]:
     }  # fmt: skip
 
 
+# -- one mode of a tensor ------------------------------------------------------------------------------------
+
+
+def mode_dot(params, plane, line, na, nb, nc, a, b, c):
+    """sum_r P_r(a, b) L_r(c): bilinear plane times linear line, summed over ranks."""
+    rank = DENSITY_RANK
+    ia, ta = texel(params, a, na)
+    ib, tb = texel(params, b, nb)
+    ic, tc = texel(params, c, nc)
+    w11 = ta * tb
+    w10 = ta - w11
+    w01 = tb - w11
+    w00 = params.dtype.type(1) - ta - w01
+    o00 = np.uint64(plane + (ia * nb + ib) * rank)
+    o01 = o00 + np.uint64(rank)
+    o10 = o00 + np.uint64(nb * rank)
+    o11 = o10 + np.uint64(rank)
+    l0 = np.uint64(line + ic * rank)
+    l1 = l0 + np.uint64(rank)
+    total = params.dtype.type(0)
+    for r in range(np.uint64(rank)):
+        p = w00 * params[o00 + r] + w01 * params[o01 + r] + w10 * params[o10 + r] + w11 * params[o11 + r]
+        total += p * (params[l0 + r] + tc * (params[l1 + r] - params[l0 + r]))
+    return total
+
+
+def mode_products(params, plane, line, na, nb, nc, a, b, c, out, base):
+    """P_r(a, b) L_r(c) for every rank, into out[base:]."""
+    rank = COLOUR_RANK
+    ia, ta = texel(params, a, na)
+    ib, tb = texel(params, b, nb)
+    ic, tc = texel(params, c, nc)
+    w11 = ta * tb
+    w10 = ta - w11
+    w01 = tb - w11
+    w00 = params.dtype.type(1) - ta - w01
+    o00 = np.uint64(plane + (ia * nb + ib) * rank)
+    o01 = o00 + np.uint64(rank)
+    o10 = o00 + np.uint64(nb * rank)
+    o11 = o10 + np.uint64(rank)
+    l0 = np.uint64(line + ic * rank)
+    l1 = l0 + np.uint64(rank)
+    start = np.uint64(base)
+    for r in range(np.uint64(rank)):
+        p = w00 * params[o00 + r] + w01 * params[o01 + r] + w10 * params[o10 + r] + w11 * params[o11 + r]
+        out[start + r] = p * (params[l0 + r] + tc * (params[l1 + r] - params[l0 + r]))
+
+
+def mode_scatter(rank, params, grads, plane, line, na, nb, nc, a, b, c, base, stride, scratch):
+    """Adjoint of `mode_products`: adds into grads what scratch[base + r * stride] sends to plane and line."""
+    literally(rank)
+    literally(stride)
+    ia, ta = texel(params, a, na)
+    ib, tb = texel(params, b, nb)
+    ic, tc = texel(params, c, nc)
+    w11 = ta * tb
+    w10 = ta - w11
+    w01 = tb - w11
+    w00 = params.dtype.type(1) - ta - w01
+    o00 = np.uint64(plane + (ia * nb + ib) * rank)
+    o01 = o00 + np.uint64(rank)
+    o10 = o00 + np.uint64(nb * rank)
+    o11 = o10 + np.uint64(rank)
+    l0 = np.uint64(line + ic * rank)
+    l1 = l0 + np.uint64(rank)
+    start = np.uint64(base)
+    jump = np.uint64(stride)
+    tile_at = np.uint64(TILE)
+    half = np.uint64(TILE + rank)
+    for tile in range(np.uint64(rank // 8)):
+        r = tile * np.uint64(8)
+        d0, d1 = scratch[start + r * jump], scratch[start + (r + np.uint64(1)) * jump]
+        d2, d3 = scratch[start + (r + np.uint64(2)) * jump], scratch[start + (r + np.uint64(3)) * jump]
+        d4, d5 = scratch[start + (r + np.uint64(4)) * jump], scratch[start + (r + np.uint64(5)) * jump]
+        d6, d7 = scratch[start + (r + np.uint64(6)) * jump], scratch[start + (r + np.uint64(7)) * jump]
+        e0 = d0 * linear(params, l0, l1, tc, r)
+        e1 = d1 * linear(params, l0, l1, tc, r + np.uint64(1))
+        e2 = d2 * linear(params, l0, l1, tc, r + np.uint64(2))
+        e3 = d3 * linear(params, l0, l1, tc, r + np.uint64(3))
+        e4 = d4 * linear(params, l0, l1, tc, r + np.uint64(4))
+        e5 = d5 * linear(params, l0, l1, tc, r + np.uint64(5))
+        e6 = d6 * linear(params, l0, l1, tc, r + np.uint64(6))
+        e7 = d7 * linear(params, l0, l1, tc, r + np.uint64(7))
+        store_8(scratch, tile_at + r, e0, e1, e2, e3, e4, e5, e6, e7)
+        e0 = d0 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r)
+        e1 = d1 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(1))
+        e2 = d2 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(2))
+        e3 = d3 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(3))
+        e4 = d4 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(4))
+        e5 = d5 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(5))
+        e6 = d6 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(6))
+        e7 = d7 * bilinear(params, o00, o01, o10, o11, w00, w01, w10, w11, r + np.uint64(7))
+        store_8(scratch, half + r, e0, e1, e2, e3, e4, e5, e6, e7)
+    scatter(rank, grads, o00, w00, scratch, tile_at)
+    scatter(rank, grads, o01, w01, scratch, tile_at)
+    scatter(rank, grads, o10, w10, scratch, tile_at)
+    scatter(rank, grads, o11, w11, scratch, tile_at)
+    scatter(rank, grads, l0, params.dtype.type(1) - tc, scratch, half)
+    scatter(rank, grads, l1, tc, scratch, half)
+
+
 # -- a tensor -----------------------------------------------------------------------------------------------
 
 
@@ -116,42 +221,44 @@ def unit_point(field, b, p):
 
 def density_feature(field, t, u, v, w):
     """Pre-activation density of tensor t at a unit point (TensoRF, eq. 6)."""
-    x, y, z = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
-    off, p = field.layout[t], field.params
+    nx, ny, nz = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
+    off = field.layout[t]
     return (
-        mode_sum(DENSITY_RANK, p, off[0], off[3], (x, y, z), (u, v, w))
-        + mode_sum(DENSITY_RANK, p, off[1], off[4], (x, z, y), (u, w, v))
-        + mode_sum(DENSITY_RANK, p, off[2], off[5], (y, z, x), (v, w, u))
+        mode_dot(field.params, off[0], off[3], nx, ny, nz, u, v, w)
+        + mode_dot(field.params, off[1], off[4], nx, nz, ny, u, w, v)
+        + mode_dot(field.params, off[2], off[5], ny, nz, nx, v, w, u)
     )
 
 
 def scatter_density(field, grads, t, u, v, w, scratch):
     """Adjoint of `density_feature`; scratch[ONE] is the incoming gradient."""
-    x, y, z = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
-    off, p, d = field.layout[t], field.params, scratch
-    mode_backward(DENSITY_RANK, p, off[0], off[3], (x, y, z), (u, v, w), d, ONE, 0, scratch, TILE, grads)
-    mode_backward(DENSITY_RANK, p, off[1], off[4], (x, z, y), (u, w, v), d, ONE, 0, scratch, TILE, grads)
-    mode_backward(DENSITY_RANK, p, off[2], off[5], (y, z, x), (v, w, u), d, ONE, 0, scratch, TILE, grads)
+    nx, ny, nz = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
+    off = field.layout[t]
+    p = field.params
+    mode_scatter(DENSITY_RANK, p, grads, off[0], off[3], nx, ny, nz, u, v, w, ONE, 0, scratch)
+    mode_scatter(DENSITY_RANK, p, grads, off[1], off[4], nx, nz, ny, u, w, v, ONE, 0, scratch)
+    mode_scatter(DENSITY_RANK, p, grads, off[2], off[5], ny, nz, nx, v, w, u, ONE, 0, scratch)
 
 
 def colour_features(field, t, u, v, w, out, base):
     """The 3 * rank colour products of tensor t at a unit point, into out[base:]."""
-    x, y, z = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
-    off, p = field.layout[t], field.params
-    mode_forward(COLOUR_RANK, p, off[6], off[9], (x, y, z), (u, v, w), out, base)
-    mode_forward(COLOUR_RANK, p, off[7], off[10], (x, z, y), (u, w, v), out, base + COLOUR_RANK)
-    mode_forward(COLOUR_RANK, p, off[8], off[11], (y, z, x), (v, w, u), out, base + 2 * COLOUR_RANK)
+    rank = COLOUR_RANK
+    nx, ny, nz = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
+    off = field.layout[t]
+    mode_products(field.params, off[6], off[9], nx, ny, nz, u, v, w, out, base)
+    mode_products(field.params, off[7], off[10], nx, nz, ny, u, w, v, out, base + rank)
+    mode_products(field.params, off[8], off[11], ny, nz, nx, v, w, u, out, base + 2 * rank)
 
 
 def scatter_colour(field, grads, t, u, v, w, scratch):
     """Adjoint of `colour_features`; scratch[D_FEATURES:] is the incoming gradient."""
-    x, y, z = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
-    off, p, d, base = field.layout[t], field.params, scratch, D_FEATURES
-    mode_backward(COLOUR_RANK, p, off[6], off[9], (x, y, z), (u, v, w), d, base, 1, scratch, TILE, grads)
-    base += COLOUR_RANK
-    mode_backward(COLOUR_RANK, p, off[7], off[10], (x, z, y), (u, w, v), d, base, 1, scratch, TILE, grads)
-    base += COLOUR_RANK
-    mode_backward(COLOUR_RANK, p, off[8], off[11], (y, z, x), (v, w, u), d, base, 1, scratch, TILE, grads)
+    rank = COLOUR_RANK
+    nx, ny, nz = field.resolution[t, 0], field.resolution[t, 1], field.resolution[t, 2]
+    off = field.layout[t]
+    p = field.params
+    mode_scatter(rank, p, grads, off[6], off[9], nx, ny, nz, u, v, w, D_FEATURES, 1, scratch)
+    mode_scatter(rank, p, grads, off[7], off[10], nx, nz, ny, u, w, v, D_FEATURES + rank, 1, scratch)
+    mode_scatter(rank, p, grads, off[8], off[11], ny, nz, nx, v, w, u, D_FEATURES + 2 * rank, 1, scratch)
 
 
 # -- a tensor's hashed detail --------------------------------------------------------------------------------
