@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 
 from formats.bundle import OpenBundle
-from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
@@ -31,6 +30,7 @@ from fusedrf_cli.bridge.scene import (
     write_field,
 )
 from fusedrf_cli.bridge.sizes import BundleSizes, graph_bytes
+from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Detail
 from fusedrf_cli.engine.fields.base import holds_matter

@@ -52,9 +52,8 @@ class Scene:
 
     def background(self) -> Placed:
         """The background in the composed scene's frame, its numbers on the CPU."""
-        found = background_of(self.loaded).placed
-        at = [p.name for p in self.loaded.placed].index(found.name)
-        return Placed(found.name, opened(found.field).to("cpu"), self.composed.placed[at].object_to_world)
+        found = background_of(self.loaded).placed.moved(self.composed.origin)
+        return replace(found, field=opened(found.field).to("cpu"))
 
 
 @dataclass(frozen=True)
