@@ -57,8 +57,16 @@ def as_trained(field):
     narrower one, whose products round by their row.
     """
     if isinstance(field, VMMLPField):
-        features, generator = 3 * field.shape.coefficients, torch.Generator().manual_seed(1)
-        return VMMLPField(field.factors, untrained(features, WIDTH, generator))
+        wide = VMMLPField(
+            replace(field.shape, width=WIDTH), field.box, field.resolution, field.scale, field.shift,
+            occupancy=field.occupancy,
+        )  # fmt: skip
+        factors = field.params[: int(field.starts[12]) + field.basis.numel()]
+        wide.params[: len(factors)] = factors
+        generator = torch.Generator().manual_seed(1)
+        for name, weight in untrained(field.shape.features, WIDTH, generator).items():
+            wide.weights[name].copy_(weight)
+        return wide
     return field
 
 

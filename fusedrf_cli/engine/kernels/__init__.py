@@ -50,7 +50,8 @@ def kernel_cache() -> Path:
 def inlined() -> list[Path]:
     """Every file of the engine whose functions may be inlined into a loop."""
     engine = Path(__file__).parent.parent
-    return sorted(p for at in ("kernels/*.py", "spaces/*.py", "kinds/*/bodies.py") for p in engine.glob(at))
+    patterns = "kernels/*.py", "spaces/*.py", "encodings/*.py", "decoders/*.py", "kinds/*/bodies.py"
+    return sorted(path for pattern in patterns for path in engine.glob(pattern))
 
 
 def temporary_cache(bodies: str) -> Path:
