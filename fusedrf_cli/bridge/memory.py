@@ -5,13 +5,13 @@ here has to grow with it (tests/bridge/test_memory.py holds each against the pea
 """
 
 import contextlib
-import os
 import resource
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -80,11 +80,8 @@ class Memory:
 
 
 def resident() -> int:
-    """What this process holds now; where the system does not say, the most it ever held."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return peak()
+    """What this process holds now."""
+    return psutil.Process().memory_info().rss
 
 
 def peak() -> int:
@@ -97,11 +94,7 @@ def peak() -> int:
 
 def available() -> int:
     """What can be had without swapping, by the system's own estimate, within a control group's limit."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        found = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    found = psutil.virtual_memory().available
     for folder, most, used in (
         ("/sys/fs/cgroup", "memory.max", "memory.current"),
         ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),

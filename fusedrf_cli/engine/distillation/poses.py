@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -121,12 +122,8 @@ def step_of(slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray) -> np.ndar
 
 
 def turns(angles: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) rotations about axes (n, 3) whose lengths are the angles, in radians (Rodrigues)."""
-    angle = np.maximum(np.linalg.norm(angles, axis=1), 1e-300)[:, None, None]
-    x, y, z = (angles / angle[..., 0]).T
-    none = np.zeros_like(x)
-    across = np.array([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
-    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+    """(n, 3, 3) rotations about axes (n, 3) whose lengths are the angles, in radians."""
+    return Rotation.from_rotvec(angles).as_matrix()
 
 
 def changed_each(poses: Poses, change: np.ndarray) -> Poses:
@@ -146,5 +143,4 @@ def changed(poses: Poses, change: np.ndarray) -> Poses:
 
 def angles_between(one: Poses, other: Poses) -> np.ndarray:
     """(n,) by how many radians cameras are turned against each other."""
-    cosine = (np.einsum("nij,nij->n", one.rotation, other.rotation) - 1) / 2
-    return np.arccos(np.clip(cosine, -1, 1))
+    return (Rotation.from_matrix(one.rotation).inv() * Rotation.from_matrix(other.rotation)).magnitude()
