@@ -19,7 +19,7 @@ import torch
 from fusedrf_cli.engine.kernels.parts import hit_box
 
 PIECES = 6  # a straight line meets at most five of the seven regions, and a sixth by rounding at an edge
-STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (DESIGN, Kernels) in 1.5 times the time
+STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (decision 001) in 1.5 times the time
 FAR = 1e3  # n at which rays end
 ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
