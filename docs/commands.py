@@ -1,13 +1,12 @@
-"""docs/commands.md, out of what `--help` and `fusedrf kinds` say: `make docs` writes it, tests/cli/test_help.py
-holds it equal."""
+"""docs/commands.md, out of what `--help` and `fusedrf kinds` say: `make docs` writes it, and
+tests/cli/test_help.py holds it equal."""
 
 from pathlib import Path
 
 import click
 
-from fusedrf_cli.bridge.listing import list_kinds
 from fusedrf_cli.main import COMMANDS, cli
-from fusedrf_cli.progress import NullProgress
+from fusedrf_cli.verbs import kinds
 
 WIDTH = 100
 """Columns of the help."""
@@ -21,7 +20,7 @@ def page() -> str:
         command = cli.get_command(root, name)
         context = click.Context(command, root, info_name=name, terminal_width=WIDTH)
         parts.append((f"fusedrf {name}", command.get_help(context)))
-    own = [kind for kind in list_kinds(NullProgress())["kinds"] if kind["package"] == "fusedrf"]
+    own = [kind for kind in kinds()["kinds"] if kind["package"] == "fusedrf"]
     return "\n".join(
         [
             "# Commands and kinds of field\n\nWhat `--help` says; `make docs` writes this page.\n",

@@ -59,7 +59,8 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
         parts = [part for part in fused.kind.parts(fused.field) if part.belongs({request.name})]
         check(request, fused, parts)
         box = placed_box(enclosing([part.box for part in parts]), fused.origin)
-        matrix = request.matrix if request.absolute else about(request.matrix, (box[:3] + box[3:]) / 2)
+        matrix = request.object_to_world
+        matrix = matrix if request.absolute else about(matrix, (box[:3] + box[3:]) / 2)
         change = Change(event, request.new_name or request.name, event == "duplicated", matrix)
         progress.phase(event, None)
         origin = placement(fused.origin)

@@ -24,27 +24,21 @@ def convert(request: ConvertRequest, progress) -> dict:
         name: getattr(request, name) for name in FuseRequest.__dataclass_fields__ if hasattr(request, name)
     }
     fused = fuse(
-        FuseRequest(
-            scene=request.field,
-            rgb=True,
-            from_scratch=True,
-            keep_sources=False,
-            allow_outside=False,
-            resume=False,
-            sources=None,
-            **words,
-        ),  # fmt: skip
+        FuseRequest(scene=request.field, from_scratch=True, **words),
         progress,
         load=as_it_is,
     )
     progress.phase("comparing", None)
     compared = evaluate(
         EvaluateRequest(
-            bundle=request.output, against=request.field, split="test", size=None, memory=request.memory,
-            allow_outside=False, device=request.device, threads=request.threads,
+            request.output,
+            request.field,
+            memory=request.memory,
+            device=request.device,
+            threads=request.threads,
         ),
         progress,
-    )  # fmt: skip
+    )
     return {
         "output": request.output,
         "bytes": fused["bytes"],

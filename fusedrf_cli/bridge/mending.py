@@ -179,11 +179,9 @@ def wanted_of(request: MendingRequest) -> TrainRequest:
     """A training as `train` without options would do it."""
     seconds = SHARE * request.time_budget if request.time_budget else SECONDS
     return TrainRequest(
-        source=request.refit, output=request.output, overwrite=request.overwrite, kind=registry.DEFAULT,
-        quality=None, ranks=None, sh_degree=None, precision="float16", max_size=None, target_psnr=None,
-        holdout=None, views=0, size=0, aabb=None, unbounded=None, centre=None, radius=None, downscale=None,
-        masks="ignore", refine_poses=False, memory=request.memory, resume=False, time_budget=seconds,
-        seed=request.seed, device=request.device, threads=request.threads,
+        request.refit, request.output, overwrite=request.overwrite, precision="float16",
+        memory=request.memory, time_budget=seconds, seed=request.seed, device=request.device,
+        threads=request.threads,
     )  # fmt: skip
 
 

@@ -2,15 +2,14 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ReplaceRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("replace")
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("source", metavar="WITH", type=options.INPUT)
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The fused field to write, OUT.rfpack.")
 @options.keep_history
 @options.time_budget
 @options.rgb
@@ -19,7 +18,7 @@ from fusedrf_cli.requests import ReplaceRequest
 @options.allow_outside
 @options.seeded
 @options.reporting
-def command(fused, name, source, output, progress, **words):
+def command(**words):
     """Put another object in the place of one.
 
     WITH stands as NAME stood, by the same move, turn and scale, and goes by its name.
@@ -28,9 +27,4 @@ def command(fused, name, source, output, progress, **words):
     Example:
       fusedrf replace fused.rfpack chair lamp.rfpack -o other.rfpack
     """
-    from fusedrf_cli import bridge
-
-    request = ReplaceRequest(
-        fused=fused, name=name, source=source, output=output, names=(name,), refit=None, fill=False, **words
-    )
-    return bridge.replace(request, progress)
+    return verbs.replace(**words)

@@ -239,7 +239,7 @@ def bricks(resolution: tuple[int, int, int]) -> list[int]:
 def bricks_ladder() -> Ladder:
     """From few bricks to more, since many take minutes."""
     for rgb, size, degree in product((False, True), LADDER_BYTES, (1, 0)):
-        yield Rung("int8", sh_degree=degree, bytes=size, rgb=rgb)
+        yield Rung("int8", sh_degree=degree, max_size=size, rgb=rgb)
 
 
 def levels(field: SparseField) -> list[dict]:
