@@ -1,6 +1,5 @@
-"""Scenes as functions of torch: open a bundle, ask it, render it, learn its numbers, a camera's pose or where an
-object stands, and save it.
-"""
+"""Scenes as functions of torch: open a bundle, ask it, render it, learn its numbers, a camera's pose or where
+an object stands, and save it."""
 
 from pathlib import Path
 
