@@ -302,7 +302,7 @@ class ArrangeRequest(Editing):
 
     @property
     def node_name(self) -> str:
-        return self.new_name or self.name
+        return self.name if self.new_name is None else self.new_name
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from fusedrf_cli.bridge.scene import (
 )
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField, largest
-from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
+from fusedrf_cli.engine.distillation.distill import DistillRun
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge, RegionJudge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
@@ -41,13 +41,13 @@ from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import Edited
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import DistillSettings
+from fusedrf_cli.engine.kinds.student import DistilConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import AddRequest, ArrangeRequest, EditRequest, Learning
 
-REGION_SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+REGION_SETTINGS = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
 LOCAL_VIEW = 100
 """Pixels a side of the views of an edit that changes nothing outside of its region: what it put in is shown
 as it was made, and asking the scene as composed takes most of such an edit's time."""
@@ -121,8 +121,8 @@ class Teacher:
         seconds = self.budget.part(max(1, self.tries))
         self.tries -= 1
         settings = replace(REGION_SETTINGS, seed=self.seed, time_budget=seconds)
-        recipe = DEFAULT_RECIPE if fresh else replace(DEFAULT_RECIPE, coarse=lambda student: False)
-        run = DistillRun(teacher, student.to(self.place), RaySampler(boxes), settings, self.rgb, recipe)
+        settings = settings if fresh else replace(settings, coarse_from=None)
+        run = DistillRun(teacher, student.to(self.place), RaySampler(boxes), settings, self.rgb)
         learnt, did = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
         self.budget.spent += run.learnt_seconds
         psnr = {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb}

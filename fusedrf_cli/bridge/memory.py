@@ -15,12 +15,12 @@ import psutil
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.finish import RAYS
+from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
-from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
+from fusedrf_cli.engine.kinds.student import DistilConfig, Plan, Student
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
 from fusedrf_cli.errors import ResourceProblem
 from fusedrf_cli.report import readable_size
@@ -169,7 +169,7 @@ def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str
     return {**learns, "its occupancy": float(grid) * PER_TRIED_CELL}
 
 
-def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
+def teaching(settings: DistilConfig, points: int) -> dict[str, float]:
     """What is asked of the teachers."""
     return {"the teachers' answers": settings.rays * PER_RAY + points * PER_POINT}
 
@@ -186,9 +186,9 @@ def stages(
     copies of the largest source, and bytes by what they are for."""
     needs = student.needs()
     numbers, learnt, grids = needs.numbers, needs.numbers - needs.settled, ownership(scene.aabb)
-    settings = student.lesson_of(learnt, request.time_budget) or DistillSettings()
+    settings = student.lesson_of(learnt, request.time_budget) or DistilConfig()
     if student.lesson is None:
-        taught = lesson(RAYS)
+        taught = lesson(RayLesson.config.rays)
     else:
         points = needs.points
         if points is None:
@@ -216,7 +216,7 @@ def stages(
 def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
     """Rays that a made student learns from, while they are asked of sources that are read one by one."""
     made = result(student.needs().numbers, measured=False)
-    return made | lesson(RAYS) | ownership(scene.aabb) | picture(256, 256, composed=True)
+    return made | lesson(RayLesson.config.rays) | ownership(scene.aabb) | picture(256, 256, composed=True)
 
 
 def learning_is_asked(student: Student, request: FuseRequest) -> bool:
@@ -226,4 +226,4 @@ def learning_is_asked(student: Student, request: FuseRequest) -> bool:
 
 def judged() -> dict[str, float]:
     """Looking at a scene to measure; some views are filled by one of its objects."""
-    return picture(DistillSettings.view_size, DistillSettings.view_size, composed=True)
+    return picture(DistilConfig.view_size, DistilConfig.view_size, composed=True)

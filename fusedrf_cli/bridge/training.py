@@ -33,7 +33,8 @@ from fusedrf_cli.bridge.running import (
 )
 from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
@@ -64,10 +65,10 @@ LARGEST_PLACE = 95_000_000
 fine as planes are, would take a hundred times those of the planes."""
 FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
-    "draft": FitSettings(longest=128, steps=1500, samples=1 << 15),
-    "normal": FitSettings(longest=224, steps=4000, samples=1 << 15),
-    "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
-    "best": FitSettings(longest=256, steps=24000, samples=1 << 15),
+    "draft": TrainConfig(longest=128, steps=1500, samples=1 << 15),
+    "normal": TrainConfig(longest=224, steps=4000, samples=1 << 15),
+    "high": TrainConfig(longest=256, steps=9000, samples=1 << 15),
+    "best": TrainConfig(longest=256, steps=24000, samples=1 << 15),
 }
 PATIENT = {"best": 200.0, "high": 90.0, "normal": 0.0}
 """Seconds of a time budget from which an object is learnt so where no quality is asked for. Of places the
@@ -237,7 +238,7 @@ def paced(seconds: float | None, place: str) -> float | None:
     return seconds and seconds * (GPU_PACE if place == "cuda" else 1)
 
 
-def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> FitSettings:
+def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> TrainConfig:
     """The settings of the asked quality, or, of an object, of the one that the time budget is enough for; the
     best of an object has texels as fine as the photos' pixels ask for, and fewer but larger steps."""
     name = request.quality or "normal"
@@ -257,7 +258,7 @@ def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: s
     return with_larger_steps(replace(settings, longest=longest))
 
 
-def with_larger_steps(settings: FitSettings) -> FitSettings:
+def with_larger_steps(settings: TrainConfig) -> TrainConfig:
     """MORE_SAMPLES in a step, in as many fewer steps."""
     steps, samples = settings.steps // MORE_SAMPLES, settings.samples * MORE_SAMPLES
     return replace(settings, steps=steps, samples=samples)
@@ -265,7 +266,7 @@ def with_larger_steps(settings: FitSettings) -> FitSettings:
 
 def fit_settings(
     request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str, besides: int = 0
-) -> FitSettings:
+) -> TrainConfig:
     """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
     bytes in its bundle."""
     settings = replace(
@@ -295,7 +296,7 @@ def fit_settings(
     return replace(settings, longest=longest)
 
 
-def of_place(settings: FitSettings, kind: Kind, box: np.ndarray, room: int | None) -> FitSettings:
+def of_place(settings: TrainConfig, kind: Kind, box: np.ndarray, room: int | None) -> TrainConfig:
     """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
     learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
     longer they learn."""
@@ -328,7 +329,7 @@ def loading(capture: Capture) -> dict[str, float]:
     return decoding(pixels, masked, 0 if capture.kind == "mesh" else loading_bytes(capture.train))
 
 
-def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:
+def fit_memory(capture: Capture, plan: Plan, settings: TrainConfig) -> dict[str, float]:
     """What a fit to a capture's photos needs."""
     pixels = max(view.width * view.height for view in capture.train)
     cameras = len({camera_of(v).intrinsics for v in capture.train})
@@ -364,7 +365,7 @@ def warn_of_numbers(figures: dict[str, int], progress) -> None:
 
 
 def fitting_longest(
-    kind: Kind, box: np.ndarray, settings: FitSettings, max_size: int | None, precision: str
+    kind: Kind, box: np.ndarray, settings: TrainConfig, max_size: int | None, precision: str
 ) -> int:
     """Texels on the longest axis, fewer than the settings' where the file would grow past max_size
     (bytes).

@@ -16,6 +16,7 @@ from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.main import COMMANDS, cli
 
 VERBS = verbs.__all__
+OF_FILES = {"compose", "history", "info", "kinds", "undo", "validate"}
 REPORTING = {"as_json", "quiet", "verbose"}
 PLACED = {"translate", "rotate", "scale", "matrix", "name", "crop", "opacity", "tint", "hidden"}
 """What belongs to an input of `compose`."""
@@ -39,7 +40,9 @@ def test_a_command_and_its_verb_take_the_same(name):
     assert taken == asked(name).keys()
 
 
-@pytest.mark.parametrize("name", sorted(set(VERBS) - {"compose", "history", "info", "kinds", "undo", "validate"}))
+@pytest.mark.parametrize(
+    "name", sorted(set(VERBS) - {"compose", "history", "info", "kinds", "undo", "validate"})
+)
 def test_a_command_line_and_a_verb_ask_the_bridge_for_the_same(run, bridge, folder, name):
     """By defaults, with what has none."""
     (folder / "photos").mkdir()

@@ -10,10 +10,10 @@ import pytest
 
 from formats.bundle import read_bundle
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
+from fusedrf_cli.engine.kinds.student import Student
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.requests import FuseRequest
 from fusedrf_cli.verbs import checked
@@ -30,7 +30,7 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 def short(tiny):  # noqa: F811
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        patch.setattr(distill, "POINTS_PER_STEP", 1 << 11)  # a network takes its time
+        patch.setattr(Student, "lesson", TinySettings(points_per_step=1 << 11))  # a network takes its time
         yield
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.exposure import FEW, fitted, gauged, identity, matched, measured, undone
-from fusedrf_cli.engine.distillation.fit import FINE_SAMPLES, FitRun
+from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.rendering.cameras import look_at, orbit
@@ -178,7 +178,7 @@ def spread(gains: np.ndarray) -> float:
 
 def run(cameras, photos, exposure: bool) -> FitRun:
     """A fit in a box, with as many samples at full resolution as a place, which alone has exposure, takes."""
-    settings = replace(LONG, samples=LONG.samples // FINE_SAMPLES, exposure=exposure)
+    settings = replace(LONG, samples=LONG.samples // LONG.fine_samples, exposure=exposure)
     fitting = FitRun.start(cameras, photos, BOX, settings)
     fitting.finish()
     return fitting
