@@ -12,7 +12,7 @@ from fusedrf_cli.bridge import training
 from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.refined import with_poses
-from fusedrf_cli.bridge.training import fit_settings, quality_of, texels_of_place
+from fusedrf_cli.bridge.training import PRESETS, fit_settings, quality_of, texels_of_place
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.fields.occupancy import ORDINARY, placed_box
@@ -146,9 +146,9 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     assert longest(300, None, 100) == 512 and longest(300, "normal", 100) == 224
     best, plain = found(300), TrainConfig()
     assert best.samples > plain.samples and best.samples * best.steps == plain.samples * plain.steps
-    there = found(300 / training.GPU_PACE, place="cuda")  # in larger steps, and sooner
+    there = found(300 / PRESETS.gpu_pace, place="cuda")  # in larger steps, and sooner
     assert (there.longest, there.steps) == (best.longest, best.steps)
-    assert there.samples == best.samples * training.GPU_SAMPLES
+    assert there.samples == best.samples * PRESETS.gpu_samples
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():
@@ -191,10 +191,10 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
 
     plain = settings(time_budget=60.0)
     assert plain.way.hashed is None
-    assert settings(time_budget=60.0, place="cuda").way.hashed is training.HASHED
+    assert settings(time_budget=60.0, place="cuda").way.hashed is PRESETS.hashed
     for words in ({"time_budget": 600.0}, {}, {"quality": "best"}, {"max_size": 30_000_000}):
         found = settings(**words)
-        assert found.way.hashed is training.HASHED
+        assert found.way.hashed is PRESETS.hashed
         assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
         larger = "time_budget" in words or "quality" in words
         named = training.QUALITY[words.get("quality", "normal")]

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+from fusedrf_cli.engine.distillation.exposure import ExposureConfig
+from fusedrf_cli.engine.distillation.keypoints import DepthConfig
+from fusedrf_cli.engine.distillation.poses import PoseConfig
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
 
@@ -45,6 +48,12 @@ class TrainConfig:
     seed: int = 0
     device: str = "cpu"
     """Where the field is trained, "cpu" or "cuda"."""
+
+    # the parts of the method that have numbers of their own
+
+    exposures: ExposureConfig = ExposureConfig()
+    refining: PoseConfig = PoseConfig()
+    depths: DepthConfig = DepthConfig()
 
     # the optimiser
 

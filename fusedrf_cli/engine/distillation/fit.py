@@ -10,22 +10,17 @@ import torch
 
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.exposure import (
-    MEASURED_AT,
     matched,
     measured,
     rays_of_each,
     undone,
 )
 from fusedrf_cli.engine.distillation.guard import Guard
-from fusedrf_cli.engine.distillation.keypoints import DEPTH_WEIGHT, KeyPoints, Known
+from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
 from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
-    RAYS_OF_ALL,
-    RAYS_OF_ONE,
-    REFINED_AT,
-    TRIED_BY,
     Poses,
     changed,
     refined,
@@ -80,9 +75,9 @@ class FitRun:
         self.maps: np.ndarray | None = None
         """(n, 3, 3) what each picture makes of the field's colours (exposure.py); None: nothing."""
         if config.exposure:
-            self.maps = matched(self.sampled()[1], pool.poses)
-        self.exposures = list(MEASURED_AT) if config.exposure else []
-        self.refinements = list(REFINED_AT) if config.poses else []
+            self.maps = matched(self.sampled()[1], pool.poses, config.exposures)
+        self.exposures = list(config.exposures.at) if config.exposure else []
+        self.refinements = list(config.refining.at) if config.poses else []
         self.mse, self.rays = None, self.config.least_rays
         self.found_matter, self.found_nothing = False, 0
         self.held: tuple[dict[str, np.ndarray], dict] | None = None
@@ -111,7 +106,7 @@ class FitRun:
         if limits is not None:
             field = field.with_occupancy(limits)
         ignored = None if pool.ignored is None else pool.ignored.numpy()
-        shown = None if known is None else KeyPoints(cameras, known, ignored, generator)
+        shown = None if known is None else KeyPoints(cameras, known, ignored, generator, config.depths)
         return cls(field, pool, config, generator, limits, shown)
 
     def finish(
@@ -252,7 +247,9 @@ class FitRun:
         if self.exposures and share >= self.exposures[0]:
             self.exposures.pop(0)
             rays, colours = self.sampled()
-            self.maps = measured(self.field, rays, colours, self.config.near, self.maps)
+            self.maps = measured(
+                self.field, rays, colours, self.config.near, self.maps, self.config.exposures
+            )
         if self.refinements and share >= self.refinements[0]:
             self.refinements.pop(0)
             if self.found_matter:
@@ -260,20 +257,20 @@ class FitRun:
 
     def refine_poses(self, share: float) -> None:
         """Move each picture's camera to where the field shows it better."""
-        pool = self.pool
-        most = int(np.clip(RAYS_OF_ALL // len(pool.pixel), *RAYS_OF_ONE))
+        pool, how = self.pool, self.config.refining
+        most = int(np.clip(how.rays // len(pool.pixel), *how.rays_of_each))
         *rays, colours = pool.sample(most, self.generator)
-        first, last = TRIED_BY
+        first, last = how.tried_by
         pixels = max(last, first * (last / first) ** (2 * share))
         colours = colours if self.maps is None else undone(self.maps, colours)
-        change = refined(self.field, rays, colours, self.config.near, pixels * pool.pixel)
+        change = refined(self.field, rays, colours, self.config.near, pixels * pool.pixel, how)
         pool.place(changed(pool.poses, change))
 
     def sampled(self) -> tuple[list[np.ndarray], torch.Tensor]:
         """Rays and colours of each picture from which its exposure is found. They are drawn apart, so that
         looking changes nothing."""
         apart = torch.Generator().manual_seed(self.steps)
-        *rays, colours = self.pool.sample(rays_of_each(len(self.pool.pixel)), apart)
+        *rays, colours = self.pool.sample(rays_of_each(len(self.pool.pixel), self.config.exposures), apart)
         return rays, colours
 
     def refresh_occupancy(self) -> None:
@@ -362,7 +359,7 @@ class FitRun:
             config.unbounded_early_stop if config.unbounded else config.early_stop,
             min(1.0, share / config.settled) * config.distortion if config.unbounded else 0.0,
             config.light if share > config.settled else 0.0,
-            DEPTH_WEIGHT,
+            config.depths.weight,
             depths,
             exposure,
         )
