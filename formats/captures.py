@@ -1,19 +1,20 @@
-"""Captures on disk: posed photos as Blender, instant-ngp, nerfstudio, COLMAP, LLFF and Polycam lay them out.
+"""Captures on disk: posed photos as Blender, instant-ngp, nerfstudio, COLMAP and others lay them out.
 
 What a folder is follows from what it holds, in this order: `transforms_train.json` (Blender),
-`transforms.json` (instant-ngp, nerfstudio), a COLMAP model, `poses_bounds.npy` (LLFF), `keyframes` (Polycam).
+`transforms.json` (instant-ngp, nerfstudio), a COLMAP model, `poses_bounds.npy` (LLFF), `keyframes` (Polycam),
+a pose file for each photo (NSVF, ScanNet, 7-Scenes), `reconstruction.json` (OpenSfM).
 World axes and units stay as the file has them: nothing is recentred, turned or scaled.
 """
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from formats import colmap, llff, polycam
+from formats import colmap, llff, opensfm, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
@@ -22,7 +23,7 @@ from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
 from formats.masks import with_masks_beside
-from formats.matching import gone, match_photos
+from formats.matching import PHOTO_FOLDERS, gone, match_photos
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
@@ -42,6 +43,7 @@ from formats.photos import (
     pictures,
 )
 from formats.points import Points
+from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
 from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
 from formats.transforms import (
     BLENDER_FILE,
@@ -56,6 +58,9 @@ from formats.views import LEAST_VIEWS, Capture, View, hold_out
 
 LEVELS, MAX_FOLDERS = 3, 500
 """How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
+
+CAMERAS = "cams"
+"""A folder of cameras that are not read, as MVSNet has one."""
 
 __all__ = [
     "Capture",
@@ -79,7 +84,9 @@ def is_capture(path: Path | str) -> bool:
     if path.is_dir():
         return _has_poses(path) or has_pictures(path) or bool(_captures_below(path))
     try:
-        return path.name == llff.NAME or (path.suffix.lower() == ".json" and "frames" in read_document(path))
+        if path.name == llff.NAME or path.name == opensfm.NAME and opensfm.is_reconstruction(path):
+            return True
+        return (path.suffix.lower() == ".json" or is_json(path)) and "frames" in read_document(path)
     except FormatError:
         return False
 
@@ -91,6 +98,8 @@ def _has_poses(path: Path) -> bool:
         or colmap.model_folder(path) is not None
         or is_file(path / llff.NAME)
         or polycam.keyframes(path) is not None
+        or pose_files(path) is not None
+        or opensfm.reconstruction(path) is not None
     )
 
 
@@ -107,11 +116,13 @@ def _captures_below(path: Path) -> list[Path]:
 
 def poses_elsewhere(path: Path) -> str | None:
     """A sentence about poses that are not used of a folder of photos: in the folder above, in a JSON file of
-    another name, or another program's; None without any."""
+    another name, or another program's in either; None without any."""
     above = path.resolve().parent
     if _has_poses(above):
         return f"{path}: {above}, the folder above it, has poses, which are not used; give that folder"
-    for file in sorted(path.iterdir()):
+    places = [path, above] if path.name.lower() in PHOTO_FOLDERS else [path]
+    places += [at / CAMERAS for at in places]
+    for file in (file for at in places for file in sorted(at.glob("*"))):
         if not is_file(file) or is_hidden(file.name) or is_picture(file.name):
             continue
         if is_capture(file):
@@ -144,6 +155,8 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
         return _read_llff(path, downscale)
     if path.suffix.lower() != ".json" and not is_json(path):
         raise not_a_capture(path)
+    if path.name == opensfm.NAME and opensfm.is_reconstruction(path):
+        return _read_opensfm(path, path, downscale)
     if match := BLENDER_FILE.fullmatch(path.name):
         return _read_blender(path, downscale, **{"test" if match[1] == "test" else "train": path})
     return _read_transforms(path, downscale)
@@ -171,6 +184,10 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
         return _read_llff(path / llff.NAME, downscale)
     if (places := polycam.keyframes(path)) is not None:
         return _read_polycam(path, *places, downscale)
+    if (files := pose_files(path)) is not None:
+        return _read_pose_files(path, files, downscale)
+    if (file := opensfm.reconstruction(path)) is not None:
+        return _read_opensfm(path, file, downscale)
     if len(below := list(path.glob("*/transforms.json"))) == 1:
         return _read_transforms(below[0], downscale, path)
     below = _captures_below(path)
@@ -185,7 +202,7 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
         raise not_a_capture(path)
     raise NoPoses(
         f"{path}: found pictures but no camera poses (transforms.json, transforms_train.json, COLMAP's "
-        "sparse/0, LLFF's poses_bounds.npy or Polycam's keyframes); estimate them first with `fusedrf pose`"
+        "sparse/0, LLFF's poses_bounds.npy and others); estimate them first with `fusedrf pose`"
     )
 
 
@@ -224,39 +241,75 @@ def _read_transforms(path: Path, downscale: int | None, base: Path | None = None
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     model = colmap.read_model(folder)
     base = colmap.capture_folder(path) if path == folder or path.name in colmap.MODELS_IN else path
-    files = {image.name: image.name.replace("\\", "/") for image in model.images}
-    matched = match_photos(folder, base, files.values(), downscale, (*colmap.PHOTOS_IN, ""))
+    others = _other_models(path, folder)
+    try:
+        notes = (*others, *model.notes)
+        return _read_model(path, "colmap", model, base, (*colmap.PHOTOS_IN, ""), downscale, notes)
+    except MissingFile as error:
+        raise MissingFile("; ".join([str(error), *others])) from error
+
+
+def _read_model(
+    path: Path,
+    kind: str,
+    model: colmap.Model,
+    base: Path,
+    homes: Sequence[str],
+    downscale: int | None,
+    notes: Sequence[str],
+) -> Capture:
+    """A model whose photos lie in one of `homes` in the folder `base`."""
+    images = [(image.name.replace("\\", "/"), image) for image in model.images]
+    part = _read_listed(
+        model.folder, base, images, lambda image, size: (image.where, image.view), downscale, homes
+    )
+    return _capture(path, kind, part, Part(), None, model.points, tuple(notes))
+
+
+def _read_listed(
+    where: Path,
+    base: Path,
+    listed: Sequence[tuple[str, object]],
+    camera: Callable[[object, tuple[int, int]], tuple[str, View]],
+    downscale: int | None,
+    homes: Sequence[str] = ("",),
+) -> Part:
+    """The photos of names, with what stands for each; `camera` makes of this and the photo's size how errors
+    name it, and its view. `where` lists them, and the photos lie in one of `homes` in `base`."""
+    matched = match_photos(where, base, [file for file, _ in listed], downscale, homes)
     if not matched.photos:
+        named = min((file for file, _ in listed), key=natural)
         raise MissingFile(
-            f"{folder}: names {len(files)} photos such as {min(files, key=natural)}, but none of them is "
-            f"there: {matched.hint}"
+            f"{where}: names {len(listed)} photos such as {named}, but none of them is there: {matched.hint}"
         )
-    images = sorted(model.images, key=lambda image: natural(image.name))
-    images = [image for image in images if files[image.name] in matched.photos]
-    names = dict(zip(images, frame_names([{"file_path": image.name} for image in images]), strict=True))
+    found = sorted((item for item in listed if item[0] in matched.photos), key=lambda item: natural(item[0]))
+    names = frame_names([{"file_path": file} for file, _ in found])
 
-    def read(image: colmap.Image) -> View:
-        photo, place = matched.photos[files[image.name]]
+    def read(numbered: tuple[int, tuple]) -> View:
+        i, (file, item) = numbered
+        photo, place = matched.photos[file]
         header = read_image_header(photo)
-        reduction = place.reduction(header, downscale)
-        view = replace(image.view, name=names[image])
-        return on_photo(view, photo, header, image.where, reduction=reduction)
+        said, view = camera(item, header[:2])
+        view = replace(view, name=names[i])
+        return on_photo(view, photo, header, said, reduction=place.reduction(header, downscale))
 
-    views, broken = read_sound(folder, images, read, lambda image: str(matched.photos[files[image.name]][0]))
-    notes = (*_other_models(path, folder), *model.notes, *matched.notes, *broken)
-    part = Part(tuple(views), matched.missing, notes)
-    return _capture(path, "colmap", part, Part(), None, model.points)
+    views, broken = read_sound(
+        where, list(enumerate(found)), read, lambda item: str(matched.photos[item[1][0]][0])
+    )
+    notes = (*matched.notes, *broken, *repair_notes(where, views))
+    return Part(tuple(views), matched.missing, notes)
 
 
-def _other_models(path: Path, folder: Path) -> Iterator[str]:
+def _other_models(path: Path, folder: Path) -> list[str]:
     """A sentence about the models beside the one that is read."""
     others = [other for other in colmap.model_folders(path) if other != folder]
-    if others:
-        named = ", ".join(f"{other.relative_to(path)} of {colmap.image_count(other)}" for other in others[:5])
-        yield (
-            f"{path}: {folder.relative_to(path)}, a model of {colmap.image_count(folder)} photos, is read, "
-            f"and not {named}; give the folder {others[0]} to read that one"
-        )
+    if not others:
+        return []
+    named = ", ".join(f"{other.relative_to(path)} of {colmap.image_count(other)}" for other in others[:5])
+    return [
+        f"{path}: {folder.relative_to(path)}, a model of {colmap.image_count(folder)} photos, is read, "
+        f"and not {named}; give the folder {others[0]} to read that one"
+    ]
 
 
 def _read_llff(path: Path, downscale: int | None) -> Capture:
@@ -297,23 +350,39 @@ def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
 
 
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
-    files = {file.stem: file for file in polycam.camera_files(cameras)}
-    matched = match_photos(cameras, images, files, downscale)
-
-    def read(name: str) -> View:
-        photo, place = matched.photos[name]
-        header = read_image_header(photo)
-        view = polycam.read_camera(files[name], header[:2])
-        reduction = place.reduction(header, downscale)
-        return on_photo(view, photo, header, str(files[name]), reduction=reduction)
-
-    views, broken = read_sound(cameras, [name for name in files if name in matched.photos], read, str)
+    files = [(file.stem, file) for file in polycam.camera_files(cameras)]
+    part = _read_listed(
+        cameras, images, files, lambda file, size: (str(file), polycam.read_camera(file, size)), downscale
+    )
     photos, poses = polycam.FOLDERS[0]
     lost = images.name != photos and (images.parent / poses).is_dir()
     uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
-    notes = (*matched.notes, *uncorrected, *broken, *repair_notes(cameras, views))
-    part = Part(tuple(views), matched.missing, notes)
-    return _capture(path, "polycam", part, Part(), None)
+    return _capture(path, "polycam", part, Part(), None, notes=tuple(uncorrected))
+
+
+def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Capture:
+    lens, notes = read_lens(files)
+    *names, unused = splits(list(files.poses))
+    parts = [
+        _read_listed(
+            files.folder,
+            files.photos,
+            [(name, files.poses[name]) for name in part],
+            lambda file, size: (str(file), read_view(file, lens, size)),
+            downscale,
+        )
+        if part
+        else Part()
+        for part in names
+    ]
+    notes += [f"{path}: {unused}"] if unused else []
+    return _capture(path, "pose files", *parts, read_box(files), notes=tuple(notes))
+
+
+def _read_opensfm(path: Path, file: Path, downscale: int | None) -> Capture:
+    model = opensfm.read_model(file)
+    base = file.parent if has_pictures(file.parent) or path == file.parent else file.parent.parent
+    return _read_model(path, "opensfm", model, base, ("images", ""), downscale, model.notes)
 
 
 # --- what they share ----------------------------------------------------------------------------------------

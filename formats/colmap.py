@@ -30,7 +30,7 @@ from formats.frame_list import once, read_sound
 from formats.inputs import decoded, open_input, read_input
 from formats.matching import stem_key
 from formats.photos import folders
-from formats.points import Points, stride, thinned_notes
+from formats.points import Points, points_notes, stride
 from formats.rotations import matrices
 from formats.views import FARTHEST, View
 
@@ -202,7 +202,7 @@ def read_model(folder: Path) -> Model:
 
     listed, repeated = once(folder, listed, _listed_name, lambda item: (*item[2], *item[3]))
     images, broken = read_sound(folder, listed, read, _listed_name)
-    notes = (*repeated, *broken, *notes, *thinned_notes(folder, known and known.points))
+    notes = (*repeated, *broken, *notes, *points_notes(folder, known and known.points))
     return Model(folder, tuple(images), known and known.points, notes)
 
 
@@ -456,7 +456,8 @@ def _sorted_points(
     order = np.argsort(ids)
     order = order[(np.abs(positions[order]) < 1e30).all(1)]
     colours = np.clip(colours[order], 0, 255).astype(np.uint8)
-    return Listed(ids[order], Points(positions[order], colours, step), errors[order])
+    points = Points(positions[order], colours, step, len(ids) - len(order))
+    return Listed(ids[order], points, errors[order])
 
 
 # --- parsing ------------------------------------------------------------------------------------------------

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, MixedSizes
-from formats.foreign import HEAD, KINDS, identify
+from formats.foreign import HEAD, identify
 from formats.inputs import open_input
 from formats.png import png_writer
 
@@ -32,6 +32,8 @@ DECODING_BYTES = 256 << 20
 """Photos are decoded side by side while they take no more than this together, a larger one alone."""
 PER_STORED_PIXEL = 8
 """Bytes while a photo is decoded: Pillow's 4, and what the decoder of a progressive JPEG keeps."""
+TAIL = 1 << 12
+"""Bytes in which the end of a whole picture is looked for; one that goes on behind it is decoded."""
 BAND = 1 << 20
 """Stored pixels that are converted at once, about."""
 DECODING_ERRORS = (
@@ -75,14 +77,16 @@ def read_image(
     reduction: int = 1,
     alpha: bool = True,
     out: np.ndarray | None = None,
+    premultiplied: bool = False,
 ) -> np.ndarray:
     """(H, W, 4) uint8, straight alpha, 255 where the file has none, or all over where `alpha` is False.
 
     The pixels stand as stored: an EXIF rotation is not applied, as the tools that estimate poses ignore it
     too, unless `orientation` (as EXIF counts them) asks for one. With `reduction` each is the mean of so many
     a side of the turned picture, colours weighted by alpha; what is left over at the right and below is cut
-    off. `out` takes the pixels where it is given. Raises BadImage, LimitExceeded (before decoding),
-    MissingExtra, MissingFile, MixedSizes (`out` has another shape).
+    off. `out` takes the pixels where it is given. Colours of a file that are `premultiplied` are divided by
+    alpha. Raises BadImage, LimitExceeded (before decoding), MissingExtra, MissingFile, MixedSizes (`out` has
+    another shape).
     """
     with _decoded(path) as image:
         (left, wide), (top, high) = _kept_spans(image.size, orientation, reduction)
@@ -98,6 +102,8 @@ def read_image(
             end = min(row + rows, high)
             box = (left, top + row * reduction, left + wide * reduction, top + end * reduction)
             band = _rgba(image.crop(box), alpha)
+            if premultiplied:
+                band = _straight(band)
             stored[row:end] = np.asarray(band if reduction == 1 else band.reduce(reduction))
     return out
 
@@ -146,6 +152,27 @@ def read_image_header(path: Path | str) -> Header:
         return Header(*image.size, image.has_transparency_data, _orientation(image))
 
 
+def check_whole(path: Path | str) -> None:
+    """BadImage where a PNG or JPEG ends too early and cannot be decoded; of whole ones only the end is read,
+    and of other formats the header tells. Raises as `read_image`."""
+    with open_input(path) as file:
+        if _reaches_its_end(file):
+            return
+    try:
+        with _decoded(path):
+            pass
+    except BadImage as error:
+        raise BadImage(f"{path}: the file is cut off; copy it again, or remove it") from error
+
+
+def _reaches_its_end(file: BinaryIO) -> bool:
+    """Whether the end of a PNG or JPEG is found in its last bytes; True of other formats."""
+    head = file.read(4)
+    mark = {b"\x89PNG": b"IEND", b"\xff\xd8\xff": b"\xff\xd9"}.get(head if head[:1] == b"\x89" else head[:3])
+    file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL))
+    return mark is None or mark in file.read()
+
+
 def read_focal(path: Path | str) -> float | None:
     """Focal length in diagonals of the picture, from EXIF; None where it does not say. Raises as
     `read_image`."""
@@ -191,8 +218,15 @@ def _flipped(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def _rgba(image, alpha: bool):
     """A decoded picture of any mode as RGBA, opaque where `alpha` is False."""
-    image = _eight_bits(image)
-    return (image if alpha else image.convert("RGB")).convert("RGBA")
+    picture = _eight_bits(image).convert("RGBA")  # first, since palettes lose transparency with a warning
+    return picture if alpha else picture.convert("RGB").convert("RGBA")
+
+
+def _straight(image):
+    """An RGBA picture whose colours are multiplied by alpha, with straight alpha."""
+    from PIL import Image
+
+    return Image.frombytes("RGBa", image.size, image.tobytes()).convert("RGBA")
 
 
 def _eight_bits(image):
@@ -265,7 +299,7 @@ def _unidentified(error: Exception) -> bool:
 def _unread(path: Path | str, head: bytes) -> FormatError:
     """The error for a file that is no picture of a known format."""
     found = identify(head, Path(path).suffix)
-    if found is None or not found.extra and found.what in (KINDS["photo"][0], KINDS["heif"][0]):
+    if found is None or not found.extra and found.kind in ("photo", "heif"):
         return BadImage(
             f"{path}: the picture cannot be decoded (damaged, or in no known format); replace or remove it"
         )

@@ -27,7 +27,7 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
         return tuple(views), ()
     shelves: dict[Path, _Shelf] = {}
     around = {view.image_path.parent: _places(view.image_path, root) for view in photos}
-    found, used, unused = [], {}, {}
+    found, used, unused, arrays = [], {}, {}, {}
     for view in views:
         mask = None
         for place in around[view.image_path.parent] if view.image_path else ():
@@ -35,12 +35,18 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
             mask = shelf.mask_of(view.image_path, place.inner, own=place.folder == view.image_path.parent)
             if mask is not None:
                 break
-            if place.folder != view.image_path.parent and shelf.files:
-                unused[place.folder] = len(shelf.files)
+            if place.folder != view.image_path.parent:
+                (unused if shelf.files else arrays)[place.folder] = len(shelf.files) or shelf.arrays
         found.append(view if mask is None else with_mask(view, mask))
         if mask is not None:
             used[mask.parent] = used.get(mask.parent, 0) + 1
     notes = [f"{at}: its masks of {count} of {len(views)} photos are used" for at, count in used.items()]
+    notes += [
+        f"{at}: holds {count} arrays of numpy, which are not read as masks; save them as PNG, white where a "
+        "photo counts"
+        for at, count in arrays.items()
+        if count and not used
+    ]
     notes += [
         f"{at}: lies beside the photos, but none of its {count} pictures is called as one of them, and they "
         "are not used; name masks as their photos"
@@ -91,18 +97,17 @@ class _Shelf:
     """The pictures of a folder and of those in it, by the folder below it and the name without its ending."""
 
     files: dict[tuple[Path, str], Path]
+    arrays: int
+    """Files of numpy among them, which are not read."""
 
     @classmethod
     def of(cls, folder: Path) -> "_Shelf":
         """Hidden files are no masks."""
         nested = [folder] + [entry for entry in sorted(folder.iterdir()) if entry.is_dir()]
-        pictures = [
-            file
-            for at in nested
-            for file in sorted(at.iterdir())
-            if file.suffix.lower() in EXTENSIONS and not file.name.startswith(".")
-        ]
-        return cls({(file.parent.relative_to(folder), _key(file.stem)): file for file in pictures})
+        files = [file for at in nested for file in sorted(at.iterdir()) if not file.name.startswith(".")]
+        pictures = [file for file in files if file.suffix.lower() in EXTENSIONS]
+        named = {(file.parent.relative_to(folder), _key(file.stem)): file for file in pictures}
+        return cls(named, sum(file.suffix.lower() in (".npy", ".npz") for file in files))
 
     def mask_of(self, photo: Path, inner: Path, own: bool) -> Path | None:
         """A photo's mask; `own`: this is the photo's own folder, where a mask has a name that says so."""

@@ -26,7 +26,7 @@ from formats.photos import (
     split_ending,
 )
 
-PHOTO_FOLDERS = ("images", "input", "rgb", "photos", "frames")
+PHOTO_FOLDERS = ("images", "input", "rgb", "photos", "frames", "color", "image", "results")
 """Folders that photos usually lie in, whatever the poses say."""
 OTHER_FOLDERS = {"masks", "mask", "depth", "depths", "normals", "semantics", "__macosx", "@eadir"}
 """Folders of pictures that are no photos."""

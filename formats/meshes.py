@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh, FormatError
+from formats.foreign import not_a_mesh
 from formats.inputs import open_input
 from formats.points import MAX_HEADER
 from formats.surfaces.gltf import read_gltf
@@ -23,7 +24,6 @@ from formats.surfaces.ply import read_ply
 from formats.surfaces.stl import read_stl
 from formats.surfaces.surface import Notes, Surface
 from formats.surfaces.tracing import GOLDEN_ANGLE, Mesh, embree_scene, render_mesh, seen_from_behind
-from formats.surfaces.unreadable import unreadable_mesh
 from formats.views import Capture, View
 
 __all__ = [
@@ -33,7 +33,6 @@ __all__ = [
     "mesh_surfaces",
     "mesh_type",
     "render_mesh",
-    "unreadable_mesh",
 ]
 
 READERS = {
@@ -142,7 +141,7 @@ def mesh_surfaces(path: Path | str) -> tuple[list[Surface], tuple[str, ...]]:
     open_input(path).close()  # a missing file gets its own error
     kind = mesh_type(path)
     if kind is None:
-        raise BadMesh(unreadable_mesh(path) or NO_MESH.format(path))
+        raise not_a_mesh(Path(path))
     notes = Notes(path)
     if kind in GLTF:
         notes.add(UPRIGHT_NOTE)
@@ -157,9 +156,6 @@ def mesh_surfaces(path: Path | str) -> tuple[list[Surface], tuple[str, ...]]:
         for surface in surfaces:
             surface.positions[:] = surface.positions @ UPRIGHT[:3, :3].T
     return surfaces, notes.sentences()
-
-
-NO_MESH = "{}: not a mesh that can be read; expected .glb, .gltf, .obj, .ply, .stl or .off with faces"
 
 
 def _load(path: Path | str) -> Mesh:

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import is_bundle
 from formats.captures import is_capture, is_mesh, poses_elsewhere, read_capture
 from formats.errors import FormatError, NoPoses
-from formats.foreign import is_json, not_a_capture
+from formats.foreign import is_json, kind_of, not_a_capture
 from formats.images import read_focal, read_image_header
 from formats.meshes import mesh_facts
 from formats.photos import has_pictures
-from formats.posing import photos_to_pose
+from formats.posing import photos_to_pose, whole_photos
 from formats.rig import upward
 from formats.views import Capture, View, check_parallax
 
+ROUNDING = 1e-12
 LENSES = {False: "pinhole", True: "fisheye"}
 
 
@@ -31,7 +31,7 @@ def overview(path: Path | str) -> dict | None:
     if is_mesh(path):
         return {"path": str(path), "format": "mesh", **mesh_facts(path)}
     if path.is_file() and not is_capture(path):
-        if is_bundle(path) or is_json(path) or path.suffix == ".rfpack":
+        if is_json(path) or path.suffix == ".rfpack" or kind_of(path) == "bundle":
             return None
         raise not_a_capture(path)
     try:
@@ -63,11 +63,11 @@ def capture_facts(capture: Capture) -> dict:
         "turned": sum(view.orientation != 1 for view in views),
         "lenses": _lenses(views),
         "space": "unbounded" if unbounded else "bounded",
-        "box": None if unbounded else (capture.object_aabb if cut_out else capture.aabb).tolist(),
+        "box": None if unbounded else _plain(capture.object_aabb if cut_out else capture.aabb),
         "layout": frame and frame.layout,
-        "looks_at": frame and frame.focus.tolist(),
+        "looks_at": frame and _plain(frame.focus, frame.distance),
         "from_distance": frame and frame.distance,
-        "up": upward(poses).tolist(),
+        "up": _plain(upward(poses)),
         "transparent": not capture.opaque,
         "masks": sum(view.mask_path is not None for view in views),
         "masks_cut_out_an_object": cut_out,
@@ -78,7 +78,7 @@ def capture_facts(capture: Capture) -> dict:
 
 def photo_facts(path: Path) -> dict:
     """The same, as far as it is known, of photos whose poses are to be estimated."""
-    photos = photos_to_pose(path)
+    photos, broken = whole_photos(path, photos_to_pose(path))
     headers = [read_image_header(photo) for photo in photos]
     note = f"{path}: its photos have no poses; `train` estimates them first, as `fusedrf pose` does"
     return {
@@ -87,8 +87,14 @@ def photo_facts(path: Path) -> dict:
         "sizes": _sizes((header.width, header.height) for header in headers),
         "turned": sum(header.orientation != 1 for header in headers),
         "focal_lengths": sum(read_focal(photo) is not None for photo in photos),
-        "notes": [note, *filter(None, [poses_elsewhere(path)])],
+        "notes": [note, *broken, *filter(None, [poses_elsewhere(path)])],
     }
+
+
+def _plain(numbers: np.ndarray, size: float = 0.0) -> list[float]:
+    """Numbers of one unit, with 0 for what is only rounding beside the others, or beside a size."""
+    least = ROUNDING * max(size, np.abs(numbers).max())
+    return np.where(np.abs(numbers) > least, numbers, 0.0).tolist()
 
 
 def _sizes(sizes) -> list[dict]:

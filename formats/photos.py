@@ -26,6 +26,7 @@ from formats.errors import (
 )
 from formats.images import (
     Header,
+    check_whole,
     decoded_at_once,
     decoding_bytes,
     oriented,
@@ -211,8 +212,10 @@ def on_photo(
 
     Tools disagree on whether poses refer to the pixels as stored or as turned by EXIF: the orientation whose
     aspect ratio is nearer to the camera's is used, and the pixels as stored where both are as near (see
-    `alike_turned`). Raises BadIntrinsics where neither fits, and BadMask where the mask has another shape.
+    `alike_turned`). Raises BadImage where the photo is cut off, BadIntrinsics where neither fits, and BadMask
+    where the mask has another shape.
     """
+    check_whole(photo)
     stored, camera = (header.width, header.height), (view.width, view.height)
     turned = stored[:: -1 if header.orientation >= 5 else 1]
     choices = ((1, stored), (header.orientation, turned))
@@ -239,6 +242,11 @@ def on_photo(
 
 def with_mask(view: View, mask: Path, where: str | None = None) -> View:
     """The view with a mask; BadMask where that has another shape than its photo."""
+    if mask.suffix.lower() in (".npy", ".npz"):
+        raise BadMask(
+            f"{where or mask}: the mask {mask} is an array of numpy, which is not read; save it as PNG, "
+            "white where the photo counts"
+        )
     header, size, photo = read_image_header(mask), (view.width, view.height), view.image_path
     found = (header.width, header.height)
     turns = [found, found[::-1]] if view.orientation >= 5 else [found]
@@ -409,4 +417,4 @@ def _decode(view: View, out: np.ndarray) -> np.ndarray:
         return out
     if view.image_path is None:
         raise MissingFile(f"view {view.name}: has a camera but no photo")
-    return read_image(view.image_path, view.orientation, view.reduction, view.alpha, out)
+    return read_image(view.image_path, view.orientation, view.reduction, view.alpha, out, view.premultiplied)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.atomic import atomic_writer
-from formats.errors import BadModel
+from formats.errors import BadModel, counted
 from formats.inputs import read_input
 
 MAX_BYTES = 2**31
@@ -48,6 +48,8 @@ class Points:
     """(N, 3) uint8 sRGB; white where the file has none."""
     thinned: int = 1
     """One out of so many of the file's points is here, from the first on."""
+    damaged: int = 0
+    """Points of the file that are left out, since they are NaN, infinite or beyond 1e30."""
 
     def moved(self, matrix: np.ndarray) -> "Points":
         """The same points behind an affine (3, 4) or (4, 4)."""
@@ -59,14 +61,18 @@ def stride(count: int) -> int:
     return max(1, -(-count // MAX_POINTS))
 
 
-def thinned_notes(path: Path | str, points: Points | None) -> list[str]:
-    """A sentence where not all points of a file were read."""
-    if points is None or points.thinned == 1:
-        return []
-    return [
-        f"{path}: of more than {MAX_POINTS:,} sparse points one in {points.thinned} is read, "
-        f"{len(points.positions):,} in all"
-    ]
+def points_notes(path: Path | str, points: Points | None) -> list[str]:
+    """Sentences where not all points of a file were read."""
+    notes = []
+    if points is not None and points.thinned > 1:
+        notes.append(
+            f"{path}: of more than {MAX_POINTS:,} sparse points one in {points.thinned} is read, "
+            f"{len(points.positions):,} in all"
+        )
+    if points is not None and points.damaged:
+        said = counted(points.damaged, "sparse point is", "sparse points are")
+        notes.append(f"{path}: {said} NaN, infinite or beyond 1e30, and left out")
+    return notes
 
 
 def read_ply_points(path: Path | str) -> Points:
@@ -95,7 +101,8 @@ def read_ply_points(path: Path | str) -> Points:
         columns = np.frombuffer(data, record, count, end.end())[::step]
     positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
     sound = (np.abs(positions) < 1e30).all(1)
-    return Points(positions[sound], _colours(columns, dict(fields))[sound], step)
+    colours = _colours(columns, dict(fields))[sound]
+    return Points(positions[sound], colours, step, int((~sound).sum()))
 
 
 def write_ply_points(path: Path | str, points: Points) -> None:

@@ -23,7 +23,8 @@ from formats.captures import write_cameras
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
 from formats.foreign import beside_photos, not_a_capture
 from formats.frame import scene_frame
-from formats.images import Header, decoded_at_once, read_focal, read_image_header, write_smaller
+from formats.frame_list import read_sound
+from formats.images import Header, check_whole, decoded_at_once, read_focal, read_image_header, write_smaller
 from formats.locks import temporary_folder
 from formats.mapper import MAX_SIDE
 from formats.photos import copies, natural, pictures
@@ -94,6 +95,16 @@ def photos_to_pose(folder: Path | str) -> list[Path]:
             f"more that overlap; take more, from different places{more}"
         )
     return sorted(found, key=lambda file: natural(file.name))
+
+
+def whole_photos(folder: Path | str, photos: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Photos without a few that are cut off, and notes on these. Raises as `read_sound`."""
+
+    def read(photo: Path) -> Path:
+        check_whole(photo)
+        return photo
+
+    return read_sound(folder, photos, read, str)
 
 
 def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress) -> Posed:

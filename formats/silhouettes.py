@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from formats.frame import nearest_point
-from formats.images import oriented, read_alpha
+from formats.images import oriented, read_alpha, read_image
 from formats.photos import OPAQUE, decoded, decoders, load_ignored
 from formats.views import View
 
@@ -30,10 +30,16 @@ BORDER_SHOWN = 0.4
 sky, passers-by, a sign in a corner."""
 SPANNED = 0.9
 """Share of a photo's shorter side that the picture of a lens spans at least."""
+SOFT_LEVELS = 26, 230
+"""Alpha of pixels whose colour tells whether it was multiplied by that."""
+LEAST_SOFT, DARK, ABOVE = 100, 0.3, 0.001
+"""How many of these tell it, at least; the share of their alpha that their colour is at least, halfway, since
+black ones do not; and the share of them that may have a brighter colour than alpha, if it was."""
 SAMPLED = 12
-"""Photos whose borders are looked at for a ground of one colour, before more are."""
-WHITE, PLAIN = 250, 3
-"""The least level of a white ground, and levels by which the colour of a ground may vary."""
+"""Photos whose borders are looked at for a ground of one colour, or colours for alpha in them, before more
+are."""
+WHITE, PLAIN, BARS_PLAIN = 250, 3, 12
+"""The least level of a white ground, and levels by which its colour may vary, and that of a film's bars."""
 GROUND = 8
 """Levels by which a pixel of an object differs from the white ground."""
 STRAY = 0.02
@@ -42,6 +48,11 @@ MOSTLY = 0.65
 """Share of photos that show an object on white all around, at least, if the others cut it off."""
 BARS = 0.97
 """Share of the box around it that a picture between bars fills; hardly any outline of an object does."""
+BESIDE = ("above and below", "left and right")
+BARS_NOTE = (
+    "photos have bars {} of one colour ({}), which are learnt as if they were seen; crop them away, and take "
+    "as many pixels off the cameras' centres, or mask them"
+)
 CELLS = 32
 """Along a side of the grid in which the box of an object is looked for, twice."""
 AMISS, AMISS_ON_WHITE = 0.1, 0.34
@@ -139,6 +150,11 @@ def sampled(views: Sequence[View]) -> list[View]:
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, count).astype(int))]
 
 
+def few(views: Sequence[View]) -> list[View]:
+    """SAMPLED of the views, evenly spaced in the list."""
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
+
+
 # --- alpha --------------------------------------------------------------------------------------------------
 
 
@@ -182,6 +198,9 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
         notes.append(
             f"{bare} of {len(views)} photos have no alpha and are left out, since it cuts out the others"
         )
+    if _premultiplied(having):
+        notes.append("colours of the photos were multiplied by their alpha, and are divided by it")
+        having = [replace(view, premultiplied=True) for view in having]
     if share < 1:
         whole = round((1 - share) * len(having))
         notes.append(
@@ -189,6 +208,19 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
             "they show is learnt; cut them out too, or remove them"
         )
     return Shown(tuple(having), tuple(looked_at), tuple(found), tuple(notes))
+
+
+def _premultiplied(views: Sequence[View]) -> bool:
+    """Whether no colour of photos is brighter than its alpha, as where that is in it already."""
+    ratios = [np.empty(0)]
+    for view in few(views):
+        alpha = (picture := read_image(view.image_path))[..., 3]
+        soft = picture[(alpha >= SOFT_LEVELS[0]) & (alpha < SOFT_LEVELS[1])].astype(float)
+        ratios.append((soft[:, :3].max(1) - 2) / soft[:, 3])
+    ratios = np.concatenate(ratios)
+    if len(ratios) < LEAST_SOFT or np.median(ratios) < DARK:
+        return False
+    return bool((ratios > 1).mean() < ABOVE)
 
 
 def _opaque(view: View, ignoring: bool) -> View:
@@ -233,16 +265,20 @@ def _filled(found: Sequence[Outline]) -> bool:
 def by_ground(views: tuple[View, ...]) -> Shown:
     """Outlines where photos show an object on white. Borders of another colour are taken as surroundings,
     since nothing tells a black ground from the night."""
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, SAMPLED).astype(int))]
+    chosen = few(views)
     seen, white, alike = [], True, True
     for view in chosen:
         seen.append(_border_colours(view))
-        lowest, mostly, highest = np.array(seen).swapaxes(0, 1)
-        white = int((mostly.min(1) < WHITE).sum()) <= (1 - MOSTLY) * len(chosen)
-        alike = (highest.max(0) - lowest.min(0) <= PLAIN).all()
-        if not (white or alike):
+        lowest, mostly, highest = np.moveaxis(seen, 2, 0)
+        white = int((mostly[:, 0].min(1) < WHITE).sum()) <= (1 - MOSTLY) * len(chosen)
+        alike = (highest.max(0) - lowest.min(0)).max(1) <= (PLAIN, BARS_PLAIN, BARS_PLAIN)
+        if not (white or alike.any()):
             return Shown(views)
-    colour = ", ".join(f"{level:.0f}" for level in np.median(lowest, axis=0))
+    part = 0 if white else int(alike.argmax())
+    colour = ", ".join(f"{level:.0f}" for level in np.median(lowest[:, part], axis=0))
+    if part:
+        bars = BARS_NOTE.format(BESIDE[part - 1], colour)
+        return Shown(views, notes=() if alike[1:].all() else (bars,))
     surroundings = (
         f"the borders of photos have one colour ({colour}) and are taken as surroundings; of an object "
         "before nothing give photos with alpha or masks, or --bounded; crop bars and frames away"
@@ -263,10 +299,12 @@ def by_ground(views: tuple[View, ...]) -> Shown:
 
 
 def _border_colours(view: View) -> np.ndarray:
-    """(3, 3) the lowest levels along the borders of a photo, the same but for stray pixels, the highest."""
+    """(3, 3, 3) the lowest levels along the borders of a photo, the same but for stray pixels, the highest:
+    of all borders, of those above and below, and of those at the sides."""
     picture = decoded(view)[..., :3]
-    border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
-    return np.quantile(border, (0.0, STRAY, 1.0), axis=0)
+    rows, columns = (np.concatenate([lines[0], lines[-1]]) for lines in (picture, picture.swapaxes(0, 1)))
+    parts = np.concatenate([rows, columns]), rows, columns
+    return np.array([np.quantile(part, (0.0, STRAY, 1.0), axis=0) for part in parts])
 
 
 # --- masks --------------------------------------------------------------------------------------------------

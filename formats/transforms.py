@@ -25,7 +25,7 @@ from formats.frame_list import once, read_sound, repair_notes
 from formats.images import Header, read_image_header
 from formats.matching import Matched, find_file, match_photos, stem_key
 from formats.photos import natural, on_photo
-from formats.points import MAX_POINTS, Points, read_ply_points, thinned_notes
+from formats.points import MAX_POINTS, Points, points_notes, read_ply_points
 from formats.views import View
 
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
@@ -297,7 +297,7 @@ def sparse_points(path: Path, document: dict, views: tuple[View, ...]) -> Sparse
     elif sparse.points is None and written:
         missing = f"{path}: its sparse points {written} do not exist and are not used"
         sparse = Sparse(notes=(*sparse.notes, missing))
-    return replace(sparse, notes=(*sparse.notes, *thinned_notes(ply or path, sparse.points)))
+    return replace(sparse, notes=(*sparse.notes, *points_notes(ply or path, sparse.points)))
 
 
 def _placed(path: Path, document: dict, points: Points | None, views: tuple[View, ...]) -> Points | None:

@@ -62,6 +62,8 @@ class View:
     transparent pixels must be."""
     alpha: bool = True
     """Whether the photo's alpha channel, if it has one, says where nothing is; False: all of it is opaque."""
+    premultiplied: bool = False
+    """Whether the photo's colours are multiplied by its alpha."""
     near: float | None = None
     far: float | None = None
     """Depths (along -z, world units) between which lie the sparse points that it sees, except for one in a
@@ -147,7 +149,7 @@ class Capture:
 
     path: Path
     kind: str
-    """"blender", "transforms", "colmap", "llff", "polycam" or "mesh"."""
+    """"blender", "transforms", "colmap", "llff", "polycam", "pose files", "opensfm" or "mesh"."""
     train: tuple[View, ...]
     test: tuple[View, ...]
     aabb: np.ndarray

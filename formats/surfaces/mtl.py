@@ -23,8 +23,13 @@ PLACING = ("-o", "-s", "-t")
 WITHOUT_LOOKS = ("-blendu", "-blendv", "-bm", "-boost", "-texres", "-type", "-colorspace")
 
 MAPS = re.compile(r"(map_\w+|norm|bump|disp|decal|refl)$")
-PICTURE = re.compile(r"\.(png|jpe?g|tga|bmp|tiff?|exr|hdr|dds|webp|gif|psd)$", re.IGNORECASE)
+ENDING = r"\.(?:png|jpe?g|tga|bmp|tiff?|exr|hdr|dds|webp|gif|psd)"
+PICTURE = re.compile(ENDING + "$", re.IGNORECASE)
 """What a word that is not known names."""
+BEHIND = re.compile(rf"(.*{ENDING}\"?)\s+(-[a-z]+\s.*)", re.IGNORECASE)
+"""Options that some write behind the name of a picture."""
+TILES = re.compile("<udim>", re.IGNORECASE)
+FIRST_TILE, TILES_ACROSS = 1001, 10
 SHOWN = ("map_kd", "map_ka", "map_d", "map_ke")
 GREY = 1 / 512
 MAX_MATERIALS = 100_000
@@ -49,9 +54,29 @@ class Material:
 
     name: str
     colours: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    """kd, ka, ke, rgb each."""
+    """kd, ka, ke, tf, rgb each."""
     alpha: float = 1.0
     maps: dict[str, Map] = field(default_factory=dict)
+
+    @property
+    def base(self) -> Map | None:
+        """The picture that is shown."""
+        return self.maps.get("map_kd", self.maps.get("map_ka"))
+
+    @property
+    def placed(self) -> Map:
+        """The picture whose options place the coordinates."""
+        return self.base or self.maps.get("map_d") or Map("", {})
+
+    @property
+    def tiled(self) -> bool:
+        """Whether each tile of the coordinates has a picture of its own."""
+        return any(TILES.search(each.name) for each in self.maps.values())
+
+    def tile(self, number: int) -> "Material":
+        """What is shown in one tile."""
+        maps = {word: Map(TILES.sub(str(number), m.name), m.options) for word, m in self.maps.items()}
+        return replace(self, name=f"{self.name} <UDIM {number}>", maps=maps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +93,15 @@ class Look:
 
 
 def parse_mtl(data: bytes, notes: Notes, file: str) -> dict[str, Material]:
-    """Materials by name."""
+    """Materials by name; of several of one name the first."""
     found, current = {}, None
     for line in lines_of(data):
         word, _, rest = line.partition(" ")
         word, rest = word.lower(), rest.strip()
         if word == "newmtl":
-            current = found.setdefault(rest, Material(rest))
+            check_repeated(found.get(current and current.name), current, notes)
+            current = Material(rest)
+            found.setdefault(rest, current)
             if len(found) > MAX_MATERIALS:
                 notes.add(f"{file} has more than {MAX_MATERIALS:,} materials, the rest is left out")
                 return found
@@ -83,11 +110,18 @@ def parse_mtl(data: bytes, notes: Notes, file: str) -> dict[str, Material]:
                 _set(current, word, rest)
             except ValueError:
                 notes.add(f"{file}: {word} {rest[:40]!r} of material {current.name[:60]!r} is not understood")
+    check_repeated(found.get(current and current.name), current, notes)
     return found
 
 
+def check_repeated(first: Material | None, other: Material | None, notes: Notes) -> None:
+    """Note that two materials of one name differ."""
+    if first is not None and first != other:
+        notes.add("is there more than once, the first is shown", f"material {first.name[:60]!r}")
+
+
 def _set(material: Material, word: str, rest: str) -> None:
-    if word in ("kd", "ka", "ke"):
+    if word in ("kd", "ka", "ke", "tf"):
         numbers = tuple(map(float, rest.split()))
         if len(numbers) not in (1, 3) or not np.isfinite(numbers).all():
             raise ValueError
@@ -107,6 +141,8 @@ def _set(material: Material, word: str, rest: str) -> None:
 def _map(rest: str) -> Map:
     """The file is what is left behind the options, with its spaces."""
     options: dict[str, list[str]] = {}
+    if not PICTURE.search(rest) and (behind := BEHIND.fullmatch(rest)):
+        rest = f"{behind[2]} {behind[1]}"
     while match := re.match(r"(-[A-Za-z]+)\s+", rest):
         option = match[1].lower()
         if option in PLACING:
@@ -120,6 +156,8 @@ def _map(rest: str) -> Map:
         if values is None:
             raise ValueError
         options[option] = values[0].split()
+        if option in PLACING:
+            list(map(float, options[option]))  # ValueError here, where it becomes a note
         rest = rest[match.end() + values.end() :]
     return Map(rest.strip().strip('"'), options)
 
@@ -143,24 +181,25 @@ class Looks:
     def _look(self, material: Material) -> Look:
         called = f"material {material.name[:60]!r}"
         maps = material.maps
-        base = maps.get("map_kd")
-        if base is None and "map_ka" in maps:
-            base = maps["map_ka"]
+        base, placed = material.base, material.placed
+        if "map_ka" in maps and "map_kd" not in maps:
             self.notes.add("has no map_Kd, its map_Ka is shown", called)
+        if len(set(material.colours.get("tf", (1,)))) > 1:
+            self.notes.add("tints what shines through it (Tf), which is not shown", called)
         self._tell_unused(material, base, called)
         texture, coverage = self._texture(base, called), self._texture(maps.get("map_d"), called)
         if coverage is not None:
             coverage = Texture(_as_alpha(coverage.pixels), coverage.wrap)
         colour = self._colour(material, base, texture, called)
         if material.alpha < 1:
-            self.notes.add("see-through, which is blended", called)
+            gone = "wholly see-through (d 0 or Tr 1), so that it is not shown"
+            self.notes.add("see-through, which is blended" if material.alpha > 0 else gone, called)
         if texture is not None and coverage is None and (texture.pixels[..., 3] < 255).any():
             self.notes.add(
                 f"the transparency of {base.name} is not shown, since no map_d asks for it", called
             )
             texture = replace(texture, pixels=opaque(texture.pixels))
         factor = np.array([*colour, np.clip(material.alpha, 0, 1)], np.float32)
-        placed = base or maps.get("map_d") or Map("", {})
         return Look(
             Paint(factor, texture, coverage=coverage),
             self._glow(material, called),

@@ -9,7 +9,7 @@ from formats.errors import BadMesh, FormatError
 from formats.inputs import read_input
 from formats.surfaces.beside import Beside
 from formats.surfaces.lines import lines_of, numbers_in, western, without_comment
-from formats.surfaces.mtl import Looks, parse_mtl
+from formats.surfaces.mtl import FIRST_TILE, TILES_ACROSS, Looks, Material, check_repeated, parse_mtl
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
     Notes,
@@ -30,6 +30,7 @@ LEFT_OUT = {
     **dict.fromkeys(("l", "p"), "points and lines"),
     **dict.fromkeys(FREE_FORM, "free-form curves and surfaces"),
     "call": "other files that are called",
+    "usemap": "pictures that usemap names",
 }
 FEW = "faces of fewer than three corners"
 POLYPAINT = re.compile(rb"^#MRGB +([0-9a-fA-F]+)", re.MULTILINE)
@@ -190,8 +191,13 @@ def _surfaces(text: _Text, path: Path | str, n_bytes: int, painted: bytes, notes
     corners = np.concatenate(text.corners)
     check_indices(path, corners[:, 0], len(positions))
     places, polygon = triangulated(counts, corners[:, 0], positions)
-    looks, names = _looks(text, path, notes)
-    found = []
+    beside = Beside(path)
+    materials = _materials(text, beside, path, notes)
+    names = _chosen(text, materials, notes)
+    for name, material in [(n, materials[m]) for n, m in names.items() if m is not None]:
+        if material.tiled:
+            _cut_into_tiles(name, material, text, used, (counts, corners, uvs), materials, names)
+    looks, found = Looks(materials, beside, notes), []
     for name, index in text.materials.items():
         own = places[used[polygon] == index]
         if len(own):
@@ -244,16 +250,19 @@ def _coordinates(coordinate: np.ndarray, uvs: np.ndarray, look, name: str, notes
 # --- materials ----------------------------------------------------------------------------------------------
 
 
-def _looks(text: _Text, path: Path | str, notes: Notes) -> tuple[Looks, dict[str | None, str | None]]:
-    """All materials, and which of them each name that faces use stands for."""
-    beside, materials = Beside(path), {}
+def _materials(text: _Text, beside: Beside, path: Path | str, notes: Notes) -> dict[str, Material]:
+    """All materials of all libraries, by name."""
+    materials: dict[str, Material] = {}
     libraries = text.libraries or ([""] if len(text.materials) > 1 else [])
     for library in libraries:
         for data, file in _libraries(library, beside, path, notes):
-            materials |= {
-                name: m for name, m in parse_mtl(data, notes, file).items() if name not in materials
-            }
-    looks = Looks(materials, beside, notes)
+            for name, material in parse_mtl(data, notes, file).items():
+                check_repeated(materials.setdefault(name, material), material, notes)
+    return materials
+
+
+def _chosen(text: _Text, materials: dict[str, Material], notes: Notes) -> dict[str | None, str | None]:
+    """Which material each name that faces use stands for."""
     folded = {_key(name): name for name in materials}
     chosen: dict[str | None, str | None] = {}
     for name in text.materials:
@@ -265,7 +274,27 @@ def _looks(text: _Text, path: Path | str, notes: Notes) -> tuple[Looks, dict[str
     lost = [name for name, found in chosen.items() if name is not None and found is None]
     if lost:
         notes.add(f"materials that no library holds: {listed(lost)}; their faces are shown white")
-    return looks, chosen
+    return chosen
+
+
+def _cut_into_tiles(name, material: Material, text: _Text, used, faces, materials, names) -> None:
+    """Give the faces of each tile of the coordinates (<UDIM>: 1001 and on, ten across) a material of its
+    own; `used`, `materials` and `names` are changed."""
+    counts, corners, uvs = faces
+    own = np.flatnonzero(used == text.materials[name])
+    if not len(own):
+        return
+    first = corners[(np.cumsum(counts) - counts)[own][:, None] + np.arange(3), 1]
+    uv = np.vstack([uvs, np.zeros(2)])[np.where((first < 0) | (first >= len(uvs)), len(uvs), first)].mean(1)
+    uv = np.nan_to_num(uv * material.placed.numbers("-s", 1) + material.placed.numbers("-o", 0))
+    across, up = np.clip(np.floor(uv), 0, [TILES_ACROSS - 1, 99]).astype(int).T
+    tiles = FIRST_TILE + across + TILES_ACROSS * up
+    for tile in np.unique(tiles):
+        cut = material.tile(int(tile))
+        materials[cut.name] = cut
+        names[cut.name] = cut.name
+        used[own[tiles == tile]] = text.materials.setdefault(cut.name, len(text.materials))
+    materials.pop(material.name, None)
 
 
 def _key(name: str) -> str:

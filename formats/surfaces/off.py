@@ -21,7 +21,7 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     data = read_input(path, MAX_FILE)
     rows = (line.partition("#")[0].strip() for line in data.decode("latin-1").splitlines())
     lines = [row for row in rows if row]
-    normals, n_points, n_faces, at = _header(path, lines)
+    keyword, n_points, n_faces, at = _header(path, lines)
     if n_points + n_faces > len(lines) - at:
         raise BadMesh(
             f"{path}: ends before the last of {n_points + n_faces:,} lines; copy or export it again"
@@ -31,8 +31,12 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
         if (widths < 3).any():
             raise ValueError("a vertex of fewer than three numbers")
         positions = numbers[starts[:, None] + np.arange(3)]
-        first = 6 if normals else 3
-        colours = _colours(numbers, starts + first, widths - first, lines[at : at + n_points])
+        first = 6 if "N" in keyword else 3
+        behind = widths - first - (2 if "ST" in keyword else 0)
+        if "ST" in keyword or not np.isin(behind, (0, 3, 4)).all():
+            notes.add("has numbers of vertices that are no colours, such as texture coordinates; not used")
+        skipped = np.full(n_points, first)
+        colours = _colours(numbers, starts, skipped, behind, lines[at : at + n_points], notes)
         lines = lines[at + n_points : at + n_points + n_faces]
         numbers, widths, starts = _table(lines)
         counts = numbers[starts].astype(np.int64)
@@ -40,7 +44,7 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
             raise ValueError("a face of fewer corners than it counts")
     except (ValueError, OverflowError) as error:
         raise BadMesh(f"{path}: the mesh cannot be loaded ({error}); export it again") from error
-    face_colours = _colours(numbers, starts + counts + 1, widths - counts - 1, lines)
+    face_colours = _colours(numbers, starts, counts + 1, widths - counts - 1, lines, notes)
     if (widths - counts == 2).any():
         notes.add("colours that are numbers of a palette are not shown")
     within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -53,8 +57,8 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     return [Surface(positions, faces, colours=colours, face_colours=face_colours)]
 
 
-def _header(path: Path | str, lines: list[str]) -> tuple[bool, int, int, int]:
-    """Whether vertices have normals, counts of vertices and faces, and the first line behind them."""
+def _header(path: Path | str, lines: list[str]) -> tuple[str, int, int, int]:
+    """The keyword, counts of vertices and faces, and the first line behind them."""
     words, at = (lines[0].split() if lines else []), 1
     keyword = KEYWORD.match(words[0]) if words else None
     if words and OTHER.match(words[0]) or "BINARY" in words:
@@ -65,7 +69,7 @@ def _header(path: Path | str, lines: list[str]) -> tuple[bool, int, int, int]:
             words, at = lines[1].split(), 2
     if not 2 <= len(words) <= 3 or not all(word.isdecimal() and len(word) < 16 for word in words):
         raise BadMesh(f"{path}: does not begin with OFF and counts of vertices and faces; export it again")
-    return bool(keyword and keyword[3]), int(words[0]), int(words[1]), at
+    return keyword[0] if keyword else "OFF", int(words[0]), int(words[1]), at
 
 
 def _table(lines: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -77,15 +81,19 @@ def _table(lines: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return numbers, widths, np.cumsum(widths) - widths
 
 
-def _colours(numbers, starts, widths, lines: list[str]) -> np.ndarray | None:
-    """(n, 4) of lines whose last `widths` numbers are a colour, white where they are none; whole numbers
-    count to 255, others to 1."""
+def _colours(numbers, starts, skipped, widths, lines: list[str], notes: Notes) -> np.ndarray | None:
+    """(n, 4) of lines that have a colour of `widths` numbers behind `skipped` others, white where they have
+    none; whole numbers count to 255, others to 1."""
     coloured = np.isin(widths, (3, 4))
     if not coloured.any():
         return None
     colours = np.ones((len(widths), 3))
-    found = numbers[starts[coloured, None] + np.arange(3)]
-    words = lines[int(np.argmax(coloured))].split()[-int(widths[coloured][0]) :]
-    whole = all(word.isdecimal() for word in words) or found.max(initial=0) > 1
-    colours[coloured] = found / (255 if whole else 1)
+    places = starts + skipped
+    found = numbers[places[coloured, None] + np.arange(3)]
+    first = int(np.argmax(coloured))
+    words = lines[first].split()[skipped[first] : skipped[first] + widths[first]]
+    most = 255 if all(word.isdecimal() for word in words) or found.max(initial=0) > 1 else 1
+    colours[coloured] = found / most
+    if (numbers[places[widths == 4] + 3] < most).any():
+        notes.add("the transparency of its colours is not shown")
     return sound_colours(colours)

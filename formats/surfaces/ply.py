@@ -31,8 +31,16 @@ ENDS = re.compile(rb"(\r\n|\n|\r)end_header[ \t]*(?:\1|\r?\n)")
 TEXTURE = re.compile(r"comment +texturefile:? +(.+)", re.IGNORECASE)
 AXES = ("x", "y", "z")
 HUES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-COORDINATES = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 CORNERS = ("vertex_indices", "vertex_index")
+COORDINATES = tuple(
+    (f"{before}{u}{after}", f"{before}{v}{after}")
+    for u, v in ("st", "uv")
+    for before in ("", "texture_", "texcoord_", "tex", "tex_", "t")
+    for after in ("", "0")
+)
+OF_VERTICES = {*AXES, "nx", "ny", "nz", "alpha", "flags", "radius", *sum(HUES + COORDINATES, ())}
+OF_FACES = {*CORNERS, "nx", "ny", "nz", "alpha", "flags", "texcoord", "texnumber", *sum(HUES, ())}
+OF_NO_LOOKS = ("camera", "range_grid")
 
 
 @dataclass
@@ -269,6 +277,7 @@ def _surfaces(path, read: dict[str, dict], textures: list[str], n_bytes: int, no
         raise BadMesh(f"{path}: its vertices lack x, y or z; export the mesh again")
     positions = np.stack([vertices[axis].astype(np.float64) for axis in AXES], 1)
     colours, found = _colours(vertices, notes), []
+    _tell_unused(read, notes)
     for name, cut in (("face", _polygons), ("tristrips", _strips)):
         faces = read.get(name, {})
         lists = next((faces[key] for key in CORNERS if isinstance(faces.get(key), _List)), None)
@@ -290,6 +299,18 @@ def _surfaces(path, read: dict[str, dict], textures: list[str], n_bytes: int, no
             notes.add("has coordinates for a picture, but names none (comment TextureFile)")
         found.append(Surface(positions.copy() if found else positions, corners.astype(np.int32), **rest))
     return found
+
+
+def _tell_unused(read: dict[str, dict], notes: Notes) -> None:
+    """Note elements and properties that are neither shape nor colour."""
+    known = {"vertex": OF_VERTICES, "face": OF_FACES, "tristrips": OF_FACES}
+    unused = [name for name in read if name not in known and name not in OF_NO_LOOKS]
+    for element, names in known.items():
+        unused += [
+            f"{name} ({element})" for name in read.get(element, {}) if name.islower() and name not in names
+        ]
+    if unused:
+        notes.add(f"holds numbers that are not shown: {listed(unused)}")
 
 
 def _polygons(path, lists: _List, positions, n_bytes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

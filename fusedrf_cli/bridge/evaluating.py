@@ -9,7 +9,7 @@ from formats.captures import is_capture, read_capture
 from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
-from fusedrf_cli.bridge.rendering import picture_memory, renderable
+from fusedrf_cli.bridge.rendering import picture_memory, renderable, tell_of_work
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
@@ -45,7 +45,8 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
             if i == 0:
                 side = camera.width, camera.height
                 needed = picture_memory(field, [camera], film=False) | measured(*side)
-                budget.expect(sources(loaded.sizes) | needed, advice="give a smaller --size")
+                budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
+                tell_of_work(bundle, field, total * side[0] * side[1], progress)
                 progress.phase("rendering", total)
                 if min(side) < SSIM_WINDOW:
                     progress.warn(
@@ -134,7 +135,7 @@ def scene_pairs(
     field, origin = renderable(loaded)
     width, height = size or SCENE_SIZE
     composed = not hasattr(field, "render_rays")
-    needed = sources(loaded.sizes) | picture(width, height, composed) | measured(width, height)
+    needed = sources(loaded.resident) | picture(width, height, composed) | measured(width, height)
     budget.expect(needed, advice="give a smaller --size")
     views = looks_of(loaded, loaded.composed(), SCENE_VIEWS, (width, height), SCENE_SEED)
     for look in views:

@@ -7,9 +7,10 @@ from dataclasses import asdict, replace
 from formats.bundle import OpenBundle
 from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
-from fusedrf_cli.bridge.making import Kept, Maker, Scene
+from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
+from fusedrf_cli.bridge.rendering import tell_of_work
 from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
 from fusedrf_cli.bridge.running import (
     Saved,
@@ -35,7 +36,7 @@ from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Det
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import Student, StudentRequest, TooSmall
+from fusedrf_cli.engine.kinds.student import DistillSettings, Student, StudentRequest, TooSmall
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
@@ -70,6 +71,8 @@ def fuse(
         cameras = kept_cameras(loaded, progress)
         framing = kept_framing(loaded, scene.composed, cameras)
         check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
+        pixels = VIEWS_TO_CHOOSE_BY * DistillSettings.view_size**2
+        tell_of_work(request.scene, scene.composed, pixels, progress)
         overhead = graph_bytes(nodes, cameras)
         found, student, figures_of_it = best_of(
             request, scene, kind, overhead, memory, place, progress, saved

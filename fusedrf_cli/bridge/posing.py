@@ -17,7 +17,16 @@ from formats.captures import poses_elsewhere, read_capture
 from formats.errors import NoPoses, ResourceError
 from formats.locks import temporary_folder
 from formats.photos import has_pictures
-from formats.posing import CAMERAS, TEMPORARY, Posed, check_extra, estimate, photos_to_pose, write_posed
+from formats.posing import (
+    CAMERAS,
+    TEMPORARY,
+    Posed,
+    check_extra,
+    estimate,
+    photos_to_pose,
+    whole_photos,
+    write_posed,
+)
 from formats.views import Capture
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.running import available_cores, written_somewhere
@@ -35,7 +44,7 @@ NAMED = 12
 def pose(request: PoseRequest, progress) -> dict:
     """Estimate poses and write them as a capture."""
     started = time.monotonic()
-    photos = photos_to_pose(request.photos)
+    photos = _whole_photos(request.photos, progress)
     posed = estimate(request.photos, photos, request.threads or available_cores(), progress)
     _warn_of_unposed(request.photos, posed.unposed, posed.plain, len(photos), progress)
     written_somewhere(
@@ -63,7 +72,7 @@ def posed_capture(source: str, downscale: int | None, threads: int | None, progr
     except NoPoses:
         if not has_pictures(Path(source)):
             raise
-    photos = photos_to_pose(source)
+    photos = _whole_photos(source, progress)
     folder = _cached(source, photos)
     if not (folder / CAMERAS).exists():
         progress.tell(f"{source}: has photos but no poses, so these are estimated first")
@@ -79,6 +88,14 @@ def posed_capture(source: str, downscale: int | None, threads: int | None, progr
     )
     elsewhere = filter(None, [poses_elsewhere(Path(source))])
     return replace(capture, path=Path(source), notes=(*elsewhere, note, *capture.notes))
+
+
+def _whole_photos(source: str, progress) -> list[Path]:
+    """The photos of a folder, but for a few that are cut off, which is said."""
+    photos, notes = whole_photos(source, photos_to_pose(source))
+    for note in notes:
+        progress.warn(note)
+    return photos
 
 
 def _cached(source: str, photos: Sequence[Path]) -> Path:

@@ -17,6 +17,7 @@ from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.editing import enclosing
@@ -27,6 +28,8 @@ from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
 JOINING = 2.5  # copies of a source while it becomes a part of the whole
+MANY_RAYS, MANY_SAMPLES, MUCH_WORK = 1 << 28, 1 << 14, 1 << 32
+"""From so many rays on, or so many samples of a ray and of all, a command says that it takes long."""
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
 
 
@@ -58,10 +61,12 @@ def render(request: RenderRequest, progress) -> dict:
         if whole is None:
             needed = picture_memory(field, views, suffix in FILMS)
             loaded.shelf.resize(budget.room(needed))
-            budget.expect(sources(loaded.sizes, loaded.shelf.room) | needed, advice="give a smaller --size")
+            held = sources(loaded.resident, loaded.shelf.room)
+            budget.expect(held | needed, advice="give a smaller --size")
         field = field if whole is None else whole
         if hasattr(field, "for_pictures"):
             field = field.for_pictures(rays_of(views))
+        tell_of_work(request.scene, field, rays_of(views), progress)
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
         shooting = _Shooting(field, how, request.background, request.depth, progress)
@@ -90,6 +95,18 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     if len(getattr(field, "blocks", ())) > 1 and rays_of(views) >= WORTH_TELLING:
         needed |= insides(field.aabb)
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
+
+
+def tell_of_work(scene: str, field, rays: int, progress) -> None:
+    """A warning where so many rays through a field may take much longer than people expect."""
+    samples = field.occupancy.most_samples(sampling_step(field))
+    if rays >= MANY_RAYS:
+        progress.warn(f"{scene}: {rays:,} pixels may take long; give a smaller --size")
+    elif samples >= MANY_SAMPLES and rays * samples >= MUCH_WORK:
+        progress.warn(
+            f"{scene}: a ray takes up to {samples:,} samples, since something is that much finer than the "
+            "whole is wide, and this may take long; leave out what is smallest, or farthest away"
+        )
 
 
 def rays_of(views: list[Camera]) -> int:

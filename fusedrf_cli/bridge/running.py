@@ -252,11 +252,34 @@ def load_checkpoint(output: str, command: str) -> Saved:
 def take_up(run, saved: Saved, output: str) -> None:
     """Have a run go on from a saved state; InvalidInput where that is not of such a run."""
     try:
+        check_alike(saved[1], run.checkpoint()[1], "its state")
         run.restore(*saved)
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
         if is_out_of_memory(error):
             raise
         raise checkpoint_mismatch(output) from error
+
+
+MOST = 2**53
+"""Beyond any count of a state."""
+
+
+def check_alike(found: object, own: object, where: str) -> None:
+    """Raise ValueError where a saved value is not of the kind that a run's `own` is: a word, a yes or no, a
+    count, a number, a list, or an object that has all of its keys. What is not known yet in a run (None) may
+    be a number. Fields check themselves (`from_state`)."""
+    if isinstance(own, dict):
+        alike = isinstance(found, dict) and own.keys() <= found.keys()
+        for key in own.keys() - {"field"} if alike else ():
+            check_alike(found[key], own[key], f"{where}.{key}")
+    elif isinstance(own, list | str | bool):
+        alike = type(found) is type(own)
+    elif type(found) is int:
+        alike = -MOST <= found <= MOST and not (isinstance(own, int) and found < 0)
+    else:
+        alike = type(found) is float and not isinstance(own, int) or own is None and found is None
+    if not alike:
+        raise ValueError(f"{where} is {str(found)[:40]!r}, expected the like of {str(own)[:40]!r}")
 
 
 def checkpoint_mismatch(output: str) -> InvalidInput:

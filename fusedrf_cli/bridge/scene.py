@@ -94,6 +94,11 @@ class LoadedScene:
         return list({id(f.placed.field): f.needs.held for f in self.fields}.values())
 
     @property
+    def resident(self) -> list[int]:
+        """Bytes that these take while they are only read."""
+        return list({id(f.placed.field): f.needs.resident for f in self.fields}.values())
+
+    @property
     def placed(self) -> list[Placed]:
         """The placed fields in node order."""
         return [f.placed for f in self.fields]
@@ -153,8 +158,9 @@ def needs_of(bundle: OpenBundle, member: str) -> FieldNeeds:
         needs = FieldNeeds(header.decoded_size, 0)
     shared = shared_members(member, header, bundle.headers, str(bundle.path)).values()
     parts = [header, *(bundle.headers[name] for name in shared)]
-    decoding = max(map(reading_size, parts)) - needs.held  # before anything is made of the arrays
-    return FieldNeeds(needs.held, sum(part.decoded_size for part in parts) + max(needs.reading, decoding))
+    decoding = max(map(reading_size, parts)) - needs.resident  # before anything is made of the arrays
+    reading = sum(part.decoded_size for part in parts) + max(needs.reading, decoding)
+    return replace(needs, reading=reading)
 
 
 def load_scene(
@@ -216,14 +222,19 @@ class _Loader:
         """A scene of fields, within the budget."""
         needs = {(bundle, member): needs_of(bundle, member) for _, bundle, member in found}
         if self.budget is not None:
-            sizes = list({key_of(leaf, member): needs[b, member].held for leaf, b, member in found}.values())
+            sizes = {
+                key_of(leaf, member): as_shown_needs(needs[b, member], leaf).resident
+                for leaf, b, member in found
+            }
             reading = {"a source while it is read": max(each.reading for each in needs.values())}
             self.shelf.resize(self.budget.room(reading))
-            self.budget.expect(sources(sizes, self.shelf.room) | reading, advice="use smaller sources")
-        fields = tuple(self.source(leaf, b, member, needs[b, member]) for leaf, b, member in found)
-        return LoadedScene(
-            fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle
+            self.budget.expect(
+                sources([*sizes.values()], self.shelf.room) | reading, advice="use smaller sources"
+            )
+        fields = tuple(
+            self.source(leaf, b, member, as_shown_needs(needs[b, member], leaf)) for leaf, b, member in found
         )
+        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle)
 
     def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
@@ -271,6 +282,11 @@ class _Loader:
 def key_of(leaf: Leaf, member: str) -> str:
     """What tells fields apart: their numbers, and what is shown of them."""
     return member if leaf.whole else f"{member} {leaf.opacity} {leaf.tint} {leaf.crops}"
+
+
+def as_shown_needs(needs: FieldNeeds, leaf: Leaf) -> FieldNeeds:
+    """What a leaf's field needs: what is cropped is a copy of some of it."""
+    return needs if leaf.whole else replace(needs, unwritten=0)
 
 
 def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:

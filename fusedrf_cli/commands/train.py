@@ -70,7 +70,7 @@ from fusedrf_cli.requests import TrainRequest
 def command(**words):
     """Learn one field from photos or a mesh.
 
-    SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF or Polycam), its
+    SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF and others), its
     transforms.json, or a .glb, .gltf, .obj, .ply, .stl or .off mesh. Photos without poses are posed first,
     as by `fusedrf pose`.
 

@@ -93,7 +93,7 @@ TABLE = {
         lambda folder: transforms(folder, w=80, h=100),
         ("transforms.json: frame 0 (p0.jpg)", "80x100", "100x80", "use the photos"),
     ),
-    "a photo that is cut off": (cut_off, ("p2.jpg", "cannot be decoded", "replace or remove it")),
+    "a photo that is cut off": (cut_off, ("p2.jpg", "the file is cut off", "copy it again", "remove it")),
     "two photos": (
         lambda folder: transforms(folder, count=2),
         ("transforms.json", "has 2 photos", "3 or more", "add photos"),

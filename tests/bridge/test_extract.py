@@ -215,7 +215,6 @@ def test_bad_words_get_one_sentence(run, folder, what):
     assert not (folder / "look").exists()
 
 
-
 def test_previews_replace_no_other_pictures(report, run, folder):
     words = ("extract", "blocks.rfpack", "--name", "red", "-o", "object.rfpack", "-w", "--preview")
     kept = sorted((folder / "masks").iterdir())
@@ -259,3 +258,14 @@ def test_photos_do_not_teach_what_they_do_not_show(tmp_path):
     pictures = part("mending").without(FIELDS["red"], capture, cameras, NullProgress())
     shown = load_photos(capture.train).pixels[:, 3] > 8
     assert shown.mean() > 0.1 and pictures.ignored[shown].all() and not pictures.ignored.all()
+
+
+def test_what_is_left_of_a_small_field_does_not_grow(report, folder):
+    """Its cells are as wide as texels, along each axis, only where something was taken out."""
+    whole = (folder / "blocks.rfpack").stat().st_size
+    said = report("extract", "blocks.rfpack", "--box", AROUND, "--invert", "-o", "rest.rfpack")
+    assert said["bytes"] < 0.6 * whole  # of two tensors one
+    said = report(
+        "extract", "blocks.rfpack", "--box", "-0.9,-0.4,-0.95,-0.5,0.4,0.4", "--invert", "-o", "less.rfpack"
+    )
+    assert said["bytes"] < 1.05 * whole  # both, with a corner of one cut off

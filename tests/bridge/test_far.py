@@ -106,8 +106,12 @@ def filled(world: World) -> World:
     report("move", "three.rfpack", "blue", "-t", world.lengths(-0.1, 0.3, 0), "-o", "moved.rfpack")
     report("delete", "moved.rfpack", "red", "-o", "less.rfpack")
     report("extract", "three.rfpack", "--name", "blue", "-o", "alone.rfpack")
+    beside = ("-t", world.lengths(0, 0.6, 0.2), "-r", "0,0,30")
+    report("duplicate", "three.rfpack", "red", "red-2", *beside, "-o", "two.rfpack")
+    ball = f"{world.point(*PLACES['red'])},{0.6 * world.unit!r}"
+    report("extract", "three.rfpack", "--sphere", ball, "--invert", "-o", "cut.rfpack")
     report("add", "box.rfpack", "blue.rfpack", *blue, "--no-rgb", "-o", "both.rfpack")
-    for name in ("box", "all", "pair", "three", "moved", "less", "alone", "both"):
+    for name in ("box", "all", "pair", "three", "moved", "less", "alone", "two", "cut", "both"):
         report("validate", f"{name}.rfpack")
         report("info", f"{name}.rfpack")
     return world
@@ -124,7 +128,8 @@ def test_photos_are_learnt_as_at_the_origin(worlds, name):
 @pytest.mark.parametrize("name", TRIED)
 def test_scenes_and_what_is_made_of_them_show_the_same(worlds, name):
     here, there = worlds("ordinary"), worlds(name)
-    for scene in ("scene.json", "pair.rfpack", "three.rfpack", "moved.rfpack", "less.rfpack", "alone.rfpack"):
+    bundles = ("pair", "three", "moved", "less", "alone", "two", "cut")
+    for scene in ("scene.json", *(f"{bundle}.rfpack" for bundle in bundles)):
         views = (("--orbit", "2"), ("--from", "30,20", "--zoom", "1.5"))
         for words in views:
             one, other = here.pictures(scene, *words, *SIDE), there.pictures(scene, *words, *SIDE)

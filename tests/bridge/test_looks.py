@@ -157,3 +157,8 @@ def test_a_verdict_counts_the_covered_pixels_apart():
     assert found.covered == pytest.approx(20, abs=0.3)
     assert found.psnr == pytest.approx(found.covered - 10 * np.log10(found.share), abs=0.2)
     assert 0.02 < found.share < 0.4 and found.views == pytest.approx([judge(student)])
+    away = replace(
+        camera, camera_to_world=np.array(looking_at(np.array([0.0, -4, 0]), np.array([0.0, -9, 0])))
+    )
+    of_nothing = Judge(teacher, [away], teacher.origin).verdict(student)
+    assert of_nothing.covered is None and of_nothing.share == 0

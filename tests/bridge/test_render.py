@@ -134,6 +134,25 @@ def test_what_cannot_be_rendered(run, folder, words, code, says):
     assert result.exit_code == code and says in result.stderr and sorted(folder.iterdir()) == before
 
 
+def test_what_takes_long_is_said_before_it_begins(run, folder, monkeypatch):
+    """Many pixels, or a node so small beside another that each ray takes very many samples."""
+    nodes = [
+        make_node("whole", source="red.rfpack"),
+        make_node("tiny", source="blue.rfpack", scale=[1e-4] * 3),
+    ]
+    write_scene(folder / "tiny.json", SceneGraph(tuple(nodes)))
+    few = "render", "tiny.json", "-o", "out.png", "-w", "--naive", "--size", "2x2"
+    assert run(*few).stderr.count("may take long") == 0
+    monkeypatch.setattr("fusedrf_cli.bridge.rendering.MUCH_WORK", 1 << 16)
+    said = run(*few).stderr
+    assert "Warning: tiny.json: a ray takes up to " in said and "leave out what is smallest" in said
+    assert run("render", "red.rfpack", "-o", "red.png", *SMALL).stderr.count("Warning") == 0
+    monkeypatch.setattr("fusedrf_cli.bridge.rendering.MANY_RAYS", 32 * 24)
+    result = run("render", "red.rfpack", "-o", "out.png", "-w", *SMALL)
+    assert result.exit_code == 0
+    assert "Warning: red.rfpack: 768 pixels may take long; give a smaller --size" in result.stderr
+
+
 @pytest.mark.parametrize("output", ["red.png", "turn"])
 def test_an_output_in_the_way_needs_a_word(run, folder, output):
     assert run("render", "red.rfpack", "-o", output, *SMALL).exit_code == 0

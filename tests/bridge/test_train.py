@@ -15,7 +15,7 @@ from safetensors.numpy import save
 
 from formats import atomic
 from formats.bundle import read_bundle
-from formats.checkpoints import write_checkpoint
+from formats.checkpoints import read_checkpoint, write_checkpoint
 from formats.rig import read_rig
 from fusedrf_cli import signals
 from fusedrf_cli.engine.distillation.config import TrainConfig
@@ -265,6 +265,53 @@ def test_a_checkpoint_of_something_else_is_refused(run, folder):
     write_checkpoint(path, {}, {"command": "train", "kind": "vm"})
     result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--resume")
     assert result.exit_code == 3 and "other settings" in result.stderr
+
+
+def test_a_checkpoint_whose_parts_do_not_fit_is_refused(run, folder, interrupted_in_step):
+    """Under a right checksum: before anything is learnt from it, and whatever it holds."""
+    with interrupted_in_step(2):
+        run("train", "photos", "-o", "out.rfpack", *WORDS)
+    path = folder / "out.rfpack.checkpoint"
+    arrays, state = read_checkpoint(path)
+    wrong = [
+        (arrays, state | {"steps": "1"}),
+        (arrays, state | {"drawn": 10**9}),
+        (arrays, state | {"refreshes": [[]]}),
+        (arrays | {"moment1": arrays["moment1"][:1]}, state),
+        (arrays | {"keys_of_order": arrays["keys_of_order"][:1]}, state),
+        (arrays | {"rotation": arrays["rotation"][:1]}, state),
+        (arrays | {"random": arrays["random"][:9]}, state),
+    ]
+    for content in wrong:
+        write_checkpoint(path, *content)
+        result = run("train", "photos", "-o", "out.rfpack", *WORDS, "--resume")
+        assert result.exit_code == 3 and "other settings" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "found, own, alike",
+    [
+        *(
+            (3, 5, True),
+            (-3, 5, False),
+            (3.5, 5, False),
+            (True, 5, False),
+            ("3", 5, False),
+            (2**60, 5, False),
+        ),
+        *((3, 0.5, True), (-3.5, 0.5, True), (None, 0.5, False), ([], 0.5, False), (float("nan"), 0.5, True)),
+        *((None, None, True), (0.5, None, True), ("x", None, False), ({}, None, False)),
+        *(([1], [], True), ({}, [], False), ("b", "a", True), (1, "a", False), (1, True, False)),
+        *(({"a": 1, "b": 2}, {"a": 3}, True), ({}, {"a": 3}, False), ({"a": "x"}, {"a": 3}, False)),
+        ({"field": 7}, {"field": {}}, True),
+    ],
+)
+def test_states_are_held_against_a_runs_own(found, own, alike):
+    try:
+        part("running").check_alike(found, own, "a state")
+        assert alike
+    except ValueError:
+        assert not alike
 
 
 def test_a_checkpoint_in_the_way_is_left_alone(run, folder):

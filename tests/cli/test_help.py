@@ -103,5 +103,5 @@ def test_completion_answers_the_shell(process, monkeypatch):
     monkeypatch.setenv("_FUSEDRF_COMPLETE", "bash_complete")
     monkeypatch.setenv("COMP_WORDS", "fusedrf fuse --from")
     monkeypatch.setenv("COMP_CWORD", "2")
-    stdout, _ = process("from fusedrf_cli.main import main; main()").communicate(timeout=10)
+    stdout, _ = process("from fusedrf_cli.main import main; main()").communicate(timeout=120)
     assert stdout == "plain,--from-scratch\n"

@@ -45,7 +45,7 @@ def caught(process):
 def test_what_no_signal_reaches_is_ended_and_leaves_nothing(caught, folder):
     before = set(folder.iterdir())
     running = caught("caught(600)", patience=0.3)
-    _, said = running.communicate(timeout=30)
+    _, said = running.communicate(timeout=120)
     assert (running.returncode, said) == (143, "Error: interrupted\n")
     assert set(folder.iterdir()) == before
 
@@ -53,22 +53,22 @@ def test_what_no_signal_reaches_is_ended_and_leaves_nothing(caught, folder):
 def test_it_saves_first_what_can_be_saved(caught, folder):
     last = "signals.last = lambda: open('saved', 'w').close(); signals.remains = 'kept'"
     running = caught(f"{last}; caught(600)", patience=0.3)
-    assert running.communicate(timeout=30)[1] == "Error: kept\n" and running.returncode == 143
+    assert running.communicate(timeout=120)[1] == "Error: kept\n" and running.returncode == 143
     assert (folder / "saved").exists()
 
 
 def test_a_second_signal_does_not_wait(caught):
     running = caught("caught(600)", patience=500, echo=0.05)
-    time.sleep(0.3)
-    running.send_signal(signal.SIGTERM)
-    running.communicate(timeout=30)
+    while running.poll() is None:  # one that comes with the first counts as the same
+        time.sleep(0.1)
+        running.send_signal(signal.SIGTERM)
     assert running.returncode == 143
 
 
 def test_saving_is_waited_for(caught, folder):
     saving = 'exec(\'with signals.unhurried():\\n try: caught(1.5)\\n finally: open("saved", "w")\')'
     running = caught(f"{saving}; caught(600)", patience=0.1)
-    running.communicate(timeout=30)
+    running.communicate(timeout=120)
     assert running.returncode == 143 and (folder / "saved").exists()
 
 
@@ -76,7 +76,7 @@ def test_two_signals_at_once_are_one(caught, folder):
     """As `timeout` sends them: what the first one began goes on."""
     running = caught("print('ready', flush=True); import time; time.sleep(60)", patience=20, echo=2)
     running.send_signal(signal.SIGTERM)
-    assert running.communicate(timeout=30)[1] == "Error: interrupted\n" and running.returncode == 143
+    assert running.communicate(timeout=120)[1] == "Error: interrupted\n" and running.returncode == 143
     assert not list(folder.glob(".out*"))
 
 
@@ -98,4 +98,4 @@ main()
 
 def test_an_error_that_an_interrupt_caused_is_the_interrupt(process):
     running = process(BROKEN_OFF, *WORDS)
-    assert (running.communicate(timeout=30)[1], running.returncode) == ("Error: interrupted\n", 143)
+    assert (running.communicate(timeout=120)[1], running.returncode) == ("Error: interrupted\n", 143)

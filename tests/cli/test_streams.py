@@ -19,7 +19,7 @@ def shell(folder):
 
     def shell(words: tuple[str, ...], redirections: str) -> subprocess.CompletedProcess:
         line = f"exec {shlex.join([sys.executable, '-c', MAIN, *words])} {redirections}"
-        return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=60)
+        return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=300)
 
     return shell
 

@@ -65,6 +65,7 @@ def test_any_failing_call_leaves_the_old_file(old, monkeypatch, call, code):
 
 def test_disk_full_while_writing_leaves_the_old_file(old, monkeypatch):
     """P5."""
+
     def full_disk(path, mode, **_):
         file = open(path, mode, buffering=0)
 

@@ -9,7 +9,9 @@ from PIL import Image
 
 import formats.foreign
 from formats.captures import read_capture
-from formats.errors import MissingExtra, NotACapture, NoViews
+from formats.errors import BadMesh, MissingExtra, NotACapture, NoViews
+from formats.meshes import mesh_surfaces
+from formats.overview import overview
 from formats.posing import photos_to_pose
 from tests.formats.test_captures import photo
 
@@ -59,6 +61,25 @@ def test_files(tmp_path, name):
     for read in (read_capture, photos_to_pose):
         with pytest.raises(NotACapture, match=rf"{name}: is .*{what}.*; .*{cure}"):
             read(tmp_path / name)
+
+
+def test_an_archive_is_no_bundle_to_info(tmp_path):
+    (tmp_path / "photos.zip").write_bytes(b"PK\x03\x04" + bytes(60))
+    with pytest.raises(NotACapture, match=r"photos\.zip: is an archive, no capture; unpack"):
+        overview(tmp_path / "photos.zip")
+
+
+def test_what_is_no_mesh(tmp_path):
+    for name, data, what in (
+        ("a.fbx", b"", "an empty file"),
+        ("a.fbx", b"Kaydara FBX", "an FBX model.*Blender"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(BadMesh, match=rf"a\.fbx: is {what}"):
+            mesh_surfaces(tmp_path / name)
+    (tmp_path / "a.txt").write_text("no mesh")
+    with pytest.raises(BadMesh, match=r"a\.txt: is a text, no mesh; give a \.glb, "):
+        mesh_surfaces(tmp_path / "a.txt")
 
 
 HEIC = FTYP + b"heic" + bytes(200)

@@ -8,12 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from formats import cameras, points
 from formats.cameras import JSON_TOKEN, read_document
 from formats.captures import read_cameras, read_capture
 from formats.colmap import read_model
-from formats.errors import BadIntrinsics, BadJson, BadModel, BadPose, BadSchema, LimitExceeded, NoViews
+from formats.errors import (
+    BadImage,
+    BadIntrinsics,
+    BadJson,
+    BadModel,
+    BadPose,
+    BadSchema,
+    LimitExceeded,
+    NoViews,
+)
 from formats.names import distinct_names, is_name
 from formats.photos import natural
 from formats.points import read_ply_points
@@ -411,3 +421,44 @@ def test_polycam_without_corrected_photos(tmp_path):
     polycam(tmp_path, "images", "cameras")
     (tmp_path / "keyframes/corrected_cameras").mkdir()
     assert "corrected_cameras is not used" in said(read_capture(tmp_path))
+
+
+# --- photos that were cut off -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_a_photo_that_is_cut_off_is_left_out(tmp_path, ending):
+    folder = capture(tmp_path)
+    pixels = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / f"4.{ending}")
+    if ending != "png":
+        (tmp_path / "4.png").unlink()
+    whole = (tmp_path / f"4.{ending}").read_bytes()
+    (tmp_path / f"4.{ending}").write_bytes(whole[: len(whole) // 2])
+    read = read_capture(folder)
+    assert [view.name for view in read.train] == [str(i) for i in range(12) if i != 4]
+    assert f"4.{ending}: the file is cut off; copy it again, or remove it (its frame is left out)" in said(
+        read
+    )
+    for i in (7, 8):
+        (tmp_path / f"{i}.png").write_bytes((tmp_path / f"{i}.png").read_bytes()[:-30])
+    with pytest.raises(BadImage, match=rf"4\.{ending}: the file is cut off"):
+        read_capture(folder)
+
+
+def test_a_photo_with_more_behind_its_end_is_whole(tmp_path):
+    """As a phone's film behind its photo."""
+    folder = capture(tmp_path)
+    (tmp_path / "3.png").write_bytes((tmp_path / "3.png").read_bytes() + bytes(9000))
+    assert len(read_capture(folder).train) == 12
+
+
+def test_damaged_points_are_told(tmp_path):
+    at = np.arange(30.0).reshape(10, 3)
+    at[4, 1], at[7, 0] = np.nan, np.inf
+    lines = "".join(f"{x} {y} {z}\n" for x, y, z in at)
+    head = "ply\nformat ascii 1.0\nelement vertex 10\n" + "".join(f"property float {a}\n" for a in "xyz")
+    (tmp_path / "points.ply").write_text(f"{head}end_header\n{lines}")
+    read = read_capture(capture(tmp_path, ply_file_path="points.ply"))
+    assert len(read.points.positions) == 8
+    assert "points.ply: 2 sparse points are NaN, infinite or beyond 1e30, and left out" in said(read)

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from formats.captures import load_ignored, read_capture
+from formats.errors import BadMask
 from formats.images import read_mask
 from tests.formats.test_captures import frame, photo, write
 from tests.formats.test_readers import binary_model, llff, photos
@@ -110,6 +111,19 @@ def test_masks_of_other_names_are_told(tmp_path):
     read = read_capture(tmp_path)
     assert read.train[0].mask_path is None
     assert "none of its 1 pictures is called as one of them" in read.notes[0]
+
+
+def test_masks_of_numpy_are_told(tmp_path):
+    capture(tmp_path, "transforms", ["a.png", "b.png", "c.png"])
+    (tmp_path / "masks").mkdir()
+    for name in "abc":
+        np.save(tmp_path / f"masks/{name}.npy", LEVELS > 0)
+    read = read_capture(tmp_path)
+    assert "masks: holds 3 arrays of numpy, which are not read as masks; save them as PNG" in str(read.notes)
+    named = [frame(f"images/{name}.png", mask_path=f"masks/{name}.npy") for name in "abc"]
+    write(tmp_path, frames=named, fl_x=80)
+    with pytest.raises(BadMask, match=r"a\.npy is an array of numpy, which is not read; save it as PNG"):
+        read_capture(tmp_path)
 
 
 def test_masks_of_another_capture_are_not_taken(tmp_path):

@@ -132,6 +132,10 @@ def test_see_through(folder, line, alpha):
     assert np.abs(facing(written(folder, f"Kd 1 0 0\n{line}"))[..., 3].astype(int) - alpha).max() <= 1
 
 
+def test_what_is_not_seen_is_named(folder):
+    assert "not shown" in notes_of(written(folder, "d 0\nmap_Kd wood.png"))
+
+
 def test_coverage(folder):
     """map_d covers by its alpha channel, or else by its brightness; map_Kd's alpha alone does not count."""
     grey = np.zeros((2, 2), np.uint8)
@@ -300,3 +304,54 @@ def test_pictures_of_unknown_words_and_small_faces_are_named(folder):
 def test_capitals(folder):
     path = written(folder, "MAP_KD WOOD.PNG", "MTLLIB a.mtl", "USEMTL wood", "F 1/1 2/2 3/3 4/4")
     assert shows(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["wood.png -s 1 1 1", '"wood.png" -o 0 0', "wood.png -clamp off", "my wood.png -bm 1"]
+)
+def test_options_behind_a_picture(folder, text):
+    assert shows(written(folder, f"map_Kd {text}"))
+
+
+@pytest.mark.parametrize("text", ["-o 1.2.3 wood.png", "-s . wood.png", "wood.png -o x"])
+def test_options_that_are_no_numbers_are_named(folder, text):
+    assert "not understood" in notes_of(written(folder, f"map_Kd {text}"))
+
+
+def test_a_picture_whose_name_looks_like_options(folder):
+    Image.fromarray(PICTURE).save(folder / "a.png -s b.png")
+    assert shows(written(folder, "map_Kd a.png -s b.png"))
+
+
+def test_tiles(folder):
+    """Two squares beside each other and one above: 1001, 1002 and 1011; a lost tile is named."""
+    colours = {1001: (200, 0, 0), 1002: (0, 200, 0), 1011: (0, 0, 200)}
+    for tile, colour in colours.items():
+        Image.new("RGB", (2, 2), colour).save(folder / f"skin.{tile}.png")
+    path = written(folder, "Kd 1 1 1\nmap_Kd skin.<UDIM>.png")
+    corners = [(x, y) for y in (0, 1, 2) for x in (0, 1, 2)]
+    text = "".join(f"v {x - 1} {y - 1} 0\nvt {x} {y}\n" for x, y in corners)
+    faces = "".join(
+        "f " + " ".join(f"{i}/{i}" for i in (a, a + 1, a + 4, a + 3)) + "\n" for a in (1, 2, 4, 5)
+    )
+    path.write_text(f"mtllib a.mtl\n{text}usemtl wood\n{faces}")
+    seen = facing(path, 4)[..., :3]
+    assert (seen[3, 0] == colours[1001]).all() and (seen[3, 3] == colours[1002]).all()
+    assert (seen[0, 0] == colours[1011]).all() and (seen[0, 3] == 255).all()
+    assert "skin.1012.png" in notes_of(path) and "no face uses" not in notes_of(path)
+
+
+def test_materials_of_one_name(folder):
+    """The first is shown; others are named where they differ."""
+    twice = written(folder, "map_Kd wood.png\nnewmtl wood\nKd 1 0 0")
+    assert shows(twice) and "more than once" in notes_of(twice)
+    (folder / "b.mtl").write_text("newmtl wood\nKd 1 0 0\n")
+    path = written(folder, lib="mtllib a.mtl b.mtl")
+    assert shows(path) and "more than once" in notes_of(path)
+    same = written(folder, "map_Kd wood.png\nnewmtl wood\nmap_Kd wood.png")
+    assert shows(same) and notes_of(same) == ""
+
+
+@pytest.mark.parametrize("line, said", [("Tf 0.2 0.5 1", True), ("Tf 1 1 1", False), ("Tf 0 0 0", False)])
+def test_light_filters_are_named(folder, line, said):
+    assert ("Tf" in notes_of(written(folder, f"Kd 1 1 1\n{line}"))) == said

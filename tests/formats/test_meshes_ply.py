@@ -62,7 +62,7 @@ def test_polygons(tmp_path, coding, rows):
 
 
 @pytest.mark.parametrize("coding", CODINGS)
-@pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v"), None])
+@pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("s0", "t0"), None])
 def test_textures(tmp_path, coding, names):
     """Coordinates of vertices, and of corners as MeshLab writes them."""
     Image.fromarray(PICTURE).save(tmp_path / "my wood.png")
@@ -241,3 +241,15 @@ def test_wide_integers_hold_colours_of_8_bits(tmp_path):
     hues = {hue: ("int", [part] * 4) for hue, part in (("red", 51), ("green", 102), ("blue", 153))}
     path = ply(tmp_path / "a.ply", "binary_big_endian", square(**hues), QUAD)
     assert (facing(path)[..., :3] == [51, 102, 153]).all()
+
+
+def test_numbers_that_are_no_colours_are_named(tmp_path):
+    vertex = square(nx=("float", [0] * 4), Quality=("float", [0, 1, 2, 3]), scalar_C2M=("float", [0] * 4))
+    path = ply(tmp_path / "a.ply", "binary_little_endian", vertex, QUAD | {"label": (None, "int", [7])})
+    notes = notes_of(path)
+    assert "quality (vertex), scalar_c2m (vertex), label (face)" in notes and "nx" not in notes
+    path.write_bytes(
+        path.read_bytes().replace(b"element face", b"element material 0\nproperty int a\nelement face")
+    )
+    assert "material" in notes_of(path)
+    assert notes_of(ply(path, "ascii", square(), QUAD)) == ""

@@ -116,3 +116,21 @@ def test_stl_that_counts_none(tmp_path):
     path = binary(tmp_path / "a.stl")
     path.write_bytes(path.read_bytes()[:80] + bytes(4) + path.read_bytes()[84:])
     assert (facing(path) == 255).all() and "counts no triangles" in notes_of(path)
+
+
+@pytest.mark.parametrize(
+    "keyword, behind, shown, said",
+    [
+        ("COFF", "51 102 153 255", True, ""),
+        ("STCOFF", "51 102 153 255 0.5 0.5", True, "no colours"),
+        ("STCNOFF", "0 0 1 0.2 0.4 0.6 1.0 0.5 0.5", True, "no colours"),
+        ("STOFF", "0.5 0.5", False, "no colours"),
+        ("OFF", "0.2 0.4 0.6 0.5", True, "transparency"),
+    ],
+)
+def test_numbers_behind_vertices(tmp_path, keyword, behind, shown, said):
+    path = tmp_path / "a.off"
+    rows = "".join(f"{x} {y} 0 {behind}\n" for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+    path.write_text(f"{keyword}\n4 1 0\n{rows}4 0 1 2 3\n")
+    assert (facing(path)[..., :3] == ([51, 102, 153] if shown else [255] * 3)).all()
+    assert said in notes_of(path) and (said != "") == (notes_of(path) != "")

@@ -1,15 +1,16 @@
 """`info` of captures, photos and meshes: what `train` would read of them."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from formats.errors import NotACapture
+from formats.errors import MissingFile, NotACapture
 from formats.overview import overview
 from tests.formats.test_captures import frame, photo, write
 from tests.formats.test_masks import keep
-from tests.formats.test_readers import noisy, ring
+from tests.formats.test_readers import binary_model, noisy, photos, ring
 
 
 def poses() -> list:
@@ -38,8 +39,18 @@ def test_a_capture(tmp_path):
     assert told["sizes"] == [{"size": "10x8", "photos": 9}]
     (lens,) = told["lenses"]
     assert (lens["lens"], lens["focal"], lens["distortion"][0]) == ("pinhole", [80, 80], 0.1)
-    assert told["looks_at"] == pytest.approx([3, -2, 1]) and told["up"] == pytest.approx([0, 0, 1])
+    assert told["looks_at"] == pytest.approx([3, -2, 1]) and told["up"] == [0, 0, 1]
     assert (told["masks"], told["points"], told["transparent"]) == (0, 0, False)
+
+
+def test_numbers_that_are_zero_are_told_so(tmp_path):
+    """Cameras around the origin, whose axes meet there but for rounding."""
+    around = ring(9, 4, np.zeros(3))
+    for i in range(9):
+        noisy(tmp_path / f"{i}.png")
+    frames = [frame(f"{i}.png", transform_matrix=pose) for i, pose in enumerate(around)]
+    write(tmp_path, frames=frames, fl_x=80)
+    assert overview(tmp_path)["looks_at"] == [0, 0, 0]
 
 
 def test_masks_and_trouble(tmp_path):
@@ -73,6 +84,49 @@ def test_poses_that_are_not_used(tmp_path, name):
         (tmp_path / name).write_text('<?xml version="1.0"?>\n<document version="2.0.0">\n <chunk>')
     (note,) = overview(tmp_path)["notes"][1:]
     assert name in note and "not used" in note and "; " in note
+
+
+OTHERS = {
+    "groundtruth.txt": "# timestamp tx ty tz qx qy qz qw\n",
+    "sfm_data.json": '{"sfm_data_version": "0.3", "views": []}',
+    "bundle.out": "# Bundle file v0.3\n",
+    "cameras_sphere.npz": "",
+    "traj.txt": "1 0 0 0\n",
+    "cams/00000000_cam.txt": "extrinsic\n",
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("where", ["", "images", "rgb"])
+def test_cameras_of_other_programs_are_told(tmp_path, name, where):
+    for i in range(3):
+        noisy(tmp_path / where / f"{i}.png")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(OTHERS[name])
+    notes = " ".join(overview(tmp_path / where)["notes"])
+    said = f"{Path(name).name}, another program's list of cameras, is not used"
+    assert f"{said}; export a COLMAP model" in notes
+    if where == "rgb":
+        with pytest.raises(NotACapture, match=f"in rgb; give that folder; {said}"):
+            overview(tmp_path)
+
+
+def test_a_transforms_json_under_another_ending_is_told(tmp_path):
+    capture(tmp_path)
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms.json.txt")
+    for path in (tmp_path / "images").iterdir():
+        path.rename(tmp_path / path.name)
+    told = overview(tmp_path)
+    assert "transforms.json.txt has poses, which are not used; give that file" in " ".join(told["notes"])
+    assert overview(tmp_path / "transforms.json.txt")["photos"]["to_learn_from"] == 9
+
+
+def test_the_largest_model_is_of_other_photos(tmp_path):
+    photos(tmp_path / "images", ("a.png", "b.png"))
+    binary_model(tmp_path / "sparse/0", ("a.png", "b.png"))
+    binary_model(tmp_path / "sparse/1", ("x.png", "y.png", "z.png"))
+    with pytest.raises(MissingFile, match=r"sparse/1: names 3 photos.*give the folder .*sparse/0 to read"):
+        overview(tmp_path)
 
 
 def test_a_centre_beside_the_picture(tmp_path):

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from formats.captures import read_capture
 from formats.errors import BadImage, MissingExtra, MissingFile, NoPoses, NotACapture, NoViews, PosingFailed
 from formats.images import read_focal, write_smaller
 from formats.mapper import ALIKE, NEIGHBOURS, likely_pairs
+from formats.overview import overview
 from formats.points import Points, read_ply_points, write_ply_points
 from formats.posing import DISTANCE, Posed, estimate, photos_to_pose, upright, write_posed
 from formats.views import View
@@ -112,6 +112,16 @@ def test_photos_are_handed_on_smaller(tmp_path, mode, ending):
     with Pillow.open(tmp_path / "b.png") as written:
         assert (written.size, written.mode) == ((40, 20), "RGB")
     assert write_smaller(tmp_path / f"a.{ending}", tmp_path / "b.png", 400) == (100, 50)
+
+
+def test_a_few_photos_that_are_cut_off_are_left_out(tmp_path):
+    corner.write_photos(tmp_path, 6)
+    data = (tmp_path / "p1.jpg").read_bytes()
+    (tmp_path / "p1.jpg").write_bytes(data[: len(data) // 2])
+    found, notes = posing.whole_photos(tmp_path, photos_to_pose(tmp_path))
+    assert [photo.stem for photo in found] == ["p0", "p2", "p3", "p4", "p5"]
+    assert len(notes) == 1 and "p1.jpg: the file is cut off; copy it again" in notes[0]
+    assert overview(tmp_path)["photos"] == {"to_pose": 5}
 
 
 def test_a_photo_that_is_cut_off_is_named_before_any_work(tmp_path, monkeypatch):
@@ -420,11 +430,9 @@ def test_the_process_ends_with_its_parent(tmp_path):
 @with_pycolmap
 def test_sceaux():
     """All of 11 photos of a castle."""
-    started = time.monotonic()
     photos = photos_to_pose(real("sceaux"))
     posed = estimate(real("sceaux"), photos, 2, NullProgress())
     assert len(posed.views) == 11 and posed.models == (11,)
-    assert time.monotonic() - started < 180
 
 
 @pytest.mark.slow

@@ -245,12 +245,12 @@ def test_refused(data, error):
 
 
 def test_limits_themselves_are_accepted_at_once():
-    began = time.perf_counter()
+    began = time.process_time()
     assert len(parse_scene(nested(MAX_DEPTH), "here").nodes) == 1
     assert (
         len(parse_scene(scene_json(*[{"name": str(i)} for i in range(MAX_NODES)]), "here").nodes) == MAX_NODES
     )
-    assert time.perf_counter() - began < 5
+    assert time.process_time() - began < 5
     for scale in (1e-12, 1e12):
         placed(scale=[scale] * 3)
     placed(translation=[1e13, 0, 0])

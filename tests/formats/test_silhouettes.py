@@ -260,6 +260,41 @@ def test_other_borders_of_one_colour_are_surroundings(tmp_path, photo):
     assert read.opaque and read.frame.layout == "inward" and "--bounded" in read.notes[0]
 
 
+def soft_ball(i: int) -> np.ndarray:
+    """Straight alpha that is soft all over."""
+    alpha = np.where(ball(i), np.random.default_rng(i).integers(30, 256, (HIGH, WIDE)), 0)
+    return with_alpha(room(i), alpha)
+
+
+def test_colours_that_were_multiplied_by_alpha(tmp_path):
+    def multiplied(i: int) -> np.ndarray:
+        pixels = soft_ball(i)
+        pixels[..., :3] = np.rint(pixels[..., :3] * (pixels[..., 3:] / 255.0))
+        return pixels
+
+    straight, read = capture(tmp_path / "a", soft_ball), capture(tmp_path / "b", multiplied)
+    assert not any("multiplied" in note for note in straight.notes)
+    assert "colours of the photos were multiplied by their alpha" in " ".join(read.notes)
+    expected, found = (load_photos(c.train).pixels.astype(int) for c in (straight, read))
+    shown = expected[:, 3] > 0
+    assert np.array_equal(expected[:, 3], found[:, 3])
+    assert (np.abs(expected - found)[shown, :3] <= 255 / expected[shown, 3:] / 2 + 1).all()
+
+
+@pytest.mark.parametrize("across", [False, True])
+def test_bars_on_two_sides_are_told(tmp_path, across):
+    def barred(i: int) -> np.ndarray:
+        pixels = room(i)
+        lines = pixels.swapaxes(0, 1) if across else pixels
+        lines[:6] = lines[-6:] = 0
+        return pixels
+
+    where = "left and right" if across else "above and below"
+    read = capture(tmp_path, barred)
+    assert f"bars {where} of one colour (0, 0, 0)" in " ".join(read.notes)
+    assert read.opaque and len(read.train) == 12
+
+
 # --- masks --------------------------------------------------------------------------------------------------
 
 

@@ -24,11 +24,13 @@ import numpy as np
 
 from formats.bundle import is_bundle
 from formats.captures import load_photos, read_capture
+from formats.checkpoints import read_checkpoint
 from formats.errors import FormatError
 from formats.meshes import is_mesh, mesh_capture
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
 from tests.bridge.conftest import stock_fields
+from tests.promises.checkpoints import NAME, RUNS, checkpoint, intact, interrupted, spoilt_checkpoint
 from tests.promises.commands import PATIENCE, QUICK, judged, run
 from tests.promises.fuzz import Hung
 from tests.promises.fuzz import patience as patiently
@@ -39,6 +41,7 @@ from tests.promises.mutations import DAMAGES, EDGES, TOKENS, spoilt_json
 EARLY = 0.2
 """Share of the commands that are asked to end after a moment."""
 TEXTS = (".json", ".gltf", ".obj", ".mtl", ".txt")
+INPUTS = (*CAPTURES, *MESHES, checkpoint)
 NUMBERS = ("nan", "inf", "-1", "0", "1e300", "-1e300", "1e-300", "4294967296", "9" * 400, "x", "", "1e999")
 
 
@@ -48,6 +51,10 @@ NUMBERS = ("nan", "inf", "-1", "0", "1e300", "-1e300", "1e-300", "4294967296", "
 def spoil(file: Path, rng: random.Random) -> str:
     """Change a file in place as a disk, another program or an enemy would; what was done."""
     data = file.read_bytes()
+    if file.name == NAME:
+        done, data = spoilt_checkpoint(data, rng)
+        file.write_bytes(data)
+        return done
     if file.suffix in (".json", ".gltf") and rng.random() < 0.7:
         file.write_bytes(spoilt_json(data, rng))
         return "JSON"
@@ -111,7 +118,11 @@ def spoilt_number(data: bytearray, rng: random.Random) -> bytes:
 
 
 def read(source: Path) -> None:
-    """What `train` reads of an input, pixels too."""
+    """What `train` reads of an input, pixels too; a checkpoint that is read has to be sealed."""
+    if source.name == NAME:
+        read_checkpoint(source)
+        assert intact(source.read_bytes())
+        return
     if is_mesh(source):
         mesh_capture(source, n_train=2, size=8, samples_per_pixel=1)
         return
@@ -150,7 +161,7 @@ def reading(source: Path) -> tuple[str, str | None]:
 
 def laid_out(folder: Path) -> dict[str, Path]:
     """Sound inputs of every kind in a folder, each in one of its own; where the source of each lies in it."""
-    return {make.__name__: make(folder / "sound" / make.__name__) for make in CAPTURES + MESHES}
+    return {make.__name__: make(folder / "sound" / make.__name__) for make in INPUTS}
 
 
 def damaged(folder: Path, sound: dict[str, Path], rng: random.Random) -> tuple[str, Path, str]:
@@ -177,23 +188,25 @@ def commands(count: int, seed: int, folder: Path) -> dict:
     for index in range(count):
         rng = random.Random(f"commands/{seed}/{index}")
         words, name, done = line(folder, sound, rng)
+        torn = "--resume" in words and not intact((folder / NAME).read_bytes())
         early = rng.random() < EARLY
         code, said, asked = run(words, folder, rng.uniform(0.0, 2.0) if early else PATIENCE)
         found[f"{words[0]} {name}: exit {code}"] += 1
         found["asked to end"] += bool(asked)
-        if problem := judged_run(code, said, early, folder):
+        if problem := judged_run(code, said, early, torn, folder):
             case = {"index": index, "words": words, "kind": name, "done": done, "problem": problem}
             wrong.append(case | {"said": said[-2000:]})
     return {"commands": count, "wrong": wrong, "counts": dict(sorted(found.items()))}
 
 
-def judged_run(code: int, said: str, early: bool, folder: Path) -> str | None:
-    """What is wrong with how a command ended, which may have been asked to end before it began."""
+def judged_run(code: int, said: str, early: bool, torn: bool, folder: Path) -> str | None:
+    """What is wrong with how a command ended, which may have been asked to end before it began, or to go on
+    from a checkpoint that is `torn`."""
     if early and code == -signal.SIGTERM:
         return None
     if not early and code in (-signal.SIGTERM, 128 + signal.SIGTERM):
         return "took too long"
-    return judged(code, said, False, folder)
+    return judged(code, said, torn and not early, folder)
 
 
 def prepare(folder: Path) -> None:
@@ -203,6 +216,8 @@ def prepare(folder: Path) -> None:
     with suppress(SystemExit):
         cli.main(["fuse", "pair.json", "-o", "good.rfpack", *QUICK])
     assert is_bundle(Path("good.rfpack"))
+    for name, words in RUNS.items():
+        Path(f"{name}.checkpoint").write_bytes(interrupted(folder, words))
 
 
 SCENE = "damaged.json"
@@ -222,7 +237,13 @@ OVER_CAPTURES = (
 
 def line(folder: Path, sound: dict[str, Path], rng: random.Random) -> tuple[tuple[str, ...], str, str]:
     """A command line over a damaged input, which kind of input it is, and what was done to it."""
-    if rng.random() < 0.4:
+    kind = rng.random()
+    if kind < 0.25:
+        name = rng.choice(sorted(RUNS))
+        shutil.copy(folder / f"{name}.checkpoint", folder / NAME)
+        done = f"checkpoint: {spoil(folder / NAME, rng)}"
+        return (*RUNS[name], "-o", "out.rfpack", "--resume"), f"checkpoint of {name}", done
+    if kind < 0.5:
         shutil.copy(folder / "pair.json", folder / SCENE)
         done = f"scene: {spoil(folder / SCENE, rng)}"
         return rng.choice(OVER_SCENES), "scene", done

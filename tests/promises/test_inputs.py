@@ -7,12 +7,11 @@ from pathlib import Path
 import pytest
 
 from tests.promises import fuzz_inputs
-from tests.promises.inputs import CAPTURES, MESHES
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("make", CAPTURES + MESHES, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", fuzz_inputs.INPUTS, ids=lambda make: make.__name__)
 def test_the_sound_inputs_are_read(make, tmp_path):
     """Else the fuzzer would only see refusals."""
     assert fuzz_inputs.reading(make(tmp_path / "sound")) == ("read", None)

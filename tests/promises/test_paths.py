@@ -57,7 +57,7 @@ def run(*words) -> dict:
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
     *said, report = done.stderr.splitlines()
     return {**json.loads(report), "said": said}

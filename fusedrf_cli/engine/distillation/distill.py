@@ -24,7 +24,7 @@ from fusedrf_cli.engine.distillation.losses import (
     point_step,
 )
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, without_haze
-from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.distillation.optimiser import Adam, alike
 from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import Schedule
@@ -298,23 +298,32 @@ class DistillRun:
         return arrays, state
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
-        """Take up a run that `checkpoint` saved, over the same teacher and config."""
+        """Take up a run that `checkpoint` saved, over the same teacher and config. Raises ValueError,
+        KeyError, TypeError or RuntimeError for what is none."""
+        if state["phase"] != ("pictures" if "before" in arrays else "points"):
+            raise ValueError(f"the phase {state['phase'][:40]!r}, but pictures begin with the numbers before")
         if self.refined is not None and not state["coarse"]:
             self._refine()
         if "before" in arrays:
-            self.student.params.copy_(torch.from_numpy(arrays["before"]))
+            self._take("before", arrays)
             self._begin_pictures()
-            self.report.psnr_before_rgb = state["psnr_before_rgb"]
+            self.report.psnr_before_rgb = float(state["psnr_before_rgb"])
             self.report.steps["points"] = state["points_steps"]
-        self.student.params.copy_(torch.from_numpy(arrays["params"]))
+        self._take("params", arrays)
         self.optimiser.restore(arrays, state["adam_steps"])
         self.count = state["rays"]
-        self.phase, self.steps, self.elapsed = state["phase"], state["steps"], state["elapsed"]
+        self.phase, self.steps, self.elapsed = state["phase"], state["steps"], max(state["elapsed"], 0)
         self.guard.restore(state["guard"])
         self.schedule.restore(state["schedule"])
-        self.report.curve = [tuple(point) for point in state["curve"]]
+        self.report.curve = [(float(at), int(made), float(psnr)) for at, made, psnr in state["curve"]]
         self.epochs.restore(arrays, state)
         self.random = torch.from_numpy(arrays["random"]) if "random" in arrays else None
+        if self.random is not None:
+            torch.Generator().set_state(self.random)  # a RuntimeError now rather than later
+
+    def _take(self, name: str, arrays: dict[str, np.ndarray]) -> None:
+        params = self.student.params
+        params.copy_(torch.from_numpy(alike(arrays[name], params, name)))
 
 
 class _Clock:

@@ -39,5 +39,12 @@ class Epochs:
         return {} if self.keys is None else {"keys_of_order": self.keys}, {"drawn": self.at}
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
-        """Inverse of `state`."""
-        self.keys, self.at = arrays.get("keys_of_order"), state["drawn"]
+        """Inverse of `state`. Raises ValueError for what is no place in an order."""
+        keys, at = arrays.get("keys_of_order"), state["drawn"]
+        if (
+            not 0 <= at <= self.count
+            or keys is not None
+            and (keys.shape, keys.dtype) != ((ROUNDS,), np.int64)
+        ):
+            raise ValueError(f"place {at} of {self.count} numbers, in an order by {keys}")
+        self.keys, self.at = keys, at

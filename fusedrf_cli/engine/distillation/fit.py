@@ -18,7 +18,7 @@ from fusedrf_cli.engine.distillation.exposure import (
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
-from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam
+from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam, alike
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
@@ -187,20 +187,26 @@ class FitRun:
         return arrays, state
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
-        """Take up a run that `checkpoint` saved, over the same pictures and config."""
+        """Take up a run that `checkpoint` saved, over the same pictures and config. Raises ValueError,
+        KeyError, TypeError or RuntimeError for what is none."""
         self.field = type(self.field).from_state(part_of(arrays, "field."), state["field"])
         self.field = self.field.to(self.config.device)
         self.optimiser = self.fresh_optimiser()
         self.optimiser.restore(arrays, state["adam_steps"])
         self.steps = state["steps"]
         self.stages = self.stages[len(self.stages) - state["stages"] :]
-        self.refreshes, self.exposures = state["refreshes"], state["exposures"]
-        self.refinements = state["refinements"]
-        self.maps = arrays.get("exposure")
-        self.pool.place(Poses(arrays["rotation"], arrays["position"]))
+        self.refreshes, self.exposures, self.refinements = (
+            [float(share) for share in state[name]] for name in ("refreshes", "exposures", "refinements")
+        )
+        if (self.maps is None) != ("exposure" not in arrays):
+            raise ValueError("exposure is learnt in one of both runs")
+        if self.maps is not None:
+            self.maps = alike(arrays["exposure"], self.maps, "exposure")
+        own = {"rotation": self.pool.rotation, "position": self.pool.position}
+        self.pool.place(Poses(*(alike(arrays[name], part, name) for name, part in own.items())))
         self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
-        self.started = working_time() - state["elapsed"]
+        self.started = working_time() - max(state["elapsed"], 0)
         self.guard.restore(state["guard"])
         self.pool.epochs.restore(arrays, state)
         if self.keypoints is not None:

@@ -98,4 +98,4 @@ class Guard:
         """Inverse of `state`; the numbers to go back to are those of the first step from here."""
         self.rate, self.skipped = state["rate"], state["skipped"]
         self.roll_backs = state["roll_backs"]
-        self.recent.extend(state["recent"])
+        self.recent.extend(map(bool, state["recent"]))

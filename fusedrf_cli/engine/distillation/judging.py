@@ -26,8 +26,8 @@ class Verdict:
 
     psnr: float
     """Of all pixels of all views together."""
-    covered: float
-    """Of those in which the teacher shows something."""
+    covered: float | None
+    """Of those in which the teacher shows something; None: there are none."""
     share: float
     """How much of the views is covered."""
     views: tuple[float, ...]
@@ -56,7 +56,7 @@ class Judge:
     def verdict(self, student: RadianceField) -> Verdict:
         """The same, and what it hides."""
         shots, seen = self.shots(student), self.covered
-        covered = psnr(shots[seen], self.truth[seen]) if seen.any() else float("nan")
+        covered = psnr(shots[seen], self.truth[seen]) if seen.any() else None
         each = tuple(psnr(*pair) for pair in zip(shots, self.truth, strict=True))
         return Verdict(psnr(shots, self.truth), covered, float(seen.mean()), each)
 

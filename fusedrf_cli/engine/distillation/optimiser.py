@@ -12,6 +12,14 @@ from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15  # TensoRF's; a gradient here can be tiny, so eps must not damp it
 
 
+def alike(array: np.ndarray, own: torch.Tensor | np.ndarray, name: str) -> np.ndarray:
+    """A saved array. Raises ValueError where it is not of the shape and type of a run's own."""
+    kind = str(own.dtype).removeprefix("torch.")
+    if array.shape != tuple(own.shape) or array.dtype.name != kind:
+        raise ValueError(f"{name} is {array.dtype} {array.shape}, expected {kind} {tuple(own.shape)}")
+    return array
+
+
 @dataclass
 class Adam:
     """Moments and gradient parts of one field."""
@@ -45,9 +53,9 @@ class Adam:
         return {name: moment.cpu().numpy() for name, moment in self._kept()}
 
     def restore(self, arrays: dict[str, np.ndarray], steps: int) -> None:
-        """Take up saved moments after so many steps."""
+        """Take up saved moments after so many steps. Raises ValueError where they are others' moments."""
         for name, moment in self._kept():
-            moment.copy_(torch.from_numpy(arrays[name]))
+            moment.copy_(torch.from_numpy(alike(arrays[name], moment, name)))
         self.steps = steps
 
     def _kept(self) -> list[tuple[str, torch.Tensor]]:

@@ -40,9 +40,16 @@ class FieldNeeds:
     numbers."""
 
     held: int
-    """While it is there."""
+    """While it is there, were all of its numbers written."""
     reading: int
     """More, beside its arrays, while it is made of them."""
+    unwritten: int = 0
+    """Of `held`, pages of zeros that no file has numbers for: they take no memory before they are copied."""
+
+    @property
+    def resident(self) -> int:
+        """While it is only read."""
+        return self.held - self.unwritten
 
 
 class StoredField(RadianceField, Protocol):

@@ -22,6 +22,7 @@ from fusedrf_cli.engine.fields.computed import (
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
+PAGE = 2 << 20  # bytes, of a large one: a vertex that is used may be alone in its
 PER_VERTEX_FOUND = 7  # bytes of a vertex, or of a cell, while the used ones are found
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
@@ -238,11 +239,13 @@ class BoxField(ComputedField):
         parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
         numbers = sum(-(-math.prod(part.shape) // LINE) * LINE for part in parts)
         counts, texels = metadata["cells"]["counts"], metadata["resolution"]
-        made = PER_CELL_MADE * math.prod(counts)
-        if any(part.on_vertices for part in parts):  # used_vertices axis by axis, and the used ones' places
-            halves = [math.prod([*texels[:n], *counts[n:]]) for n in range(4)]
-            made = max(made, PER_VERTEX_FOUND * max(halves), (1 + 8) * math.prod(texels))
-        return FieldNeeds(4 * numbers + PER_CELL * math.prod(counts), made)
+        made, unwritten = PER_CELL_MADE * math.prod(counts), 0
+        for part in parts:
+            if part.on_vertices:  # used_vertices axis by axis, and the used ones' places
+                halves, used = [math.prod([*texels[:n], *counts[n:]]) for n in range(4)], shapes[part.name][0]
+                made = max(made, PER_VERTEX_FOUND * max(halves), math.prod(texels) + 8 * used)
+                unwritten += max(0, 4 * math.prod(part.shape) - used * PAGE)
+        return FieldNeeds(4 * numbers + PER_CELL * math.prod(counts), made, unwritten)
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "BoxField":

@@ -35,10 +35,9 @@ def as_it_is(points: np.ndarray) -> np.ndarray:
 
 def refined(grid: OccupancyGrid, voxel: float) -> OccupancyGrid:
     """The same cells, each made of several that are no smaller than about a voxel."""
-    times = max(1, min(FINEST // max(grid.occupied.shape), int(np.ceil(grid.cell.max() / voxel))))
     finer = grid.occupied
-    for axis in range(3):
-        finer = np.repeat(finer, times, axis)
+    for axis, (cell, count) in enumerate(zip(grid.cell, grid.occupied.shape, strict=True)):
+        finer = np.repeat(finer, max(1, min(FINEST // count, int(np.ceil(cell / voxel)))), axis)
     return grid.marked(finer)
 
 
@@ -46,13 +45,13 @@ def without_object(
     grid: OccupancyGrid, voxel: float, selection: Selection, to_field: ToField = as_it_is
 ) -> OccupancyGrid:
     """A grid of a field with such voxels without the cells that hold cells of the object and no other matter,
-    so that nothing of that is lost."""
+    so that nothing of that is lost; the grid itself where there are none."""
     finer = refined(grid, voxel)
     index = np.argwhere(finer.occupied)
     kept, matter = finer.occupied.copy(), Matter(selection)
     for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
         kept[tuple(part[emptied(finer, part, matter, to_field)].T)] = False
-    return grid.marked(kept)
+    return grid if (kept == finer.occupied).all() else grid.marked(kept)
 
 
 class Matter:

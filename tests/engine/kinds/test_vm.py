@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
@@ -182,6 +182,30 @@ def test_owners_are_named_lower_first():
     assert (
         both.any() and (first[both] < second[both]).all() and (first[~both & (first != NO_BLOCK)] < 3).all()
     )
+
+
+def test_blocks_in_one_place_are_settled_by_bounded_work(monkeypatch):
+    """Where many meet in many cells, neighbours are asked as one: of blocks that differ everywhere alike the
+    two densest still own all that they did, and cells that several make up are marked as one."""
+    places = (0.0, 0.02, 0.04, 0.06, 0.08)
+    whole = assembled(*places)
+    asked, peaks = [], VMField.peaks
+
+    def counted(self, lo, cell, cells, offsets, frame=0):
+        asked.append(len(cells))
+        return peaks(self, lo, cell, cells, offsets, frame)
+
+    monkeypatch.setattr(VMField, "peaks", counted)
+    module = "fusedrf_cli.engine.kinds.vm.field."
+    limit = 3_000 * len(places) * len(PROBES) * whole.shape.density_rank
+    monkeypatch.setattr(module + "MOST_PROBED", limit)
+    monkeypatch.setattr(module + "MOST_MARKED", sum(t.occupancy.occupied.sum() for t in whole.tensors) // 4)
+    found = assembled(*places)
+    assert len(asked) == len(places) and max(asked) <= 3_000
+    assert (found.occupancy.occupied >= whole.occupancy.occupied).all()
+    crowded = (whole.owners[1] != NO_BLOCK) & (found.owners[1] != NO_BLOCK)
+    alike = (whole.owners[0] == found.owners[0]) & (whole.owners[1] == found.owners[1])
+    assert crowded.sum() > 3_000 and alike[crowded].mean() > 0.5
 
 
 # -- storage -------------------------------------------------------------------------------------------------

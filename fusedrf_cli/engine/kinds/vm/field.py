@@ -63,11 +63,16 @@ from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 ROUNDING = 1e-6  # share of a ball's radius by which it is larger
+CELLS_PER_NUMBER = 4  # of a tensor, from which on its cells are stored in bricks where these are smaller
 PER_OWNED_CELL = 8  # bytes of a cell of several blocks: owners, distances, strides
 PER_OWNED_CELL_MADE = 16  # more while they are found
 PER_PLACED_CELL = 110  # of a tensor's cell while it is placed in the field
 BY_ROUTES = 40  # blocks at most: which of them it meets, each ray is asked for each
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
+MOST_MARKED = 1 << 26
+"""Occupied cells of all blocks together from which on several are marked as one: 32 times 128³ of them."""
+MOST_PROBED = 1 << 32
+"""Probes times ranks of the cells in which more than two blocks meet, from which on neighbours share them."""
 TOUCHING = 1e-6  # of a block's peak: its rank in a cell where no probe meets its matter
 MAX_RANK = 1024  # of a stored field
 BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less
@@ -254,10 +259,11 @@ class VMField(ComputedField):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
         grids = [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks]
         if any(grid.space is unbounded for grid, _ in grids):
-            space, aabb, marks = unbounded, unbounded.WHOLE, unbounded_cells(grids, OWNERSHIP_CELLS)
+            marks = unbounded_cells(marked_as(grids), OWNERSHIP_CELLS)
+            space, aabb = unbounded, unbounded.WHOLE
         else:
             boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
-            space, (aabb, marks) = bounded, placed_cells(boxes, grids, OWNERSHIP_CELLS)
+            space, (aabb, marks) = bounded, placed_cells(boxes, marked_as(grids), OWNERSHIP_CELLS)
         steps = [tensors[b.tensor].step for b in blocks]
         pace = Pace(OccupancyGrid.full(aabb, OWNERSHIP_CELLS, space))
         first, second, count = claimed_cells(pace.kept(marks, grids, steps))
@@ -500,7 +506,8 @@ class VMField(ComputedField):
                 needs |= {"held", "runs"}
                 arrays |= {detail: arrays[detail][held.rows], runs_of(detail): held.lengths}
                 arrays |= {f"{detail}_{name}": bits for name, bits in held.state().items()}
-            cells = packed_bits(f"tensor_{t}.occupancy", grid, FEW_CELLS if held is None else 0)
+            few = min(FEW_CELLS, CELLS_PER_NUMBER * self.tensors[t].size(self.shape))
+            cells = packed_bits(f"tensor_{t}.occupancy", grid, few if held is None else 0)
             needs |= {"held"} if len(cells) > 1 else set()
             arrays |= cells
         metadata = ({"needs": sorted(needs)} if needs else {}) | {
@@ -693,6 +700,14 @@ def detail_arrays(tensors: tuple[VMTensor, ...], real: np.dtype) -> tuple[np.nda
     return rows, lattice
 
 
+def marked_as(grids: list[tuple[OccupancyGrid, np.ndarray]]) -> list[tuple[OccupancyGrid, np.ndarray]]:
+    """Placed grids as their cells are marked: as they are, or so many halved that they have MOST_MARKED."""
+    while sum(int(grid.occupied.sum()) for grid, _ in grids) > MOST_MARKED:
+        halved = {id(grid): grid.halved() for grid, _ in grids}
+        grids = [(halved[id(grid)], matrix) for grid, matrix in grids]
+    return grids
+
+
 def claimed_cells(marks: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Three (X, Y, Z) uint8 grids: the lowest and second lowest block with matter in a cell, and how many
     have."""
@@ -708,14 +723,21 @@ def claimed_cells(marks: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray, 
 
 
 def settle_crowded(field: VMField, crowded: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-    """Give the cells (N, 3) in which more than two blocks have matter to the two densest."""
+    """Give the cells (N, 3) in which more than two blocks have matter to the two densest. Where that would
+    take more than MOST_PROBED, neighbours are asked as one."""
     if not len(crowded):
         return
-    grid = field.occupancy
-    best = np.full((2, len(crowded)), -1.0, np.float32)
-    densest = np.full((2, len(crowded)), NO_BLOCK, np.uint8)
+    grid, cells, each, side = field.occupancy, crowded, slice(None), 1
+    cost = len(field.blocks) * len(PROBES) * field.shape.density_rank
+    while len(cells) * cost > MOST_PROBED and side < OWNERSHIP_CELLS:
+        side *= 2
+        numbers = np.ravel_multi_index(tuple((crowded // side).T), grid.occupied.shape)
+        numbers, each = np.unique(numbers, return_inverse=True)
+        cells = np.stack(np.unravel_index(numbers, grid.occupied.shape), 1)
+    best = np.full((2, len(cells)), -1.0, np.float32)
+    densest = np.full((2, len(cells)), NO_BLOCK, np.uint8)
     for b in range(len(field.blocks)):
-        peak = field.peaks(grid.aabb[:3], grid.cell, crowded, PROBES, b)
+        peak = field.peaks(grid.aabb[:3], side * grid.cell, cells, PROBES, b)
         # A probe misses matter that barely reaches into a cell: such blocks come last, by their peak
         # elsewhere.
         peak = np.where(peak > 0, peak, TOUCHING * peak.max())
@@ -725,4 +747,4 @@ def settle_crowded(field: VMField, crowded: np.ndarray, first: np.ndarray, secon
             for held, new in ((best, peak), (densest, np.uint8(b)))
         )
         best[0], densest[0] = np.where(leads, peak, best[0]), np.where(leads, np.uint8(b), densest[0])
-    first[tuple(crowded.T)], second[tuple(crowded.T)] = np.sort(densest, axis=0)
+    first[tuple(crowded.T)], second[tuple(crowded.T)] = np.sort(densest, axis=0)[:, each]

@@ -1,0 +1,68 @@
+"""P1: kept bundles of everything that was ever written answer, show and are edited as they were
+(tests/promises/golden.py)."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from formats.bundle import sha256_of
+from formats.past import past_of
+from fusedrf_cli.main import cli
+from tests.promises.golden import CASES, KEPT, answers, edited, picture
+
+CLOSE = {"rtol": 2e-4, "atol": 2e-5}  # float32 numbers that are added up in another order
+EDITS = [(name, edit) for name, case in CASES.items() for edit in case.edits]
+
+
+def kept(name: str) -> dict[str, np.ndarray]:
+    """What was answered when the bundle was written."""
+    with np.load(KEPT / f"{name}.npz") as found:
+        return dict(found)
+
+
+def check(path, found: dict, prefix: str = "") -> None:
+    """A bundle's answers against those that were kept."""
+    sigma, rgb = answers(path, found["points"], found["dirs"])
+    wanted, there = found[f"{prefix}sigma"], found[f"{prefix}sigma"] > 0
+    np.testing.assert_allclose(sigma, wanted, rtol=CLOSE["rtol"], atol=CLOSE["atol"] * wanted.max())
+    np.testing.assert_allclose(rgb[there], found[f"{prefix}rgb"][there], **CLOSE)
+    assert there.sum() > 10
+
+
+def test_every_kept_bundle_has_its_case_and_is_small():
+    files = [path for path in KEPT.rglob("*") if path.is_file()]
+    assert {path.stem for path in KEPT.glob("*.rfpack") if path.is_file()} == CASES.keys()
+    assert sum(path.stat().st_size for path in files) < 3_500_000
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_valid_and_answers_as_it_did(name):
+    result = CliRunner().invoke(cli, ["validate", str(KEPT / f"{name}.rfpack")])
+    assert result.exit_code == 0, result.stderr
+    check(KEPT / f"{name}.rfpack", kept(name))
+
+
+@pytest.mark.parametrize(("name", "edit"), EDITS)
+def test_an_edit_of_it_gives_what_it_gave(name, edit, tmp_path):
+    path, words, out = KEPT / f"{name}.rfpack", CASES[name].edits[edit], tmp_path / "out.rfpack"
+    edited(path, words, out)
+    check(out, kept(name), f"{edit} ")
+    if words[0] == "undo":
+        assert (past_of(path) / f"{sha256_of(out)}.rfpack").read_bytes() == out.read_bytes()
+
+
+def test_the_kept_history_tells_what_was_done():
+    result = CliRunner().invoke(cli, ["history", str(KEPT / "blocks-edited.rfpack"), "--json"])
+    said = json.loads(result.stdout)
+    events = ["fused", "added", "moved", "duplicated", "renamed", "replaced", "deleted"]
+    assert [entry["event"] for entry in said["history"]] == events and said["undoable"] == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_it_shows_what_it_showed(name):
+    found, wanted = picture(KEPT / f"{name}.rfpack", CASES[name]), kept(name)["picture"]
+    error = float(np.mean((found - wanted) ** 2))
+    assert -10 * np.log10(max(error, 1e-12)) >= CASES[name].bar
