@@ -279,9 +279,9 @@ def test_pruned_drops_empty_cells_only():
 
 def test_points_have_three_quarters_of_the_seconds_and_all_where_nothing_else_is_learnt():
     def share(phase: str, rgb: bool = True, **words) -> float:
-        settings = DistilConfig(time_budget=8.0, **words)
-        run = SimpleNamespace(settings=settings, rgb=rgb, phase=phase)
-        return DistillRun._share(run, settings.steps if phase == "points" else settings.rgb_steps, 3.0)
+        config = DistilConfig(time_budget=8.0, **words)
+        run = SimpleNamespace(config=config, rgb=rgb, phase=phase)
+        return DistillRun._share(run, config.steps if phase == "points" else config.rgb_steps, 3.0)
 
     assert share("points") == pytest.approx(3 / 6) and share("pictures") == pytest.approx(3 / 2)
     assert share("points", rgb=False) == share("pictures", steps=0) == pytest.approx(3 / 8)
