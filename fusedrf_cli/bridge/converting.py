@@ -1,5 +1,7 @@
 """`convert`: a field of any kind to one of any other."""
 
+from dataclasses import fields
+
 from formats.bundle import OpenBundle, is_bundle
 from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.evaluating import evaluate
@@ -20,9 +22,8 @@ def convert(request: ConvertRequest, progress) -> dict:
         raise unusable_kind(error) from error
     if wanted.field is None:
         raise UsageProblem(f"--kind {request.kind} is a way of fusing and no kind of field; choose another")
-    words = {
-        name: getattr(request, name) for name in FuseRequest.__dataclass_fields__ if hasattr(request, name)
-    }
+    same = [field.name for field in fields(FuseRequest) if hasattr(request, field.name)]
+    words = {name: getattr(request, name) for name in same}
     fused = fuse(
         FuseRequest(scene=request.field, from_scratch=True, **words),
         progress,

@@ -120,7 +120,7 @@ def test_rays_show_the_scene_whether_or_not_it_is_put_together(monkeypatch, in_m
 def test_a_student_that_learns_from_nothing_is_taught_by_the_sources_put_together(monkeypatch):
     taught_by = []
 
-    def run(teacher, *words):
+    def run(teacher, *words, **more):
         taught_by.append(teacher)
         raise InterruptedError
 
