@@ -1,6 +1,6 @@
 """What of unbounded space a capture's photos are learnt in."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def request() -> TrainRequest:
     """`train` with unbounded space asked for."""
-    known = {name: None for name, field in TrainRequest.__dataclass_fields__.items()}
+    known = {field.name: None for field in fields(TrainRequest)}
     return TrainRequest(**known | {"source": "photos", "output": "out.rfpack", "unbounded": True})
 
 

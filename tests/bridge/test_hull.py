@@ -1,6 +1,6 @@
 """The visual hull of a ball whose masks are known in closed form."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import numpy as np
@@ -133,7 +133,7 @@ def test_the_hull_of_an_object_far_away_is_that_of_the_same_at_the_origin(tmp_pa
     moved = [replace(view, camera_to_world=view.camera_to_world.copy()) for view in views]
     for view in moved:
         view.camera_to_world[:3, 3] = unit * view.camera_to_world[:3, 3] + at
-    words = {name: None for name in TrainRequest.__dataclass_fields__}
+    words = {field.name: None for field in fields(TrainRequest)}
     found = []
     for chosen, box in ((views, BOX), (moved, unit * BOX + np.tile(at, 2))):
         capture = Capture(tmp_path, "transforms", tuple(chosen), (), box, True, object_aabb=box)
