@@ -1,5 +1,5 @@
-"""Frames of `vm` fields with parts left out, to tell what the parts take: loops like `render_ray` of
-kernels/loops.py, for benchmarks/filled.py.
+"""Frames of `vm` fields with parts left out, to tell what the parts take: loops like `show_ray` of
+kernels/instances.py, for benchmarks/filled.py.
 
 A module like a kind's bodies.py, with the kind's own functions and these items of work beside them.
 """
@@ -34,7 +34,7 @@ class Walked(NamedTuple):
 
 
 def count_ray(field, grid, rays, i, scratch, memory, out):
-    """The samples that `render_ray` takes of ray i, and those that it jumps over where there is nothing."""
+    """The samples that `show_ray` takes of ray i, and those that it jumps over where there is nothing."""
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
     out.samples[i], out.dense[i], out.colours[i] = 0, 0, 0

@@ -33,6 +33,7 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.kernels.loops import RAYS_PER_TASK, Rays
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
@@ -168,7 +169,7 @@ def parts(frame: Frame, repeats: int) -> dict[str, float]:
     field._afresh("loops")
     counts = counting.Counts(*np.zeros((3, len(rays_o)), np.int64))
     field.loops.each("count_ray", field.arrays, field.grid, rays, len(rays_o), counts, RAYS_PER_TASK)
-    out = np.zeros((len(rays_o), 5))
+    out = np.zeros((len(rays_o), 5), np.float32)
 
     def run(item: str, asked, to) -> None:
         field.loops.each(item, field.arrays, field.grid, asked, len(rays_o), to, RAYS_PER_TASK)
@@ -177,7 +178,7 @@ def parts(frame: Frame, repeats: int) -> dict[str, float]:
         [
             lambda: run("walk_ray", counting.Walked(*rays, counts.samples, False), out[:, 0]),
             lambda: run("walk_ray", counting.Walked(*rays, counts.samples, True), out[:, 0]),
-            lambda: run("render_ray", rays, out),
+            lambda: ComputedField.show(field, rays, out),
         ],
         repeats,
     )

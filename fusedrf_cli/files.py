@@ -4,7 +4,7 @@ import os
 import sys
 from pathlib import Path
 
-from formats import past
+from formats import undo as past
 from formats.bundle import OpenBundle, is_bundle, read_summary, summary_of
 from formats.errors import FormatError
 from formats.overview import overview

@@ -372,8 +372,8 @@ precision = click.option(
     type=PRECISION,
     help="How numbers are stored; default: int8 of a place that fills all of space, else float16.",
 )
-edited_precision = click.option(
-    "--precision", type=PRECISION, help="How numbers are stored; default: as those of FUSED are."
+added_precision = click.option(
+    "--precision", type=PRECISION, help="How the numbers that come are stored; default: as they are."
 )
 fused_precision = click.option(
     "--precision",

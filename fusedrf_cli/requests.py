@@ -21,6 +21,8 @@ Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Vector = tuple[float, float, float]
 Box = tuple[float, float, float, float, float, float]
 Sphere = tuple[float, float, float, float]
+Shape = Annotated[tuple[float, ...], Meta(min_length=4, max_length=6)]
+"""A box, or a sphere's centre and radius."""
 Row = tuple[float, float, float, float]
 Size = tuple[Count, Count]
 Precision = Literal["float32", "float16", "int8", "int4"]
@@ -172,8 +174,7 @@ class Input(Placing):
     name: str | None = None
     """None: the file's stem."""
     background_node: bool = False
-    crop: Annotated[tuple[float, ...], Meta(min_length=4, max_length=6)] | None = None
-    """A box or a sphere."""
+    crop: Shape | None = None
     opacity: Annotated[float, Meta(gt=0, le=1)] | None = None
     tint: Vector | None = None
     hidden: bool = False
@@ -224,20 +225,12 @@ class ConvertRequest(Writing, Learning, Sizing):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Editing(Writing):
+class EditRequest(Writing):
     """A bundle that is changed; `fused` is read, and may be the output itself."""
 
     keep_history: bool = False
     """Whether to keep the bundle as it was, for `undo`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EditRequest(Editing, Learning):
-    """What `add` and `delete` have in common."""
-
-    precision: Precision | None = None
-    """None: the field's own."""
-    rgb: bool = True
+    memory: Count | None = None
 
 
 @dataclass(frozen=True)
@@ -249,6 +242,8 @@ class AddRequest(EditRequest, Placing):
     output: str
     _: KW_ONLY
     name: str
+    precision: Precision | None = None
+    """None: as it is stored in its source."""
 
     @property
     def node_name(self) -> str:
@@ -273,6 +268,8 @@ class DeleteRequest(EditRequest, MendingRequest):
     names: tuple[str, ...]
     output: str
     _: KW_ONLY
+    rgb: bool = True
+    """Whether what fills a hole finishes on pictures."""
     allow_outside: bool = False
 
 
@@ -280,25 +277,58 @@ class DeleteRequest(EditRequest, MendingRequest):
 class ReplaceRequest(EditRequest):
     """Another object in the place of one."""
 
-    refit: ClassVar[None] = None
-    fill: ClassVar[bool] = False
     fused: str
     name: str
     source: str
     output: str
     _: KW_ONLY
+    precision: Precision | None = None
+    """None: as it is stored in its source."""
     allow_outside: bool = False
 
+
+class ShowRequest(EditRequest):
+    """An object that is shown otherwise: `event` of the history, and words of a node, `showing`
+    (formats/scene.py: SHOWING_KEYS), of which None takes one away."""
+
+
+@dataclass(frozen=True)
+class CropRequest(ShowRequest):
+    """What of an object is shown."""
+
+    event: ClassVar[str] = "cropped"
+    fused: str
+    name: str
+    output: str
+    _: KW_ONLY
+    shape: Shape | None = None
+    """Of the object's own world; None: all of it."""
+
     @property
-    def names(self) -> tuple[str]:
-        return (self.name,)
+    def showing(self) -> dict:
+        return {"crop": self.shape and list(self.shape)}
+
+
+@dataclass(frozen=True)
+class TintRequest(ShowRequest):
+    """What an object's colours and density are multiplied by; None: nothing."""
+
+    event: ClassVar[str] = "tinted"
+    fused: str
+    name: str
+    output: str
+    _: KW_ONLY
+    colour: Vector | None = None
+    opacity: Annotated[float, Meta(gt=0, le=1)] | None = None
+
+    @property
+    def showing(self) -> dict:
+        return {"tint": self.colour and list(self.colour), "opacity": self.opacity}
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArrangeRequest(Editing):
+class ArrangeRequest(EditRequest):
     """An object that is moved, copied or renamed."""
-
-    memory: Count | None = None
 
     @property
     def node_name(self) -> str:

@@ -17,11 +17,12 @@ import msgspec
 from fusedrf_cli import requests
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.progress import NullProgress
-from fusedrf_cli.requests import STDIO, Editing, Writing
+from fusedrf_cli.requests import STDIO, EditRequest, Writing
 
 __all__ = [
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
-    *("replace", "extract", "history", "undo", "render", "eval", "chart", "info", "kinds", "validate"),
+    *("replace", "crop", "tint", "extract", "history", "undo"),
+    *("render", "eval", "chart", "info", "kinds", "validate"),
 ]
 
 
@@ -85,8 +86,8 @@ def held_outputs(asked: Writing, progress: NullProgress) -> Iterator[None]:
             waiting = progress.tell if in_place and path == asked.output else None
             locks.enter_context(output_lock(path, waiting))
         check_all()  # one may have come while we waited
-        if isinstance(asked, Editing) and asked.keep_history:
-            from formats.past import check_past
+        if isinstance(asked, EditRequest) and asked.keep_history:
+            from formats.undo import check_past
 
             check_past(edited, asked.output)
         yield
@@ -108,6 +109,8 @@ move = verb("move", requests.MoveRequest)
 duplicate = verb("duplicate", requests.DuplicateRequest)
 rename = verb("rename", requests.RenameRequest)
 replace = verb("replace", requests.ReplaceRequest)
+crop = verb("crop", requests.CropRequest, does="show")
+tint = verb("tint", requests.TintRequest, does="show")
 extract = verb("extract", requests.ExtractRequest)
 history = verb("history", requests.HistoryRequest, module="files")
 undo = verb("undo", requests.UndoRequest, module="files")

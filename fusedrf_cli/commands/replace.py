@@ -1,4 +1,4 @@
-"""`fusedrf replace`: another object in the place of one in a fused field."""
+"""`fusedrf replace`: another object in the place of one in a bundle."""
 
 import click
 
@@ -9,14 +9,11 @@ from fusedrf_cli import options, verbs
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("source", metavar="WITH", type=options.INPUT)
-@options.writing("The fused field to write, OUT.rfpack.")
+@options.writing("The bundle to write, OUT.rfpack.")
 @options.keep_history
-@options.time_budget
-@options.rgb
 @options.memory
-@options.edited_precision
+@options.added_precision
 @options.allow_outside
-@options.seeded
 @options.reporting
 def command(**words):
     """Put another object in the place of one.

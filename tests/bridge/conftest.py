@@ -26,8 +26,8 @@ from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student
-from fusedrf_cli.engine.kinds.vm import editing, students
 from fusedrf_cli.engine.kinds.vm import field as vm
+from fusedrf_cli.engine.kinds.vm import students
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -111,8 +111,8 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     patch.setattr(part("making"), "VIEWS_TO_CHOOSE_BY", 2)
     patch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
-    patch.setattr(part("editing"), "REGION_SETTINGS", TinySettings())
-    patch.setattr(editing, "NUMBERS", SHAPE.size((20, 20, 20)))
+    patch.setattr(part("mending"), "SETTINGS", TinySettings())
+    patch.setattr(part("mending"), "NUMBERS", SHAPE.size((20, 20, 20)))
     draft = TrainConfig(longest=24, steps=60, samples=1 << 13, steps_to_show=1)
     patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high", "best"), draft))
 

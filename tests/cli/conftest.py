@@ -18,7 +18,7 @@ from fusedrf_cli.main import cli
 ROOT = Path(__file__).parents[2]
 BRIDGE_VERBS = (
     *("pose", "train", "fuse", "convert", "add", "delete", "move", "duplicate", "rename", "render"),
-    *("evaluate", "chart", "extract", "replace"),
+    *("evaluate", "chart", "extract", "replace", "show"),
 )
 
 

@@ -115,7 +115,7 @@ def test_a_matrix_goes_with_no_other_word():
 
 # --- commands and their bridge ------------------------------------------------------------------------------
 
-EDIT = ("fused", "output", "precision", "rgb", "time_budget", "keep_history")
+EDIT = ("fused", "output", "overwrite", "memory", "keep_history")
 COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False, "memory": None}
 
 
@@ -185,14 +185,15 @@ def test_add_hands_on_one_matrix(run, bridge):
         "out",
     )
     assert matrix.tolist() == [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
-    assert set(asked) == {*COMMON, *EDIT, "source", "name", "translate", "rotate", "scale", "matrix"}
+    assert set(asked) == {*EDIT, "source", "name", "precision", "translate", "rotate", "scale", "matrix"}
 
 
 def test_delete_hands_on_its_names(run, bridge):
     run("delete", "chair.rfpack", "a", "b", "-o", "out")
     name, asked = bridge.call
     assert (name, asked["fused"], asked["names"]) == ("delete", "chair.rfpack", ("a", "b"))
-    assert set(asked) == {*COMMON, *EDIT, "names", "allow_outside", "refit", "fill"}
+    more = {"names", "allow_outside", "refit", "fill", "rgb", "time_budget"}
+    assert set(asked) == {*COMMON, *EDIT, *more}
 
 
 @pytest.mark.parametrize(

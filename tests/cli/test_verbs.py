@@ -91,9 +91,9 @@ def test_a_word_of_another_kind_is_refused(bridge, folder, words, says):
 
 def test_paths_and_arrays_are_words(bridge, folder):
     place = np.eye(4) * [2, 2, 2, 1]
-    verbs.add(folder / "chair.rfpack", "table.rfpack", Path("out"), name="a", matrix=place, seed=np.int64(3))
+    verbs.add(folder / "chair.rfpack", "table.rfpack", Path("out"), name="a", matrix=place, memory=np.int64(3))
     name, given = bridge.call
-    assert (given["fused"], given["output"], given["seed"]) == (str(folder / "chair.rfpack"), "out", 3)
+    assert (given["fused"], given["output"], given["memory"]) == (str(folder / "chair.rfpack"), "out", 3)
     np.testing.assert_array_equal(bridge.request.object_to_world, place)
     with pytest.raises(UsageProblem, match="--matrix"):
         verbs.add("chair.rfpack", "table.rfpack", "out", name="a", matrix=place, scale=2)
