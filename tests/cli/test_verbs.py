@@ -91,7 +91,8 @@ def test_a_word_of_another_kind_is_refused(bridge, folder, words, says):
 
 def test_paths_and_arrays_are_words(bridge, folder):
     place = np.eye(4) * [2, 2, 2, 1]
-    verbs.add(folder / "chair.rfpack", "table.rfpack", Path("out"), name="a", matrix=place, memory=np.int64(3))
+    words = {"name": "a", "matrix": place, "memory": np.int64(3)}
+    verbs.add(folder / "chair.rfpack", "table.rfpack", Path("out"), **words)
     name, given = bridge.call
     assert (given["fused"], given["output"], given["memory"]) == (str(folder / "chair.rfpack"), "out", 3)
     np.testing.assert_array_equal(bridge.request.object_to_world, place)
