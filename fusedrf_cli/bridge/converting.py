@@ -13,9 +13,9 @@ from fusedrf_cli.requests import ConvertRequest, EvaluateRequest, FuseRequest
 
 
 def convert(request: ConvertRequest, progress) -> dict:
-    """Teach a field of another kind all that a field shows (after PVD, Fang et al., AAAI 2023), and hold it
+    """Teach a field of another kind all that a bundle shows (after PVD, Fang et al., AAAI 2023), and hold it
     against its source on views that nothing was learnt from."""
-    before = kind_of(request.field)
+    before = kinds_of(request.field)
     try:
         wanted = registry.kind(request.kind)
     except ValueError as error:
@@ -56,12 +56,13 @@ def convert(request: ConvertRequest, progress) -> dict:
     }
 
 
-def kind_of(path: str) -> str:
-    """The kind of the one field that a bundle places; InvalidInput where it is something else."""
+def kinds_of(path: str) -> str:
+    """The kinds of the fields that a bundle places; InvalidInput where it is something else, or places
+    none."""
     if not is_bundle(path):
-        raise InvalidInput(f"{path}: not a bundle; convert takes a .rfpack with one field")
+        raise InvalidInput(f"{path}: not a bundle; convert takes a .rfpack")
     bundle = OpenBundle(path)
-    placed = [leaf.field for leaf in bundle.scene.leaves() if leaf.field is not None]
-    if len(placed) != 1:
-        raise InvalidInput(f"{path}: holds {len(placed)} placed fields where one was expected; fuse it first")
-    return bundle.headers[placed[0]].kind
+    kinds = {bundle.headers[leaf.field].kind for leaf in bundle.scene.leaves() if leaf.field is not None}
+    if not kinds:
+        raise InvalidInput(f"{path}: the bundle places no field; choose another one")
+    return ", ".join(sorted(kinds))
