@@ -41,7 +41,7 @@ from tests.engine.distillation.test_fit import pictures
 BRIEF = FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
 LONG = replace(BRIEF, longest=32, steps=300)
 CAMERAS = orbit(BOX, 14, 24, 24) + orbit(BOX, 8, 24, 24, elevation=-0.5)
-UNSEEN = scattered(BOX, 4, 24, 24, seed=3)
+UNSEEN = scattered(BOX, 4, 24, 24, seed=3)  # of which a picture of the mean colour shows 16 dB
 
 
 def over_white(images: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
     assert run.found_nothing >= 2 and run.found_matter
     moved = max(abs(box - BOX).max() for box in boxes[:3])
     row.check("T1", "largest move of the box", moved, 0, at_most=True)
-    row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 20, unit="dB")
+    row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 28, unit="dB")
 
 
 def test_t1_tries_again_soon_but_not_twice(images, monkeypatch):
@@ -256,7 +256,7 @@ def test_t9_poisoned_numbers_are_recovered_from(row, images, unseen_psnr, value)
     run.step = poisoning
     field = run.finish()
     assert run.guard.roll_backs >= 1 and torch.isfinite(field.params).all()
-    row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 18, unit="dB")
+    row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 21, unit="dB")
 
 
 def test_t11_rays_without_samples(row, images):
