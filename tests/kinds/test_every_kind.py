@@ -61,7 +61,7 @@ def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
     assert fused["chosen"]["why"] and f"--kind {kind}" in fused["chosen"]["flags"]
     own = registry.kind(kind).field
     assert own is None or type(opened(load_scene(str(folder / "fused.rfpack")).placed[0].field)) is own
-    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 13
+    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 18
     assert fused["memory"]["predicted_bytes"] > 0
 
 
@@ -81,7 +81,7 @@ def test_an_object_comes_and_goes(fused, report, picture, folder, kind):
     more, away = picture("more.rfpack"), ~covered("blue")
     local = "the same bits" in said["touched"]["how"]
     assert local or "is not the same to the bit" in said["touched"]["how"]
-    assert psnr(more[away], before[away]) >= (45 if local else 14)
+    assert psnr(more[away], before[away]) >= (45 if local else 17)
     assert more[covered("blue", -0.1)].mean(0)[2] > before[covered("blue", -0.1)].mean(0)[2] - 0.05
     assert blues(more) > 10 and blues(before) == 0
     said = report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
@@ -101,14 +101,14 @@ def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, ki
     said = report(*PHOTOS, "--kind", kind)
     assert said["kind"] == kind and said["steps"] == 60
     assert said["bytes"] == (folder / "out.rfpack").stat().st_size
-    assert np.isfinite(said["training_psnr"]) and said["training_psnr"] > 5
+    assert np.isfinite(said["training_psnr"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_target_that_is_easy_takes_few_bytes(report, kind):
-    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "12", "--no-rgb")
+    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "16", "--no-rgb")
     said = report("fuse", "pair.json", "-o", "small.rfpack", *words)
-    assert said["psnr"]["stored"] >= 12 and said["bytes"] < SIZE
+    assert said["psnr"]["stored"] >= 16 and said["bytes"] < SIZE
 
 
 @pytest.mark.parametrize("kind", KINDS)
