@@ -492,9 +492,19 @@ def small_sources(folder: Path) -> None:
         )
 
 
+def sunk(folder: Path) -> None:
+    """pair.json of the floor and the red box, which stands in it and hides a part of it."""
+    small_sources(folder)
+    nodes = (
+        node("floor", source="floor.rfpack", background=True),
+        node("red", source="red.rfpack", translation=(-0.3, 0.1, 0.25)),
+    )
+    write_scene(folder / "pair.json", SceneGraph(nodes), overwrite=True)
+
+
 def restored(folder: Path) -> None:
     """A distilled field out of which an object was cut: a small tensor shows what it hid."""
-    small_sources(folder)
+    sunk(folder)
     learnt("vm", "--keep-sources", size="120kB")(folder)
     done("delete", "kept.rfpack", "red", "-o", "kept.rfpack", "-w", "--keep-history", "--no-rgb")
 
@@ -521,7 +531,7 @@ def learnt_place(folder: Path) -> None:
 
 def filled(folder: Path) -> None:
     """A hole of a distilled field that goes on smoothly with what is around it."""
-    small_sources(folder)
+    sunk(folder)
     learnt("vm", size="120kB")(folder)
     (folder / "red.rfpack").unlink()
     (folder / "floor.rfpack").unlink()
