@@ -372,8 +372,8 @@ precision = click.option(
     type=PRECISION,
     help="How numbers are stored; default: int8 of a place that fills all of space, else float16.",
 )
-edited_precision = click.option(
-    "--precision", type=PRECISION, help="How numbers are stored; default: as those of FUSED are."
+added_precision = click.option(
+    "--precision", type=PRECISION, help="How the numbers that come are stored; default: as they are."
 )
 fused_precision = click.option(
     "--precision",
@@ -515,7 +515,7 @@ def writing(
                 for path, folder in outputs.items():  # it may have come while we waited
                     check_writable(path, overwrite, folders=folder)
                 if words.get("keep_history"):
-                    from formats.past import check_past
+                    from formats.undo import check_past
 
                     check_past(words[edits], output)
                 return command(output=output, overwrite=overwrite, **words)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.bridge.saving import save_scene
-from fusedrf_cli.bridge.scene import LoadedScene, load_scene, short_origin
+from fusedrf_cli.bridge.scene import LoadedScene, grouped, load_scene, short_origin
 from fusedrf_cli.engine.composition.affine import Placed, rigid_motion
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.differentiable import Poses, numbers, query
@@ -51,16 +51,17 @@ class Scene:
 
     def __init__(self, loaded: LoadedScene):
         self._loaded = loaded
-        read: dict[str, RadianceField] = {}
+        read: dict[int, RadianceField] = {}
         self.fields: dict[str, RadianceField] = {}
         """Each node's field by name; nodes that show the same one share it."""
         self.placements: dict[str, torch.Tensor] = {}
         """Where each node stands: (4, 4) float64, object to world. Another tensor may be put in place of one,
         and may require a gradient."""
         for source in loaded.fields:
-            if source.member not in read:
-                read[source.member] = opened(source.placed.field)
-            self.fields[source.placed.name] = read[source.member]
+            key = id(source.placed.field)
+            if key not in read:
+                read[key] = opened(source.placed.field)
+            self.fields[source.placed.name] = read[key]
             self.placements[source.placed.name] = torch.from_numpy(source.placed.object_to_world.copy())
         self._composed = None
 
@@ -161,6 +162,7 @@ class Scene:
         known = self._composed and {p.name: p.object_to_world for p in self._composed[0]}
         if not known or any(not np.array_equal(known[name], pose) for name, pose in now.items()):
             placed = [Placed(name, self.fields[name], pose) for name, pose in now.items()]
-            self._composed = placed, ComposedField(placed, self.rule)
+            parts = grouped(placed, [source.groups for source in self._loaded.fields], self.rule)
+            self._composed = placed, ComposedField(parts, self.rule)
         field = self._composed[1]
         return field, field.origin, shifted(learnt, field.origin)

@@ -112,15 +112,12 @@ class ConvertRequest(Learning):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EditRequest(Learning):
-    """What `add` and `delete` have in common."""
+class EditRequest:
+    """What edits have in common."""
 
     fused: str
     output: str
     overwrite: bool
-    precision: str | None
-    """None: the field's own."""
-    rgb: bool
     memory: int | None
     keep_history: bool
     """Whether to keep the bundle as it was, for `undo`."""
@@ -130,6 +127,8 @@ class EditRequest(Learning):
 class AddRequest(EditRequest):
     """One more object."""
 
+    precision: str | None
+    """None: as it is stored in its source."""
     source: str
     name: str
     object_to_world: Any
@@ -154,24 +153,37 @@ class DeleteRequest(EditRequest, MendingRequest):
     """Objects to be taken out."""
 
     names: tuple[str, ...]
+    rgb: bool
+    """Whether what fills a hole finishes on pictures."""
     allow_outside: bool
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplaceRequest(DeleteRequest):
-    """Another object in the place of one, which `names` holds alone."""
+class ReplaceRequest(EditRequest):
+    """Another object in the place of one."""
 
     name: str
     source: str
+    precision: str | None
+    """None: as it is stored in its source."""
+    allow_outside: bool
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArrangeRequest:
+class ShowRequest(EditRequest):
+    """An object that is shown otherwise."""
+
+    name: str
+    event: str
+    """Of the history."""
+    showing: dict
+    """Words of a node (formats/scene.py: SHOWING_KEYS); None takes one away."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrangeRequest(EditRequest):
     """An object that is moved, copied or renamed."""
 
-    fused: str
-    output: str
-    overwrite: bool
     name: str
     new_name: str | None
     """None: the same."""
@@ -179,8 +191,6 @@ class ArrangeRequest:
     """(4, 4) float64 of the world."""
     absolute: bool
     """Whether that turns and scales about the world's origin, not about the middle of the object."""
-    memory: int | None
-    keep_history: bool
 
 
 @dataclass(frozen=True, kw_only=True)

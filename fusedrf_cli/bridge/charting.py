@@ -14,7 +14,6 @@ import numpy as np
 from formats.atomic import atomic_folder, temporary_sibling
 from formats.errors import ResourceError
 from fusedrf_cli import plots
-from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
 from fusedrf_cli.bridge.looks import looks_of
@@ -24,6 +23,7 @@ from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
+from fusedrf_cli.bridge.sources import as_it_is
 from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered

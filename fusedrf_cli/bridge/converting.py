@@ -1,10 +1,10 @@
 """`convert`: a field of any kind to one of any other."""
 
 from formats.bundle import OpenBundle, is_bundle
-from fusedrf_cli.bridge.anew import as_it_is
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.scene import unusable_kind
+from fusedrf_cli.bridge.sources import as_it_is
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ConvertRequest, EvaluateRequest, FuseRequest

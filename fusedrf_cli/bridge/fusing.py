@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 
 from formats.bundle import OpenBundle
-from fusedrf_cli.bridge.anew import load_to_fuse
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
@@ -31,6 +30,7 @@ from fusedrf_cli.bridge.scene import (
     write_field,
 )
 from fusedrf_cli.bridge.sizes import BundleSizes, graph_bytes
+from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Detail
 from fusedrf_cli.engine.fields.base import holds_matter
@@ -141,9 +141,8 @@ def best_of(
     asked = student_request(request, scene, overhead)
     try:
         student = kind.student(scene.composed, asked)
-        held = make_room(memory, student, scene, request)
-        maker, choosing, seconds = begin(student, scene, request, place, progress)
-        maker.sources_in_memory = held
+        together = make_room(memory, student, scene, request)
+        maker, choosing, seconds = begin(student, scene, request, place, progress, together)
         found = search(maker, choosing, student, request, saved, seconds)
     except TooSmall as error:
         raise UsageProblem(
@@ -205,12 +204,12 @@ def remedy(kind: Kind, loaded: LoadedScene, composed: ComposedField) -> str:
 
 
 def begin(
-    student: Student, scene: Scene, request: FuseRequest, place: str, progress
+    student: Student, scene: Scene, request: FuseRequest, place: str, progress, together: bool
 ) -> tuple[Maker, Choosing, dict[str, float]]:
     """What makes students, what chooses among them, and the seconds that measuring the scene took."""
     started = time.monotonic()
     progress.phase("measuring", None)
-    maker = Maker(student, scene, request, place, progress)
+    maker = Maker(student, scene, request, place, progress, together)
     choosing = Choosing(maker.make, student.kind.name, progress.note)
     progress.phase(student.kind.name, None)
     return maker, choosing, {"measuring the scene": time.monotonic() - started}
@@ -359,19 +358,14 @@ def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
 
 def make_room(memory: Memory, student: Student, scene: Scene, request: FuseRequest) -> bool:
     """Keep no more sources in memory than fit beside what every stage of a student needs; ResourceProblem
-    where not even the largest does. Whether all of them may be held at once, as a teacher."""
+    where not even the largest does. Whether all of them may be held at once."""
     needed = stages(student, scene.composed, request, student.scene)
     sizes, shelf = scene.loaded.sizes, scene.loaded.shelf
-    together = memory.room(needed[-1][1]) > 2 * sum(sizes)
-    whole = registry.joined(student.scene) if together and student.learnt else None
-    if whole is not None:  # of which fewer empty points are asked
-        needed = stages(student, scene.composed, request, whole)
-    if together and needed[-1][1]:
-        needed[-1][1]["the sources put together"] = sum(sizes)
+    room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
+    together = room >= sum(sizes)
     if not together and student.lesson is None and learning_is_asked(student, request):
         needed.append((0.0, asking_in_waves(student, scene.composed)))
-    room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
-    if room < sum(sizes):  # then one is read now and then in every stage
+    if not together:  # then one is read now and then in every stage
         needed = [(max(copies, READING), parts) for copies, parts in needed]
         room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
     shelf.resize(room)

@@ -16,13 +16,13 @@ from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
 from fusedrf_cli.bridge.training import warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import NOTHING, DistillSettings, MadeStudent, Plan, Student, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.requests import FuseRequest
@@ -52,9 +52,8 @@ class Scene:
 
     def background(self) -> Placed:
         """The background in the composed scene's frame, its numbers on the CPU."""
-        found = background_of(self.loaded).placed
-        at = [p.name for p in self.loaded.placed].index(found.name)
-        return Placed(found.name, opened(found.field).to("cpu"), self.composed.placed[at].object_to_world)
+        found = background_of(self.loaded).placed.moved(self.composed.origin)
+        return replace(found, field=opened(found.field).to("cpu"))
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,16 @@ def same_texels(field: StoredField, other: StoredField) -> bool:
 class Maker:
     """Makes the students of one scene."""
 
-    def __init__(self, student: Student, scene: Scene, request: FuseRequest, place: str, progress):
+    def __init__(
+        self,
+        student: Student,
+        scene: Scene,
+        request: FuseRequest,
+        place: str,
+        progress,
+        together: bool = True,
+    ):
+        """together: whether memory holds all sources at once, and they are answered by compiled loops."""
         self.student, self.scene, self.request = student, scene, request
         self.place, self.progress = place, progress
         self.budget = Budget(request.time_budget)
@@ -85,11 +93,12 @@ class Maker:
         self.views = VIEWS_TO_CHOOSE_BY if compares else lesson.views
         size = lesson.view_size, lesson.view_size
         self.looks = looks_of(scene.loaded, scene.composed, self.views, size, (JUDGED_SEED, 3, request.seed))
-        cameras = [look.camera for look in self.looks]
-        self.judge = Judge(scene.composed, cameras, scene.composed.origin)
+        answered = as_composite if together else lambda scene: scene
+        truth = self.teacher = answered(scene.composed)
+        if student.scene is not scene.composed:
+            self.teacher = answered(student.scene)
+        self.judge = Judge(truth, [look.camera for look in self.looks], truth.origin)
         self.best: Kept | None = None
-        self.sources_in_memory = True
-        """Whether all sources may be in memory at once, as a teacher."""
         self.finished_tries = 0
         self.saved: Saved | None = None
         """What an interrupted run left, until it is taken up."""
@@ -208,13 +217,6 @@ class Maker:
     def rays(self) -> RayLesson:
         """What there is to learn from, drawn once."""
         return RayLesson(self.teacher, self.scene.sampler, self.request.seed)
-
-    @cached_property
-    def teacher(self) -> RadianceField:
-        """What the student learns from: the sources put together, where memory holds them and a kind can be
-        that, else the scene that it stands for."""
-        whole = registry.joined(self.student.scene) if self.sources_in_memory else None
-        return self.student.scene if whole is None else whole.to(self.place)
 
     # -- students that learn from nothing --------------------------------------------------------------------
 

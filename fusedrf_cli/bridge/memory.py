@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import SLOTS_AT_ONCE, Composite
 from fusedrf_cli.engine.distillation.finish import RAYS
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
@@ -35,6 +36,8 @@ PER_PIXEL = 350  # of a band: rays in float64, before and after turning, those o
 PER_SAMPLE = 300  # of a wave through the general renderer: distances, points in each field, σ, colour
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
 PER_KNOWN_CELL = 30  # of a scene's grid: the bits of its parts, strides and distances
+PER_SEGMENT = 400  # of a ray of a composite: its segments, their ends, and the numbers that sort them
+PER_SLOT = 1400  # of an instance in a segment that several share: its samples
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
 PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
 PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
@@ -126,6 +129,12 @@ def picture(width: int, height: int, composed: bool) -> dict[str, float]:
     band = min(width * max(1, ROWS_AT_ONCE_PIXELS // width), width * height)
     waves = min(band, RAYS_AT_ONCE) * SAMPLES_PER_WAVE * PER_SAMPLE if composed else 0
     return {"a band of the picture": band * PER_PIXEL + waves}
+
+
+def segments(rays: int) -> dict[str, float]:
+    """Rays of a picture of a Composite, so many in all, and the samples of several instances."""
+    rays = min(rays, Composite.rays_at_once)
+    return {"segments of rays": rays * PER_SEGMENT + SLOTS_AT_ONCE * PER_SLOT}
 
 
 def insides(aabb: np.ndarray) -> dict[str, float]:

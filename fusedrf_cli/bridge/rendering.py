@@ -12,22 +12,19 @@ from formats.atomic import atomic_folder
 from formats.filenames import DEPTH, depth_of, distinct
 from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
-from fusedrf_cli.bridge.memory import Memory, insides, ownership, picture, sources
+from fusedrf_cli.bridge.memory import Memory, insides, picture, segments, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.composition.composite import Composite, as_composite
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
-from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.editing import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
-from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
-JOINING = 2.5  # copies of a source while it becomes a part of the whole
 MANY_RAYS, MANY_SAMPLES, MUCH_WORK = 1 << 28, 1 << 14, 1 << 32
 """From so many rays on, or so many samples of a ray and of all, a command says that it takes long."""
 FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
@@ -47,7 +44,7 @@ def render(request: RenderRequest, progress) -> dict:
         progress.phase("reading", None)
         budget = Memory(request.memory)
         loaded = load_scene(request.scene, request.allow_outside, budget, place)
-        field, origin = renderable(loaded)
+        field, origin = renderable(loaded, reference=True)
         views = choose_views(request, loaded, field, origin)
         if suffix in FILMS:
             check_sizes(output, views)
@@ -55,15 +52,13 @@ def render(request: RenderRequest, progress) -> dict:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
             )
-        whole = None
-        if loaded.lone() is None and not request.naive:
-            whole = joined(loaded, field, picture_memory(None, views, suffix in FILMS), budget, place)
-        if whole is None:
-            needed = picture_memory(field, views, suffix in FILMS)
-            loaded.shelf.resize(budget.room(needed))
-            held = sources(loaded.resident, loaded.shelf.room)
-            budget.expect(held | needed, advice="give a smaller --size")
-        field = field if whole is None else whole
+        if not request.naive:
+            field = in_memory(loaded, field, picture_memory(None, views, suffix in FILMS), budget)
+        needed = picture_memory(field, views, suffix in FILMS)
+        held = isinstance(field, Composite)
+        loaded.shelf.resize(sum(loaded.sizes) if held else budget.room(needed))
+        advice = "use --naive" if held else "give a smaller --size"
+        budget.expect(sources(loaded.resident, loaded.shelf.room) | needed, advice=advice)
         if hasattr(field, "for_pictures"):
             field = field.for_pictures(rays_of(views))
         tell_of_work(request.scene, field, rays_of(views), progress)
@@ -87,11 +82,13 @@ def render(request: RenderRequest, progress) -> dict:
 
 
 def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
-    """What rendering needs beside the sources; field None: of a field that is still to be put together."""
+    """What rendering needs beside the sources; field None: of what is still to become a Composite."""
     largest = max(views, key=lambda view: view.width * view.height)
     pixels = largest.width * largest.height
     composed = field is not None and not hasattr(field, "render_rays")
     needed = picture(largest.width, largest.height, composed=composed)
+    if field is None or isinstance(field, Composite):
+        needed |= segments(pixels)
     if len(getattr(field, "blocks", ())) > 1 and rays_of(views) >= WORTH_TELLING:
         needed |= insides(field.aabb)
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
@@ -99,7 +96,8 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
 
 def tell_of_work(scene: str, field, rays: int, progress) -> None:
     """A warning where so many rays through a field may take much longer than people expect."""
-    samples = field.occupancy.most_samples(sampling_step(field))
+    sampled = field.fields if isinstance(field, Composite) else [field]
+    samples = max(f.occupancy.most_samples(sampling_step(f)) for f in sampled)
     if rays >= MANY_RAYS:
         progress.warn(f"{scene}: {rays:,} pixels may take long; give a smaller --size")
     elif samples >= MANY_SAMPLES and rays * samples >= MUCH_WORK:
@@ -114,32 +112,23 @@ def rays_of(views: list[Camera]) -> int:
     return sum(view.width * view.height for view in views)
 
 
-def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
+def renderable(loaded: LoadedScene, reference: bool = False) -> tuple[object, np.ndarray]:
     """The field to march, and where its frame lies in the world (see `render_image`): a lone field is taken
-    as it is.
+    as it is; the nodes of a bundle are a Composite, but for a reference, where they can be.
     """
     if (lone := loaded.lone()) is not None:
         return lone
     composed = loaded.composed()
-    return composed, composed.origin
+    return composed if reference or loaded.bundle is None else as_composite(composed), composed.origin
 
 
-def joined(loaded: LoadedScene, composed: ComposedField, needed: dict, budget: Memory, place: str):
-    """A scene as one field with the numbers of its sources, which is looked at as fast as a fused one; None
-    where no kind of field can be that, or there is no memory for it. needed: for its pictures."""
-    around = any(p.unbounded for p in composed.placed)
-    box = WHOLE if around else enclosing([p.aabb for p in composed.placed])  # no grid is made to know it
-    result = {"the sources put together": sum(loaded.sizes)} | ownership(box)
-    joining = sources(loaded.sizes, copies=JOINING) | result
-    looking = sources(loaded.sizes) | result | insides(box) | needed
-    if min(budget.room(joining), budget.room(looking)) < 0:
-        return None
+def in_memory(loaded: LoadedScene, field: RadianceField, needed: dict, budget: Memory) -> RadianceField:
+    """A composed scene as a Composite, whose fields are all in memory, where compiled loops compute all of
+    them and there is room; else the field as it is. needed: for its pictures."""
+    if not isinstance(field, ComposedField) or budget.room(sources(loaded.resident) | needed) < 0:
+        return field
     loaded.shelf.resize(sum(loaded.sizes))
-    field = registry.joined(composed)
-    if field is None:
-        return None
-    budget.expect(joining, looking, advice="use --naive")
-    return field.to(place)
+    return as_composite(field)
 
 
 def check_sizes(output: str, views: list[Camera]) -> None:

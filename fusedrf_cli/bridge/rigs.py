@@ -78,4 +78,5 @@ def framed_box(scene: LoadedScene, field, origin: np.ndarray) -> np.ndarray:
     frame lies at `origin` (see `render_image`)."""
     if scene.graph.framing is not None:
         return np.asarray(scene.graph.framing)
-    return placed_box(field.occupancy.subject, origin)
+    subject = field.subject if isinstance(field, ComposedField) else field.occupancy.subject
+    return placed_box(subject, origin)

@@ -40,7 +40,7 @@ from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Section, Way
-from fusedrf_cli.engine.spaces.unbounded import SIDE
+from fusedrf_cli.engine.spaces.unbounded import REACH
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
@@ -51,7 +51,7 @@ PATIENCE, FOR_MORE, MOST_MORE = 120, 0.23, 1.5
 most: on two cores ten minutes with 1.45 times as many reach 0.5 dB more, two minutes less."""
 PLACE_PRECISION = "int8"
 """Of a place, where none is asked for: half the bytes of float16 for 0.0001 dB."""
-HASHED = Hashed((2 * SIDE / 256, 2 * SIDE / 512, 2 * SIDE / 1024), 1 << 20)
+HASHED = Hashed((2 * REACH / 256, 2 * REACH / 512, 2 * REACH / 1024), 1 << 20)
 """What the texels of a place cannot tell apart. The first level is coarser than they are: after as many steps
 a park shows 0.4 dB more with it than without; one more, of 128, takes half a dB."""
 HASHED_FROM, HASHED_STEPS, HASHED_TEXELS = 360.0, 4000, 1.5
@@ -317,7 +317,7 @@ def texels_of_place(box: np.ndarray, longest: float) -> int:
     """Texels on the longest side of a part (6,) of unbounded space: planes over it have as many as those over
     all of space that have so many a side."""
     a, b, c = box[3:] - box[:3]
-    shrunk = np.sqrt((a * b + b * c + c * a) / (3 * (2 * SIDE) ** 2)) / (max(a, b, c) / (2 * SIDE))
+    shrunk = np.sqrt((a * b + b * c + c * a) / (3 * (2 * REACH) ** 2)) / (max(a, b, c) / (2 * REACH))
     return round(longest / shrunk)
 
 

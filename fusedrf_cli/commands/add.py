@@ -1,4 +1,4 @@
-"""`fusedrf add`: one more object into a fused field."""
+"""`fusedrf add`: one more object into a bundle."""
 
 import click
 
@@ -10,21 +10,18 @@ from fusedrf_cli.requests import AddRequest
 @click.command("add")
 @click.argument("fused", type=options.INPUT)
 @click.argument("source", metavar="OBJECT", type=options.INPUT)
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
 @click.option("--name", required=True, help="The object's name in the scene.")
 @options.placement
 @options.keep_history
-@options.time_budget
-@options.rgb
 @options.memory
-@options.edited_precision
-@options.seeded
+@options.added_precision
 @options.reporting
 def command(fused, source, output, name, translate, rotate, scale, matrix, progress, **words):
-    """Put one more object into a fused field.
+    """Put one more object into a bundle.
 
-    OBJECT is scaled, then turned, then moved. What is in FUSED
-    already keeps its numbers.
+    OBJECT, of any kind, is scaled, then turned, then moved, and becomes a node of FUSED. All fields keep
+    their numbers; one that is there already is stored once.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""`fusedrf delete`: objects out of a fused field."""
+"""`fusedrf delete`: objects out of a bundle."""
 
 import click
 
@@ -9,22 +9,21 @@ from fusedrf_cli.requests import DeleteRequest
 @click.command("delete")
 @click.argument("fused", type=options.INPUT)
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
 @options.mending
 @options.keep_history
 @options.time_budget
 @options.rgb
 @options.memory
-@options.edited_precision
 @options.allow_outside
 @options.seeded
 @options.reporting
 def command(fused, names, output, progress, **words):
-    """Take objects out of a fused field.
+    """Take objects out of a bundle.
 
-    An object that the field holds apart is taken out as it is. Of others the region is emptied, and shows
-    what they hid where the other sources are known, or --refit gives photos of it. With --fill what nobody
-    saw goes on smoothly with what is seen around it.
+    An object that is a node goes as it is. Of one that was distilled into a field with others the region is
+    emptied, and shows what it hid where the other sources are known, or --refit gives photos of it. With
+    --fill what nobody saw goes on smoothly with what is seen around it.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""`fusedrf duplicate`: an object of a fused field once more."""
+"""`fusedrf duplicate`: an object of a bundle once more."""
 
 import click
 
@@ -11,16 +11,16 @@ from fusedrf_cli.requests import ArrangeRequest
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("new_name", metavar="NEW")
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
 @options.placement
 @options.keep_history
 @options.memory
 @options.reporting
 def command(fused, name, new_name, translate, rotate, scale, matrix, progress, **words):
-    """Put a copy of an object of a fused field beside it.
+    """Put a copy of an object of a bundle beside it.
 
-    The copy, NEW, is placed from where NAME stands as `fusedrf move` does, and shares its numbers: a copy
-    costs a few hundred bytes. The object has to be held apart, as in fields of --kind blocks.
+    The copy, NEW, is placed from where NAME stands as `fusedrf move` does, and shares its field: a copy
+    costs a few hundred bytes. The object has to be a node of its own, as in bundles of --kind blocks.
 
     \b
     Example:

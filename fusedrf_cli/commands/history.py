@@ -26,6 +26,6 @@ def command(fused, progress):
     Example:
       fusedrf history fused.rfpack
     """
-    from formats.past import history
+    from formats.undo import history
 
     return history(fused)

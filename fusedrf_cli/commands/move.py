@@ -1,4 +1,4 @@
-"""`fusedrf move`: an object of a fused field somewhere else."""
+"""`fusedrf move`: an object of a bundle somewhere else."""
 
 import click
 
@@ -11,17 +11,17 @@ from fusedrf_cli.requests import ArrangeRequest
 @click.command("move")
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
 @options.placement
 @options.keep_history
 @options.memory
 @options.reporting
 def command(fused, name, translate, rotate, scale, matrix, progress, **words):
-    """Move, turn or scale an object of a fused field.
+    """Move, turn or scale an object of a bundle.
 
     From where it stands: it is scaled and turned about the middle of its box, then moved by -t; or --matrix
-    is applied to it in the world. The numbers of the field stay as they are, so that nothing is lost however
-    often. The object has to be held apart, as in fields of --kind blocks.
+    is applied to it in the world. All fields keep their numbers, so that nothing is lost however often. The
+    object has to be a node of its own, as in bundles of --kind blocks.
 
     \b
     Example:

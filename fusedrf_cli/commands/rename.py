@@ -1,4 +1,4 @@
-"""`fusedrf rename`: another name for an object of a fused field."""
+"""`fusedrf rename`: another name for an object of a bundle."""
 
 import click
 
@@ -10,14 +10,14 @@ from fusedrf_cli.requests import ArrangeRequest
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("new_name", metavar="NEW")
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
 @options.keep_history
 @options.memory
 @options.reporting
 def command(fused, name, new_name, progress, **words):
-    """Give an object of a fused field another name.
+    """Give an object of a bundle another name.
 
-    The object has to be held apart, as in fields of --kind blocks.
+    The object has to be a node of its own, as in bundles of --kind blocks.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""`fusedrf replace`: another object in the place of one in a fused field."""
+"""`fusedrf replace`: another object in the place of one in a bundle."""
 
 import click
 
@@ -10,14 +10,11 @@ from fusedrf_cli.requests import ReplaceRequest
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("source", metavar="WITH", type=options.INPUT)
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
 @options.keep_history
-@options.time_budget
-@options.rgb
 @options.memory
-@options.edited_precision
+@options.added_precision
 @options.allow_outside
-@options.seeded
 @options.reporting
 def command(fused, name, source, output, progress, **words):
     """Put another object in the place of one.
@@ -30,7 +27,5 @@ def command(fused, name, source, output, progress, **words):
     """
     from fusedrf_cli import bridge
 
-    request = ReplaceRequest(
-        fused=fused, name=name, source=source, output=output, names=(name,), refit=None, fill=False, **words
-    )
+    request = ReplaceRequest(fused=fused, name=name, source=source, output=output, **words)
     return bridge.replace(request, progress)

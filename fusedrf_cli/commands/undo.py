@@ -19,6 +19,6 @@ def command(fused, output, overwrite, progress):
     Example:
       fusedrf undo fused.rfpack -o fused.rfpack -w
     """
-    from formats.past import undo
+    from formats.undo import undo
 
     return undo(fused, output)

@@ -26,8 +26,8 @@ from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistillSettings, Student
-from fusedrf_cli.engine.kinds.vm import editing, students
 from fusedrf_cli.engine.kinds.vm import field as vm
+from fusedrf_cli.engine.kinds.vm import students
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -113,8 +113,8 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(finish, "RAYS_PER_STEP", 500)
     patch.setattr(finish, "STEPS", 30)
     patch.setattr(finish.RayLesson.__init__, "__defaults__", (15_000,))  # as many as those steps take
-    patch.setattr(part("editing"), "REGION_SETTINGS", TinySettings())
-    patch.setattr(editing, "NUMBERS", SHAPE.size((20, 20, 20)))
+    patch.setattr(part("mending"), "SETTINGS", TinySettings())
+    patch.setattr(part("mending"), "NUMBERS", SHAPE.size((20, 20, 20)))
     draft = FitSettings(longest=24, steps=60, samples=1 << 13)
     patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high", "best"), draft))
     patch.setattr(fit, "STEPS_TO_SHOW", 1)

@@ -14,6 +14,7 @@ from fusedrf_cli.bridge.fusing import choose
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.distillation.distill import POINTS_PART, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
@@ -67,13 +68,13 @@ def asked(**words) -> SimpleNamespace:
     return SimpleNamespace(**usual | words)
 
 
-def maker_of(monkeypatch, student, psnr, request) -> making.Maker:
+def maker_of(monkeypatch, student, psnr, request, together=True) -> making.Maker:
     """A maker whose judge says psnr(field)."""
     monkeypatch.setattr(making, "Judge", lambda *words: psnr)
     monkeypatch.setattr(making, "looks_of", lambda *words: [])
     monkeypatch.setattr(making, "stored", lambda field, precision: field)
     scene = making.Scene(None, SCENE, SAMPLER)
-    return making.Maker(student, scene, request, "cpu", NullProgress())
+    return making.Maker(student, scene, request, "cpu", NullProgress(), together)
 
 
 @pytest.mark.parametrize("target", [None, 30.0])
@@ -105,12 +106,10 @@ def test_of_two_tries_the_better_is_kept():
     assert poor.better(None, 30.0)
 
 
-@pytest.mark.parametrize("in_memory", [True, False])
-def test_rays_show_the_scene_whether_or_not_it_is_put_together(monkeypatch, in_memory):
-    maker = maker_of(monkeypatch, Restless(None), lambda field: 0.0, asked())
-    maker.sources_in_memory = in_memory
-    teacher = maker.teacher
-    assert (teacher is SCENE) != in_memory
+@pytest.mark.parametrize("together", [True, False])
+def test_rays_show_the_scene_whether_or_not_its_sources_are_in_memory_at_once(monkeypatch, together):
+    teacher = maker_of(monkeypatch, Restless(None), lambda field: 0.0, asked(), together).teacher
+    assert isinstance(teacher, Composite) == together and (teacher is SCENE) != together
     rays = SAMPLER.draw(300, torch.Generator().manual_seed(5))
     shown, wanted = (render_rays(field, *rays)[:, :4] for field in (teacher, SCENE))
     assert wanted[:, 3].max() > 0.5 and psnr(shown, wanted) > 50

@@ -6,7 +6,7 @@ import pytest
 
 from formats.bundle import read_bundle, single_field_bundle
 from formats.errors import MissingFile
-from formats.past import keep
+from formats.undo import keep
 from fusedrf_cli.main import COMMANDS, cli
 
 WITH_INPUT = [name for name in COMMANDS if name not in ("completion", "kinds")]

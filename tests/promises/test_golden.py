@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from formats.bundle import sha256_of
-from formats.past import past_of
+from formats.undo import past_of
 from fusedrf_cli.main import cli
 from tests.promises.golden import CASES, KEPT, answers, decibels, drawn, edited, picture
 

@@ -79,11 +79,17 @@ class ComposedField:
             steps = (sampling_step(p.field) for p in self.placed)
             pace = Pace(OccupancyGrid.full(unbounded.WHOLE, OCCUPANCY_CELLS, unbounded))
             marks = pace.kept(unbounded_cells(grids, OCCUPANCY_CELLS), again, steps)
-            grid, place = pace.grid(reduce(np.logical_or, marks)), largest(self.placed)
-            seen = placed_box(place.field.occupancy.subject, place.object_to_world)
-            return replace(grid, looked_at=seen)
+            return replace(pace.grid(reduce(np.logical_or, marks)), looked_at=self.subject)
         aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
+
+    @property
+    def subject(self) -> np.ndarray:
+        """(6,) box of this frame that views look at, as OccupancyGrid.subject."""
+        if not any(p.unbounded for p in self.placed):
+            return self.occupancy.subject
+        around = largest(self.placed)
+        return placed_box(around.field.occupancy.subject, around.object_to_world)
 
     @property
     def aabb(self) -> np.ndarray:

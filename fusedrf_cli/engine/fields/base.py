@@ -67,7 +67,10 @@ class StoredField(RadianceField, Protocol):
 
 def sampling_step(field: RadianceField) -> float:
     """The distance, in the coordinates of its space, at which pictures sample a field; where its grid says
-    how far apart samples may lie in which cells, their smallest distance."""
+    how far apart samples may lie in which cells, their smallest distance. A field without a grid of its own
+    says so itself."""
+    if (step := getattr(field, "sampling_step", None)) is not None:
+        return step
     grid = field.occupancy
     return grid.unit or grid.space.picture_step(field.voxel_size)
 

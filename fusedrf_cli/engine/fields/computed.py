@@ -15,6 +15,7 @@ from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.fields.base import FieldNeeds
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
+from fusedrf_cli.engine.kernels.instances import FARTHEST, Slots
 from fusedrf_cli.engine.kernels.loops import (
     RAYS_PER_TASK,
     Answers,
@@ -291,7 +292,19 @@ class ComputedField:
 
     def show(self, rays: Rays, out: np.ndarray) -> None:
         """`render_rays` of rays as the loops take them."""
-        self.loops.each("render_ray", self.arrays, self.grid, rays, len(out), out, RAYS_PER_TASK)
+        count = len(out)
+        each, reach = np.arange(count), np.minimum(rays.reach, FARTHEST)
+        first, (begin, end) = np.zeros(count, np.int64), np.ascontiguousarray(reach.T)
+        slots = Slots(
+            rays.rays_o, rays.rays_d, reach, each, each, first, begin, end, np.eye(4)[None, :3], rays.step,
+            rays.early_stop, out,
+        )  # fmt: skip
+        out[:] = 0
+        self.each("show_ray", slots, count, out, RAYS_PER_TASK)
+
+    def each(self, item: str, asked: NamedTuple, count: int, out: object, per_task: int) -> None:
+        """An item of work for each i < count, which fills `out`; see Loops.each."""
+        self.loops.each(item, self.arrays, self.grid, asked, count, out, per_task)
 
     def peaks(
         self, lo: np.ndarray, cell: np.ndarray, cells: np.ndarray, offsets: np.ndarray, frame: int = 0

@@ -80,7 +80,7 @@ class Sent(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """What `render_ray` follows."""
+    """What `ComputedField.show` follows."""
 
     rays_o: object  # (N, 3) float64
     rays_d: object  # (N, 3) float64, unit length
@@ -294,53 +294,6 @@ def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
                 end(field, frame, d, scratch, grad)
 
 
-def render_ray(field, grid, rays, i, scratch, memory, out):
-    """Marches, shades and composites ray i in one pass: out[i] is premultiplied rgb, opacity, Σ w t.
-
-    A sample sits in the middle of the steps it stands for. `waiting` is the weight of samples too light to be
-    shaded: the next one that is lends them its colour, at the end of the ray the last one.
-    """
-    o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
-    red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
-    r, g, b = 0.0, 0.0, 0.0
-    trans, waiting, enough = 1.0, 0.0, COLOUR_FROM
-    current, begun = -1, entered(o, d, rays.reach[i, 0])
-    started(field, step, scratch)
-    for _ in range(PIECES):
-        if trans <= rays.early_stop:
-            break
-        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, rays.reach[i, 1])
-        u0 = u0 + 0.5 * step
-        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
-        while k >= 0 and trans > rays.early_stop:
-            u = u0 + 0.5 * between(k, many) * step
-            p, opacity, _, steps, place = met(
-                field, grid, (origin, way, course), k, many, u, step, d, scratch
-            )
-            if steps > 0:
-                weight = trans * opacity
-                if rays.early_stop > 0.0 and trans - weight <= REST_FROM:
-                    weight = trans
-                trans -= weight
-                depth += weight * distance(course, u)
-                waiting += weight
-                if waiting > enough:
-                    if frame_of(place) != current:
-                        current = frame_of(place)
-                        begin(field, current, d, scratch)
-                    r, g, b = colour(field, place, p, d, scratch, memory, 0)
-                    red += waiting * r
-                    green += waiting * g
-                    blue += waiting * b
-                    waiting, enough = 0.0, LENT_FROM
-            k = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
-            k, many = next_sample(grid, origin, way, u0, u1, step, k)
-    red += waiting * r
-    green += waiting * g
-    blue += waiting * b
-    out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = red, green, blue, 1.0 - trans, depth
-
-
 def drawn(jitter):
     """A number in [0, 1) that has nothing to do with where a ray's samples lie: the jitter's last digits."""
     last = jitter * 1048576.0
@@ -375,7 +328,8 @@ def ask_for(field, held, origin, way, u0, step, k, many):
 
 
 def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
-    """Ray i of a batch: forward as in `render_ray`, compare, and back along the ray into grad (P,)."""
+    """Ray i of a batch: forward as in `show_ray` of instances.py, compare, and back along the ray into grad
+    (P,)."""
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
     red, green, blue = 0.0, 0.0, 0.0
     trans, waiting = 1.0, 0.0

@@ -260,7 +260,7 @@ def put_behind_task(found, lengths, chosen, low, high, out):
 
 @loop
 def put_behind(found, lengths, chosen, out):
-    """Composites what rays chosen (M,) show farther on, found (M, 5) as `render_ray` of loops.py leaves it,
+    """Composites what rays chosen (M,) show farther on, found (M, 5) as `show_ray` of instances.py leaves it,
     behind what out (N, 5) has of them; their distances are in units of which `lengths` (M,) make one."""
     m = chosen.shape[0]
     for part in prange((m + RAYS_PER_TASK - 1) // RAYS_PER_TASK):

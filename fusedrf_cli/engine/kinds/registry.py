@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fusedrf_cli.engine.composition.composed import ComposedField
-    from fusedrf_cli.engine.fields.base import StoredField
     from fusedrf_cli.engine.kinds.kind import Kind
 
 GROUP = "fusedrf.kinds"
@@ -94,12 +92,6 @@ def kinds() -> "list[Kind]":
         with contextlib.suppress(BrokenKind):
             found.append(kind(name))
     return found
-
-
-def joined(scene: "ComposedField") -> "StoredField | None":
-    """A scene as one field with the numbers of its sources, by the first kind that can be that: it shows the
-    same and is rendered faster. None where no kind can."""
-    return next((field for kind in kinds() if (field := kind.joined(scene)) is not None), None)
 
 
 def field_kinds() -> dict[str, type]:

@@ -68,7 +68,9 @@ def render_rays(
         else:
             march_rays(field, rays_o[part], rays_d[part], reach[part], step, early_stop, out[part])
 
-    at_once = RAYS_AT_ONCE if fast is None else rays_at_once(field, step)
+    at_once = getattr(field, "rays_at_once", RAYS_AT_ONCE)
+    if fast is not None and not hasattr(field, "rays_at_once"):
+        at_once = rays_at_once(field, step)
     for start in range(0, len(rays_o), at_once):
         in_halves(render, start, min(start + at_once, len(rays_o)))
     return out

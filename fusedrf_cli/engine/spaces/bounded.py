@@ -52,6 +52,16 @@ def distance(course, u):
     return u
 
 
+def length_at(course, t):
+    """Inverse of `distance`, within the piece."""
+    return t
+
+
+def interval(course, u, length):
+    """From and to which distance a length of u around `u` stands: `span` is the difference."""
+    return u - 0.5 * length, u + 0.5 * length
+
+
 def span(course, u, length):
     """How much of t a length of u around `u` stands for: densities are per t."""
     return length

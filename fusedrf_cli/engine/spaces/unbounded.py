@@ -8,7 +8,9 @@ and planes flat, so that a ray is a few straight pieces (see bounded.py for what
 
 A slab's part of a ray from (t0, n0) to (t1, n1) is a line of length L in coordinates; at u along it, with
 s = u / L,
-    t(u) = t0 + (t1 - t0) s n0 / (s n0 + (1 - s) n1).
+    t(u) = t0 + (t1 - t0) s n0 / (s n0 + (1 - s) n1),
+and with r = (t - t0) / (t1 - t0)
+    s(t) = r n1 / ((1 - r) n0 + r n1).
 """
 
 import math
@@ -23,10 +25,10 @@ STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (decision
 FAR = 1e3  # n at which rays end
 ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
-SIDE = 2.0  # coordinates lie between -SIDE and SIDE
+REACH = 2.0  # coordinates lie between -REACH and REACH
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
 LEARN_FROM, LENT_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
-WHOLE = np.array([-SIDE] * 3 + [SIDE] * 3)
+WHOLE = np.array([-REACH] * 3 + [REACH] * 3)
 SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
 
 
@@ -167,13 +169,34 @@ def distance(course, u):
     return t0 + length * s * n0 / (s * n0 + (1.0 - s) * n1)
 
 
-def span(course, u, length):
-    """How much of t a length of u around `u` stands for; where there is less than another such length before
-    or behind it in the piece, that is its own too. Exact, since far out t goes up manifold in one step."""
-    _, whole, n0, n1, per = course
+def length_at(course, t):
+    """See bounded.py."""
+    t0, length, n0, n1, per = course
+    r = min(max((t - t0) / length, 0.0), 1.0)
+    return r * n1 / ((1.0 - r) * n0 + r * n1) / per
+
+
+def share_of(course, u, length):
+    """From and to which share of a piece a length of u around `u` stands; where there is less than another
+    such length before or behind it in the piece, that is its own too."""
+    per = course[4]
     s0, s1 = (u - 0.5 * length) * per, (u + 0.5 * length) * per
     s0 = 0.0 if (u - length) * per < 0.0 else s0
     s1 = 1.0 if (u + length) * per >= 1.0 else s1
+    return s0, s1
+
+
+def interval(course, u, length):
+    """See bounded.py."""
+    s0, s1 = share_of(course, u, length)
+    return distance(course, s0 / course[4]), distance(course, s1 / course[4])
+
+
+def span(course, u, length):
+    """How much of t a length of u around `u` stands for, see `share_of`. Exact, since far out t goes up
+    manifold in one step."""
+    _, whole, n0, n1, _ = course
+    s0, s1 = share_of(course, u, length)
     return whole * n0 * n1 * (s1 - s0) / ((s0 * n0 + (1.0 - s0) * n1) * (s1 * n0 + (1.0 - s1) * n1))
 
 

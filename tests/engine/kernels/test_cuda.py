@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -135,6 +137,26 @@ def test_render(name, dtype):
     for wanted, found in twice(field, picture):
         check(found, wanted, dtype)
         assert wanted[:, 3].max() > 0.1
+
+
+@on_a_device
+@pytest.mark.parametrize("rule", ["max", "add"])
+def test_a_composite_of_two_kinds(rule):
+    """Its segments are found here, and marched, traced, shaded and asked there."""
+    other, rays = random_sparse(0), rays_at(BOX, 4)
+    points = torch.from_numpy(points_in(BOX, 20))
+    dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(20, 3))))
+
+    def picture(field):
+        second = other if SIMULATED else other.to(field.params.device)
+        scene = Composite([Placed("a", field, np.eye(4)), Placed("b", second, TURNED)], rule)
+        out, reach = np.zeros((4, 5)), reach_of(4, 0.0, np.inf)
+        scene.render_rays(rays[0] - scene.origin, rays[1], reach, 2 * scene.sampling_step, 1e-3, out)
+        return out, *(found.numpy() for found in scene.query(points, dirs))
+
+    for wanted, found in twice(vm(torch.float64), picture):
+        check(found, wanted, torch.float32)
+        assert wanted.max() > 0.1
 
 
 @on_a_device

@@ -7,11 +7,12 @@ from types import ModuleType
 
 import pytest
 
-from fusedrf_cli.engine.kernels import loops, specialise
+from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
 from fusedrf_cli.engine.kinds.sparse import bodies as sparse
 from fusedrf_cli.engine.kinds.vm import bodies as vm
 from fusedrf_cli.engine.kinds.vm_mlp import bodies as vm_mlp
-from fusedrf_cli.engine.spaces import bounded
+from fusedrf_cli.engine.spaces import SPACES, bounded
+from tests.engine.kinds.cases import KINDS
 
 SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
 
@@ -109,8 +110,29 @@ def test_every_function_carries_the_name():
     for function in ("density", "colour", "query_point", "train_ray", "piece", "march"):
         assert names[function].py_func.__qualname__ == f"{function}_{name}"
     runs = specialise.Loops(vm, SIZES, bounded)
-    runs = [runs._over("each", item) for item in ("query_point", "render_ray")]
+    runs = [runs._over("each", item) for item in ("query_point", "show_ray")]
     assert len({run.py_func.__qualname__ for run in runs}) == 2
+
+
+HOOKS = {
+    "started", "standing", "begin", "end", "frame_of", "keep", "again", "advance", "known", "unstretched",
+    "ahead_density", "ahead_colour", "COLOUR_FROM", "LEARN_FROM", "LENT_FROM", "REST_FROM", "SHADING_COST",
+}  # fmt: skip
+"""What a kind or a space may have in place of the loops' own, see loops.py."""
+
+
+@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+@pytest.mark.parametrize("name", KINDS)
+def test_no_name_means_two_things_in_a_namespace(name, space):
+    """It is flat, and the later name wins: a template's constant would be a kind's offset in scratch."""
+    field = KINDS[name]()
+    ours = [vars(module) for module in (parts, loops, instances, space)]
+    theirs = {k: v for module in specialise.family(field.bodies) for k, v in vars(module).items()}
+    meanings: dict[str, object] = {}
+    for names in (*ours, theirs, field.bodies.sizes(field)):
+        for key, value in names.items():
+            if not key.startswith("__") and key not in HOOKS:
+                assert meanings.setdefault(key, value) is value, key
 
 
 def test_what_a_kind_leaves_out_has_a_default_and_what_it_takes_from_another_is_that():

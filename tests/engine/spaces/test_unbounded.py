@@ -23,7 +23,7 @@ from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
-from fusedrf_cli.engine.spaces import space_named, unbounded
+from fusedrf_cli.engine.spaces import bounded, space_named, unbounded
 from fusedrf_cli.engine.spaces.unbounded import FAR, PIECES, WHOLE
 from tests.analytic.export import vm_field as exported
 from tests.analytic.export import way_of
@@ -101,6 +101,25 @@ def test_a_span_is_a_difference_of_distances(share):
             u, e = (u0 + u1) / 2, share * (u1 - u0)
             moved = SPACE["distance"](course, u + e / 2) - SPACE["distance"](course, u - e / 2)
             assert SPACE["span"](course, u, e) == pytest.approx(moved, rel=1e-6, abs=1e-8)
+
+
+def test_a_length_and_its_distance_are_inverses_and_an_interval_is_a_span():
+    for names, pieces_of in ((SPACE, pieces), (specialised(None, {}, bounded)[1], in_box)):
+        for o, d in rays(300):
+            for _, _, u0, u1, course in pieces_of(o, d):
+                for u in u0 + (u1 - u0) * np.array([1e-6, 0.3, 0.98]):
+                    t = names["distance"](course, u)
+                    assert names["length_at"](course, t) == pytest.approx(u, rel=1e-7, abs=1e-9)
+                    low, high = names["interval"](course, u, 0.1)
+                    assert high - low == pytest.approx(names["span"](course, u, 0.1), rel=1e-6, abs=1e-9)
+                    assert low <= t * (1 + 1e-9) and t <= high * (1 + 1e-9)
+
+
+def in_box(o, d) -> list[tuple]:
+    """The piece of a ray in a box, where it meets that."""
+    grid = OccupancyGrid.full(np.array([-1.0, -2, -1, 1, 1, 1]))
+    found = specialised(None, {}, bounded)[1]["piece"](0, grid.arrays, tuple(o), tuple(d), 0.0, np.inf)
+    return [found] if found[3] > found[2] else []
 
 
 @pytest.mark.parametrize("step", [0.31, 0.01])

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from itertools import product
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.detail import LOST_NOTED, Detail
+from fusedrf_cli.engine.composition.detail import Detail
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung, shrinking
 from fusedrf_cli.engine.kinds.student import Made, MadeStudent, Needs, StudentRequest, Suits, Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
-from fusedrf_cli.engine.kinds.vm.details import block_details, lost_shares
+from fusedrf_cli.engine.kinds.vm.details import block_details
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.students import contents_of
 from fusedrf_cli.engine.kinds.vm.trimming import without_unread
@@ -50,16 +50,6 @@ class BlocksKind(Kind):
     def student(self, scene: ComposedField, request: StudentRequest) -> "BlocksStudent":
         """Blocks of a scene."""
         return BlocksStudent(self, scene, request)
-
-    def joined(self, scene: ComposedField) -> VMField | None:
-        """The sources' own tensors; None where so many meet in a cell that some would not be seen."""
-        if self.suits(scene).score is None:
-            return None
-        try:
-            field = blocks_of(scene.placed)
-        except ValueError:  # more than a field holds
-            return None
-        return field if lost_shares(field).max() <= LOST_NOTED else None
 
     def describe(self, field: VMField) -> dict:
         """Texels per axis of every tensor, ranks and SH degree."""

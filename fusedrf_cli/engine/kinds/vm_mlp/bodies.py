@@ -2,7 +2,7 @@
 
 With the matrix B (FEATURES, 3 rank), which the tensor's colour basis is, and the products P ∘ L of a point:
 f = B (P ∘ L), x = [f, d] with d the direction in the object's frame, and the network's input is
-[x, sin x, sin 2x, cos x, cos 2x] (INPUTS numbers); two layers of WIDTH rectified outputs and one of three,
+[x, sin x, sin 2x, cos x, cos 2x] (INPUTS numbers); two layers of LAYER rectified outputs and one of three,
 behind a sigmoid, follow. Each layer lies in params from `network` on as W (inputs, outputs) and then its
 bias, where outputs are filled up to multiples of 8 with zeros, which stay so.
 
@@ -45,7 +45,7 @@ def sizes(field) -> dict[str, int]:
     kept = np.cumsum([3 * rank, inputs, width, width, OUTPUTS]).tolist()
     return {
         "DENSITY_RANK": field.shape.density_rank, "COLOUR_RANK": rank, "PRODUCTS": 3 * rank,
-        "FEATURES": features, "WIDTH": width,
+        "FEATURES": features, "LAYER": width,
         "INPUTS": inputs, **dict(zip(held, starts, strict=False)), "SCRATCH": starts[-1],
         "INPUT": kept[0], "FIRST": kept[1], "SECOND": kept[2], "LAST": kept[3], "KEPT": kept[4],
         "LEARN_FROM": 1 / 64, "SHADING_COST": 8, "CROSSING": int(any(field.factors.crossings)), "DETAIL": 0,
@@ -81,11 +81,11 @@ def colour(field, place, p, d, scratch, memory, at):
     second, last = layers(field)
     first_at, second_at = base + np.uint64(FIRST), base + np.uint64(SECOND)
     last_at = base + np.uint64(LAST)
-    dense(INPUTS, WIDTH, field.params, np.uint64(field.network), memory, x, memory, first_at)
-    rectify(WIDTH, memory, first_at)
-    dense(WIDTH, WIDTH, field.params, second, memory, first_at, memory, second_at)
-    rectify(WIDTH, memory, second_at)
-    dense(WIDTH, OUTPUTS, field.params, last, memory, second_at, memory, last_at)
+    dense(INPUTS, LAYER, field.params, np.uint64(field.network), memory, x, memory, first_at)
+    rectify(LAYER, memory, first_at)
+    dense(LAYER, LAYER, field.params, second, memory, first_at, memory, second_at)
+    rectify(LAYER, memory, second_at)
+    dense(LAYER, OUTPUTS, field.params, last, memory, second_at, memory, last_at)
     return (
         float(sigmoid(memory[last_at])),
         float(sigmoid(memory[last_at + np.uint64(1)])),
@@ -95,8 +95,8 @@ def colour(field, place, p, d, scratch, memory, at):
 
 def layers(field):
     """Where the second and the third layer begin in params."""
-    second = np.uint64(field.network) + np.uint64((INPUTS + 1) * WIDTH)
-    return second, second + np.uint64((WIDTH + 1) * WIDTH)
+    second = np.uint64(field.network) + np.uint64((INPUTS + 1) * LAYER)
+    return second, second + np.uint64((LAYER + 1) * LAYER)
 
 
 def encode(memory, x):
@@ -129,14 +129,14 @@ def colour_backward(field, p, rgb, d_rgb, scratch, memory, at, grad):
     scratch[d_last + np.uint64(1)] = d_rgb[1] * rgb[1] * (1 - rgb[1])
     scratch[d_last + np.uint64(2)] = d_rgb[2] * rgb[2] * (1 - rgb[2])
     dense_backward(
-        WIDTH, OUTPUTS, field.params, last, memory, second_at, True, scratch, d_last, scratch, d_second, grad
+        LAYER, OUTPUTS, field.params, last, memory, second_at, True, scratch, d_last, scratch, d_second, grad
     )
     dense_backward(
-        WIDTH, WIDTH, field.params, second, memory, first_at, True, scratch, d_second, scratch, d_first, grad
+        LAYER, LAYER, field.params, second, memory, first_at, True, scratch, d_second, scratch, d_first, grad
     )
     network, d_input = np.uint64(field.network), np.uint64(D_INPUT)
     dense_backward(
-        INPUTS, WIDTH, field.params, network, memory, x, False, scratch, d_first, scratch, d_input, grad
+        INPUTS, LAYER, field.params, network, memory, x, False, scratch, d_first, scratch, d_input, grad
     )
     encode_backward(memory, x, scratch)
     basis, width = np.uint64(field.layout[0, 12]), np.uint64(PRODUCTS)

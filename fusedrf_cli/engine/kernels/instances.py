@@ -1,0 +1,347 @@
+"""What the loops do for scenes of several placed fields: templates beside those of loops.py, compiled for a
+kind and a space (`specialise`).
+
+An *instance* is a field placed in the scene's frame. Along a ray it has samples of its own, at its own step,
+which begin where the ray does, wherever the ray is cut into *segments*: a segment takes those samples whose
+first step has its middle in it. Distances t along rays are those of the scene's frame, whose unit is `length`
+long in an instance's. A *slot* is the segment of one ray and one instance in it.
+
+    show_ray    slots of an instance that is alone: marched, shaded and composited behind what the ray has
+    trace_ray   slots of segments where instances meet: the samples of one of them, without their colours
+    shade_ray   the colours of those samples by the weights that they were given
+    densest_at, colour_at
+                the same for points
+    next_change where along a ray an instance's occupied cells begin, or end (needs no kind, only a space)
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fusedrf_cli.engine.kernels.parts import FACE_TOLERANCE, along, cell_of, exit_distance, next_sample
+
+MAX_TRACED = 24  # samples of a slot: what does not fit is left to the ray's next segment
+FARTHEST = 1e30  # farther than any ray goes
+ANYWHERE = -1.0  # for a gap: where occupied cells begin
+
+
+class Instances(NamedTuple):
+    """Placed fields by the cells that they occupy (B instances)."""
+
+    world_to_instance: object  # (B, 3, 4) from the scene's frame
+    lo: object  # (B, 3) lower corner of its grid, in the coordinates of its space
+    hi: object  # (B, 3)
+    cell: object  # (B, 3) size of a cell
+    counts: object  # (B, 3) int64 cells per axis
+    first_cell: object  # (B,) int64, where its cells begin in `skip`
+    skip: object  # flat uint8, see GridArrays
+    step: object  # (B,) at which it is sampled, in its own coordinates
+    spheres: object  # (B, 4) centre and radius around its occupied cells, in the scene's frame; or infinite
+
+
+class Box(NamedTuple):
+    """As much of a grid as `stretch` reads."""
+
+    lo: object
+    hi: object
+
+
+class Slots(NamedTuple):
+    """Those slots, chosen (M,) of S, on N rays that belong to instances of one field."""
+
+    rays_o: object  # (N, 3) float64, in the scene's frame
+    rays_d: object  # (N, 3) float64, unit length
+    reach: object  # (N, 2) float64, from which distance to which rays are followed: samples begin there
+    chosen: object  # (M,) int64
+    ray: object  # (S,) int64
+    instance: object  # (S,) int64
+    begin: object  # (N,) float64, where the ray's segment begins
+    end: object  # (N,) float64, where it ends
+    world_to_instance: object  # (B, 3, 4)
+    step: object  # float, in the coordinates of the instance
+    early_stop: object  # float, the transmittance at which a ray ends
+    rendered: object  # (N, 5) what lies before the segment, as `show_ray` leaves it
+
+
+class Traces(NamedTuple):
+    """The samples of S slots, at most MAX_TRACED each, in order; distances are the scene's."""
+
+    count: object  # (S,) int64
+    complete: object  # (S,) up to where they are all of them, FARTHEST where none was left out
+    low: object  # (S, MAX_TRACED) from where a sample stands
+    high: object  # (S, MAX_TRACED) to where
+    middle: object  # (S, MAX_TRACED) where it was taken
+    depth: object  # (S, MAX_TRACED) its optical depth
+    weight: object  # (S, MAX_TRACED) the share of the light that it takes, see `merge_samples`
+    cell: object  # (S, MAX_TRACED) int64, what `keep` makes of its place
+    cursor: object  # (S,) int64, used while samples are merged
+    rgb: object  # (S, 3) the sum of their colours by weight
+
+
+class PointQuery(NamedTuple):
+    """Points chosen (M,) of N for one instance."""
+
+    points: object  # (N, 3) float64, in the scene's frame
+    dirs: object  # (N, 3) float64, unit length
+    chosen: object  # (M,) int64
+    instance: object  # int
+    world_to_instance: object  # (B, 3, 4)
+    adds: object  # bool: densities add up, and colours by their shares
+    with_colour: object  # bool
+
+
+class PointAnswers(NamedTuple):
+    """What `densest_at` and `colour_at` fill."""
+
+    sigma: object  # (N,) float64 per length of the scene's frame
+    densest: object  # (N,) int64, the densest instance, or -1
+    cell: object  # (N,) int64, what `keep` makes of its place
+    rgb: object  # (N, 3) float64
+
+
+# -- rays ----------------------------------------------------------------------------------------------------
+
+
+def ray_in_instance(world_to_instance, b, rays_o, rays_d, r):
+    """Row r of origins and directions in the frame of instance b: (origin, direction, its length), not of
+    unit length: distances along it are those of the scene."""
+    m = world_to_instance[b]
+    x, y, z = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
+    o = (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
+    )
+    x, y, z = rays_d[r, 0], rays_d[r, 1], rays_d[r, 2]
+    d = (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
+    return o, d, math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+
+
+def slot_ray(slots, s):
+    """The ray of a slot: its number, origin and unit direction in the instance's frame, and how long a unit
+    of the scene's is along it."""
+    r = slots.ray[s]
+    o, d, length = ray_in_instance(slots.world_to_instance, slots.instance[s], slots.rays_o, slots.rays_d, r)
+    return r, o, (d[0] / length, d[1] / length, d[2] / length), length
+
+
+def samples_between(slots, r, length, warp, u0, u1):
+    """Which samples of a piece from u0 to u1 lie in the segment of ray r: (where sample 0 is, the number of
+    the first, where they end). Both ends go by the numbers of samples, so that of two segments that touch
+    every sample is in one, and none of them stands for less than it does in the whole ray."""
+    step, end = slots.step, length_at(warp, slots.end[r] * length)
+    u0 = u0 + 0.5 * step
+    first = math.ceil((min(length_at(warp, slots.begin[r] * length), u1) - u0) / step)
+    if end < u1:
+        u1 = u0 + (math.ceil((end - u0) / step) - 0.5) * step
+    return u0, max(0, int(first)), u1
+
+
+def show_ray(field, grid, slots, i, scratch, memory, out):
+    """Marches, shades and composites slot chosen[i] in one pass behind what out[r] has of its ray:
+    premultiplied rgb, opacity, Σ w t.
+
+    A sample sits in the middle of the steps it stands for. `pending` is the weight of samples too light to be
+    shaded: the next one that is lends them its colour, at the end of the segment the last one.
+    """
+    r, o, d, length = slot_ray(slots, slots.chosen[i])
+    step, far = slots.step, slots.reach[r, 1] * length
+    red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
+    c_r, c_g, c_b = 0.0, 0.0, 0.0
+    trans, pending, enough = 1.0 - out[r, 3], 0.0, COLOUR_FROM
+    current, begun = -1, entered(o, d, slots.reach[r, 0] * length)
+    started(field, step, scratch)
+    for _ in range(PIECES):
+        if trans <= slots.early_stop:
+            break
+        (origin, way, u0, u1, warp), begun = stretch(begun, grid, o, d, far)
+        if u1 <= u0:
+            continue
+        u0, index, u1 = samples_between(slots, r, length, warp, u0, u1)
+        index, many = next_sample(grid, origin, way, u0, u1, step, index)
+        while index >= 0 and trans > slots.early_stop:
+            u = u0 + 0.5 * between(index, many) * step
+            p, opacity, _, steps, place = met(
+                field, grid, (origin, way, warp), index, many, u, step, d, scratch
+            )
+            if steps > 0:
+                weight = trans * opacity
+                if slots.early_stop > 0.0 and trans - weight <= REST_FROM:
+                    weight = trans
+                trans -= weight
+                depth += weight * distance(warp, u)
+                pending += weight
+                if pending > enough:
+                    if frame_of(place) != current:
+                        current = frame_of(place)
+                        begin(field, current, d, scratch)
+                    c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
+                    red += pending * c_r
+                    green += pending * c_g
+                    blue += pending * c_b
+                    pending, enough = 0.0, LENT_FROM
+            index = advance(field, grid, place, many, steps, index, p, way, u, u0, step)
+            index, many = next_sample(grid, origin, way, u0, u1, step, index)
+    out[r, 0] += red + pending * c_r
+    out[r, 1] += green + pending * c_g
+    out[r, 2] += blue + pending * c_b
+    out[r, 3] = 1.0 - trans
+    out[r, 4] += depth / length
+
+
+def trace_ray(field, grid, slots, i, scratch, memory, out):
+    """The samples of slot chosen[i] that are not empty, up to where they alone would leave no light."""
+    s = slots.chosen[i]
+    r, o, d, length = slot_ray(slots, s)
+    step, far = slots.step, slots.reach[r, 1] * length
+    trans, count, complete = 1.0 - slots.rendered[r, 3], 0, FARTHEST
+    begun = entered(o, d, slots.reach[r, 0] * length)
+    started(field, step, scratch)
+    for _ in range(PIECES):
+        if trans <= slots.early_stop or count == MAX_TRACED:
+            break
+        (origin, way, u0, u1, warp), begun = stretch(begun, grid, o, d, far)
+        if u1 <= u0:
+            continue
+        u0, index, u1 = samples_between(slots, r, length, warp, u0, u1)
+        index, many = next_sample(grid, origin, way, u0, u1, step, index)
+        while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
+            u = u0 + 0.5 * between(index, many) * step
+            p = along(origin, way, u)
+            standing(field, many, scratch)
+            sigma, _, steps, place = density(field, grid, index, p, d, scratch)
+            if steps > 0 and sigma > 0.0:
+                depth = sigma * optical_length(warp, p, u, many, steps, step)
+                low, high = interval(warp, u + 0.5 * (steps - 1) * many * step, steps * many * step)
+                out.low[s, count], out.high[s, count] = low / length, high / length
+                out.middle[s, count] = distance(warp, u) / length
+                out.depth[s, count], out.weight[s, count], out.cell[s, count] = depth, 0.0, keep(place)
+                trans *= math.exp(-depth)
+                count += 1
+            index = advance(field, grid, place, many, steps, index, p, way, u, u0, step)
+            index, many = next_sample(grid, origin, way, u0, u1, step, index)
+        if count == MAX_TRACED:
+            left_out = u0 + (index - 0.5) * step if index >= 0 else u1
+            complete = distance(warp, left_out) / length
+    out.count[s], out.complete[s] = count, complete
+
+
+def shade_ray(field, grid, slots, i, scratch, memory, out):
+    """The colours of the samples of slot chosen[i] that show, by their weights; light ones as in
+    `show_ray`."""
+    s = slots.chosen[i]
+    _, o, d, length = slot_ray(slots, s)
+    red, green, blue = 0.0, 0.0, 0.0
+    c_r, c_g, c_b = 0.0, 0.0, 0.0
+    pending, enough, current = 0.0, COLOUR_FROM, -1
+    for q in range(out.count[s]):
+        pending += out.weight[s, q]
+        if pending > enough:
+            p = point(along(o, d, out.middle[s, q] * length))
+            place = again(field, out.cell[s, q], p)
+            if frame_of(place) != current:
+                current = frame_of(place)
+                begin(field, current, d, scratch)
+            c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
+            red += pending * c_r
+            green += pending * c_g
+            blue += pending * c_b
+            pending, enough = 0.0, LENT_FROM
+    out.rgb[s, 0] = red + pending * c_r
+    out.rgb[s, 1] = green + pending * c_g
+    out.rgb[s, 2] = blue + pending * c_b
+
+
+# -- points --------------------------------------------------------------------------------------------------
+
+
+def point_in_instance(field, grid, query, i):
+    """Point chosen[i] in the instance's space, the unit direction there, and how long a unit of the scene's
+    is along it; asks for the numbers that a later point will read."""
+    matrix, b, n = query.world_to_instance, query.instance, i + POINTS_AHEAD
+    if n < query.chosen.shape[0]:
+        p = point(ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[n])[0])
+        if known(field, grid, p):
+            ahead_density(field, field.params, 0, p)
+            if query.with_colour:
+                ahead_colour(field, field.params, 0, p)
+    o, d, length = ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[i])
+    return point(o), (d[0] / length, d[1] / length, d[2] / length), length
+
+
+def densest_at(field, grid, query, i, scratch, memory, out):
+    """Enter an instance's density at point chosen[i] where it is the densest so far, or add it."""
+    j = query.chosen[i]
+    p, d, length = point_in_instance(field, grid, query, i)
+    if known(field, grid, p):
+        sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
+        sigma *= rate(p) * length
+        if steps > 0 and query.adds:
+            out.sigma[j] += sigma
+        elif steps > 0 and sigma > out.sigma[j]:
+            out.sigma[j], out.densest[j], out.cell[j] = sigma, query.instance, keep(place)
+
+
+def colour_at(field, grid, query, i, scratch, memory, out):
+    """An instance's colour at point chosen[i], where it is the densest, or its share by density where they
+    add up."""
+    j, share = query.chosen[i], 1.0
+    p, d, length = point_in_instance(field, grid, query, i)
+    if query.adds:
+        if not known(field, grid, p):
+            return
+        sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
+        if steps == 0 or sigma <= 0.0:
+            return
+        share = sigma * rate(p) * length / out.sigma[j]
+    else:
+        place = again(field, out.cell[j], p)
+    begin(field, frame_of(place), d, scratch)
+    c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
+    out.rgb[j, 0] += share * c_r
+    out.rgb[j, 1] += share * c_g
+    out.rgb[j, 2] += share * c_b
+
+
+# -- occupancy along a ray -----------------------------------------------------------------------------------
+
+
+def next_change(instances, b, o, d, t, end, gap):
+    """Along a ray o + t d of the frame of instance b, d of any length, from t to `end`: where an occupied
+    cell begins, or FARTHEST where none does; for a gap of 0 or more where, from t on, nothing occupied
+    follows for longer than that."""
+    box = Box(instances.lo[b], instances.hi[b])
+    lo, cell, first = instances.lo[b], instances.cell[b], instances.first_cell[b]
+    nx, ny, nz = instances.counts[b, 0], instances.counts[b, 1], instances.counts[b, 2]
+    begun, last = entered(o, d, t), t
+    for _ in range(PIECES):
+        (origin, way, u0, u1, warp), begun = stretch(begun, box, o, d, end)
+        # From where the ray enters, so that steps are seen however far away that is.
+        start, u, most = along(origin, way, u0), 0.0, u1 - u0
+        least = FACE_TOLERANCE * cell[0] / max(abs(way[0]), max(abs(way[1]), abs(way[2])))
+        while u < most:
+            x, y, z = along(start, way, u)
+            i, j = cell_of(x, lo[0], cell[0], nx), cell_of(y, lo[1], cell[1], ny)
+            k = cell_of(z, lo[2], cell[2], nz)
+            empty = int(instances.skip[np.uint64(first + (i * ny + j) * nz + k)])
+            if empty == 0 and gap < 0.0:
+                return distance(warp, u0 + u)
+            if empty != 0 and gap >= 0.0 and distance(warp, u0 + u) > last + gap:
+                return last
+            cube = max(empty, 1)
+            away = min(
+                exit_distance(x, way[0], lo[0], cell[0], i, cube),
+                min(
+                    exit_distance(y, way[1], lo[1], cell[1], j, cube),
+                    exit_distance(z, way[2], lo[2], cell[2], k, cube),
+                ),
+            )
+            u += max(away, 0.0) + least
+            if empty == 0:
+                last = distance(warp, u0 + min(u, most))
+    return FARTHEST if gap < 0.0 else last

@@ -1,0 +1,367 @@
+"""Rays of scenes of several instances (instances.py), cut into segments by which of these have occupied cells
+there, and how the samples of several are merged. Loops for the CPU.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import prange
+
+from fusedrf_cli.engine.kernels.instances import ANYWHERE, FARTHEST
+from fusedrf_cli.engine.kernels.parts import along, body
+from fusedrf_cli.engine.kernels.plain import loop, task
+from fusedrf_cli.engine.kernels.specialise import loops_for
+from fusedrf_cli.engine.spaces import bounded, unbounded
+
+TILE = 256  # rays, which lie close together in pictures
+PER_TASK = 1024
+GAP = 4.0  # steps: occupied cells that are no farther apart belong together
+ROUNDING = 1e-6  # of angles, in radians, and of distances, by which rays may come nearer than is reckoned
+DONE, SHARED = -1, -2  # of a ray's segment: there is none; several instances meet in it
+
+
+class RayBatch(NamedTuple):
+    """N rays in the scene's frame."""
+
+    rays_o: object  # (N, 3) float64
+    rays_d: object  # (N, 3) float64, unit length
+    reach: object  # (N, 2) float64, from which distance to which they are followed
+
+
+class Segments(NamedTuple):
+    """The segments that N rays come to next: perhaps one of the only unbounded instance alone, and behind it
+    one of an instance or of several."""
+
+    alone_from: object  # (N,) where the first one begins, which is where the ray's last segment ended
+    alone_to: object  # (N,) where it ends; the same where there is none
+    instance: object  # (N,) int64 of the second one, or SHARED, or DONE
+    begin: object  # (N,) where it begins
+    end: object  # (N,) where it ends
+    n_meeting: object  # (N,) int64, how many instances meet in it, if it is SHARED
+    meeting: object  # (N, W) int64, the first W of them
+
+
+next_in_box, next_in_space = (loops_for(None, (), s).names["next_change"] for s in (bounded, unbounded))
+ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
+
+
+# -- which instances a ray may meet --------------------------------------------------------------------------
+
+
+@body
+def bundle_of(rays, chosen, low, high):
+    """A cone that holds the directions of rays chosen[low:high], and a ball that holds their origins: centre,
+    radius, axis and half angle."""
+    rays_o, rays_d, r = rays.rays_o, rays.rays_d, chosen[low]
+    x, y, z = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
+    dx, dy, dz, wide = 0.0, 0.0, 0.0, 0.0
+    for i in range(low, high):
+        r = chosen[i]
+        dx, dy, dz = dx + rays_d[r, 0], dy + rays_d[r, 1], dz + rays_d[r, 2]
+        ox, oy, oz = rays_o[r, 0] - x, rays_o[r, 1] - y, rays_o[r, 2] - z
+        wide = max(wide, ox * ox + oy * oy + oz * oz)
+    length, least = math.sqrt(dx * dx + dy * dy + dz * dz), 1.0
+    if length <= 0.0:
+        return (x, y, z), math.sqrt(wide), (1.0, 0.0, 0.0), math.pi
+    dx, dy, dz = dx / length, dy / length, dz / length
+    for i in range(low, high):
+        r = chosen[i]
+        least = min(least, rays_d[r, 0] * dx + rays_d[r, 1] * dy + rays_d[r, 2] * dz)
+    return (x, y, z), math.sqrt(wide), (dx, dy, dz), math.acos(max(least, -1.0))
+
+
+@body
+def bundle_may_reach(bundle, sphere):
+    """Whether a ray of a bundle, see `bundle_of`, may come into a sphere (centre and radius)."""
+    centre, wide, axis, angle = bundle
+    x, y, z = sphere[0] - centre[0], sphere[1] - centre[1], sphere[2] - centre[2]
+    far, radius = math.sqrt(x * x + y * y + z * z), sphere[3] + wide
+    if far * (1 - ROUNDING) <= radius:
+        return True
+    off = math.acos(min(max((x * axis[0] + y * axis[1] + z * axis[2]) / far, -1.0), 1.0))
+    return off - math.asin(radius / far) <= angle + ROUNDING
+
+
+@body
+def ray_reaches(rays, r, sphere, begin, end):
+    """Whether ray r comes into a sphere (centre and radius) between two distances."""
+    x, y, z = sphere[0] - rays.rays_o[r, 0], sphere[1] - rays.rays_o[r, 1], sphere[2] - rays.rays_o[r, 2]
+    d = rays.rays_d[r, 0], rays.rays_d[r, 1], rays.rays_d[r, 2]
+    middle = x * d[0] + y * d[1] + z * d[2]
+    x, y, z = along((x, y, z), d, -middle)  # past the centre: exact however far away that is
+    passes = x * x + y * y + z * z <= sphere[3] * sphere[3]
+    return passes and middle + sphere[3] >= begin and middle - sphere[3] < end
+
+
+@body
+def instances_near(rays, instances, chosen, low, high, near):
+    """The instances that rays chosen[low:high] may meet into near (B,), unbounded ones first: how many of
+    these, and how many in all."""
+    bundle, count = bundle_of(rays, chosen, low, high), 0
+    for b in range(instances.step.shape[0]):
+        if instances.spheres[b, 3] >= FARTHEST:
+            near[count] = b
+            count += 1
+    n_unbounded = count
+    for b in range(instances.step.shape[0]):
+        if instances.spheres[b, 3] < FARTHEST and bundle_may_reach(bundle, instances.spheres[b]):
+            near[count] = b
+            count += 1
+    return n_unbounded, count
+
+
+# -- the next segment of a ray -------------------------------------------------------------------------------
+
+
+@body
+def next_on_ray(rays, instances, b, r, begin, end, gaps):
+    """`next_change` of instance b on ray r, for a gap of so many of its steps, and how long a step is."""
+    o, d, length = ray_in_instance(instances.world_to_instance, b, rays.rays_o, rays.rays_d, r)
+    step = instances.step[b] / length
+    if instances.spheres[b, 3] >= FARTHEST:
+        return next_in_space(instances, b, o, d, begin, end, gaps * step), step
+    return next_in_box(instances, b, o, d, begin, end, gaps * step), step
+
+
+@body
+def occupied_from(rays, instances, b, r, begin, end):
+    """Where from `begin` on instance b has occupied cells on ray r, or FARTHEST where it has none before the
+    end; and how long one of its steps is there."""
+    if instances.spheres[b, 3] < FARTHEST and not ray_reaches(rays, r, instances.spheres[b], begin, end):
+        return FARTHEST, 0.0
+    return next_on_ray(rays, instances, b, r, begin, end, ANYWHERE)
+
+
+@body
+def first_two(rays, instances, r, near, low, high, begin, two):
+    """Those two of instances near[low:high], and of `two`, whose occupied cells come first on ray r from
+    `begin` on: (where the first begins, where the second does, the first, the second, a step of the
+    first)."""
+    for c in range(low, high):
+        at, step = occupied_from(rays, instances, near[c], r, begin, two[1])
+        if at < two[0]:
+            two = at, two[0], near[c], two[2], step
+        elif at < two[1]:
+            two = two[0], at, two[2], near[c], two[4]
+    return two
+
+
+@body
+def end_of_meeting(rays, instances, r, two, far):
+    """Where the first of two instances whose cells begin close to each other on ray r ends."""
+    first, second, b, other, step = two
+    one, _ = next_on_ray(rays, instances, b, r, first, far, GAP)
+    end, _ = next_on_ray(rays, instances, other, r, second, far, GAP)
+    return min(max(min(one, end), second + GAP * step), far)
+
+
+@body
+def note_meeting(rays, instances, r, near, count, begin, end, segments):
+    """Enter those of instances near[:count] that have occupied cells on ray r between two distances."""
+    found = 0
+    for c in range(count):
+        at, _ = occupied_from(rays, instances, near[c], r, begin, end)
+        if at < end:
+            if found < segments.meeting.shape[1]:
+                segments.meeting[r, found] = near[c]
+            found += 1
+    segments.n_meeting[r] = found
+
+
+@task
+def segment_task(rays, instances, chosen, low, high, near, segments):
+    """`next_segments` of rays chosen[low:high]; near (B,) is room."""
+    n_unbounded, count = instances_near(rays, instances, chosen, low, high, near)
+    for i in range(low, high):
+        r = chosen[i]
+        begin, far = segments.end[r], rays.reach[r, 1]
+        two = first_two(rays, instances, r, near, n_unbounded, count, begin, (far, far, DONE, DONE, 0.0))
+        segments.alone_from[r], segments.alone_to[r] = begin, begin
+        if n_unbounded == 1 and (two[2] == DONE or two[0] - begin > GAP * two[4]):
+            begin = two[0]
+            segments.alone_to[r] = begin
+        if begin < far:
+            two = first_two(rays, instances, r, near, 0, n_unbounded, begin, two)
+        segments.begin[r] = max(begin, two[0] - two[4])  # what was walked over need not be walked over again
+        segments.instance[r] = two[2]
+        if two[2] != DONE:
+            if two[3] == DONE or two[1] - two[0] > GAP * two[4]:
+                segments.end[r] = two[1]
+            else:
+                segments.instance[r], segments.end[r] = SHARED, end_of_meeting(rays, instances, r, two, far)
+                note_meeting(rays, instances, r, near, count, begin, segments.end[r], segments)
+
+
+@loop
+def next_segments(rays, instances, chosen, threads, segments):
+    """The next segments of rays chosen (M,), from where their last ended."""
+    n = chosen.shape[0]
+    tasks = (n + TILE - 1) // TILE
+    each_has = (tasks + threads - 1) // threads
+    for turn in prange(each_has * threads):
+        part = turn % each_has * threads + turn // each_has
+        low, high = part * TILE, min(n, (part + 1) * TILE)
+        if low < high:
+            near = np.empty(instances.step.shape[0], np.int64)
+            segment_task(rays, instances, chosen, low, high, near, segments)
+
+
+@task
+def sort_slots(chosen, instance, field_of, ends, order):
+    """Slots chosen (M,) into order (M,) by the fields of instance (S,): SHARED ones up to ends[0], then those
+    of field f up to ends[1 + f], where instance b has field field_of[b]. DONE ones are left out."""
+    ends[:] = 0
+    for i in range(chosen.shape[0]):
+        b = instance[chosen[i]]
+        if b != DONE:
+            ends[0 if b == SHARED else 1 + field_of[b]] += 1
+    total = 0
+    for f in range(ends.shape[0]):
+        total, ends[f] = total + ends[f], total
+    for i in range(chosen.shape[0]):
+        b = instance[chosen[i]]
+        if b != DONE:
+            f = 0 if b == SHARED else 1 + field_of[b]
+            order[ends[f]] = chosen[i]
+            ends[f] += 1
+
+
+@task
+def rays_left(chosen, rays, segments, rendered, early_stop, left):
+    """Those of rays chosen (M,) that go on behind their segments into left (M,): how many. A ray whose
+    segment has no length ends: it would never come any farther."""
+    count = 0
+    for i in range(chosen.shape[0]):
+        r = chosen[i]
+        moved = segments.instance[r] != DONE and segments.end[r] > segments.alone_from[r]
+        if moved and segments.end[r] < rays.reach[r, 1] and rendered[r, 3] < 1.0 - early_stop:
+            left[count] = r
+            count += 1
+    return count
+
+
+# -- samples of several instances ----------------------------------------------------------------------------
+
+
+@body
+def sample_at(traces, s, t, end):
+    """The sample of slot s that stands at t, or comes next: (whether there is one that was taken before the
+    end, whether it stands at t, its density)."""
+    q = traces.cursor[s]
+    while q < traces.count[s] and traces.high[s, q] <= t:
+        q += 1
+    traces.cursor[s] = q
+    if q == traces.count[s] or traces.middle[s, q] >= end:
+        return False, False, 0.0
+    return True, traces.low[s, q] <= t, traces.depth[s, q] / (traces.high[s, q] - traces.low[s, q])
+
+
+@body
+def group_at(traces, group, adds, s, behind, t, end):
+    """The group of slots that begins with slot s: (the first slot of the next one, the group's density at t,
+    its densest slot there or -1, where one of its samples begins or ends next)."""
+    g, total, densest, winner, following = group[s], 0.0, 0.0, -1, FARTHEST
+    while s < behind and group[s] == g:
+        comes, stands, sigma = sample_at(traces, s, t, end)
+        if comes:
+            q = traces.cursor[s]
+            following = min(following, traces.high[s, q] if stands else traces.low[s, q])
+        if stands:
+            total += sigma
+            if sigma > densest:
+                densest, winner = sigma, s
+        s += 1
+    return s, total if adds[g] else densest, winner, following
+
+
+@body
+def share_out(traces, group, adds, s, behind, t, end, weight):
+    """Give a weight to what stands at t of the group that begins with slot s: to its densest sample, or,
+    where it adds them up, to all by their densities; returns the first slot of the next group."""
+    following, density, winner, _ = group_at(traces, group, adds, s, behind, t, end)
+    if winner >= 0 and not adds[group[s]]:
+        traces.weight[winner, traces.cursor[winner]] += weight
+    elif winner >= 0:
+        for other in range(s, following):
+            _, stands, sigma = sample_at(traces, other, t, end)
+            if stands:
+                traces.weight[other, traces.cursor[other]] += weight * sigma / density
+    return following
+
+
+@body
+def merge_ray(traces, group, adds, all_add, s0, s1, r, early_stop, segment_end, out):
+    """`merge_samples` of slots s0 to s1 of ray r."""
+    trans, depth, t, end = 1.0 - out[r, 3], 0.0, -FARTHEST, FARTHEST
+    for s in range(s0, s1):
+        end, traces.cursor[s] = min(end, traces.complete[s]), 0
+    segment_end[r] = min(segment_end[r], end)
+    while trans > early_stop:
+        following, densest, total, first, s = FARTHEST, 0.0, 0.0, -1, s0
+        while s < s1:
+            this = s
+            s, sigma, _, change = group_at(traces, group, adds, s, s1, t, end)
+            following, total = min(following, change), total + sigma
+            if sigma > densest:
+                densest, first = sigma, this
+        if following >= FARTHEST:
+            break
+        if first >= 0:
+            weight = trans * (1.0 - math.exp(-(total if all_add else densest) * (following - t)))
+            trans -= weight
+            depth += weight * 0.5 * (t + following)
+            if all_add:
+                s = s0
+                while s < s1:
+                    sigma = group_at(traces, group, adds, s, s1, t, end)[1]
+                    s = share_out(traces, group, adds, s, s1, t, end, weight * sigma / total)
+            else:
+                share_out(traces, group, adds, first, s1, t, end, weight)
+        t = following
+    out[r, 3] = 1.0 - trans
+    out[r, 4] += depth
+
+
+@task
+def merge_task(shared, start, low, high, early_stop, groups, traces, segment_end, out):
+    """`merge_samples` for rays shared[low:high]."""
+    group, adds, all_add = groups
+    for m in range(low, high):
+        s0, s1 = start[m], start[m + 1]
+        merge_ray(traces, group, adds, all_add, s0, s1, shared[m], early_stop, segment_end, out)
+
+
+@loop
+def merge_samples(shared, start, early_stop, groups, traces, segment_end, out):
+    """Composite the samples of rays shared (M,), slots start[m] to start[m + 1] of the m-th, as piecewise
+    constant densities behind what out (N, 5) has. Leaves in traces.weight what each takes of the light, and
+    in segment_end (N,) how far that went.
+
+    groups is (the group of each slot (S,), whether samples of a group add up (G,), whether groups do): where
+    they do not, the densest counts. Slots of a ray that belong to one group lie side by side.
+    """
+    m = shared.shape[0]
+    for part in prange((m + PER_TASK - 1) // PER_TASK):
+        low, high = part * PER_TASK, min(m, (part + 1) * PER_TASK)
+        merge_task(shared, start, low, high, early_stop, groups, traces, segment_end, out)
+
+
+@loop
+def add_colours(shared, start, traces, out):
+    """Add the colours of the slots to those of their rays, see `merge_samples`."""
+    for m in prange(shared.shape[0]):
+        for s in range(start[m], start[m + 1]):
+            for c in range(3):
+                out[shared[m], c] += traces.rgb[s, c]
+
+
+@task
+def points_in_sphere(points, sphere, found):
+    """The numbers of points (N, 3) in a sphere into found (N,): how many."""
+    count = 0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0] - sphere[0], points[i, 1] - sphere[1], points[i, 2] - sphere[2]
+        found[count] = i
+        count += 1 if x * x + y * y + z * z <= sphere[3] * sphere[3] else 0
+    return count
