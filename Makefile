@@ -13,6 +13,7 @@ RUNS ?= 1000
 KILLS ?= 200
 SEED ?= 0
 
+SLOW ?=
 SCENE ?=
 SHARE ?= 1
 
@@ -31,8 +32,8 @@ test: export OMP_NUM_THREADS = 1
 test: $(VENV)  ## the quick tests
 	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile
 
-test-slow: $(VENV)  ## every test
-	$(PYTHON) -m pytest -q
+test-slow: $(VENV)  ## the slow tests, two files at a time, and how long each takes; SLOW=--third: a third of them
+	$(PYTHON) -m tests.slow $(SLOW)
 
 fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, and 200 kills of every command; PACKS=, RUNS=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)

@@ -34,7 +34,7 @@ SHOWS = TrainConfig.steps_to_show
 BRIEF = TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
 LONG = replace(BRIEF, longest=32, steps=300)
 CAMERAS = orbit(BOX, 14, 24, 24) + orbit(BOX, 8, 24, 24, elevation=-0.5)
-UNSEEN = scattered(BOX, 4, 24, 24, seed=3)
+UNSEEN = scattered(BOX, 4, 24, 24, seed=3)  # of which a picture of the mean colour shows 16 dB
 
 
 def over_white(images: np.ndarray) -> np.ndarray:
@@ -84,7 +84,7 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
     assert run.found_nothing >= 2 and run.found_matter
     moved = max(abs(box - BOX).max() for box in boxes[:3])
     row.check("T1", "largest move of the box", moved, 0, at_most=True)
-    row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 20, unit="dB")
+    row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 28, unit="dB")
 
 
 def test_t1_tries_again_soon_but_not_twice(images, monkeypatch):
@@ -252,7 +252,7 @@ def test_t9_poisoned_numbers_are_recovered_from(row, images, unseen_psnr, value)
     run.step = poisoning
     field = run.finish()
     assert run.guard.roll_backs >= 1 and torch.isfinite(field.params).all()
-    row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 18, unit="dB")
+    row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 21, unit="dB")
 
 
 def test_t11_rays_without_samples(row, images):
@@ -274,14 +274,13 @@ def test_t12_no_seed_fails(row, images, unseen_psnr):
 
 @pytest.mark.slow
 def test_t13_the_rate_may_be_a_third_or_thrice(row, images, unseen_psnr):
-    """Over as many steps as the shortest preset has, PSNR of unseen views differs by 3 dB at most."""
+    """Over as many steps as the shortest preset has; two seeds of one rate are up to 2 dB apart."""
     settings = replace(LONG, steps=QUALITY["draft"].steps)
     found = []
     for factor in (1 / 3, 1, 3):
         changed = replace(settings, rate=factor * settings.rate)
         found.append(unseen_psnr(fit(CAMERAS, images, BOX, changed)))
-    spread = max(found) - min(found)
-    row.check("T13", "PSNR between rates of 1/3 and 3", spread, 3, at_most=True, unit="dB")
+    row.check("T13", "worst PSNR of rates of 1/3, 1 and 3", min(found), 27, unit="dB")
 
 
 @pytest.mark.parametrize("opaque", [60.0, 1e3])

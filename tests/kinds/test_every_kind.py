@@ -62,7 +62,7 @@ def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
     assert fused["chosen"]["why"] and f"--kind {kind}" in fused["chosen"]["flags"]
     own = registry.kind(kind).field
     assert own is None or type(opened(load_scene(str(folder / "fused.rfpack")).placed[0].field)) is own
-    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 13
+    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 18
     assert fused["memory"]["predicted_bytes"] > 0
 
 
@@ -111,14 +111,14 @@ def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, ki
     said = report(*PHOTOS, "--kind", kind)
     assert said["kind"] == kind and said["steps"] == 60
     assert said["bytes"] == (folder / "out.rfpack").stat().st_size
-    assert np.isfinite(said["training_psnr"]) and said["training_psnr"] > 5
+    assert np.isfinite(said["training_psnr"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_target_that_is_easy_takes_few_bytes(report, kind):
-    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "12", "--no-rgb")
+    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "16", "--no-rgb")
     said = report("fuse", "pair.json", "-o", "small.rfpack", *words)
-    assert said["psnr"]["stored"] >= 12 and said["bytes"] < SIZE
+    assert said["psnr"]["stored"] >= 16 and said["bytes"] < SIZE
 
 
 @pytest.mark.parametrize("kind", KINDS)
