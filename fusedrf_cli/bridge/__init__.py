@@ -8,7 +8,7 @@ whole or not at all, and returns a JSON-able report.
 from fusedrf_cli.bridge.charting import chart
 from fusedrf_cli.bridge.converting import convert
 from fusedrf_cli.bridge.deleting import delete
-from fusedrf_cli.bridge.editing import add, crop, duplicate, move, rename, tint
+from fusedrf_cli.bridge.editing import add, duplicate, move, rename, show
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.extracting import extract
 from fusedrf_cli.bridge.fusing import fuse
@@ -22,7 +22,6 @@ __all__ = [
     "add",
     "chart",
     "convert",
-    "crop",
     "delete",
     "duplicate",
     "evaluate",
@@ -34,6 +33,6 @@ __all__ = [
     "rename",
     "render",
     "replace",
-    "tint",
+    "show",
     "train",
 ]

@@ -1,5 +1,7 @@
 """`convert`: a field of any kind to one of any other."""
 
+from dataclasses import fields
+
 from formats.bundle import OpenBundle, is_bundle
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
@@ -20,31 +22,24 @@ def convert(request: ConvertRequest, progress) -> dict:
         raise unusable_kind(error) from error
     if wanted.field is None:
         raise UsageProblem(f"--kind {request.kind} is a way of fusing and no kind of field; choose another")
-    words = {
-        name: getattr(request, name) for name in FuseRequest.__dataclass_fields__ if hasattr(request, name)
-    }
+    same = [field.name for field in fields(FuseRequest) if hasattr(request, field.name)]
+    words = {name: getattr(request, name) for name in same}
     fused = fuse(
-        FuseRequest(
-            scene=request.field,
-            rgb=True,
-            from_scratch=True,
-            keep_sources=False,
-            allow_outside=False,
-            resume=False,
-            sources=None,
-            **words,
-        ),  # fmt: skip
+        FuseRequest(scene=request.field, from_scratch=True, **words),
         progress,
         load=as_it_is,
     )
     progress.phase("comparing", None)
     compared = evaluate(
         EvaluateRequest(
-            bundle=request.output, against=request.field, split="test", size=None, memory=request.memory,
-            allow_outside=False, device=request.device, threads=request.threads,
+            request.output,
+            request.field,
+            memory=request.memory,
+            device=request.device,
+            threads=request.threads,
         ),
         progress,
-    )  # fmt: skip
+    )
     return {
         "output": request.output,
         "bytes": fused["bytes"],

@@ -195,7 +195,7 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
         draft.check_node(name)
         if request.new_name is not None:
             draft.check_free(request.new_name)
-        matrix, copies = request.matrix, event == "duplicated"
+        matrix, copies = request.object_to_world, event == "duplicated"
         if not request.absolute and not np.array_equal(matrix[:3, :3], np.eye(3)):
             box = draft.box({name})
             if box is None:
@@ -214,24 +214,14 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
         return edit.done(event, [new_name], chosen(draft.graph, {new_name}), before, renamed_from)
 
 
-def crop(request: ShowRequest, progress) -> dict:
-    """Show what of an object lies in a box or a sphere."""
-    return show(request, "cropped", progress)
-
-
-def tint(request: ShowRequest, progress) -> dict:
-    """Show an object in other colours, or thinner."""
-    return show(request, "tinted", progress)
-
-
-def show(request: ShowRequest, event: str, progress) -> dict:
-    """Show an object otherwise."""
+def show(request: ShowRequest, progress) -> dict:
+    """Show an object otherwise: cropped, tinted, or thinner."""
     with engine("cpu", None, progress):
         edit = Edit(request, progress)
         draft, name = edit.draft, request.name
         draft.check_node(name)
         draft.graph = changed(draft.graph, {name}, lambda node, _: (shown(node, request.showing),))
-        return edit.done(event, [name], chosen(draft.graph, {name}))
+        return edit.done(request.event, [name], chosen(draft.graph, {name}))
 
 
 class Edit:

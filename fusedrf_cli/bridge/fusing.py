@@ -40,7 +40,7 @@ from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Det
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import DistillSettings, Student, StudentRequest, TooSmall
+from fusedrf_cli.engine.kinds.student import DistilConfig, Student, StudentRequest, TooSmall
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
@@ -78,7 +78,7 @@ def fuse(
         cameras = kept_cameras(loaded, progress)
         framing = kept_framing(loaded, scene.composed, cameras)
         check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
-        pixels = VIEWS_TO_CHOOSE_BY * DistillSettings.view_size**2
+        pixels = VIEWS_TO_CHOOSE_BY * DistilConfig.view_size**2
         tell_of_work(request.scene, scene.composed, pixels, progress)
         overhead = graph_bytes(nodes, cameras)
         found, student, figures_of_it = best_of(
