@@ -3,15 +3,16 @@
 import hashlib
 import math
 import re
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from formats.archive import MAGIC, parse_archive, pieces, read_archive, write_archive
+from formats.archive import MAGIC, parse_archive, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
+from formats.blocks import Instance, Unfolded, unfolded
 from formats.contents import objects_in, world_aabb
 from formats.errors import (
     BadHeader,
@@ -29,11 +30,14 @@ from formats.records import (
     decode_header,
     encode_field,
     mapped_array,
+    member_name,
+    sha256_of_bytes,
 )
 from formats.rig import read_rig
 from formats.scene import (
     FORMAT,
     MEMBER,
+    WHITE,
     SceneGraph,
     dump_scene,
     make_node,
@@ -54,33 +58,38 @@ class Bundle:
     fields: dict[str, FieldRecord]
 
 
-class OpenBundle:
-    """A bundle that was opened and verified once, and is read from that version to the end: whatever takes
-    its name meanwhile is another file."""
+class FieldSet:
+    """Fields in their bytes, of which none is decoded before it is asked for."""
 
-    def __init__(self, path: Path | str, *, verify: bool = True):
-        """Every byte is checked, but no array decoded; without `verify` the checksums are not. Raises a
-        FormatError naming the file and the member: see `formats/errors.py`."""
-        self.path = Path(path)
-        views = read_archive(path, verify=verify)
-        self.scene, self.headers = _headers(views, str(path), verify)
-        self._views = views
+    def __init__(
+        self,
+        path: Path | str,
+        views: Mapping[str, bytes | memoryview],
+        headers: Mapping[str, FieldHeader] | None = None,
+        instances: Mapping[str, tuple[Instance, ...]] | None = None,
+    ):
+        """views: their bytes, by member. path leads error sentences."""
+        self.path, self._views, self.instances = Path(path), dict(views), dict(instances or {})
+        where = str(path)
+        self.headers = {
+            name: (headers or {}).get(name) or decode_header(data, f"{where}: {name}")
+            for name, data in self._views.items()
+        }
 
-    @property
-    def size(self) -> int:
-        """Bytes of the file."""
-        return len(self._views[SCENE].obj)
+    def with_fields(self, views: Mapping[str, bytes | memoryview]) -> "FieldSet":
+        """These fields and others."""
+        return FieldSet(self.path, self._views | dict(views), self.headers, self.instances)
 
-    @cached_property
-    def sha256(self) -> str:
-        """Hex SHA-256 of the file's bytes."""
-        return _sha256(memoryview(self._views[SCENE].obj))
-
-    def data(self, member: str) -> memoryview:
+    def data(self, member: str) -> bytes | memoryview:
         """A field's bytes. Raises MissingMember."""
         if member not in self.headers:
             raise MissingMember(f"{self.path}: holds no member {member!r}")
         return self._views[member]
+
+    def placed(self, member: str) -> tuple[Instance, ...]:
+        """What a member stands for, which may have held several objects; nothing of one that is not here."""
+        alone = (Instance("", False, member, np.eye(4), WHITE),) if member in self.headers else ()
+        return self.instances.get(member, alone)
 
     def field(self, member: str) -> FieldRecord:
         """One field. Raises MissingMember, and as `decode_field`."""
@@ -94,6 +103,31 @@ class OpenBundle:
         return mapped_array(self.data(member), self.headers[member].specs[name])
 
 
+class OpenBundle(FieldSet):
+    """A bundle that was opened and verified once, and is read from that version to the end: whatever takes
+    its name meanwhile is another file. Fields of several objects, which earlier versions wrote, are read as
+    nodes, each with a field of its own (formats/blocks.py)."""
+
+    def __init__(self, path: Path | str, *, verify: bool = True):
+        """Every byte is checked, but no array decoded; without `verify` the checksums are not. Raises a
+        FormatError naming the file and the member: see `formats/errors.py`."""
+        views = read_archive(path, verify=verify)
+        self._file = memoryview(views[SCENE].obj)
+        read = _unfolded(views, str(path), verify)
+        super().__init__(path, read.views, read.headers, read.instances)
+        self.scene = read.scene
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return len(self._file)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hex SHA-256 of the file's bytes."""
+        return sha256_of_bytes(self._file)
+
+
 class BundleWriter:
     """Collects encoded fields, then writes them with a scene graph that names them.
 
@@ -104,7 +138,7 @@ class BundleWriter:
 
     def __init__(self, scene: SceneGraph | None = None):
         self.scene = scene
-        self.members: dict[str, bytes] = {}
+        self.members: dict[str, bytes | memoryview] = {}
 
     def add_field(self, record: FieldRecord, precision: str = "float16") -> str:
         """The member name of `record`, encoded; equal fields share one member. Raises as `encode_field`.
@@ -127,15 +161,23 @@ class BundleWriter:
             parts[part] = self.add_field(FieldRecord(PART, own), precision)
         return FieldRecord(record.kind, arrays, record.metadata | {SHARED: parts})
 
-    def copy_field(self, bundle: OpenBundle | Path | str, member: str) -> str:
+    def copy_field(self, bundle: FieldSet | Path | str, member: str) -> str:
         """Take over a member of another bundle, and the parts it shares, byte for byte. Raises MissingMember,
         and of a path as `read_bundle`."""
-        bundle = bundle if isinstance(bundle, OpenBundle) else OpenBundle(bundle)
+        bundle = bundle if isinstance(bundle, FieldSet) else OpenBundle(bundle)
         header, members = bundle.headers.get(member), bundle.headers
         shared = {} if header is None else shared_members(member, header, members, str(bundle.path))
         for name in (member, *shared.values()):
-            self.members[name] = bytes(bundle.data(name))
+            self.members[name] = bundle.data(name)
         return member
+
+    def unfolded(self, scene: SceneGraph) -> SceneGraph:
+        """A scene of the fields that were added, in which those of several objects became nodes with a field
+        each (formats/blocks.py)."""
+        headers = {name: decode_header(data, name) for name, data in self.members.items()}
+        read = unfolded(scene, self.members, headers, writing=True)
+        self.members = read.views
+        return read.scene
 
     def write(self, path: Path | str, scene: SceneGraph | None = None, *, overwrite: bool = False) -> None:
         """The bundle at `path`, whole or not at all; `scene` defaults to the writer's own.
@@ -170,18 +212,6 @@ def field_member(record: FieldRecord, precision: str = "float16") -> tuple[str, 
     """The member name and bytes of one field."""
     data = encode_field(record, precision)
     return member_name(data), data
-
-
-def member_name(data: bytes | memoryview) -> str:
-    """The name that a field's bytes give it."""
-    return f"fields/{_sha256(data)[:16]}.safetensors"
-
-
-def _sha256(data: bytes | memoryview) -> str:
-    digest = hashlib.sha256()
-    for piece in pieces(data):
-        digest.update(piece)
-    return digest.hexdigest()
 
 
 def read_bundle(path: Path | str, *, verify: bool = True) -> Bundle:
@@ -231,19 +261,23 @@ def read_summary(path: Path | str) -> dict:
     `objects` are what a fused field was made of (formats/contents.py); a plain scene has nodes alone.
     """
     if _is_json(path):
-        summary = _scene_summary(read_scene(path), {})
-        return {"path": str(path), "format": "scene", "bytes": _size(path), **summary, "fields": []}
+        return summary_of(read_scene(path), str(path), _size(path))
     views = read_archive(path)
-    scene, headers = _headers(views, str(path), verify=False)
-    fields = [_field_summary(name, header) for name, header in headers.items()]
+    read = _unfolded(views, str(path), verify=False)
+    fields = [_field_summary(name, header) for name, header in sorted(read.headers.items())]
     return {
         "path": str(path),
         "format": FORMAT,
         # The size of the file that was mapped: the path may name another file by now.
         "bytes": len(views[SCENE].obj),
-        **_scene_summary(scene, headers),
+        **_scene_summary(read.scene, read.headers),
         "fields": fields,
     }
+
+
+def summary_of(scene: SceneGraph, path: str, size: int) -> dict:
+    """`read_summary` of a scene that was read from `path`, in so many bytes."""
+    return {"path": path, "format": "scene", "bytes": size, **_scene_summary(scene, {}), "fields": []}
 
 
 def is_bundle(path: Path | str) -> bool:
@@ -282,16 +316,18 @@ def _bundle(views: dict[str, memoryview], where: str, verify: bool) -> Bundle:
     return Bundle(scene, fields)
 
 
-def _headers(
-    views: dict[str, memoryview], where: str, verify: bool
-) -> tuple[SceneGraph, dict[str, FieldHeader]]:
+def _unfolded(views: dict[str, memoryview], where: str, verify: bool) -> Unfolded:
+    """The scene, and the headers of its fields."""
     scene = _scene(views, where)
     members = _checked_members(views, where, verify)
     check_fields(scene, members, where)
     headers = {name: decode_header(view, f"{where}: {name}") for name, view in members.items()}
     for member, header in headers.items():
         shared_members(member, header, headers, where)
-    return scene, headers
+    try:
+        return unfolded(scene, members, headers)
+    except FormatError as error:
+        raise error.within(where) from error
 
 
 def _scene(views: dict[str, memoryview], where: str) -> SceneGraph:

@@ -1,5 +1,6 @@
 """One radiance field as a plain record, and its bytes: a safetensors file with one metadata key."""
 
+import hashlib
 import json
 import math
 import re
@@ -8,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import safetensors.numpy
 
-from formats.archive import give_back
+from formats.archive import give_back, pieces
 from formats.errors import (
     BadArray,
     BadHeader,
@@ -116,9 +117,7 @@ class FieldHeader:
     @property
     def decoded_size(self) -> int:
         """Bytes of its arrays once decoded: floats as float32."""
-        return sum(
-            math.prod(shape) * (1 if dtype == "uint8" else 4) for dtype, shape in self.arrays.values()
-        )
+        return sum(math.prod(shape) * (1 if dtype == "uint8" else 4) for dtype, shape in self.arrays.values())
 
 
 def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
@@ -130,12 +129,17 @@ def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
     becomes uint8, other integers int32. Raises NotFinite (NaN, infinity, overflow in the cast), BadArray,
     BadSchema, LimitExceeded.
     """
-    where = f"field of kind {record.kind!r}"
-    stored, coded = _stored_arrays(record.arrays, precision, where)
-    content = {"kind": record.kind, "metadata": record.metadata, "version": PLAIN}
+    stored, coded = _stored_arrays(record.arrays, precision, f"field of kind {record.kind!r}")
+    return encode_stored(record.kind, record.metadata, stored, coded)
+
+
+def encode_stored(kind: str, metadata: dict, stored: dict[str, np.ndarray], coded: dict[str, dict]) -> bytes:
+    """As `encode_field`, of arrays as they are stored, and what the header says of those that are coded."""
+    where = f"field of kind {kind!r}"
+    content = {"kind": kind, "metadata": metadata, "version": PLAIN}
     if coded:
         content |= {"version": CODED, "coded": coded}
-    if "needs" in record.metadata:
+    if "needs" in metadata:
         content["version"] = VERSION
     try:
         text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
@@ -144,6 +148,19 @@ def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
     data = safetensors.numpy.save(stored, metadata={KEY: text})
     decode_header(data, where)
     return data
+
+
+def member_name(data: bytes | memoryview) -> str:
+    """The name that a field's bytes give it in a bundle."""
+    return f"fields/{sha256_of_bytes(data)[:16]}.safetensors"
+
+
+def sha256_of_bytes(data: bytes | memoryview) -> str:
+    """Hex SHA-256, a piece after the other."""
+    digest = hashlib.sha256()
+    for piece in pieces(data):
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def coded_bytes(shape: tuple[int, ...], precision: str) -> int:

@@ -41,13 +41,16 @@ from formats.rig import FARTHEST, RigSchema, read_rig
 from formats.rotations import matrices
 
 FORMAT = "rfpack"
-VERSION = "1.3"
+VERSION = "1.4"
+FAR_VERSION = "1.3"  # of scenes that require FAR
 SHOWING_VERSION = "1.2"  # of scenes that show a node otherwise than it is
 FRAMED_VERSION = "1.1"  # of scenes with cameras or a framing
 PLAIN_VERSION = "1.0"  # of scenes that have neither
 FAR = "far"
 """The feature that scenes beyond NEAR_TRANSLATION, NEAR_SINGULAR_VALUES or NEAR_CAMERAS require (1.3);
 readers of earlier versions refuse what they do not know, with a sentence."""
+RULES = "rules"
+"""The feature that scenes in which a node has a rule of its own require (1.4)."""
 MEMBER = r"fields/[0-9a-f]{16}\.safetensors"
 MAX_SCENE_BYTES = 4 << 20
 MAX_NODES = 10_000
@@ -89,6 +92,7 @@ class NodeSchema(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True)
     crop: Shape | msgspec.UnsetType = msgspec.UNSET
     opacity: Share | msgspec.UnsetType = msgspec.UNSET
     tint: Tint | msgspec.UnsetType = msgspec.UNSET
+    composition: Literal["max", "add"] | msgspec.UnsetType = msgspec.UNSET
     children: list["NodeSchema"] = []
 
 
@@ -101,7 +105,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
     generator: str = ""
     composition: Literal["max", "add"] = "max"
     history: list[dict] = []
-    requires: Annotated[list[Literal["far"]], msgspec.Meta(max_length=1)] = []
+    requires: Annotated[list[Literal["far", "rules"]], msgspec.Meta(max_length=2)] = []
     framing: Box | msgspec.UnsetType = msgspec.UNSET
     cameras: RigSchema | msgspec.UnsetType = msgspec.UNSET
 
@@ -127,16 +131,22 @@ class Node:
     extras: dict = dataclasses.field(default_factory=dict)
     showing: dict = dataclasses.field(default_factory=dict)
     """What is shown of it and of its children, as it was written: see `Leaf`."""
+    composition: str | None = None
+    """The rule by which what is in it is one field; None: that of what it is in."""
     node_to_parent: np.ndarray = dataclasses.field(init=False, compare=False, repr=False)
 
     def __post_init__(self):
-        _check_name(self.name)
+        check_name(self.name)
         if self.field is not None and self.source is not None:
             raise BadSchema(f"node {self.name!r}: has both a field and a source, expected one of them")
         matrix = _placement_matrix(self.placement, self.name)
         check_affine(matrix, f"node {self.name!r}")
         matrix.flags.writeable = False
         _check_showing(self.showing, self.name)
+        if self.composition not in (None, "max", "add"):
+            raise BadSchema(
+                f"node {self.name!r}: composition {self.composition!r} is neither 'max' nor 'add'"
+            )
         object.__setattr__(self, "node_to_parent", matrix)
 
 
@@ -162,6 +172,8 @@ class Leaf:
     """Its colours are multiplied by these, red, green and blue."""
     crops: tuple["Crop", ...] = ()
     """It is empty outside of any of them."""
+    groups: tuple[tuple[str, str], ...] = ()
+    """The nodes around it that have a rule of their own, from the root down, and their rules."""
 
     @property
     def whole(self) -> bool:
@@ -178,6 +190,7 @@ class Leaf:
             opacity=outer.opacity * self.opacity,
             tint=multiplied(outer.tint, self.tint),
             crops=(*(crop.within(self.object_to_world) for crop in outer.crops), *self.crops),
+            groups=(*outer.groups, *((f"{outer.name}/{name}", rule) for name, rule in self.groups)),
         )
 
 
@@ -248,9 +261,10 @@ class SceneGraph:
     def leaves(self) -> list[Leaf]:
         """The nodes that hold a field or a source, in document order."""
         found = []
-        stack = [(node, node.node_to_parent, True, 1.0, WHITE, ()) for node in reversed(self.nodes)]
+        stack = [(node, node.node_to_parent, True, 1.0, WHITE, (), ()) for node in reversed(self.nodes)]
         while stack:
-            node, object_to_world, visible, opacity, tint, crops = stack.pop()
+            node, object_to_world, visible, opacity, tint, crops, groups = stack.pop()
+            groups = groups if node.composition is None else (*groups, (node.name, node.composition))
             visible = visible and node.showing.get("visible", True)
             opacity *= node.showing.get("opacity", 1.0)
             tint = multiplied(tint, node.showing.get("tint", WHITE))
@@ -258,10 +272,10 @@ class SceneGraph:
                 crops = (*crops, Crop(tuple(node.showing["crop"]), np.eye(4)))
             if node.field is not None or node.source is not None:
                 placed = node.name, node.field, node.source, object_to_world, node.background
-                found.append(Leaf(*placed, visible, opacity, tint, crops))
+                found.append(Leaf(*placed, visible, opacity, tint, crops, groups))
             for child in reversed(node.children):
                 own = tuple(crop.within(child.node_to_parent) for crop in crops)
-                shown = visible, opacity, tint, own
+                shown = visible, opacity, tint, own, groups
                 stack.append((child, object_to_world @ child.node_to_parent, *shown))
         return found
 
@@ -346,13 +360,17 @@ def dump_scene(scene: SceneGraph) -> bytes:
     """
     shown = {"framing": scene.framing and list(scene.framing), "cameras": scene.cameras}
     shown = {key: value for key, value in shown.items() if value is not None}
-    least, far = FRAMED_VERSION if shown else PLAIN_VERSION, scene.far
-    if far or any(node.showing for node, _, _ in scene.walk()):
-        least = VERSION if far else SHOWING_VERSION
+    least = FRAMED_VERSION if shown else PLAIN_VERSION
+    if any(node.showing for node, _, _ in scene.walk()):
+        least = SHOWING_VERSION
+    requires = [FAR] if scene.far else []
+    requires += [RULES] if any(node.composition for node, _, _ in scene.walk()) else []
+    if requires:
+        least = VERSION if RULES in requires else FAR_VERSION
     content = {
         "format": FORMAT,
         "version": max(scene.version, least, key=_numbered),
-        **({"requires": [FAR]} if far else {}),
+        **({"requires": requires} if requires else {}),
         "generator": scene.generator,
         "composition": scene.composition,
         "nodes": [_node_content(node) for node in scene.nodes],
@@ -413,9 +431,9 @@ def resolve_source(scene_path: Path | str, source: str, allow_outside: bool = Fa
 def expand_scene(path: Path | str, allow_outside: bool = False) -> SceneGraph:
     """The scene in `path` with sources that are scenes themselves inlined as groups of children.
 
-    Inner names become `outer/inner`; inner sources become relative to the folder of `path`. Raises what
-    `read_scene` and `resolve_source` raise, CyclicScene where a scene leads back to itself, BadSchema where
-    an inner scene has another composition.
+    Inner names become `outer/inner`; inner sources become relative to the folder of `path`; an inner scene
+    keeps its rule of composition. Raises what `read_scene` and `resolve_source` raise, CyclicScene where a
+    scene leads back to itself.
     """
     scene = read_scene(path)
     return inline_scenes(scene, path, allow_outside)
@@ -423,8 +441,9 @@ def expand_scene(path: Path | str, allow_outside: bool = False) -> SceneGraph:
 
 def inline_scenes(scene: SceneGraph, path: Path | str, allow_outside: bool = False) -> SceneGraph:
     """As `expand_scene`, of a `scene` already read from `path`, which may be a bundle."""
-    expansion = _Expansion(Path(path).parent, scene.composition, allow_outside)
-    nodes = expansion.nodes(scene.nodes, Path(path), "", (os.path.realpath(path),))
+    expansion = _Expansion(Path(path).parent, allow_outside)
+    trail = (os.path.realpath(path),)
+    nodes = expansion.nodes(scene.nodes, Path(path), "", trail, scene.composition)
     try:
         return replace(scene, nodes=nodes)
     except FormatError as error:
@@ -445,20 +464,20 @@ class _Expansion:
     """One run of `inline_scenes`; `count` bounds its result, which doubles with every scene named twice."""
 
     folder: Path
-    composition: str
     allow_outside: bool
     count: int = 0
     found: dict[tuple[Path, str], tuple] = dataclasses.field(default_factory=dict)
 
-    def nodes(self, nodes, path: Path, prefix: str, trail: tuple[str, ...]) -> tuple[Node, ...]:
-        return tuple(self.node(node, path, prefix, trail) for node in nodes)
+    def nodes(self, nodes, path: Path, prefix: str, trail: tuple[str, ...], rule: str) -> tuple[Node, ...]:
+        return tuple(self.node(node, path, prefix, trail, rule) for node in nodes)
 
-    def node(self, node: Node, path: Path, prefix: str, trail: tuple[str, ...]) -> Node:
+    def node(self, node: Node, path: Path, prefix: str, trail: tuple[str, ...], rule: str) -> Node:
         self.count += 1
         if self.count > MAX_NODES or len(trail) > MAX_DEPTH:
             bound = f"{MAX_NODES:,} nodes or {MAX_DEPTH} levels"
             raise LimitExceeded(f"{path}: its nested scenes unfold to more than {bound}")
-        children = self.nodes(node.children, path, prefix, trail)
+        rule = node.composition or rule
+        children = self.nodes(node.children, path, prefix, trail, rule)
         node = replace(node, name=prefix + node.name, children=children)
         if node.source is None:
             return node
@@ -468,12 +487,14 @@ class _Expansion:
         if real in trail:
             loop = " -> ".join(Path(step).name for step in (*trail[trail.index(real) :], real))
             raise CyclicScene(f"{target}: leads back to itself ({loop}); remove one of these sources")
-        if inner.composition != self.composition:
-            rules = f"{inner.composition!r}, but the scene that names it {self.composition!r}"
-            raise BadSchema(f"{target}: its composition is {rules}; give both the same")
-        nested = self.nodes(inner.nodes, target, node.name + "/", (*trail, real))
+        nested = self.nodes(inner.nodes, target, node.name + "/", (*trail, real), inner.composition)
         if node.background:
             nested = tuple(replace(child, background=True) for child in nested)
+        if inner.composition != rule:
+            if children:
+                rules = f"{inner.composition!r}, but that of the nodes beside it {rule!r}"
+                raise BadSchema(f"{target}: its composition is {rules}; put them into a group of their own")
+            node = replace(node, composition=inner.composition)
         return replace(node, source=None, background=False, children=(*nested, *node.children))
 
     def find(self, path: Path, source: str) -> tuple[Path, str, SceneGraph | None]:
@@ -493,7 +514,7 @@ def _outside(scene_path: Path | str, source: str) -> OutsideFolder:
     return OutsideFolder(f"{what}; move the file in, or give --allow-outside")
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
     if not isinstance(name, str) or not 0 < len(name.encode(errors="replace")) <= MAX_NAME_BYTES:
         raise BadName(f"node name {str(name)[:40]!r} is empty or longer than {MAX_NAME_BYTES} bytes")
     if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or c in BIDIRECTIONAL for c in name):
@@ -594,7 +615,7 @@ def _check_version(content: object, where: str) -> bool:
     if int(match[1]) != major:
         raise NewerVersion(f"{where}: version {found}, but this fusedrf reads {major}.x; update fusedrf")
     required = content.get("requires", [])
-    if not isinstance(required, list) or any(word != FAR for word in required):
+    if not isinstance(required, list) or any(word not in (FAR, RULES) for word in required):
         raise NewerVersion(
             f"{where}: requires {required!r}, which this version does not know; update fusedrf"
         )
@@ -662,6 +683,7 @@ def _build_node(content: dict) -> Node:
         tuple(_build_node(child) for child in content.get("children", ())),
         {key: value for key, value in content.items() if key not in NODE_KEYS},
         {key: content[key] for key in SHOWING_KEYS if key in content},
+        content.get("composition"),
     )
 
 
@@ -672,6 +694,8 @@ def _node_content(node: Node) -> dict:
     if node.background:
         content["background"] = True
     content |= {key: node.showing[key] for key in SHOWING_KEYS if key in node.showing}
+    if node.composition is not None:
+        content["composition"] = node.composition
     content |= {key: node.extras[key] for key in sorted(node.extras)}
     if node.children:
         content["children"] = [_node_content(child) for child in node.children]

@@ -17,7 +17,7 @@ from fusedrf_cli.errors import FusedRFError
 
 COMMANDS = (
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
-    *("replace", "extract", "history", "undo"),
+    *("replace", "crop", "tint", "extract", "history", "undo"),
     *("render", "eval", "chart", "info", "kinds", "validate", "completion"),
 )
 COMPLETE_VARIABLE = "_FUSEDRF_COMPLETE"

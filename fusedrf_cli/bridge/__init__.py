@@ -5,11 +5,10 @@ Every function takes one request (fusedrf_cli/requests.py) and somebody to tell 
 whole or not at all, and returns a JSON-able report.
 """
 
-from fusedrf_cli.bridge.arranging import duplicate, move, rename
 from fusedrf_cli.bridge.charting import chart
 from fusedrf_cli.bridge.converting import convert
 from fusedrf_cli.bridge.deleting import delete
-from fusedrf_cli.bridge.editing import add
+from fusedrf_cli.bridge.editing import add, duplicate, move, rename, show
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.extracting import extract
 from fusedrf_cli.bridge.fusing import fuse
@@ -34,5 +33,6 @@ __all__ = [
     "rename",
     "render",
     "replace",
+    "show",
     "train",
 ]

@@ -1,171 +1,209 @@
-"""`delete`: objects out of a fused field, and what they hid in their place where it is known."""
+"""`delete`: objects out of a bundle. Those that are nodes go from the graph. One that was distilled into a
+field with others is cut out of it: cells of that field are emptied, and what its sources show there comes as
+nodes, where they are known. No number is changed."""
 
-import os
-import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from formats.records import FieldRecord
-from fusedrf_cli.bridge.anew import unchanged
-from fusedrf_cli.bridge.editing import Fused, Teacher, edit_report, read_fused, write_edited
-from fusedrf_cli.bridge.history import graph_nodes
-from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.mending import hole_of, learnt_from, put_in, up_of
+from formats.blocks import UNNAMED
+from formats.bundle import PART
+from formats.graph import belongs, with_field, without
+from formats.scene import Leaf
+from fusedrf_cli.bridge.editing import SAME_BITS, Edit
+from fusedrf_cli.bridge.mending import LEARNT, Frame, Teacher, hole_of, learnt_from, learnt_surfaces, up_of
+from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import make_field
+from fusedrf_cli.bridge.scene import load_found, make_field
+from fusedrf_cli.bridge.sources import Elsewhere, leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.occupancy import seen_box
-from fusedrf_cli.engine.kinds.editing import Edited, enclosing
+from fusedrf_cli.engine.composition.detail import extent
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import enclosing, placement, seen_box
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.splitting import CUT
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import DeleteRequest
 
+RESTORED = "restored"
+"""Nodes of what fills a cut are named `restored/...`."""
+OVERLAP = 2.0
+"""Cells by which what fills a cut reaches beyond it: those are kept that lie wholly inside."""
+EMPTIED = "cells of the field that it was distilled into emptied, and filled by nodes; no number changes"
+
 
 def delete(request: DeleteRequest, progress) -> dict:
-    """Take objects out of a fused field: those that it holds apart are dropped; the region of another is
-    emptied or learnt again.
-
-    What an object hid is taken from the remaining sources where these are known, else left empty. Without a
-    precision the field keeps its own.
-    """
+    """Take objects out of a bundle. What an object hid in a field that it was distilled into is taken from
+    the remaining sources where these are known, else from photos or left empty."""
     with engine(request.device, request.threads, progress) as place:
-        started = time.monotonic()
-        progress.phase("reading", None)
-        memory = Memory(request.memory)
-        fused = read_fused(request.fused, memory)
-        names = set(request.names)
-        check_names(request, fused)
-        edited, restored = without_objects(request, fused, names, memory, place, progress)
-        if edited is None:
-            raise nothing_left(request)
-        hole = None
-        if request.fill or not restored:
-            edited, hole = with_hole(request, fused, edited, place, progress)
-        entry = {"event": "deleted", "names": list(request.names), "restored": restored}
-        size = write_edited(request, fused, edited.field, request.precision or fused.precision, entry)
-    figures = (
-        {"restored": restored, "hole": hole, "seconds": {}} | edited.figures | {"memory": memory.report()}
-    )
-    return edit_report(request, size, ", ".join(request.names), fused, edited, figures, started)
+        edit = Edit(request, progress, place)
+        draft = edit.draft
+        for name in request.names:
+            draft.check(name)
+        if {*request.names} >= draft.names:
+            raise nothing_left(request.fused, request.names)
+        deletion = Deletion(edit, request.names, request.allow_outside)
+        deletion.drop()
+        if deletion.inside:
+            deletion.cut(request)
+        elif request.refit:
+            progress.warn("--refit is not needed: what the deleted objects hid is known")
+        if not draft.graph.leaves():
+            raise nothing_left(request.fused, request.names)
+        hole = deletion.mend(request) if request.fill or not deletion.restored else None
+        entry = {"names": list(request.names), "restored": deletion.restored}
+        how = EMPTIED if deletion.inside else SAME_BITS
+        said = edit.done("deleted", [], [], (), entry, deletion.boxes, how)
+        return said | {"restored": deletion.restored, "hole": hole, "seconds": {}} | deletion.told
 
 
-def without_objects(
-    request: DeleteRequest, fused: Fused, names: set[str], memory: Memory, place: str, progress
-) -> tuple[Edited | None, bool]:
-    """The field without some objects, None where nothing is left; and whether what they hid is shown."""
-    kind, field, told = fused.kind, fused.field, {}
-    apart = [part for part in kind.parts(field) if part.belongs(names)]
-    edits: list[Edited] = []
-    if apart:
-        field = kind.without(field, names)
-        if field is None:
-            return None, True
-        how = "taken out, since it was held apart"
-        edits.append(Edited(field, enclosing([part.box for part in apart]), how))
-    inside = [
-        node
-        for node in graph_nodes(fused.scene)
-        if node["name"] in names and not any(part.belongs({node["name"]}) for part in apart)
-    ]
-    teach = Teacher(request, request.rgb, place, progress, len(inside))
-    rest = remaining(request, fused, place, progress) if inside else None
-    if inside and rest is None and request.refit:
-        learnt, told = learnt_from(request, fused, None, memory, place, progress)
-        rest = [Placed(request.refit, learnt, np.eye(4))]
-    if inside and rest is None:
-        progress.warn(
-            "what the deleted objects hid stays empty; --refit PHOTOS learns it from photos, --fill goes on "
-            "smoothly with what is seen around it"
-        )
-    if request.refit and "photos" not in told:
-        progress.warn("--refit is not needed: what the deleted objects hid is known")
-    restored = rest is not None or not inside
-    for node in inside:
-        progress.phase(f"deleting {node['name']}", 1.0)
-        box = seen_box(np.asarray(node["aabb"], np.float64), fused.origin)
-        edited = kind.refilled(field, box, rest, teach)
-        if edited is None:
-            return None, restored
-        field = edited.field
-        edits.append(edited)
-    edited = joined(edits)
-    return replace(edited, figures=edited.figures | told), restored
-
-
-def with_hole(
-    request: DeleteRequest, fused: Fused, edited: Edited, place: str, progress
-) -> tuple[Edited, dict]:
-    """What is left, with the hole filled where that was asked for, and what the report says of it."""
-    surfaces, unseen = hole_of(edited.field, edited.box, up_of(fused))
-    filled = bool(request.fill and surfaces)
-    if filled:
-        progress.phase("filling", None)
-        teach = Teacher(request, request.rgb, place, progress, len(surfaces))
-        edited = replace(edited, field=put_in(fused, edited.field, surfaces, teach))
-    return edited, {"unseen": round(unseen, 3), "filled": filled}
-
-
-def joined(edits: list[Edited]) -> Edited:
-    """One edit that tells of several, one after the other."""
-    figures = {}
-    for edit in edits:
-        figures |= edit.figures
-    how = "; ".join(dict.fromkeys(edit.how for edit in edits))
-    box, local = enclosing([edit.box for edit in edits]), all(edit.local for edit in edits)
-    return Edited(edits[-1].field, box, how, local, figures)
-
-
-def check_names(request: DeleteRequest, fused: Fused) -> None:
-    """InvalidInput for a name that is not there, or where all of them are to go."""
-    for name in request.names:
-        if name not in fused.names:
-            raise InvalidInput(
-                f"{request.fused}: there is no '{name}'; it holds "
-                f"{', '.join(sorted(fused.names)) or 'nothing that has a name'}"
-            )
-    if set(request.names) == fused.names:
-        raise nothing_left(request)
-
-
-def nothing_left(request: DeleteRequest) -> InvalidInput:
-    """The refusal of a deletion that would empty the field."""
+def nothing_left(path: str, names: Sequence[str]) -> InvalidInput:
+    """The refusal of a deletion that would empty a bundle."""
     return InvalidInput(
-        f"{request.fused}: deleting {', '.join(sorted(request.names))} would leave nothing; keep one object, "
-        "or delete the file"
+        f"{path}: deleting {', '.join(sorted(names))} would leave nothing; keep one object, or delete "
+        "the file"
     )
 
 
-def remaining(request: DeleteRequest, fused: Fused, place: str, progress) -> list[Placed] | None:
-    """The other objects of the graph as placed fields, from inside the bundle or from their files; None, with
-    a warning, where one of them is not found as it was."""
-    found, path = [], Path(fused.path)
-    for node in graph_nodes(fused.scene):
-        name = node["name"]
-        if name in request.names:
-            continue
-        if node["field"] in fused.others:
-            record = fused.bundle.field(node["field"])
-        else:
-            record = record_from_file(node, path, request.allow_outside)
-        if record is None:
-            progress.warn(f"the source of '{name}' is gone, has changed, or lies outside of the folder")
-            return None
-        field = make_field(record, name).to(place)
-        placed = Placed(name, field, np.asarray(node["object_to_world"], np.float64))
-        found.append(placed.moved(fused.origin))
-    return found
+class Deletion:
+    """Takes objects out of a draft."""
+
+    def __init__(self, edit: Edit, names: Sequence[str], allow_outside: bool):
+        self.edit, self.draft, self.allow_outside = edit, edit.draft, allow_outside
+        self.names, self.progress = set(names), edit.progress
+        self.inside = {name: node for name, node in self.draft.inside.items() if name in self.names}
+        """Those that were distilled into a field."""
+        self.boxes: list[np.ndarray] = []
+        """(6,) in the world, each: what was touched."""
+        self.restored = True
+        """Whether what they hid is shown."""
+        self.told: dict = {}
+        """For the report."""
+
+    def drop(self) -> None:
+        """Take out those that are nodes."""
+        box = self.draft.box(self.names)
+        self.boxes += [] if box is None else [box]
+        self.draft.graph = without(self.draft.graph, self.names)
+
+    def cut(self, request: DeleteRequest | None = None) -> None:
+        """Empty the cells of those that were distilled, and fill them with what the others show there; where
+        that is not known, with what a request's photos show."""
+        for name, node in self.inside.items():
+            self.progress.phase(f"deleting {name}", None)
+            box = np.asarray(node["aabb"], np.float64)
+            rest = self.remaining(box)
+            holders = self.holders(box)
+            if rest is None and request is not None and request.refit:
+                rest = self.from_photos(request, holders[0])
+            elif rest is None:
+                self.progress.warn(
+                    "what the deleted objects hid stays empty; --refit PHOTOS learns it from photos, --fill "
+                    "goes on smoothly with what is seen around it"
+                )
+            self.restored &= rest is not None
+            widest = max(self.empty(leaf, box) for leaf in holders)
+            self.boxes.append(box)
+            for one, precision in rest or ():
+                self.fill(one, precision, box, widest)
+        if request is not None and request.refit and "photos" not in self.told:
+            self.progress.warn("--refit is not needed: what the deleted objects hid is known")
+
+    def holders(self, box: np.ndarray) -> list[Leaf]:
+        """The nodes of the fields that objects were distilled into, and of what filled earlier cuts, as far
+        as they reach into a box (6,) of the world."""
+        leaves = [leaf for leaf in self.draft.graph.leaves() if leaf.field is not None]
+        own = [leaf for leaf in leaves if belongs(leaf.name, UNNAMED)] or leaves
+        return [leaf for leaf in own if self.placed(leaf).reaches(box)] or own[:1]
+
+    def placed(self, leaf: Leaf) -> Placed:
+        """A node's field in the world, as it is stored."""
+        field = make_field(self.draft.fields.field(leaf.field), self.draft.path)
+        return Placed(leaf.name, field, leaf.object_to_world)
+
+    def empty(self, leaf: Leaf, box: np.ndarray) -> float:
+        """Empty the cells of a node's field that reach into a box (6,) of the world; the side of such a
+        cell."""
+        one = self.placed(leaf)
+        left = self.cropped(one, lambda at: ((at < box[:3]) | (at > box[3:])).any(1))
+        precision = self.draft.fields.headers[leaf.field].precision
+        member = None if left is None else self.draft.put(left, precision)
+        self.draft.graph = with_field(self.draft.graph, leaf.name, member)
+        return side_of(one)
+
+    def fill(self, one: Placed, precision: str, box: np.ndarray, widest: float) -> None:
+        """Add a node that shows what a field has in a box (6,) of the world, and in cells that reach into it;
+        widest: the side of those that were emptied."""
+        grown = box + (widest + OVERLAP * side_of(one)) * np.repeat([-1, 1], 3)
+        part = self.cropped(one, lambda at: ((at >= grown[:3]) & (at <= grown[3:])).all(1))
+        if part is not None:
+            part = registry.kind(part.kind).trimmed(part)
+            name = one.name if belongs(one.name, (RESTORED,)) else f"{RESTORED}/{one.name}"
+            self.draft.add_node(name, part, one.object_to_world, precision)
+
+    def cropped(self, one: Placed, holds: Callable[[np.ndarray], np.ndarray]) -> StoredField | None:
+        """What of a field lies where `holds` says so of points (N, 3) of the world."""
+        matrix, kind = one.object_to_world, registry.kind(one.field.kind)
+        try:
+            return kind.cropped(one.field, lambda at: holds(at @ matrix[:3, :3].T + matrix[:3, 3]))
+        except ValueError as error:
+            raise InvalidInput(f"{self.draft.path}: {error}") from error
+
+    def remaining(self, box: np.ndarray) -> list[tuple[Placed, str]] | None:
+        """The other objects that were distilled, as far as they reach into a box (6,) of the world, and the
+        precisions that they are stored in: from inside the bundle or from their files. None, with a warning,
+        where one of them is not found as it was."""
+        found, draft = [], self.draft
+        for name, node in draft.inside.items():
+            if name in self.names:
+                continue
+            own = source_of(node, leaf_of(node), draft.bundle, Elsewhere(None), self.allow_outside)
+            if not own and (node.get("background") or meet(np.asarray(node["aabb"]), box)):
+                self.progress.warn(
+                    f"the source of '{name}' is gone, has changed, or lies outside of the folder"
+                )
+                return None
+            for leaf, file, member in own:
+                one = load_found(file.path, draft.graph, [(leaf, file, member)], None).placed[0]
+                if one.reaches(box):
+                    found.append((replace(one, field=opened(one.field)), file.headers[member].precision))
+        return found
+
+    def from_photos(self, request: DeleteRequest, leaf: Leaf) -> list[tuple[Placed, str]]:
+        """What photos show, learnt in the frame of a node's field."""
+        edit, one = self.edit, self.placed(leaf)
+        frame = Frame(self.draft.path, self.draft.graph, one.field, one.object_to_world)
+        learnt, self.told = learnt_from(request, frame, None, edit.memory, self.draft.place, self.progress)
+        precision = self.draft.fields.headers[leaf.field].precision
+        return [(Placed(LEARNT, learnt, one.object_to_world), precision)]
+
+    def mend(self, request: DeleteRequest) -> dict:
+        """What the report says of the hole that is left, which is filled where that was asked for."""
+        rest, origin = renderable(self.draft.after())
+        at = placement(origin)
+        box = seen_box(enclosing(self.boxes), at)
+        surfaces, unseen = hole_of(rest, box, up_of(self.draft.graph, at))
+        if request.fill and surfaces:
+            self.progress.phase("filling", None)
+            teach = Teacher(request, request.rgb, self.draft.place, self.progress, len(surfaces))
+            for one in learnt_surfaces(surfaces, teach):
+                self.draft.add_node(one.name, one.field, at @ one.object_to_world, self.precision)
+        return {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}
+
+    @property
+    def precision(self) -> str:
+        """In which most of the bundle's fields are stored."""
+        told = [header.precision for header in self.draft.bundle.headers.values() if header.kind != PART]
+        return max(told, key=told.count)
 
 
-def record_from_file(node: dict, path: Path, allow_outside: bool) -> FieldRecord | None:
-    """A source's field from the file the history names, if it is still there, unchanged, and may be read."""
-    source = (path.resolve().parent / node.get("source", "")).resolve()
-    inside = source.is_relative_to(path.resolve().parent)
-    if (
-        "source" not in node
-        or not os.path.isfile(source)
-        or not (inside or allow_outside)
-        or (bundle := unchanged(source, node["sha256"])) is None
-    ):
-        return None
-    return bundle.field(node["field"]) if node["field"] in bundle.headers else None
+def meet(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two boxes (6,) have anything in common."""
+    return bool((one[:3] <= other[3:]).all() and (other[:3] <= one[3:]).all())
+
+
+def side_of(one: Placed) -> float:
+    """The side in the world of the cells in which a field is cropped."""
+    return max(one.voxel_size, extent(one) / CUT)

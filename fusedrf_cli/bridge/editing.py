@@ -1,338 +1,299 @@
-"""`add` and `delete`: edits of a fused bundle that leave everything outside the touched region as it was, or
-as near to it as its kind of field can."""
+"""Edits of a bundle's scene graph: objects put in, taken out, placed, named and shown otherwise. No field is
+changed: those that stay keep their bytes, and those that come have the bytes of the bundle they come from."""
 
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated
 
-import msgspec
 import numpy as np
 
-from formats.bundle import OpenBundle, is_bundle
-from formats.past import keep
-from formats.rig import read_rig
-from formats.scene import Leaf, Matrix4, SceneGraph
-from fusedrf_cli.bridge.budget import Budget
-from fusedrf_cli.bridge.history import graph_nodes, summed_up
-from fusedrf_cli.bridge.looks import Subject, looks
-from fusedrf_cli.bridge.memory import FLOAT, RESAMPLING, Memory, ownership, picture, sources
-from fusedrf_cli.bridge.memory import result as finished
-from fusedrf_cli.bridge.rigs import rig_of
-from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
-from fusedrf_cli.bridge.scene import (
-    LoadedScene,
-    history_nodes,
-    load_scene,
-    make_field,
-    needs_of,
-    short_origin,
-    stored,
-    write_field,
+from formats.blocks import UNNAMED
+from formats.bundle import BundleWriter, FieldSet, OpenBundle, is_bundle
+from formats.embedding import Embedding, as_one
+from formats.graph import (
+    belongs,
+    changed,
+    chosen,
+    free_name,
+    leaf_names,
+    moved,
+    placement_of,
+    renamed,
+    shown,
+    with_nodes,
 )
-from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.composed import ComposedField, largest
-from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
-from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge, RegionJudge
-from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.occupancy import placed_box, placement, transformed_aabb
-from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.editing import Edited
-from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import DistillSettings
-from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.spaces import bounded
+from formats.history import check_history, distilled, summed_up
+from formats.records import FieldRecord
+from formats.scene import Node
+from formats.undo import keep
+from fusedrf_cli import __version__
+from fusedrf_cli.bridge.memory import Memory
+from fusedrf_cli.bridge.running import engine, written_somewhere
+from fusedrf_cli.bridge.scene import LoadedScene, load_bundle
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import enclosing
 from fusedrf_cli.errors import InvalidInput
-from fusedrf_cli.requests import AddRequest, ArrangeRequest, EditRequest, Learning
+from fusedrf_cli.requests import (
+    AddRequest,
+    ArrangeRequest,
+    EditRequest,
+    Learning,
+    ReplaceRequest,
+    ShowRequest,
+)
 
-REGION_SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
-LOCAL_VIEW = 100
-"""Pixels a side of the views of an edit that changes nothing outside of its region: what it put in is shown
-as it was made, and asking the scene as composed takes most of such an edit's time."""
-SAME_BITS = "outside of it all numbers are the same bits"
-ROUNDED = "outside of it all numbers are the same bits, but for those near it, which are rounded anew"
-NEARLY = "outside of it the field was held to what it showed, and is not the same to the bit"
-
-
-class HistoryNode(msgspec.Struct):
-    """What an edit reads of a node in a bundle's history."""
-
-    name: str
-    object_to_world: Matrix4
-    aabb: Annotated[list[float], msgspec.Meta(min_length=6, max_length=6)]
-    field: str
-    source: str = ""
-    sha256: str = ""
+SAME_BITS = "an edit of the scene graph: all fields keep their bits"
 
 
-@dataclass(frozen=True)
-class Fused:
-    """A bundle of one field that is to be edited."""
+class Draft:
+    """A bundle that is being edited: its graph as it is to be, and the fields that come to those it has."""
 
-    bundle: OpenBundle
-    scene: SceneGraph
-    others: list[str]
-    """Members besides the field: sources that were kept inside."""
-    node: Leaf
-    field: StoredField
-    kind: Kind
-    precision: str
-    """Of the field as it is stored."""
+    def __init__(self, path: str, memory: Memory | None = None, place: str = "cpu"):
+        """InvalidInput where there is no bundle at the path, BadSchema where its history is malformed."""
+        if not is_bundle(path):
+            raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
+        self.path, self.memory, self.place = path, memory, place
+        self.bundle = OpenBundle(path)
+        check_history(self.bundle.scene, path)
+        self.graph, self.writer = self.bundle.scene, BundleWriter()
+
+    @cached_property
+    def before(self) -> LoadedScene:
+        """The scene as it was; its fields are read when they are asked."""
+        return load_bundle(self.bundle, self.bundle.scene, self.memory, self.place)
 
     @property
-    def path(self) -> str:
-        """Of the bundle."""
-        return str(self.bundle.path)
+    def fields(self) -> FieldSet:
+        """The fields that it has, and those that come."""
+        return self.bundle.with_fields(self.writer.members)
 
-    @property
-    def origin(self) -> np.ndarray:
-        """Where the field's frame lies in the world: a position (3,), or a placement (4, 4)."""
-        return short_origin(self.node.object_to_world)
+    def after(self) -> LoadedScene:
+        """The scene as it is to be."""
+        return load_bundle(self.fields, self.graph, self.memory, self.place)
 
-    @property
-    def framing(self) -> np.ndarray | tuple[float, ...] | None:
-        """(6,) the box in the world that pictures show, before the edit and after it; None where they are
-        taken from a capture's cameras."""
-        if self.scene.framing is not None or (self.scene.cameras or {}).get("surroundings"):
-            return self.scene.framing
-        return placed_box(self.field.occupancy.subject, self.origin)
+    def put(self, field: StoredField, precision: str) -> str:
+        """The member that a field is stored as."""
+        return self.writer.add_field(FieldRecord(field.kind, *field.state()), precision)
+
+    def add_node(self, name: str, field: StoredField, object_to_world: np.ndarray, precision: str) -> None:
+        """One more node, placed by a (4, 4), of such a name, with a number where it is taken."""
+        free = free_name(name, {node.name for node, _, _ in self.graph.walk()})
+        node = Node(free, self.put(field, precision), None, placement_of(object_to_world))
+        self.graph = with_nodes(self.graph, [node])
+
+    @cached_property
+    def inside(self) -> dict[str, dict]:
+        """The objects that were distilled into one field, by name, as the history tells of them."""
+        return distilled(self.bundle.scene.history)
 
     @property
     def names(self) -> set[str]:
-        """Of the objects that can be deleted: those that the history and those that the field tell of."""
-        parts = {part.name for part in self.kind.parts(self.field)} - {self.node.name}
-        return {n["name"] for n in graph_nodes(self.scene)} | parts
+        """Of all objects."""
+        nodes = {node.name for node, _, _ in self.graph.walk()}
+        if self.inside:
+            nodes = {name for name in nodes if not belongs(name, UNNAMED)}
+        return nodes | self.inside.keys()
+
+    def check(self, name: str) -> None:
+        """InvalidInput where there is no object of a name."""
+        if not any(belongs(one, {name}) for one in self.names):
+            raise InvalidInput(
+                f"{self.path}: there is no '{name}'; it holds "
+                f"{', '.join(sorted(self.names)) or 'nothing that has a name'}"
+            )
+
+    def check_node(self, name: str) -> None:
+        """InvalidInput where there is no node of a name."""
+        self.check(name)
+        if name in self.inside:
+            raise InvalidInput(
+                f"{self.path}: '{name}' is no node of its own, since it was distilled into one field with "
+                "others; fuse the scene with --kind blocks, or delete the object and add it again"
+            )
+
+    def check_free(self, name: str) -> None:
+        """InvalidInput where an object has a name already."""
+        if name in self.names:
+            raise InvalidInput(f"{self.path}: there is a '{name}' already; choose another name")
+
+    def box(self, names: Iterable[str]) -> np.ndarray | None:
+        """(6,) in the world around nodes as they were; None where none of them is visible."""
+        return box_of(self.before, leaf_names(chosen(self.bundle.scene, set(names))))
+
+    @cached_property
+    def framing(self) -> tuple[float, ...] | None:
+        """(6,) the box in the world that pictures show, before the edit and after it; None where they are
+        taken from a capture's cameras."""
+        scene = self.bundle.scene
+        if scene.framing is not None or (scene.cameras or {}).get("surroundings"):
+            return scene.framing
+        return tuple(box_of(self.before, {p.name for p in self.before.placed}).tolist())
+
+    def write(self, request: EditRequest, entry: dict, learnt: bool = False) -> int:
+        """Write the bundle with one more entry of history; the bytes written. learnt: it took long."""
+        if request.keep_history:
+            entry = entry | {"before": keep(self.path, request.output)}
+        used = {leaf.field for leaf in self.graph.leaves()}
+        was = {leaf.field for leaf in self.bundle.scene.leaves()}
+        for member in self.bundle.headers:  # what no node places was kept for the history
+            if member in used or member not in was:
+                self.writer.copy_field(self.bundle, member)
+        framing = self.framing
+        history = summed_up((*self.graph.history, entry), used)
+        generator = f"fusedrf {__version__}"
+        graph = replace(self.graph, history=history, framing=framing, generator=generator)
+
+        def write(output: str) -> int:
+            self.writer.write(output, graph, overwrite=request.overwrite)
+            return Path(output).stat().st_size
+
+        return written_somewhere(request.output, write) if learnt else write(request.output)
 
 
-class Teacher:
-    """Teaches students for an edit (engine/kinds/editing.py: Teach), within one command's budget."""
+def box_of(scene: LoadedScene, names: set[str]) -> np.ndarray | None:
+    """(6,) in the world around what some leaves of a scene show; None where that is nothing."""
+    boxes = [p.aabb for p in scene.placed if belongs(p.name, names)]
+    return enclosing(boxes) if boxes else None
 
-    def __init__(self, request: Learning, rgb: bool, place: str, progress, tries: int = 1):
-        """rgb: whether it finishes on pictures; tries: how many times it may be asked, about."""
-        self.seed, self.rgb, self.place, self.progress = request.seed, rgb, place, progress
-        self.budget, self.tries = Budget(request.time_budget), tries
 
-    def __call__(
-        self, teacher: RadianceField, student: StoredField, boxes: list[np.ndarray], fresh: bool
-    ) -> tuple[StoredField, dict]:
-        """See Teach."""
-        seconds = self.budget.part(max(1, self.tries))
-        self.tries -= 1
-        settings = replace(REGION_SETTINGS, seed=self.seed, time_budget=seconds)
-        recipe = DEFAULT_RECIPE if fresh else replace(DEFAULT_RECIPE, coarse=lambda student: False)
-        run = DistillRun(teacher, student.to(self.place), RaySampler(boxes), settings, self.rgb, recipe)
-        learnt, did = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
-        self.budget.spent += run.learnt_seconds
-        psnr = {"before_rgb": did.psnr_before_rgb, "after_rgb": did.psnr_after_rgb}
-        return learnt.to("cpu"), {"psnr": psnr, "seconds": did.seconds}
+# -- edits ---------------------------------------------------------------------------------------------------
 
 
 def add(request: AddRequest, progress) -> dict:
-    """Put one more object into a fused field; cells that it does not reach keep their numbers where the kind
-    of field allows that. Without a precision the field keeps its own.
-    """
-    with engine(request.device, request.threads, progress) as place:
-        started = time.monotonic()
+    """Put one more object into a bundle, as a node that is placed."""
+    with engine("cpu", None, progress):
+        edit = Edit(request, progress)
+        draft = edit.draft
+        draft.check_free(request.name)
+        node = brought(draft, request, request.name, request.object_to_world)
+        draft.graph = with_nodes(draft.graph, [node])
+        return edit.done("added", [request.name], [node])
+
+
+def move(request: ArrangeRequest, progress) -> dict:
+    """Place an object anew: scaled and turned about the middle of its box, then moved."""
+    return arrange(request, "moved", progress)
+
+
+def duplicate(request: ArrangeRequest, progress) -> dict:
+    """Put a copy of an object beside it, which places the same field."""
+    return arrange(request, "duplicated", progress)
+
+
+def rename(request: ArrangeRequest, progress) -> dict:
+    """Give an object another name."""
+    return arrange(request, "renamed", progress)
+
+
+def arrange(request: ArrangeRequest, event: str, progress) -> dict:
+    """Do one of the three."""
+    with engine("cpu", None, progress):
+        edit = Edit(request, progress)
+        draft, name, new_name = edit.draft, request.name, request.new_name or request.name
+        draft.check_node(name)
+        if request.new_name is not None:
+            draft.check_free(request.new_name)
+        matrix, copies = request.object_to_world, event == "duplicated"
+        if not request.absolute and not np.array_equal(matrix[:3, :3], np.eye(3)):
+            box = draft.box({name})
+            if box is None:
+                raise InvalidInput(f"{request.fused}: '{name}' is hidden, and has no middle; give --matrix")
+            matrix = about(matrix, (box[:3] + box[3:]) / 2)
+
+        def arranged(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
+            still = np.array_equal(matrix, np.eye(4))
+            one = node if still else moved(node, parent, matrix)
+            one = renamed(one, name, new_name, copies) if new_name != name else one
+            return (node, one) if copies else (one,)
+
+        draft.graph = changed(draft.graph, {name}, arranged)
+        before = () if copies else (name,)
+        renamed_from = {"names": [name]} if event == "renamed" else {}
+        return edit.done(event, [new_name], chosen(draft.graph, {new_name}), before, renamed_from)
+
+
+def show(request: ShowRequest, progress) -> dict:
+    """Show an object otherwise: cropped, tinted, thinner, or not at all."""
+    with engine("cpu", None, progress):
+        edit = Edit(request, progress)
+        draft, name = edit.draft, request.name
+        draft.check_node(name)
+        draft.graph = changed(draft.graph, {name}, lambda node, _: (shown(node, request.showing),))
+        return edit.done(request.event, [name], chosen(draft.graph, {name}))
+
+
+class Edit:
+    """One edit, from reading to its report."""
+
+    def __init__(self, request: EditRequest, progress, place: str = "cpu"):
+        self.started, self.request, self.progress = time.monotonic(), request, progress
         progress.phase("reading", None)
-        memory = Memory(request.memory)
-        fused = read_fused(request.fused, memory)
-        precision = request.precision or fused.precision
-        if request.name in fused.names:
-            raise InvalidInput(f"{request.fused}: there is a '{request.name}' already; choose another --name")
-        new = load_scene(request.source, budget=memory, place=place)
-        memory.expect(*addition_memory(fused.field, new), advice="add a smaller object")
-        placed = [placed_at(p, opened(p.field), request) for p in new.placed]
-        objects = [p.moved(fused.origin) for p in placed]
-        parts = [Placed("", fused.field.to(place), np.eye(4)), *objects]
-        if any(p.unbounded for p in objects) and largest(parts) is not parts[0]:
-            raise InvalidInput(
-                f"{request.source}: it fills all of space, around more than {request.fused} does; place both "
-                "in a scene.json and fuse that"
-            )
-        truth = ComposedField(parts, origin=np.eye(4))
-        progress.phase("adding", 1.0)
-        try:
-            teach = Teacher(request, request.rgb, place, progress, len(objects))
-            edited = fused.kind.added(fused.field, objects, teach)
-        except ValueError as error:
-            raise InvalidInput(f"{request.fused}: {error}") from error
-        progress.phase("measuring", None)
-        origin = placement(fused.origin)
-        size = LOCAL_VIEW if edited.local else REGION_SETTINGS.view_size
-        cameras = cameras_of(request, fused, new, placed, truth, origin, size)
-        if edited.local:  # what the region hides is all that can differ
-            judge = RegionJudge(truth, cameras, origin, placed_box(edited.box, fused.origin))
-        else:
-            judge = Judge(truth, cameras, origin)
-        nodes = history_nodes(new, request.output, {})
-        entry = {
-            "event": "added",
-            "nodes": [placed_note(n, request.object_to_world, request.name) for n in nodes],
+        self.memory = Memory(request.memory)
+        self.draft = Draft(request.fused, self.memory, place)
+
+    def done(
+        self,
+        event: str,
+        objects: list[str],
+        nodes: Sequence[Node],
+        before: Sequence[str] = (),
+        entry: dict | None = None,
+        boxes: Sequence[np.ndarray] = (),
+        how: str = SAME_BITS,
+    ) -> dict:
+        """Write the bundle, whose history tells of what was done to objects, and report it. What was touched
+        are nodes as they are now, others, by name, as they were, and boxes (6,) in the world."""
+        draft, entry, boxes = self.draft, entry or {}, list(boxes)
+        found = [
+            box_of(draft.after(), leaf_names(nodes)) if nodes else None,
+            draft.box(before) if before else None,
+        ]
+        boxes += [box for box in found if box is not None]
+        entry = {"event": event} | ({"objects": objects} if objects else {}) | entry
+        size = draft.write(self.request, entry, isinstance(self.request, Learning))
+        names = objects or entry.get("names", [])
+        return self.report(size, names, enclosing(boxes) if boxes else None, how)
+
+    def report(self, size: int, names: Iterable[str], box: np.ndarray | None, how: str) -> dict:
+        """The report of an edit that touched a box (6,) of the world."""
+        request = self.request
+        return {
+            "output": request.output,
+            "bytes": size,
+            "source_bytes": self.draft.bundle.size,
+            "touched": {
+                "names": ", ".join(names),
+                "aabb": None if box is None else box.tolist(),
+                "nodes": len(self.draft.graph.leaves()),
+                "how": how,
+            },
+            "total_seconds": time.monotonic() - self.started,
+            "memory": self.memory.report(),
         }
-        try:
-            reached = judge(stored(edited.field, precision).to(place))
-        except KeyboardInterrupt:
-            if not edited.local:  # it was learnt
-                with held_back(request.output):
-                    write_edited(request, fused, edited.field, precision, entry)
-            raise
-        size = write_edited(request, fused, edited.field, precision, entry | {"psnr": reached})
-    figures = {**edited.figures, "psnr": {"before_rgb": reached}, "memory": memory.report()}
-    return edit_report(request, size, request.name, fused, edited, figures, started)
 
 
-def write_edited(request: EditRequest, fused: Fused, field: StoredField, precision: str, entry: dict) -> int:
-    """Write the edited field with one more entry of history; the bytes written."""
-    if request.keep_history:
-        entry = entry | {"before": keep(fused.path, request.output)}
-
-    def write(output: str) -> int:
-        return write_field(
-            output,
-            field,
-            fused.node.name,
-            precision=precision,
-            overwrite=request.overwrite,
-            origin=fused.origin,
-            history=summed_up((*fused.scene.history, entry)),
-            kept=dict.fromkeys(fused.others, fused.bundle),
-            extras=fused.scene.extras,
-            framing=fused.framing,
-            cameras=fused.scene.cameras,
-        )
-
-    learnt = isinstance(request, Learning)
-    return written_somewhere(request.output, write) if learnt else write(request.output)
+def brought(
+    draft: Draft,
+    request: AddRequest | ReplaceRequest,
+    name: str,
+    matrix: np.ndarray,
+    background: bool = False,
+) -> Node:
+    """The scene of a request's source as a node of a draft, placed by a (4, 4). InvalidInput where it cannot
+    be one."""
+    source = request.source
+    embedding = Embedding(draft.writer, precision=request.precision)
+    scene = embedding.scene(source)
+    node = as_one(scene, name, matrix, draft.graph.composition, background)
+    if not leaf_names([node]):
+        raise InvalidInput(f"{source}: it holds no field; choose another source")
+    return node
 
 
-def addition_memory(field: StoredField, new: LoadedScene) -> list[dict[str, float]]:
-    """The stages of adding a scene's fields to a field: putting together, measuring."""
-    view, old = REGION_SETTINGS.view_size, field.params.numel() * FLOAT
-    sizes, numbers = [old, *new.sizes], (old + sum(new.sizes)) // FLOAT
-    return [
-        sources(sizes, copies=RESAMPLING) | finished(numbers, measured=False) | ownership(field.aabb),
-        sources(sizes) | finished(numbers) | ownership(field.aabb) | picture(view, view // 2, composed=True),
-    ]
-
-
-def read_fused(path: str, memory: Memory, turned: bool = False) -> Fused:
-    """A bundle of one field, in a frame that may be turned or scaled; InvalidInput when it is something
-    else."""
-    if not is_bundle(path):
-        raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
-    bundle = OpenBundle(path)
-    scene = bundle.scene
-    check_history(scene, path)
-    leaves = [leaf for leaf in scene.leaves() if leaf.field is not None]
-    if len(leaves) != 1:
-        raise InvalidInput(
-            f"{path}: holds {len(leaves)} placed fields where one fused field was expected; fuse it first"
-        )
-    (leaf,) = leaves
-    if not leaf.whole:
-        raise InvalidInput(
-            f"{path}: its field is cropped, thinned or hidden, and cannot be edited; fuse it first"
-        )
-    needs = needs_of(bundle, leaf.field)
-    memory.expect({"the field while it is read": needs.held + needs.reading}, advice="edit a smaller field")
-    field = make_field(bundle.field(leaf.field), path)
-    linear = leaf.object_to_world[:3, :3]
-    upright = linear[0, 0] > 0 and np.array_equal(linear, linear[0, 0] * np.eye(3))
-    if not upright and not turned and field.occupancy.space is bounded:
-        raise InvalidInput(f"{path}: its field is turned or stretched, and cannot be edited; fuse it first")
-    others = [member for member in bundle.headers if member != leaf.field]
-    precision = bundle.headers[leaf.field].precision
-    return Fused(bundle, scene, others, leaf, field, registry.kind(field.kind), precision)
-
-
-def check_history(scene: SceneGraph, path: str) -> None:
-    """InvalidInput where the history, which the format leaves free, does not tell of nodes as an edit needs
-    them.
-    """
-    for entry in scene.history:
-        try:
-            msgspec.convert(entry.get("names", []), list[str])
-            for node in msgspec.convert(entry.get("nodes", []), list[HistoryNode]):
-                Placed(node.name, None, np.array(node.object_to_world))
-                if not node.source.isprintable():
-                    raise ValueError("a source that is no path")
-        except ValueError as error:
-            raise InvalidInput(f"{path}: its history is malformed ({error}); fuse the scene again") from error
-
-
-def cameras_of(
-    request: AddRequest,
-    fused: Fused,
-    new: LoadedScene,
-    placed: list[Placed],
-    truth: ComposedField,
-    origin: np.ndarray,
-    side: int,
-) -> list[Camera]:
-    """The views, `side` pixels a side, that an addition is judged by: of the whole, whose frame lies at
-    `origin` (4, 4), and of what was added."""
-    kept = fused.scene.cameras
-    own = rig_of(new)
-    rig = own and own.placed(request.object_to_world)
-    subjects = [
-        Subject(p.name, placed_box(p.field.occupancy.subject, p.object_to_world), rig)
-        for p in placed
-        if not p.unbounded
-    ]
-    box = placed_box(truth.occupancy.subject, origin)
-    seed = JUDGED_SEED, 3, request.seed
-    whole = None if kept is None else read_rig(kept)
-    return [look.camera for look in looks(whole, box, subjects, REGION_SETTINGS.views, (side, side), seed)]
-
-
-def placed_at(placed: Placed, field: StoredField, request: AddRequest) -> Placed:
-    """A field placed as another one and then once more, under a name; InvalidInput where both placements
-    together are singular."""
-    try:
-        return Placed(request.name, field, request.object_to_world @ placed.object_to_world)
-    except ValueError as error:
-        raise InvalidInput(f"{request.source}: {error}; give an invertible placement") from error
-
-
-def placed_note(node: dict, object_to_world: np.ndarray, name: str) -> dict:
-    """A history node of an added object, in the world it was added to."""
-    return node | {
-        "name": name,
-        "object_to_world": (object_to_world @ np.asarray(node["object_to_world"])).tolist(),
-        "aabb": transformed_aabb(np.asarray(node["aabb"]), object_to_world).tolist(),
-    }
-
-
-def edit_report(
-    request: EditRequest | ArrangeRequest,
-    size: int,
-    names: str,
-    fused: Fused,
-    edited: Edited,
-    figures: dict,
-    started: float,
-) -> dict:
-    """The report of an edit."""
-    extent = edited.box[3:] - edited.box[:3]
-    whole = edited.field.occupancy.aabb[3:] - edited.field.occupancy.aabb[:3]
-    rounded, near = None, SAME_BITS if edited.local else NEARLY
-    kept = isinstance(request, ArrangeRequest)  # whose numbers are written as they are
-    if edited.local and not kept and not (request.precision or fused.precision).startswith("float"):
-        rounded = fused.kind.rounded(edited.field, edited.box)
-    return {
-        "output": request.output,
-        "bytes": size,
-        "source_bytes": Path(request.fused).stat().st_size,
-        "touched": {
-            "names": names,
-            "aabb": placed_box(edited.box, fused.origin).tolist(),
-            **({} if rounded is None else {"rounded_in": placed_box(rounded, fused.origin).tolist()}),
-            **fused.kind.counts(edited.field),
-            "share_of_box": float(min(1.0, np.prod(extent / whole))),
-            "how": f"{edited.how}; {near if rounded is None else ROUNDED}",
-        },
-        **figures,
-        "total_seconds": time.monotonic() - started,
-    }
+def about(matrix: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """(4, 4) that scales and turns about a point (3,) as `matrix` does about the origin, and then moves."""
+    found = matrix.copy()
+    found[:3, 3] += centre - matrix[:3, :3] @ centre
+    return found

@@ -10,34 +10,44 @@ import numpy as np
 import torch
 
 from formats.atomic import atomic_folder, check_writable
+from formats.bundle import OpenBundle
 from formats.captures import read_cameras
 from formats.errors import BadMask, FormatError, OutputExists
 from formats.filenames import distinct
+from formats.graph import belongs
+from formats.history import summed_up
 from formats.hulls import Hull
 from formats.images import read_mask, write_png
 from formats.photos import pictures
-from formats.records import BITS
+from formats.records import BITS, BYTES_PER_NUMBER
 from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph
 from formats.views import View
-from fusedrf_cli.bridge.editing import Fused, read_fused
-from fusedrf_cli.bridge.fusing import best_of, best_suited
-from fusedrf_cli.bridge.history import summed_up
+from fusedrf_cli.bridge.editing import Draft
+from fusedrf_cli.bridge.fusing import FUSED, best_of, best_suited
 from fusedrf_cli.bridge.making import Scene
 from fusedrf_cli.bridge.memory import FLOAT, Memory, ownership
 from fusedrf_cli.bridge.memory import sources as in_memory
-from fusedrf_cli.bridge.mending import mended
+from fusedrf_cli.bridge.mending import Frame, mended
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import to_pixels
 from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
-from fusedrf_cli.bridge.scene import LoadedScene, PlacedRig, SourceField, stored, write_field
+from fusedrf_cli.bridge.scene import (
+    NO_MEMBER,
+    LoadedScene,
+    PlacedRig,
+    SourceField,
+    stored,
+    write_field,
+)
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, graph_bytes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
-from fusedrf_cli.engine.fields.occupancy import placed_box, placement
+from fusedrf_cli.engine.fields.occupancy import enclosing, placed_box, placement
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.editing import enclosing
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
@@ -81,6 +91,58 @@ UNSURE = 0.6
 
 
 @dataclass(frozen=True)
+class Whole:
+    """A bundle as one field, out of which an object is taken."""
+
+    draft: Draft
+    field: StoredField
+    origin: np.ndarray
+    """Where its frame lies in the world: a position (3,), or a placement (4, 4)."""
+    name: str
+    """Of its node."""
+    lone: bool
+    """Whether it has one node alone."""
+
+    @property
+    def kind(self) -> Kind:
+        """Of the field."""
+        return registry.kind(self.field.kind)
+
+    @property
+    def bundle(self) -> OpenBundle:
+        """That it is in."""
+        return self.draft.bundle
+
+    @property
+    def scene(self) -> SceneGraph:
+        """Of the bundle."""
+        return self.draft.bundle.scene
+
+    @property
+    def path(self) -> str:
+        """Of the bundle."""
+        return self.draft.path
+
+    @property
+    def frame(self) -> Frame:
+        """What is to be mended."""
+        return Frame(self.path, self.scene, self.field, self.origin)
+
+    @property
+    def others(self) -> list[str]:
+        """Members that no node places: sources that were kept inside."""
+        placed = {leaf.field for leaf in self.scene.leaves()}
+        return [member for member in self.bundle.headers if member not in placed]
+
+    @property
+    def precision(self) -> str:
+        """The most exact one of its fields."""
+        placed = {leaf.field for leaf in self.scene.leaves()} - {None}
+        told = {self.bundle.headers[member].precision for member in placed}
+        return max(told, key=BYTES_PER_NUMBER.get)
+
+
+@dataclass(frozen=True)
 class Told:
     """What tells of the object, in the field's frame."""
 
@@ -114,7 +176,7 @@ def extract(request: ExtractRequest, progress) -> dict:
             check_preview(request)
         progress.phase("reading", None)
         memory = Memory(request.memory)
-        fused = read_fused(request.field, memory, turned=True)
+        fused = read_whole(request.field, memory)
         held = fused.field.params.numel() * 4
         memory.expect(
             in_memory([held], copies=COPIES) | ownership(fused.field.aabb) | {"its cells": CELLS_BYTES},
@@ -147,15 +209,17 @@ def extract(request: ExtractRequest, progress) -> dict:
                 raise InvalidInput(f"{request.field}: {error}") from error
             figures = {"sure": round(selection.sure, 3), "seen": seen_share(fused, rig, parts[0])}
         found, rest = parts
-        wanted = rest if request.invert else found
+        wanted, beside = rest if request.invert else found, []
         if wanted is None:
             raise InvalidInput(f"{request.field}: nothing is left beside the object; leave --invert out")
         if request.invert:
-            wanted, figures["hole"] = mended(request, fused, wanted, found, memory, place, progress)
+            frame = fused.frame
+            fillings, figures["hole"] = mended(request, frame, wanted, found, memory, place, progress)
+            wanted, beside = with_fillings(wanted, fillings)
             parts = found, wanted
         progress.phase("trimming", None)
-        wanted = fused.kind.trimmed(wanted)
-        bundle = bundle_of(request, fused, found)
+        wanted = registry.kind(wanted.kind).trimmed(wanted)
+        bundle = bundle_of(request, fused, found) | {"beside": beside}
         piece = Piece(wanted, fused.origin, precision_of(request, fused, wanted))
         if request.max_size is not None:
             piece, told = within_size(request, fused, piece, bundle, memory, place, progress)
@@ -189,6 +253,27 @@ def extract(request: ExtractRequest, progress) -> dict:
     }
 
 
+def read_whole(path: str, memory: Memory) -> Whole:
+    """The bundle at a path as one field. InvalidInput where its nodes are none that can be taken apart."""
+    draft = Draft(path, memory)
+    leaves, scene = draft.bundle.scene.leaves(), draft.before
+    if len(leaves) == 1:
+        if not leaves[0].whole:
+            raise InvalidInput(f"{path}: its field is cropped, thinned or tinted; fuse it first")
+        field, origin = scene.lone()
+        return Whole(draft, field, origin, leaves[0].name, True)
+    composed = scene.composed()
+    try:
+        field = blocks_of(composed.placed)
+    except ValueError as error:
+        kinds = ", ".join(sorted({p.field.kind for p in composed.placed}))
+        raise InvalidInput(
+            f"{path}: its nodes are fields of the kinds {kinds}, which cannot be taken apart together; "
+            "delete nodes by name, or fuse it to one field first"
+        ) from error
+    return Whole(draft, field, composed.origin, FUSED, False)
+
+
 def check_preview(request: ExtractRequest) -> None:
     """Before any work: the folder of previews may be written, and what would be replaced are previews.
     `--overwrite` is asked for the sake of the bundle, and must not take other files with it."""
@@ -205,7 +290,7 @@ def check_preview(request: ExtractRequest) -> None:
 # -- what tells of it ----------------------------------------------------------------------------------------
 
 
-def rig_for(request: ExtractRequest, fused: Fused) -> dict[str, View]:
+def rig_for(request: ExtractRequest, fused: Whole) -> dict[str, View]:
     """The views that masks and points are of, by name."""
     if request.cameras is not None:
         return {view.name: view for view in read_cameras(request.cameras)}
@@ -215,7 +300,7 @@ def rig_for(request: ExtractRequest, fused: Fused) -> dict[str, View]:
     return {view.name: view for view in rig.test + rig.train}
 
 
-def told_by(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress) -> Told:
+def told_by(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress) -> Told:
     """What a request says, read and checked."""
     if not (request.masks or request.points or request.boxes or request.spheres or request.mesh):
         raise UsageProblem("say which object: --masks, --points, --box, --sphere, --mesh or --name")
@@ -234,7 +319,7 @@ def told_by(request: ExtractRequest, fused: Fused, rig: dict[str, View], progres
     return Told(within(request, fused), masks, pointed, own, other)
 
 
-def within(request: ExtractRequest, fused: Fused) -> Callable[[np.ndarray], np.ndarray] | None:
+def within(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.ndarray] | None:
     """Which points of the frame lie in the shapes: in any of the boxes, if there are some, in any of the
     spheres, and in the mesh."""
     hull = Hull(request.mesh) if request.mesh else None
@@ -255,7 +340,7 @@ def within(request: ExtractRequest, fused: Fused) -> Callable[[np.ndarray], np.n
     return holds
 
 
-def masked(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress) -> list[Look]:
+def masked(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress) -> list[Look]:
     """The masks of a folder, each with the view that is named as it."""
     files = pictures(Path(request.masks))
     if not files:
@@ -284,7 +369,7 @@ def masked(request: ExtractRequest, fused: Fused, rig: dict[str, View], progress
     return found
 
 
-def looked_at(view: View, path: Path, fused: Fused) -> Look:
+def looked_at(view: View, path: Path, fused: Whole) -> Look:
     """A mask and its view, at most LONGEST pixels a side. Raises BadMask where their shapes differ."""
     mask = read_mask(path)
     high, wide = mask.shape
@@ -307,12 +392,12 @@ def small(view: View, longest: int) -> View:
     )
 
 
-def in_frame(view: View, fused: Fused) -> Camera:
+def in_frame(view: View, fused: Whole) -> Camera:
     """The camera of a view in the field's frame."""
     return camera_of(view).seen_from(placement(fused.origin))
 
 
-def pointed_at(point: tuple, request: ExtractRequest, fused: Fused, rig: dict[str, View]) -> Look:
+def pointed_at(point: tuple, request: ExtractRequest, fused: Whole, rig: dict[str, View]) -> Look:
     """The pixels around a point, which say whether they show the object."""
     name, column, row, shows = point
     if name not in rig:
@@ -384,19 +469,31 @@ def nothing(request: ExtractRequest) -> str:
     return "there is nothing in the given shape; shapes are in the units of the world (see fusedrf info)"
 
 
-def named(request: ExtractRequest, fused: Fused) -> tuple[StoredField | None, StoredField | None]:
-    """The part that goes by a name, and what is left without it."""
+def named(request: ExtractRequest, fused: Whole) -> tuple[StoredField | None, StoredField | None]:
+    """The nodes that go by a name, and what is left without them."""
     if request.masks or request.points or request.boxes or request.spheres or request.mesh:
         raise UsageProblem("--name takes a whole part; leave out what else tells of the object")
-    names = {part.name for part in fused.kind.parts(fused.field)}
-    own = {name for name in names if name == request.name or name.startswith(f"{request.name}/")}
+    names = {leaf.name for leaf in fused.scene.leaves()}
+    own = {name for name in names if belongs(name, {request.name})}
     if not own:
-        held = ", ".join(sorted(names)) or "no parts that are held apart"
+        held = ", ".join(sorted(names))
         raise InvalidInput(f"{request.field}: there is no part '{request.name}'; it holds {held}")
+    if fused.lone:
+        return fused.field, None
     return fused.kind.without(fused.field, names - own), fused.kind.without(fused.field, own)
 
 
-def seen_share(fused: Fused, rig: dict[str, View], found: StoredField | None) -> float | None:
+def with_fillings(rest: StoredField, fillings: list[Placed]) -> tuple[StoredField, list[Placed]]:
+    """What is left of a field with what fills its hole, and of that what has to be a field of its own."""
+    if not fillings:
+        return rest, []
+    try:
+        return blocks_of([Placed("", rest, np.eye(4)), *fillings]), []
+    except ValueError:
+        return rest, fillings
+
+
+def seen_share(fused: Whole, rig: dict[str, View], found: StoredField | None) -> float | None:
     """Of the object's cells that some view around it shows, the share that the capture's views show; None
     where there are no views."""
     if not rig or found is None:
@@ -426,7 +523,7 @@ def weighed(field: StoredField, cameras: list[Camera]) -> np.ndarray:
     return total
 
 
-def watching(fused: Fused) -> list[Camera]:
+def watching(fused: Whole) -> list[Camera]:
     """Cameras of the capture, in the field's frame, that tell what of it was ever seen; of a field that
     keeps none, none."""
     views = [] if fused.scene.cameras is None else read_rig(fused.scene.cameras).views
@@ -435,7 +532,7 @@ def watching(fused: Fused) -> list[Camera]:
 
 
 def cut(
-    fused: Fused,
+    fused: Whole,
     selection: Selection,
     shown: np.ndarray,
     least: float,
@@ -465,17 +562,18 @@ def cut(
 # -- writing -------------------------------------------------------------------------------------------------
 
 
-def bundle_of(request: ExtractRequest, fused: Fused, found: StoredField) -> dict:
+def bundle_of(request: ExtractRequest, fused: Whole, found: StoredField) -> dict:
     """What `write_field` writes beside the field: of what is left all that the bundle had, of the object what
     is its own."""
     if request.invert:
-        history = summed_up((*fused.scene.history, {"event": "extracted", "names": [], "nodes": []}))
+        entry = {"event": "extracted", "names": [request.name] if request.name else []}
+        history = summed_up((*fused.scene.history, entry), ())
         return {
-            "name": fused.node.name,
+            "name": fused.name,
             "history": history,
             "kept": dict.fromkeys(fused.others, fused.bundle),
             "extras": fused.scene.extras,
-            "framing": fused.framing,
+            "framing": fused.draft.framing,
             "cameras": fused.scene.cameras,
         }
     return {
@@ -485,7 +583,7 @@ def bundle_of(request: ExtractRequest, fused: Fused, found: StoredField) -> dict
     }
 
 
-def precision_of(request: ExtractRequest, fused: Fused, wanted: StoredField) -> str:
+def precision_of(request: ExtractRequest, fused: Whole, wanted: StoredField) -> str:
     """As asked for, or as the numbers of the field are stored; those of an object in 8 or 4 bits only where
     they stay what they are, else in float16."""
     if request.precision or request.invert:
@@ -498,7 +596,7 @@ def precision_of(request: ExtractRequest, fused: Fused, wanted: StoredField) -> 
 
 def within_size(
     request: ExtractRequest,
-    fused: Fused,
+    fused: Whole,
     piece: Piece,
     bundle: dict,
     memory: Memory,
@@ -509,13 +607,12 @@ def within_size(
     the report says of that."""
     overhead = graph_bytes(list(bundle.get("history", ())), bundle["cameras"], bundle.get("extras"))
     overhead += sum(BESIDES + fused.bundle.headers[member].size for member in bundle.get("kept", ()))
+    overhead += sum(BESIDES + BundleSizes().exactly(one.field, piece.precision) for one in bundle["beside"])
     if overhead + BundleSizes().exactly(piece.field, piece.precision) <= request.max_size:
         return piece, {}
     wanted = FuseRequest(
-        scene=request.field, output=request.output, overwrite=request.overwrite, kind=registry.AUTO,
-        max_size=request.max_size, target_psnr=None, precision=request.precision, ranks=None,
-        sh_degree=None, rgb=True, from_scratch=False, keep_sources=False, memory=request.memory,
-        allow_outside=False, resume=False, sources=None, time_budget=request.time_budget,
+        request.field, request.output, overwrite=request.overwrite, max_size=request.max_size,
+        precision=request.precision, memory=request.memory, time_budget=request.time_budget,
         seed=request.seed, device=request.device, threads=request.threads,
     )  # fmt: skip
     scene = Scene.of(alone(fused, piece, bundle))
@@ -528,18 +625,18 @@ def within_size(
     return Piece(kept.field, scene.composed.origin, kept.tried.way.precision), told
 
 
-def alone(fused: Fused, piece: Piece, bundle: dict) -> LoadedScene:
+def alone(fused: Whole, piece: Piece, bundle: dict) -> LoadedScene:
     """A piece as a scene of its own, with the cameras that its bundle keeps."""
     background = piece.field.space is not bounded
     at, cameras = placement(piece.origin), bundle["cameras"]
     placed = Placed(bundle["name"], piece.field, at)
     rigs = () if cameras is None else (PlacedRig(bundle["name"], background, cameras, np.eye(4)),)
     needs = FieldNeeds(held=piece.field.params.numel() * FLOAT, reading=0)
-    field = SourceField(placed, background, fused.bundle, fused.node.field, needs)
+    field = SourceField(placed, background, fused.bundle, NO_MEMBER, needs)
     return LoadedScene((field,), "max", SceneGraph(()), Path(fused.path), Shelf(), rigs)
 
 
-def own_cameras(fused: Fused, found: StoredField) -> dict | None:
+def own_cameras(fused: Whole, found: StoredField) -> dict | None:
     """The cameras that photographed the object, as of one that stands free."""
     if fused.scene.cameras is None:
         return None
@@ -554,7 +651,7 @@ def own_cameras(fused: Fused, found: StoredField) -> dict | None:
 
 
 def previews(
-    request: ExtractRequest, fused: Fused, rig: dict[str, View], parts: list[Piece | None], progress
+    request: ExtractRequest, fused: Whole, rig: dict[str, View], parts: list[Piece | None], progress
 ) -> list[str]:
     """Pictures of a few views: the object, the rest, and the whole with the object marked."""
     views = [small(view, SHOWN) for view in shown_views(request, rig)]
@@ -590,7 +687,7 @@ def framed(found: Piece) -> Camera:
     return framing(grown, lens).camera(lens)
 
 
-def pictures_of(fused: Fused, parts: list[Piece | None], camera: Camera) -> dict[str, np.ndarray]:
+def pictures_of(fused: Whole, parts: list[Piece | None], camera: Camera) -> dict[str, np.ndarray]:
     """(H, W, 3 or 4) uint8 of the object alone, over nothing; of the rest; and of the whole, in which the
     object is red."""
     found, rest = parts

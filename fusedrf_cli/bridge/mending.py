@@ -1,35 +1,40 @@
 """What an object leaves behind when it is taken out: filled from photos, or smoothly, or left empty."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.ndimage import binary_dilation
 
 from formats.frame import scene_frame
 from formats.photos import load_photos
 from formats.rig import read_rig
+from formats.scene import SceneGraph
 from formats.views import Capture, View
-from fusedrf_cli.bridge.editing import Fused, Teacher
+from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.extent import NEAR_OF_POINTS, Extent, near_of
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.training import fit_memory, fit_settings, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.distillation.distill import DistillRun
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
+from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.visibility import shown_cells
-from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.kinds import registry, splitting
+from fusedrf_cli.engine.kinds.student import DistilConfig, Way
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.kinds.vm.trimming import without_unasked
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.selection.holes import patches
 from fusedrf_cli.engine.spaces import bounded
-from fusedrf_cli.errors import InvalidInput
-from fusedrf_cli.requests import MendingRequest, TrainRequest
+from fusedrf_cli.requests import Learning, MendingRequest, TrainRequest
 
 SECONDS = 120.0
 """Of learning from --refit's photos, where no time budget is given."""
@@ -39,12 +44,47 @@ FAINT = 0.03
 """Opacity of the object from which a pixel of a photo is left out."""
 GROWN = 4
 """Pixels around those that are left out too: what the object's rim colours."""
-LEARNT, FILLED = "refit", "filled"
-"""Names of what is put into the hole."""
+LEARNT, FILLED = "restored/refit", "restored/filled"
+"""Names of nodes of what is put into the hole."""
+SETTINGS = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+NUMBERS = 2_000_000
+"""Of the tensor that a smooth surface is learnt into, at most."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The field in which there is a hole, and where it lies."""
+
+    path: str
+    scene: SceneGraph
+    """Of the bundle that it is in."""
+    field: StoredField
+    origin: np.ndarray
+    """Of its frame in the world: a position (3,), or a placement (4, 4)."""
+
+
+class Teacher:
+    """Teaches fields what others show, within one command's budget."""
+
+    def __init__(self, request: Learning, rgb: bool, place: str, progress, tries: int = 1):
+        """rgb: whether it finishes on pictures; tries: how many times it may be asked, about."""
+        self.seed, self.rgb, self.place, self.progress = request.seed, rgb, place, progress
+        self.budget, self.tries = Budget(request.time_budget), tries
+
+    def __call__(self, teacher: RadianceField, student: StoredField) -> StoredField:
+        """The student, taught, with its numbers on the CPU."""
+        seconds = self.budget.part(max(1, self.tries))
+        self.tries -= 1
+        settings = replace(SETTINGS, seed=self.seed, time_budget=seconds)
+        rays = RaySampler([teacher.occupancy.subject])
+        run = DistillRun(teacher, student.to(self.place), rays, settings, self.rgb)
+        learnt, _ = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
+        self.budget.spent += run.learnt_seconds
+        return learnt.to("cpu")
 
 
 def hole_of(
-    rest: StoredField, box: np.ndarray, up: np.ndarray, gone: StoredField | None = None
+    rest: RadianceField, box: np.ndarray, up: np.ndarray, gone: StoredField | None = None
 ) -> tuple[list[Placed], float]:
     """Smooth surfaces for the hole that an object of a box (6,) leaves, placed in the frame of `rest`, and
     the share of what was behind it that is seen nowhere (`patches`)."""
@@ -52,49 +92,49 @@ def hole_of(
     return [Placed(FILLED, patch, np.eye(4)) for patch in found], share
 
 
-def up_of(fused: Fused) -> np.ndarray:
-    """(3,) the direction in the field's frame that its cameras hold upwards, or the world's z."""
-    cameras = fused.scene.cameras
-    up = np.array([0.0, 0.0, 1.0]) if cameras is None else read_rig(cameras).up
-    own = up @ placement(fused.origin)[:3, :3]
+def up_of(scene: SceneGraph, origin: np.ndarray) -> np.ndarray:
+    """(3,) the direction, in a frame at an origin, that a scene's cameras hold upwards, or the world's z."""
+    up = np.array([0.0, 0.0, 1.0]) if scene.cameras is None else read_rig(scene.cameras).up
+    own = up @ placement(origin)[:3, :3]
     return own / np.linalg.norm(own)
 
 
-def put_in(fused: Fused, field: StoredField, placed: list[Placed], teach: Teacher) -> StoredField:
-    """A field of the bundle's kind with fields placed in its frame."""
-    for one in placed:
-        try:
-            field = fused.kind.added(field, [one], teach).field
-        except ValueError as error:
-            raise InvalidInput(f"{fused.path}: {error}") from error
-    return field
+def learnt_surfaces(surfaces: list[Placed], teach: Teacher) -> list[Placed]:
+    """Smooth surfaces as fields that a bundle can hold, each placed where it was."""
+    kind, found = registry.kind(registry.DEFAULT), []
+    for one in surfaces:
+        teacher = ComposedField([one])
+        generator = torch.Generator().manual_seed(teach.seed)
+        student = kind.empty(teacher, Way(), NUMBERS, generator, one.name)
+        found.append(Placed(one.name, teach(teacher, student), placement(teacher.origin)))
+    return found
 
 
 def mended(
     request: MendingRequest,
-    fused: Fused,
+    frame: Frame,
     rest: StoredField,
     found: StoredField,
     memory: Memory,
     place: str,
     progress,
-) -> tuple[StoredField, dict]:
-    """What is left of a field without an object, with the hole filled as was asked for, and what the report
-    says of the hole."""
-    teach = Teacher(request, False, place, progress, 3)
-    box, told = found.occupancy.subject, {}
+) -> tuple[list[Placed], dict]:
+    """What fills the hole that an object leaves in a field, as was asked for, placed in the field's frame,
+    and what the report says of the hole."""
+    told, fillings = {}, []
     if request.refit:
-        learnt, told = learnt_from(request, fused, found, memory, place, progress)
+        learnt, told = learnt_from(request, frame, found, memory, place, progress)
         behind = in_hole(learnt, rest, found)
         if behind is None:
             progress.warn(f"{request.refit}: its photos show nothing in the place of the object")
         else:
-            rest = put_in(fused, rest, [Placed(LEARNT, behind, np.eye(4))], teach)
-    surfaces, unseen = hole_of(rest, box, up_of(fused), found)
+            fillings.append(Placed(LEARNT, behind, np.eye(4)))
+    whole = ComposedField([Placed("", rest, np.eye(4)), *fillings], origin=np.eye(4)) if fillings else rest
+    surfaces, unseen = hole_of(whole, found.occupancy.subject, up_of(frame.scene, frame.origin), found)
     if request.fill and surfaces:
         progress.phase("filling", None)
-        rest = put_in(fused, rest, surfaces, teach)
-    return rest, told | {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}
+        fillings += learnt_surfaces(surfaces, Teacher(request, False, place, progress, len(surfaces)))
+    return fillings, told | {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}
 
 
 def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredField | None:
@@ -122,7 +162,7 @@ def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredFie
 
 def learnt_from(
     request: MendingRequest,
-    fused: Fused,
+    frame: Frame,
     found: StoredField | None,
     memory: Memory,
     place: str,
@@ -131,8 +171,8 @@ def learnt_from(
     """A field in the frame of the bundle's, learnt from photos with the pixels of an object left out (None:
     the photos show none), and what the report says of it."""
     progress.phase("reading photos", None)
-    capture = posed_as(posed_capture(request.refit, None, request.threads, progress), fused, progress)
-    extent = extent_like(fused, capture)
+    capture = posed_as(posed_capture(request.refit, None, request.threads, progress), frame, progress)
+    extent = extent_like(frame, capture)
     kind = registry.kind(registry.DEFAULT)
     wanted = wanted_of(request)
     settings = fit_settings(wanted, kind, capture, extent, place)
@@ -147,23 +187,23 @@ def learnt_from(
     return field.to("cpu"), {"photos": len(capture.train), "training_psnr": run.psnr}
 
 
-def posed_as(capture: Capture, fused: Fused, progress) -> Capture:
+def posed_as(capture: Capture, frame: Frame, progress) -> Capture:
     """A capture whose photos stand where the bundle's cameras of their names do, or, of a bundle that keeps
     none of them, where the capture says; all of them to learn from."""
     views = capture.train + capture.test
-    rig = {} if fused.scene.cameras is None else {v.name: v for v in read_rig(fused.scene.cameras).views}
+    rig = {} if frame.scene.cameras is None else {v.name: v for v in read_rig(frame.scene.cameras).views}
     known = tuple(replace(v, camera_to_world=rig[v.name].camera_to_world) for v in views if v.name in rig)
     if not known and rig:
         progress.warn(
-            f"{capture.path}: none of its photos is named as a camera of {fused.path}; they are taken to "
+            f"{capture.path}: none of its photos is named as a camera of {frame.path}; they are taken to "
             "stand in its world where they say"
         )
     return replace(capture, train=known or views, test=())
 
 
-def extent_like(fused: Fused, capture: Capture) -> Extent:
+def extent_like(frame: Frame, capture: Capture) -> Extent:
     """The extent of the bundle's own field, for cameras of its world."""
-    origin, field = placement(fused.origin), fused.field
+    origin, field = placement(frame.origin), frame.field
     box = field.occupancy.aabb
     if field.occupancy.space is bounded:
         return Extent(box, origin)
@@ -179,11 +219,9 @@ def wanted_of(request: MendingRequest) -> TrainRequest:
     """A training as `train` without options would do it."""
     seconds = SHARE * request.time_budget if request.time_budget else SECONDS
     return TrainRequest(
-        source=request.refit, output=request.output, overwrite=request.overwrite, kind=registry.DEFAULT,
-        quality=None, ranks=None, sh_degree=None, precision="float16", max_size=None, target_psnr=None,
-        holdout=None, views=0, size=0, aabb=None, unbounded=None, centre=None, radius=None, downscale=None,
-        masks="ignore", refine_poses=False, memory=request.memory, resume=False, time_budget=seconds,
-        seed=request.seed, device=request.device, threads=request.threads,
+        request.refit, request.output, overwrite=request.overwrite, precision="float16",
+        memory=request.memory, time_budget=seconds, seed=request.seed, device=request.device,
+        threads=request.threads,
     )  # fmt: skip
 
 

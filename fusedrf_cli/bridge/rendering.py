@@ -17,7 +17,7 @@ from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.composite import Composite, can_be_composite
+from fusedrf_cli.engine.composition.composite import Composite, as_composite
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -44,7 +44,7 @@ def render(request: RenderRequest, progress) -> dict:
         progress.phase("reading", None)
         budget = Memory(request.memory)
         loaded = load_scene(request.scene, request.allow_outside, budget, place)
-        field, origin = renderable(loaded)
+        field, origin = renderable(loaded, reference=True)
         views = choose_views(request, loaded, field, origin)
         if suffix in FILMS:
             check_sizes(output, views)
@@ -112,14 +112,14 @@ def rays_of(views: list[Camera]) -> int:
     return sum(view.width * view.height for view in views)
 
 
-def renderable(loaded: LoadedScene) -> tuple[object, np.ndarray]:
+def renderable(loaded: LoadedScene, reference: bool = False) -> tuple[object, np.ndarray]:
     """The field to march, and where its frame lies in the world (see `render_image`): a lone field is taken
-    as it is.
+    as it is; the nodes of a bundle are a Composite, but for a reference, where they can be.
     """
     if (lone := loaded.lone()) is not None:
         return lone
     composed = loaded.composed()
-    return composed, composed.origin
+    return composed if reference or loaded.bundle is None else as_composite(composed), composed.origin
 
 
 def in_memory(loaded: LoadedScene, field: RadianceField, needed: dict, budget: Memory) -> RadianceField:
@@ -128,9 +128,7 @@ def in_memory(loaded: LoadedScene, field: RadianceField, needed: dict, budget: M
     if not isinstance(field, ComposedField) or budget.room(sources(loaded.resident) | needed) < 0:
         return field
     loaded.shelf.resize(sum(loaded.sizes))
-    if not can_be_composite(field.placed, field.rule):
-        return field
-    return Composite(loaded.placed, loaded.composition)
+    return as_composite(field)
 
 
 def check_sizes(output: str, views: list[Camera]) -> None:

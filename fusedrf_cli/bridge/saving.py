@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from formats.bundle import BundleWriter
+from formats.graph import placement_of, shown
 from formats.records import FieldRecord
-from formats.scene import Node, SceneGraph, make_node
+from formats.scene import Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.rigs import kept_cameras
 from fusedrf_cli.bridge.scene import LoadedScene
@@ -35,12 +36,14 @@ def save_scene(
         field = fields[name]
         if id(field) not in members:
             members[id(field)] = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
-        nodes.append(placed_node(name, members[id(field)], placements[name], source.background))
+        tint = getattr(field, "tint", None)  # which the field itself does not store
+        node = placed_node(name, members[id(field)], placements[name], source.background)
+        nodes.append(node if tint is None else shown(node, {"tint": list(tint)}))
     history = ()
     if scene.bundle is not None:
         history = scene.graph.history
-        shown = {source.member for source in scene.fields}
-        for member in scene.bundle.headers.keys() - shown:
+        placed = {source.member for source in scene.fields}
+        for member in scene.bundle.headers.keys() - placed:
             writer.copy_field(scene.bundle, member)
     graph = SceneGraph(
         tuple(nodes),
@@ -51,13 +54,10 @@ def save_scene(
         framing=scene.graph.framing,
         cameras=kept_cameras(scene),
     )
-    writer.write(output, graph, overwrite=overwrite)
+    writer.write(output, writer.unfolded(graph), overwrite=overwrite)
     return Path(output).stat().st_size
 
 
 def placed_node(name: str, member: str, object_to_world: np.ndarray, background: bool) -> Node:
-    """A node that holds a field; one that is only moved says so, which edits of a fused field ask for."""
-    only_moved = np.array_equal(object_to_world[:3, :3], np.eye(3))
-    shift = object_to_world[:3, 3] if object_to_world[:3, 3].any() else None
-    place = {"translation": shift} if only_moved else {"matrix": object_to_world}
-    return make_node(name, field=member, background=background, **place)
+    """A node that holds a field, placed by a (4, 4)."""
+    return Node(name, member, None, placement_of(object_to_world), background)

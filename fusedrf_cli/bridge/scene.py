@@ -11,10 +11,12 @@ import numpy as np
 
 from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
+from formats.graph import free_name, placement_of, with_nodes
 from formats.records import FieldRecord, as_stored, reading_size
 from formats.scene import (
     WHITE,
     Leaf,
+    Node,
     SceneGraph,
     check_affine,
     dump_scene,
@@ -30,6 +32,7 @@ from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
+from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
@@ -55,6 +58,9 @@ class SourceField:
     needs: FieldNeeds
     whole: bool = True
     """Whether it is shown as the bundle has it."""
+    groups: tuple[tuple[str, str], ...] = ()
+    """The groups of nodes that it is in which have a rule of their own, from the root down, and their
+    rules."""
 
 
 FoundField = tuple[Leaf, OpenBundle, str]
@@ -105,7 +111,9 @@ class LoadedScene:
 
     def composed(self) -> ComposedField:
         """The scene as one field."""
-        return ComposedField(self.placed, self.composition)
+        return ComposedField(
+            grouped(self.placed, [f.groups for f in self.fields], self.composition), self.composition
+        )
 
     def lone(self) -> tuple[StoredField, np.ndarray] | None:
         """The field of a scene that is one field, and where its frame lies in the world: a position (3,)
@@ -114,6 +122,28 @@ class LoadedScene:
             placed = self.fields[0].placed
             return opened(placed.field), short_origin(placed.object_to_world)
         return None
+
+
+def grouped(placed: Sequence[Placed], groups: Sequence[tuple], rule: str, depth: int = 0) -> list[Placed]:
+    """Placed fields, in groups of nodes, as what is composed by a rule: groups of another rule are fields of
+    their own, placed where their frames lie."""
+    found, start = [], 0
+    while start < len(placed):
+        group = groups[start][depth] if len(groups[start]) > depth else None
+        end = start + 1
+        while group is not None and end < len(placed) and groups[end][depth : depth + 1] == (group,):
+            end += 1
+        if group is None:
+            found.append(placed[start])
+        else:
+            own = grouped(placed[start:end], groups[start:end], group[1], depth + 1)
+            if group[1] == rule or len(own) == 1:
+                found += own
+            else:
+                inner = ComposedField(own, group[1])
+                found.append(Placed(group[0], inner, placement(inner.origin)))
+        start = end
+    return found
 
 
 def make_field(record: FieldRecord, where: str) -> StoredField:
@@ -182,6 +212,13 @@ def load_scene(
         bundle = OpenBundle(path)
         return _Loader(Path(path), budget, place).load(bundle.scene, allow_outside, bundle)
     return _Loader(Path(path), budget, place).load(expand_scene(path, allow_outside), allow_outside)
+
+
+def load_bundle(
+    bundle: OpenBundle, graph: SceneGraph, budget: Memory | None = None, place: str = "cpu"
+) -> LoadedScene:
+    """As `load_scene`, of a bundle that is open, by its graph or another one over its fields."""
+    return _Loader(bundle.path, budget, place).load(graph, False, bundle)
 
 
 def load_found(
@@ -255,6 +292,8 @@ class _Loader:
         if scene.cameras is not None:
             self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
+        if len(inner) > 1:
+            leaf = replace(leaf, groups=(*leaf.groups, (leaf.name, scene.composition)))
         return [
             (replace(node.inside(leaf), name=name), self.bundles[path], node.field)
             for name, node in zip(named, inner, strict=True)
@@ -276,7 +315,7 @@ class _Loader:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
-        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole)
+        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole, leaf.groups)
 
 
 def key_of(leaf: Leaf, member: str) -> str:
@@ -353,18 +392,25 @@ def write_field(
     extras: dict | None = None,
     framing: Sequence[float] | None = None,
     cameras: dict | None = None,
+    beside: Sequence[Placed] = (),
 ) -> int:
     """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
-    node is placed at `origin`: a position (3,), or a placement (4, 4). Returns the bytes written. `extras`
-    are the scene's keys that this version does not know; framing (6,) and cameras are what pictures of it
-    show (bridge/rigs.py).
+    node is placed at `origin`: a position (3,), or a placement (4, 4). Of a field that holds several objects
+    each becomes a node. Returns the bytes written. `extras` are the scene's keys that this version does not
+    know; framing (6,) and cameras are what pictures of it show (bridge/rigs.py). beside: fields placed in its
+    frame that are nodes of their own.
     """
     writer = BundleWriter()
-    for member, bundle in (kept or {}).items():
-        writer.copy_field(bundle, member)
-    arrays, metadata = field.state()
-    member = writer.add_field(FieldRecord(field.kind, arrays, metadata), precision)
+    member = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
     graph = replace(graph_of(member, name, origin, framing, cameras), history=history, extras=extras or {})
+    taken, at = {name}, placement(np.zeros(3) if origin is None else origin)
+    for one in beside:
+        own = writer.add_field(FieldRecord(one.field.kind, *one.field.state()), precision)
+        place = placement_of(at @ one.object_to_world)
+        graph = with_nodes(graph, [Node(free_name(one.name, taken), own, None, place)])
+    graph = writer.unfolded(graph)
+    for kept_member, bundle in (kept or {}).items():
+        writer.copy_field(bundle, kept_member)
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
 
@@ -378,7 +424,7 @@ def graph_of(
 ) -> SceneGraph:
     """The scene of a bundle of one field; see `write_field`."""
     return SceneGraph(
-        nodes=(make_node(name, field=member, **placement_of(origin)),),
+        nodes=(make_node(name, field=member, **({} if origin is None else placement_of(placement(origin)))),),
         generator=f"fusedrf {__version__}",
         framing=None if framing is None else tuple(float(number) for number in framing),
         cameras=cameras,
@@ -404,15 +450,3 @@ def short_origin(object_to_world: np.ndarray) -> np.ndarray:
     """A placement (4, 4), or, where it only moves, the position (3,)."""
     moves = np.array_equal(object_to_world[:3, :3], np.eye(3))
     return object_to_world[:3, 3] if moves else object_to_world
-
-
-def placement_of(origin: np.ndarray | None) -> dict:
-    """What a node says of where it lies, as `make_node` takes it: a position (3,), or a placement (4, 4)."""
-    if origin is None or not np.any(origin) or np.array_equal(origin, np.eye(4)):
-        return {}
-    if origin.shape == (3,):
-        return {"translation": [float(v) for v in origin]}
-    unit = float(origin[0, 0])
-    if not np.array_equal(origin[:3, :3], unit * np.eye(3)):
-        return {"matrix": origin}
-    return placement_of(origin[:3, 3]) | ({} if unit == 1 else {"scale": [unit] * 3})

@@ -1,35 +1,31 @@
-"""`fusedrf delete`: objects out of a fused field."""
+"""`fusedrf delete`: objects out of a bundle."""
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import DeleteRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("delete")
 @click.argument("fused", type=options.INPUT)
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @options.mending
 @options.keep_history
 @options.time_budget
 @options.rgb
 @options.memory
-@options.edited_precision
 @options.allow_outside
 @options.seeded
 @options.reporting
-def command(fused, names, output, progress, **words):
-    """Take objects out of a fused field.
+def command(**words):
+    """Take objects out of a bundle.
 
-    An object that the field holds apart is taken out as it is. Of others the region is emptied, and shows
-    what they hid where the other sources are known, or --refit gives photos of it. With --fill what nobody
-    saw goes on smoothly with what is seen around it.
+    An object that is a node goes as it is. Of one that was distilled into a field with others the region is
+    emptied, and shows what it hid where the other sources are known, or --refit gives photos of it. With
+    --fill what nobody saw goes on smoothly with what is seen around it.
 
     \b
     Example:
       fusedrf delete fused.rfpack lamp chair-2 -o less.rfpack
     """
-    from fusedrf_cli import bridge
-
-    return bridge.delete(DeleteRequest(fused=fused, names=names, output=output, **words), progress)
+    return verbs.delete(**words)

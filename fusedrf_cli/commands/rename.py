@@ -1,39 +1,25 @@
-"""`fusedrf rename`: another name for an object of a fused field."""
+"""`fusedrf rename`: another name for an object of a bundle."""
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ArrangeRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("rename")
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("new_name", metavar="NEW")
-@options.writing("The fused field to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @options.keep_history
 @options.memory
 @options.reporting
-def command(fused, name, new_name, progress, **words):
-    """Give an object of a fused field another name.
+def command(**words):
+    """Give an object of a bundle another name.
 
-    The object has to be held apart, as in fields of --kind blocks.
+    The object has to be a node of its own, as in bundles of --kind blocks.
 
     \b
     Example:
       fusedrf rename fused.rfpack chair red-chair -o named.rfpack
     """
-    from formats.scene import make_node
-
-    node = make_node(new_name)
-    from fusedrf_cli import bridge
-
-    request = ArrangeRequest(
-        fused=fused,
-        name=name,
-        new_name=new_name,
-        matrix=node.node_to_parent,
-        absolute=True,
-        **words,
-    )
-    return bridge.rename(request, progress)
+    return verbs.rename(**words)

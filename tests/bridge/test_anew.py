@@ -2,12 +2,14 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
 
 VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
 BLOCKS = ("--kind", "blocks", "--no-rgb")
+SMALL = (*BLOCKS, "--max-size", "30kB")
 
 
 def members(path) -> list[str]:
@@ -21,18 +23,29 @@ def test_a_fused_bundle_is_fused_anew_from_what_is_in_it_now(report, folder):
     report("fuse", "less.rfpack", "-o", "anew.rfpack", *BLOCKS)
     report("fuse", "pair.json", "-o", "direct.rfpack", *BLOCKS)
     assert members(folder / "anew.rfpack") == members(folder / "direct.rfpack")
-    nodes = [read_bundle(folder / f"{name}.rfpack").scene.history[0]["nodes"] for name in ("anew", "direct")]
-    assert nodes[0] == nodes[1]
+    scenes = [read_bundle(folder / f"{name}.rfpack").scene for name in ("anew", "direct")]
+    assert [node.name for node in scenes[0].nodes] == [node.name for node in scenes[1].nodes]
+    for one, other in zip(*(scene.leaves() for scene in scenes), strict=True):
+        np.testing.assert_allclose(one.object_to_world, other.object_to_world, atol=1e-12)
+
+
+def test_what_is_as_its_source_is_needs_none(report, folder):
+    report("fuse", "pair.json", "-o", "fused.rfpack", *BLOCKS)
+    for name in ("floor", "red"):
+        (folder / f"{name}.rfpack").unlink()
+    said = report("fuse", "fused.rfpack", "-o", "anew.rfpack", *BLOCKS)
+    assert members(folder / "anew.rfpack") == members(folder / "fused.rfpack") and not said["warnings"]
 
 
 def test_sources_are_found_by_their_checksum(report, run, folder):
-    report("fuse", "pair.json", "-o", "fused.rfpack", *BLOCKS)
+    report("fuse", "pair.json", "-o", "fused.rfpack", *SMALL)
     (folder / "attic" / "deep").mkdir(parents=True)
     (folder / "floor.rfpack").rename(folder / "attic" / "deep" / "renamed.rfpack")
     shutil.copy(folder / "blue.rfpack", folder / "floor.rfpack")  # of the right name, and another thing
-    said = report("fuse", "fused.rfpack", "-o", "anew.rfpack", *BLOCKS, "--sources", "attic")
-    assert members(folder / "anew.rfpack") == members(folder / "fused.rfpack") and not said["warnings"]
-    said = report("fuse", "fused.rfpack", "-o", "itself.rfpack", *BLOCKS)
+    said = report("fuse", "fused.rfpack", "-o", "anew.rfpack", *SMALL, "--sources", "attic")
+    assert members(folder / "anew.rfpack") == members(folder / "fused.rfpack")
+    assert not any("is not found" in warning for warning in said["warnings"])
+    said = report("fuse", "fused.rfpack", "-o", "itself.rfpack", *SMALL)
     assert "'floor' is not found" in said["warnings"][0] and "--sources" in said["warnings"][0]
     (folder / "empty").mkdir()
     result = run("fuse", "fused.rfpack", "-o", "no.rfpack", "--sources", "empty")

@@ -110,7 +110,7 @@ def filled(world: World) -> World:
     report("duplicate", "three.rfpack", "red", "red-2", *beside, "-o", "two.rfpack")
     ball = f"{world.point(*PLACES['red'])},{0.6 * world.unit!r}"
     report("extract", "three.rfpack", "--sphere", ball, "--invert", "-o", "cut.rfpack")
-    report("add", "box.rfpack", "blue.rfpack", *blue, "--no-rgb", "-o", "both.rfpack")
+    report("add", "box.rfpack", "blue.rfpack", *blue, "-o", "both.rfpack")
     for name in ("box", "all", "pair", "three", "moved", "less", "alone", "two", "cut", "both"):
         report("validate", f"{name}.rfpack")
         report("info", f"{name}.rfpack")

@@ -239,7 +239,7 @@ def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, 
     red = (wanted[..., 0] > 0.6) & (wanted[..., 2] < 0.4)
     near = np.pad(red, 2)
     near = np.any([np.roll(near, (a, b), (0, 1)) for a in range(-2, 3) for b in range(-2, 3)], 0)[2:-2, 2:-2]
-    assert red.sum() > 5 and psnr(one[~near], wanted[~near]) > 28
+    assert red.sum() > 5 and psnr(one[~near], wanted[~near]) > 34
     assert ((one[red][:, 0] > 0.5) & (one[red][:, 2] < 0.5)).mean() > 0.6
 
 
@@ -248,17 +248,10 @@ def test_an_object_comes_into_a_place_and_goes_again(picture, report):
     said = report(
         "add", "fused.rfpack", "blue.rfpack", "--name", "blue", "-t", "0.7,0,0", "-o", "more.rfpack"
     )
-    assert said["psnr"]["before_rgb"] > 35
     np.testing.assert_allclose(said["touched"]["aabb"], [0.4, -0.3, -0.3, 1.0, 0.3, 0.3], atol=1e-6)
     assert blues(before) == 0 and blues(picture("more.rfpack")) > 20
     report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
-    assert psnr(picture("less.rfpack"), before) > 60
-
-
-def test_a_place_is_not_added_around_another(run, folder):
-    shutil.copy(folder / "room.rfpack", folder / "hall.rfpack")
-    result = run("add", "fused.rfpack", "hall.rfpack", "--name", "hall", "--scale", "3", "-o", "x.rfpack")
-    assert result.exit_code == 3 and "fills all of space" in result.stderr
+    assert np.array_equal(picture("less.rfpack"), before)
 
 
 def test_one_place_in_the_core_of_another(folder, picture, report):

@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from formats.bundle import single_field_bundle
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import background_of, load_scene
+from fusedrf_cli.bridge.scene import background_of, grouped, load_scene
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.errors import InvalidInput
 from tests.bridge.conftest import FIELDS, PLACES
@@ -112,3 +116,42 @@ def test_nodes_that_show_a_field_differently_each_count(folder):
     write_scene(folder / "thinned.json", SceneGraph(tuple(nodes)))
     sizes = load_scene(str(folder / "thinned.json")).sizes
     assert len(sizes) == 8 and len(load_scene(str(folder / "scene.json")).sizes) == 3
+
+
+class Fog:
+    """One density everywhere in the unit cube, and one colour."""
+
+    kind, voxel_size = "fog", 0.1
+    occupancy = OccupancyGrid.full(np.array([0, 0, 0, 1.0, 1, 1]))
+    aabb = occupancy.aabb
+
+    def __init__(self, sigma: float, rgb: tuple):
+        self.sigma, self.rgb = sigma, rgb
+
+    def query(self, points, dirs, with_colour=True):
+        inside = ((points >= 0) & (points <= 1)).all(1)
+        return self.sigma * inside.float(), torch.tensor([self.rgb]).repeat(len(points), 1)
+
+
+def test_groups_of_nodes_have_a_rule_of_their_own():
+    """In the middle of three cubes, two of which add up before the densest of that and the third is taken."""
+    at = np.eye(4)
+    at[:3, 3] = 5, 0, 0
+    fogs = {"a": Fog(1.0, (1.0, 0, 0)), "b": Fog(3.0, (0, 1.0, 0)), "c": Fog(3.5, (0, 0, 1.0))}
+    placed = [Placed(name, fog, at) for name, fog in fogs.items()]
+    point, way = torch.tensor([[5.5, 0.5, 0.5]], dtype=torch.float64), torch.tensor([[0, 0, 1.0]]).double()
+    pair = [(("g", "add"),)] * 2
+    cases = {
+        "max": ([()] * 3, "max", 3.5, (0, 0, 1)),
+        "max of a sum": ([*pair, ()], "max", 4.0, (0.25, 0.75, 0)),
+        "sum of a max": ([(("g", "max"),)] * 2 + [()], "add", 6.5, (0, 3 / 6.5, 3.5 / 6.5)),
+        "a sum in a sum": ([*pair, ()], "add", 7.5, (1 / 7.5, 3 / 7.5, 3.5 / 7.5)),
+        "a sum in a max in a sum": (
+            [(("h", "max"), ("h/g", "add"))] * 2 + [(("h", "max"),)], "add", 4.0, (0.25, 0.75, 0)
+        ),
+    }  # fmt: skip
+    for name, (groups, rule, sigma, rgb) in cases.items():
+        field = ComposedField(grouped(placed, groups, rule), rule)
+        found, colour = field.query(point - torch.from_numpy(field.origin), way)
+        assert float(found[0]) == pytest.approx(sigma), name
+        np.testing.assert_allclose(colour[0].numpy(), rgb, atol=1e-6, err_msg=name)

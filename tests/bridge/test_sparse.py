@@ -42,7 +42,7 @@ def fused(made):
 
 def field_of(folder, name: str):
     bundle = read_bundle(folder / name)
-    (leaf,) = bundle.scene.leaves()
+    leaf = bundle.scene.leaves()[0]
     return make_field(bundle.fields[leaf.field], name), leaf.object_to_world[:3, 3]
 
 
@@ -78,24 +78,27 @@ def test_equal_seeds_give_equal_bytes(report, folder):
 
 
 def test_added_and_deleted_it_is_as_before(fused, report, folder, picture):
-    """Numbers outside the new object's box are the same bits all along."""
+    """What is added is a node, and the bricks stay as they are."""
     before = picture("sparse.rfpack")
     said = report("add", "sparse.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
-    assert said["touched"]["bricks"] > 10
+    assert said["touched"]["nodes"] == 2
     more = picture("more.rfpack")
     assert blues(more) > 20 and blues(before) == 0
     away = ~covered("blue")
-    assert psnr(more[away], before[away]) >= 45
-    box = np.asarray(said["touched"]["aabb"])
-    touched = report("delete", "more.rfpack", "blue", "-o", "less.rfpack")["touched"]["aabb"]
-    assert np.abs(np.asarray(touched) - box).max() < 0.1
-    rows = [rows_by_place(folder, f"{name}.rfpack") for name in ("sparse", "more", "less")]
-    for other, aabb in zip(rows[1:], (box, np.asarray(touched)), strict=True):
-        low, high = aabb[:3] - 1e-4, aabb[3:] + 1e-4
-        outside = [p for p in rows[0] if (p < low).any() or (p > high).any()]
-        assert all(other[p] == rows[0][p] for p in outside if p in other)
-        assert sum(p in other for p in outside) > 0.98 * len(outside)
-    assert blues(picture("less.rfpack")) == 0 and psnr(picture("less.rfpack"), before) > 30
+    assert psnr(more[away], before[away]) >= 40  # on another lattice
+    report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
+    assert np.array_equal(picture("less.rfpack"), before)
+    one, other = (read_bundle(folder / f"{name}.rfpack") for name in ("sparse", "less"))
+    assert one.fields.keys() == other.fields.keys() and one.scene.nodes == other.scene.nodes
+
+
+def test_of_a_deleted_object_no_other_number_changes(fused, report, folder):
+    said = report("delete", "sparse.rfpack", "red", "-o", "less.rfpack")
+    aabb = np.asarray(said["touched"]["aabb"])
+    rows = [rows_by_place(folder, f"{name}.rfpack") for name in ("sparse", "less")]
+    assert rows[1].items() <= rows[0].items()
+    outside = [p for p in rows[0] if (p < aabb[:3] - 0.1).any() or (p > aabb[3:] + 0.1).any()]
+    assert outside and all(p in rows[1] for p in outside)
 
 
 def test_what_a_deleted_object_hid_comes_back_from_its_source(fused, report, picture):

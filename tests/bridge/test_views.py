@@ -22,7 +22,7 @@ from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera, azimuth_of, framing_camera, orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -250,7 +250,7 @@ def test_cameras_are_those_of_the_background_or_of_the_only_source_that_has_any(
 def test_fused_converted_and_edited_bundles_keep_the_cameras(report, folder):
     place(folder, "s.json", TURNED, True, "blue")
     report("fuse", "s.json", "-o", "f.rfpack", *SMALL)
-    report("add", "f.rfpack", "blue.rfpack", "--name", "more", "-t", "9,0,0", "-o", "g.rfpack", *SMALL)
+    report("add", "f.rfpack", "blue.rfpack", "--name", "more", "-t", "9,0,0", "-o", "g.rfpack")
     report("delete", "g.rfpack", "blue", "-o", "h.rfpack", *SMALL)
     report("fuse", "h.rfpack", "-o", "i.rfpack", *SMALL)
     kept = cameras_in(folder, "f.rfpack")
@@ -285,7 +285,7 @@ def test_a_scene_saved_from_python_keeps_its_cameras(folder):
 def test_an_edit_does_not_move_the_view(report, folder):
     """Objects far away come and go; the scene, what is fused of it and what is edited look alike."""
     report("fuse", "pair.json", "-o", "f.rfpack", *SMALL)
-    report("add", "f.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack", *SMALL)
+    report("add", "f.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack")
     report("delete", "g.rfpack", "red", "-o", "h.rfpack", *SMALL)
     report("convert", "f.rfpack", "--kind", "vm", "-o", "i.rfpack", "--max-size", "400kB")
     for asked in ({}, {"orbit": 3}, {"zoom": 2.0, "direction": (10.0, 20.0)}):
@@ -297,7 +297,7 @@ def test_an_edit_does_not_move_the_view(report, folder):
 
 def test_an_edit_of_a_trained_field_does_not_move_the_view_either(report, folder):
     before = views_of(folder, "red.rfpack")[0]
-    report("add", "red.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack", *SMALL)
+    report("add", "red.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack")
     assert same(views_of(folder, "g.rfpack")[0], before)
 
 
@@ -411,7 +411,7 @@ def test_a_picture_from_a_side(report, folder):
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(part("training"), "QUALITY", {"draft": FitSettings(longest=64, steps=5, samples=512)})
+    monkeypatch.setattr(part("training"), "QUALITY", {"draft": TrainConfig(longest=64, steps=5, samples=512)})
 
 
 def speckled_capture(folder, count: int = 6) -> list[View]:

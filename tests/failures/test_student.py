@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from formats.bundle import read_bundle, read_headers
 from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
-from fusedrf_cli.bridge.scene import make_field, write_field
+from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
@@ -103,14 +103,9 @@ def reached(box: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return (spans[:, 1] > spans[:, 0]).reshape(48, 48)
 
 
-def tensors(path) -> list[bytes]:
-    """The numbers of every tensor of a fused bundle."""
-    (record,) = (r for r in read_bundle(path).fields.values())
-    found: dict[str, bytes] = {}
-    for name, array in sorted(record.arrays.items()):
-        tensor = name.split(".")[0]
-        found[tensor] = found.get(tensor, b"") + array.tobytes()
-    return [found[name] for name in sorted(found, key=lambda name: int(name.removeprefix("tensor_")))]
+def fields(path) -> list[str]:
+    """The fields of a bundle's nodes, by members, whose names are made of their bytes."""
+    return [leaf.field for leaf in read_bundle(path).scene.leaves()]
 
 
 # -- C1: outside the bounds ----------------------------------------------------------------------------------
@@ -123,8 +118,8 @@ def test_c1_an_object_beyond_the_bounds_leaves_the_rest(row, folder, growth):
     x = 2.8 * (growth - 1) + 1.4
     words = ("blue.rfpack", "--name", "far", "-t", f"{-x},0,0")
     done(folder, "add", "pair.rfpack", *words, "-o", "far.rfpack")
-    kept = tensors(folder / "far.rfpack")[:2] == tensors(folder / "pair.rfpack")
-    row.check("C1", f"old tensors bit-equal at g = {growth:g}", kept, 1)
+    kept = fields(folder / "far.rfpack")[:2] == fields(folder / "pair.rfpack")
+    row.check("C1", f"old fields bit-equal at g = {growth:g}", kept, 1)
     away = ~reached(PARTS["blue"][0].aabb, affine(1.0, (-x, 0, 0)))
     wanted = truth("floor", "red")[away]  # samples begin at the larger box, so the two pictures differ a bit
     lost = psnr(before[away], wanted) - psnr(picture(folder, "far.rfpack")[away], wanted)
@@ -173,8 +168,8 @@ def test_c3_added_and_deleted_is_as_before(row, folder):
     words = ("blue.rfpack", "--name", "blue", "-t", "0.7,0,-0.1")
     done(folder, "add", "pair.rfpack", *words, "-o", "more.rfpack")
     done(folder, "delete", "more.rfpack", "blue", "-o", "less.rfpack")
-    same = tensors(folder / "less.rfpack") == tensors(folder / "pair.rfpack")
-    row.check("C3", "tensors bit-equal after add and delete", same, 1)
+    same = fields(folder / "less.rfpack") == fields(folder / "pair.rfpack")
+    row.check("C3", "fields bit-equal after add and delete", same, 1)
     before, after = picture(folder, "pair.rfpack"), picture(folder, "less.rfpack")
     row.check("C3", "add then delete against fuse without", psnr(after, before), 50.0, unit="dB")
     away = ~reached(*[PARTS["blue"][0].aabb, PARTS["blue"][1]])
@@ -182,28 +177,27 @@ def test_c3_added_and_deleted_is_as_before(row, folder):
 
 
 def test_c3_out_of_one_tensor_what_lies_outside_stays(row, folder):
-    """Every number of the distilled tensor, and its occupancy outside the whole cells of the box."""
-    done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
-    (old,), new = (tensors(folder / name) for name in ("vm.rfpack", "less.rfpack"))
-    bits = len(bytes_of_grid(folder / "vm.rfpack"))
-    row.check("C3", "numbers of the distilled tensor kept", old[:-bits] in new[0] + b"", 1)
-
-
-def bytes_of_grid(path) -> bytes:
-    (record,) = read_bundle(path).fields.values()
-    return record.arrays["tensor_0.occupancy"].tobytes()
+    """The distilled field answers as it did, away from the object's box."""
+    said = done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
+    old, new = (load_scene(str(folder / name)).placed[0] for name in ("vm.rfpack", "less.rfpack"))
+    box = np.array(said["touched"]["aabb"]) + 2 * old.voxel_size * np.repeat([-1, 1], 3)
+    points = old.aabb[:3] + np.random.default_rng(0).random((4000, 3)) * (old.aabb[3:] - old.aabb[:3])
+    points = torch.from_numpy(points[((points < box[:3]) | (points > box[3:])).any(1)])
+    dirs = torch.tensor([[1.0, 0, 0]], dtype=torch.float64).expand(len(points), 3)
+    found = [p.field.query(*p.to_object(points, dirs)[:2])[0] for p in (old, new)]
+    lost = (found[0] - found[1]).abs().max() / found[0].max()
+    row.check("C3", "largest change of density outside of the box", lost, 1e-3, at_most=True)
 
 
 def test_c3_without_its_sources_nothing_is_guessed(row, folder):
-    """The hole stays empty, is warned of, and the history says so."""
+    """Whether anything stood in the object's box is known from the history; where nothing did, nothing is."""
     for name in PARTS:
         (folder / f"{name}.rfpack").unlink()
     said = done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
     scene, _ = read_headers(folder / "less.rfpack")
-    told = bool(said["warnings"]) and scene.history[-1]["restored"] is False
-    row.check("C3", "nothing is guessed where sources are gone", told and len(said["touched"]) > 0, 1)
-    (record,) = read_bundle(folder / "less.rfpack").fields.values()
-    row.check("C3", "blocks made up", len(record.metadata["blocks"]) - 1, 0, at_most=True)
+    told = not said["warnings"] and scene.history[-1]["restored"] is True
+    row.check("C3", "sources of what stands elsewhere are not missed", told, 1)
+    row.check("C3", "nodes made up", len(scene.leaves()) - 1, 0, at_most=True)
 
 
 def test_c4_the_background_can_go_and_the_last_cannot(row, folder):
@@ -225,9 +219,8 @@ def test_c4_a_parent_takes_its_subtree_along(row, folder):
     nested = ("whole.rfpack", "--name", "twice", "-t", "0,0,5")
     done(folder, "add", "pair.rfpack", *nested, "-o", "nested.rfpack")
     done(folder, "delete", "nested.rfpack", "twice", "-o", "less.rfpack")
-    (record,) = read_bundle(folder / "less.rfpack").fields.values()
-    left = {block["name"] for block in record.metadata["blocks"]}
-    row.check("C4", "blocks of a deleted parent that are left", len(left - {"floor", "red"}), 0, at_most=True)
+    left = {leaf.name for leaf in read_bundle(folder / "less.rfpack").scene.leaves()}
+    row.check("C4", "nodes of a deleted parent that are left", len(left - {"floor", "red"}), 0, at_most=True)
 
 
 # -- C5, C6, C7: thin, faint, and edges ----------------------------------------------------------------------
@@ -345,8 +338,8 @@ def test_c8_c9_five_seeds_of_one_tensor(row):
         found = [render_image(student, camera, origin=teacher.origin).over(WHITE) for camera in cameras]
         figures.append(psnr(np.stack(found), truth))
     sd = float(np.std(figures, ddof=1))
-    row.check("C9", "mean - 2 sd over five seeds", np.mean(figures) - 2 * sd, 20.0, unit="dB")
-    row.check("C9", "sd over five seeds", sd, 0.5, at_most=True, unit="dB")
+    row.check("C9", "mean - 2 sd over five seeds", np.mean(figures) - 2 * sd, 25.0, unit="dB")
+    row.check("C9", "sd over five seeds", sd, 1.0, at_most=True, unit="dB")
 
 
 # -- C10, C11: precision, carving ----------------------------------------------------------------------------
@@ -369,11 +362,9 @@ def test_c10_float16_looks_like_float32(row, tmp_path, kind, density):
 def test_c11_what_is_cut_out_does_not_show_through(row, folder):
     """Out of one distilled tensor: where the object stood and nothing else is, there is nothing."""
     done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
-    (record,) = read_bundle(folder / "less.rfpack").fields.values()
-    leaf = read_bundle(folder / "less.rfpack").scene.leaves()[0]
-    field = make_field(record, "less.rfpack")
+    field = load_scene(str(folder / "less.rfpack")).composed()
     y, z = np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0.0, 0.1, 5))
-    rays_o = np.stack([np.full(25, 0.7), y.ravel(), z.ravel() + 1.5], 1) - leaf.object_to_world[:3, 3]
+    rays_o = np.stack([np.full(25, 0.7), y.ravel(), z.ravel() + 1.5], 1) - field.origin
     found = render_rays(field, rays_o, np.tile([[0.0, 0, -1.0]], (25, 1)))
     depth = found[:, 4] / np.maximum(found[:, 3], 1e-6)
     floor = 1.5 + z.ravel() + 0.5  # distance to the floor's upper face

@@ -436,10 +436,23 @@ def test_scenes_that_double_at_every_level_are_stopped(tmp_path):
 
 
 def test_a_nested_scene_keeps_the_rule_of_composition(tmp_path):
-    write_scene(tmp_path / "inner.json", SceneGraph((), "add"))
-    write_scene(tmp_path / "outer.json", SceneGraph((make_node("n", source="inner.json"),)))
+    (tmp_path / "a").touch()
+    pair = tuple(make_node(name, source="a") for name in "bc")
+    write_scene(tmp_path / "inner.json", SceneGraph(pair, "add"))
+    write_scene(tmp_path / "outer.json", SceneGraph((make_node("n", source="inner.json"), *pair)))
+    scene = expand_scene(tmp_path / "outer.json")
+    assert [(leaf.name, leaf.groups) for leaf in scene.leaves()] == [
+        ("n/b", (("n", "add"),)), ("n/c", (("n", "add"),)), ("b", ()), ("c", ())
+    ]  # fmt: skip
+    again = parse_scene(dump_scene(scene), "here")
+    assert again.nodes == scene.nodes and again.version == "1.4"
+    assert json.loads(dump_scene(scene))["requires"] == ["rules"]
+    beside = make_node("n", source="inner.json", children=pair)
+    write_scene(tmp_path / "mixed.json", SceneGraph((beside,)))
     with pytest.raises(errors.BadSchema, match="'add'.*'max'"):
-        expand_scene(tmp_path / "outer.json")
+        expand_scene(tmp_path / "mixed.json")
+    with pytest.raises(errors.BadSchema, match="neither"):
+        replace(scene.nodes[0], composition="min")
 
 
 @settings(max_examples=100, deadline=None)

@@ -1,6 +1,7 @@
 """What every kind of field does, whoever wrote it: fused, edited, trained and charted as whole commands."""
 
 import shutil
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -8,15 +9,15 @@ import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
-from fusedrf_cli.bridge.ladders import in_flags
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.commands.chart import fuse_request
-from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
+from fusedrf_cli.engine.kinds.student import Student
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import TinySettings, done
+from fusedrf_cli.requests import FuseRequest
+from fusedrf_cli.verbs import checked
+from tests.bridge.conftest import TinySettings, done, write_scene_of
 from tests.bridge.test_edit import AT, blues, covered
 
 QUICK = {"blocks", "vm"}  # the others' loops take half a minute each to compile
@@ -29,7 +30,7 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 def short(tiny):  # noqa: F811
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        patch.setattr(distill, "POINTS_PER_STEP", 1 << 11)  # a network takes its time
+        patch.setattr(Student, "lesson", TinySettings(points_per_step=1 << 11))  # a network takes its time
         yield
 
 
@@ -61,7 +62,7 @@ def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
     assert fused["chosen"]["why"] and f"--kind {kind}" in fused["chosen"]["flags"]
     own = registry.kind(kind).field
     assert own is None or type(opened(load_scene(str(folder / "fused.rfpack")).placed[0].field)) is own
-    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 13
+    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 18
     assert fused["memory"]["predicted_bytes"] > 0
 
 
@@ -75,20 +76,29 @@ def test_equal_seeds_give_equal_bytes(report, folder, kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_object_comes_and_goes(fused, report, picture, folder, kind):
-    """It shows where it was put and nowhere else; taken out, it is gone, and the report says how."""
+    """It shows where it was put and nowhere else; taken out, all is as it was, to the bit."""
     before = picture("fused.rfpack")
-    said = report("add", "fused.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
+    report("add", "fused.rfpack", "blue.rfpack", *AT, "-o", "more.rfpack")
     more, away = picture("more.rfpack"), ~covered("blue")
-    local = "the same bits" in said["touched"]["how"]
-    assert local or "is not the same to the bit" in said["touched"]["how"]
-    assert psnr(more[away], before[away]) >= (45 if local else 14)
+    assert psnr(more[away], before[away]) >= 35  # on another lattice
     assert more[covered("blue", -0.1)].mean(0)[2] > before[covered("blue", -0.1)].mean(0)[2] - 0.05
     assert blues(more) > 10 and blues(before) == 0
-    said = report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
-    less = picture("less.rfpack")
-    assert blues(less) < 0.5 * blues(more) and said["touched"]["how"]
-    history = read_bundle(folder / "less.rfpack").scene.history
-    assert [entry["event"] for entry in history] == ["fused", "added", "deleted"]
+    report("delete", "more.rfpack", "blue", "-o", "less.rfpack")
+    assert np.array_equal(picture("less.rfpack"), before)
+    fused, less = (read_bundle(folder / f"{name}.rfpack") for name in ("fused", "less"))
+    assert fused.fields.keys() == less.fields.keys() and fused.scene.nodes == less.scene.nodes
+    assert [entry["event"] for entry in less.scene.history] == ["fused", "added", "deleted"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_was_distilled_is_cut_out(fused, report, picture, folder, kind):
+    """Cells are emptied, and what its source shows there is a node; nothing else changes."""
+    write_scene_of(folder, "floor", file="floor.json")
+    before, gone = picture("fused.rfpack"), covered("red", -0.1)
+    said = report("delete", "fused.rfpack", "red", "-o", "less.rfpack")
+    less, wanted = picture("less.rfpack"), picture("floor.json")
+    assert said["restored"] and said["warnings"] == []
+    assert psnr(less[gone], wanted[gone]) > psnr(before[gone], wanted[gone]) + 3
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -101,21 +111,22 @@ def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, ki
     said = report(*PHOTOS, "--kind", kind)
     assert said["kind"] == kind and said["steps"] == 60
     assert said["bytes"] == (folder / "out.rfpack").stat().st_size
-    assert np.isfinite(said["training_psnr"]) and said["training_psnr"] > 5
+    assert np.isfinite(said["training_psnr"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_target_that_is_easy_takes_few_bytes(report, kind):
-    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "12", "--no-rgb")
+    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "16", "--no-rgb")
     said = report("fuse", "pair.json", "-o", "small.rfpack", *words)
-    assert said["psnr"]["stored"] >= 12 and said["bytes"] < SIZE
+    assert said["psnr"]["stored"] >= 16 and said["bytes"] < SIZE
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_its_ladders_are_flags_of_fuse(kind):
+def test_its_ladders_are_keywords_of_fuse(kind):
     groups = registry.kind(kind).ladders(30.0)
-    first = [next(in_flags(kind, ladder)) for found in groups.values() for ladder in found]
-    assert first and all(fuse_request(flags).kind == kind for flags in first)
+    first = [asdict(next(ladder)) for found in groups.values() for ladder in found]
+    words = {"scene": "scene.json", "output": "fused.rfpack", "kind": kind}
+    assert first and all(checked(FuseRequest, words | rung) for rung in first)
 
 
 def test_a_kind_that_nobody_has_is_a_clear_sentence(run, folder):

@@ -41,7 +41,7 @@ COMMANDS = {
     "render its photos' views": ("render", "PACK", "-o", "views", "--views", "capture", *QUICK),
     "eval": ("eval", "PACK", "--against", "good.rfpack", "--size", "24x24", *QUICK[1:]),
     "fuse": ("fuse", "PACK", "-o", "out.rfpack", "--time-budget", "1", *QUICK),
-    "add": ("add", "good.rfpack", "PACK", "--name", "new", "-o", "out.rfpack", *QUICK),
+    "add": ("add", "good.rfpack", "PACK", "--name", "new", "-o", "out.rfpack", "-w", "-q", "--memory", "2GB"),
 }
 BOX = [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
 

@@ -19,12 +19,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge import deleting, editing, scene
-from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
@@ -75,14 +75,16 @@ def reading(read):
 
 
 def edited(path: str) -> None:
-    fused = editing.read_fused(path, Memory())
-    assert isinstance(fused.names, set)
-    asked = SimpleNamespace(names=(), allow_outside=False)
-    deleting.remaining(asked, fused, "cpu", Silence())
+    edit = editing.Edit(SimpleNamespace(fused=path, memory=None), Silence())
+    assert isinstance(edit.draft.names, set)
+    deleting.Deletion(edit, (), False).remaining(np.array([-1e9] * 3 + [1e9] * 3))
 
 
 class Silence:
     def warn(self, _: str) -> None:
+        pass
+
+    def phase(self, *_) -> None:
         pass
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from formats.errors import BadSchema
+from formats.history import check_history
 from formats.scene import SceneGraph, dump_scene, make_node, resolve_source
 from tests.formats.test_scene import OUTSIDE
 from tests.promises.packs import GOLDEN, write_generation
@@ -108,16 +110,16 @@ def test_a_hard_link_is_a_file_like_any_other(folder):
 
 @pytest.mark.parametrize("source", ["../secret.rfpack", "/etc/passwd", "a\0b", "x" * 5000, "\u202e"])
 def test_a_history_cannot_send_an_edit_outside(folder, source, monkeypatch):
-    """P9: `delete` looks for the sources that a history names, where these lie inside alone."""
-    from fusedrf_cli.bridge import deleting
+    """P9: edits look for the sources that a history names, where these lie inside alone."""
+    from fusedrf_cli.bridge import sources
 
-    def opened(*_):
-        raise AssertionError("a file outside was read")
+    def opened(path, _):
+        assert path.is_relative_to(folder), "a file outside was read"
 
-    monkeypatch.setattr(deleting, "unchanged", opened)
+    monkeypatch.setattr(sources, "unchanged", opened)
     node = {"source": source, "sha256": "0" * 64, "field": "f"}
     try:
-        assert deleting.record_from_file(node, folder / "fused.rfpack", False) is None
+        assert sources.source_bundle(node, folder / "fused.rfpack", sources.Elsewhere(None), False) is None
     except ValueError:
         assert not source.isprintable()  # such a history is refused before; see below
 
@@ -135,9 +137,14 @@ def test_a_history_cannot_send_an_edit_outside(folder, source, monkeypatch):
 )
 def test_a_history_of_another_shape_is_refused(nodes):
     """P9, P12: the format leaves a history free; an edit says what it cannot use."""
-    from fusedrf_cli.bridge.editing import check_history
-    from fusedrf_cli.errors import InvalidInput
-
     scene = SceneGraph((), history=({"event": "fused", "nodes": nodes},))
-    with pytest.raises(InvalidInput, match="history is malformed"):
+    with pytest.raises(BadSchema, match="history is malformed"):
+        check_history(scene, "a.rfpack")
+
+
+@pytest.mark.parametrize("sources", [[1], "x", {"f": 1}, {"f": {}}, {"f": {"field": "g", "source": "a\0b"}}])
+def test_sources_of_another_shape_are_refused(sources):
+    """P9, P12: as above, of what a history says that fields were made of."""
+    scene = SceneGraph((), history=({"event": "fused", "sources": sources},))
+    with pytest.raises(BadSchema, match="history is malformed"):
         check_history(scene, "a.rfpack")

@@ -10,8 +10,8 @@ from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import ask
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
-from fusedrf_cli.engine.rendering.metrics import psnr, psnr_of_mse
-from fusedrf_cli.engine.rendering.volume import render_image, render_rays, seen_from
+from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 
 HELD_OUT = 1 << 12  # rays whose PSNR is the learning curve
 HELD_OUT_SEED = 9_000_001
@@ -59,27 +59,6 @@ class Judge:
         covered = psnr(shots[seen], self.truth[seen]) if seen.any() else None
         each = tuple(psnr(*pair) for pair in zip(shots, self.truth, strict=True))
         return Verdict(psnr(shots, self.truth), covered, float(seen.mean()), each)
-
-
-class RegionJudge:
-    """PSNR of a field against another one that is the same outside of a box: only rays through it are asked,
-    all others count as shown without an error."""
-
-    def __init__(
-        self, teacher: RadianceField, cameras: Sequence[Camera], origin: np.ndarray, box: np.ndarray
-    ):
-        """As those of `Judge`, and the box (6,) in the world."""
-        self.pixels = sum(camera.width * camera.height for camera in cameras)
-        rays = [camera.rays() for camera in cameras]
-        rays_o, rays_d = (np.concatenate(parts) for parts in zip(*rays, strict=True))
-        met = meets(rays_o, rays_d, box)
-        self.rays = seen_from(origin, rays_o[met], rays_d[met])[:2]
-        self.truth = over_white(render_rays(teacher, *self.rays))
-
-    def __call__(self, student: RadianceField) -> float:
-        """PSNR in dB of all pixels of all views together, over white."""
-        lost = np.square(over_white(render_rays(student, *self.rays)) - self.truth, dtype=np.float64).sum()
-        return psnr_of_mse(lost / (3 * self.pixels))
 
 
 def meets(rays_o: np.ndarray, rays_d: np.ndarray, box: np.ndarray) -> np.ndarray:

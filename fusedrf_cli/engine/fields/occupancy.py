@@ -477,3 +477,8 @@ def box_corners(aabb: np.ndarray) -> np.ndarray:
     """(8, 3) corners of a box (6,)."""
     sides = zip(aabb[:3], aabb[3:], strict=True)
     return np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
+
+
+def enclosing(boxes: list[np.ndarray]) -> np.ndarray:
+    """(6,) the box around boxes."""
+    return np.concatenate([np.min([b[:3] for b in boxes], 0), np.max([b[3:] for b in boxes], 0)])

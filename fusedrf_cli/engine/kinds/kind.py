@@ -17,8 +17,7 @@ from fusedrf_cli.engine.fields.base import FieldNeeds, RadianceField, StoredFiel
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.computed import WHITE, Reads
 from fusedrf_cli.engine.fields.occupancy import texels
-from fusedrf_cli.engine.kinds import refitting, splitting
-from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
+from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
 from fusedrf_cli.engine.kinds.splitting import Holds
 from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Suits, Way, finest_within
@@ -133,23 +132,10 @@ class Kind:
         come first."""
         return {self.name: [by_sizes()]}
 
-    def counts(self, field: StoredField) -> dict[str, int]:
-        """What a field is made of, and how many of it, where that can be counted."""
-        return {}
-
-    # -- editing ---------------------------------------------------------------------------------------------
-
-    def parts(self, field: StoredField) -> list[Part]:
-        """Objects in a field that can be taken out as they are; most kinds know of none."""
-        return []
+    # -- cutting ---------------------------------------------------------------------------------------------
 
     def without(self, field: StoredField, names: set[str]) -> StoredField | None:
         """A field without the parts that go by those names; None where nothing is left."""
-        return field
-
-    def arranged(self, field: StoredField, becoming: Becoming) -> StoredField:
-        """A field whose parts are named and placed anew, with the numbers that it has. Raises ValueError
-        where there would be too many, or one of them is singular."""
         return field
 
     def cut_out(self, field: StoredField, selection: Selection) -> StoredField | None:
@@ -189,20 +175,3 @@ class Kind:
         other = copy(field)
         other.tint = tuple(np.multiply(field.tint or WHITE, tint).tolist())
         return other._afresh("arrays", "loops")
-
-    def rounded(self, field: StoredField, box: np.ndarray) -> np.ndarray | None:
-        """(6,) in the field's frame, as the box (6,) of an edit: outside of it, numbers that are stored in
-        few bits keep their codes. None: outside of the edit's box they do."""
-        return None
-
-    def added(self, field: StoredField, objects: list[Placed], teach: Teach) -> Edited:
-        """A field with objects placed in its frame put in, by the rule `max`. Raises ValueError where they
-        cannot be."""
-        return refitting.added(field, objects, teach)
-
-    def refilled(
-        self, field: StoredField, box: np.ndarray, rest: list[Placed] | None, teach: Teach
-    ) -> Edited | None:
-        """A field that in a box (6,) of its frame shows what `rest`, placed in it, does there; None for rest:
-        nothing is known of it, and the box stays empty. None where nothing is left of the field."""
-        return refitting.refilled(field, box, rest or [], teach)

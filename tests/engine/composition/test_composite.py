@@ -62,7 +62,9 @@ PAIRS = {
     "unbounded and vm": lambda: (surroundings(), blob("vm", "blue")),
     "unbounded and sparse": lambda: (surroundings(), blob("sparse", "blue")),
     "unbounded and unbounded": lambda: (surroundings(), surroundings(1)),
+    "assembled and sparse": lambda: (blob("vm-mlp"), blob("sparse", "blue")),
 }
+TRIED = [pytest.param(pair, marks=pytest.mark.slow if "assembled" in pair else ()) for pair in PAIRS]
 SPOTS = {
     "apart": (affine(TURNED), affine(MIRRORED, (2.0, 0.3, -0.4))),
     "in one another": (affine(TURNED), affine(SMALL, (0.35, 0.0, 0.1))),
@@ -103,7 +105,7 @@ def naively(scene: ComposedField, rays_o, rays_d, step: float) -> np.ndarray:
 
 @pytest.mark.parametrize("rule", ["max", "add"])
 @pytest.mark.parametrize("spots", SPOTS)
-@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("pair", TRIED)
 def test_points_are_answered_as_the_naive_composition_answers_them(pair, spots, rule):
     composite, naive = scenes(pair, spots, rule)
     points = torch.from_numpy(points_in(np.array([-1, -1, -1, 2.2, 1, 1.0]), 3000))
@@ -119,7 +121,7 @@ def test_points_are_answered_as_the_naive_composition_answers_them(pair, spots, 
 
 @pytest.mark.parametrize("rule", ["max", "add"])
 @pytest.mark.parametrize("spots", SPOTS)
-@pytest.mark.parametrize("pair", PAIRS)
+@pytest.mark.parametrize("pair", TRIED)
 def test_pictures_come_to_those_of_the_naive_composition(pair, spots, rule):
     """Its samples lie elsewhere, so that the two agree as these come to lie closer."""
     composite, naive = scenes(pair, spots, rule)

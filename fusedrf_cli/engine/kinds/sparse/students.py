@@ -10,22 +10,19 @@ from math import prod
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
 from fusedrf_cli.engine.kinds import splitting
-from fusedrf_cli.engine.kinds.editing import Edited, Teach, enclosing
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
-from fusedrf_cli.engine.kinds.sparse.editing import added, emptied, runs_box, with_fringe
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
 from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
 from fusedrf_cli.engine.kinds.student import (
     Contents,
-    DistillSettings,
+    DistilConfig,
     Made,
     MadeStudent,
     Needs,
@@ -97,10 +94,6 @@ class SparseKind(Kind):
         """The voxel and the bricks of every level, and how many vertices they have."""
         return {"levels": levels(field), "sh_degree": field.shape.sh_degree, "vertices": field.fine.free}
 
-    def counts(self, field: SparseField) -> dict[str, int]:
-        """Its bricks."""
-        return {"bricks": len(field.tree.level)}
-
     def details(self, scene: ComposedField, field: SparseField) -> list[Detail]:
         """What bricks hold of placed objects."""
         return [
@@ -128,37 +121,15 @@ class SparseKind(Kind):
         """The same vertices, with another scale."""
         return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)
 
-    def rounded(self, field: SparseField, box: np.ndarray) -> np.ndarray:
-        """Numbers share scales with others of their run alone."""
-        return runs_box(field, box)
-
-    def added(self, field: SparseField, objects: list[Placed], teach: Teach) -> Edited:
-        """Bricks of the objects, filled by asking them."""
-        for placed in objects:
-            field = added(field, placed)
-        return Edited(field, enclosing([p.aabb for p in objects]), "the bricks that it reaches filled anew")
-
-    def refilled(
-        self, field: SparseField, box: np.ndarray, rest: list[Placed] | None, teach: Teach
-    ) -> Edited | None:
-        """The bricks in a box, filled by asking the rest."""
-        if rest is not None:
-            box = with_fringe(field, box)
-        result = emptied(field, box, rest or [])
-        how = (
-            "the bricks in its box filled from the other sources" if rest else "the bricks in its box emptied"
-        )
-        return None if result is None else Edited(result, box, how)
-
 
 class SparseStudent(MadeStudent):
     """Bricks about as fine as each object of a scene needs, all wider by one factor under a limit."""
 
     # what was asked needs no learning from points
-    lesson = DistillSettings(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
+    lesson = DistilConfig(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
     compares = False
 
-    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistillSettings:
+    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistilConfig:
         """See Student: the more numbers, the more rays, steps and samples."""
         lesson, rays, more = self.lesson, *(max(1.0, numbers / n) for n in (TOLD_BY_RAYS, TOLD_BY_STEPS))
         return replace(
@@ -239,7 +210,7 @@ def bricks(resolution: tuple[int, int, int]) -> list[int]:
 def bricks_ladder() -> Ladder:
     """From few bricks to more, since many take minutes."""
     for rgb, size, degree in product((False, True), LADDER_BYTES, (1, 0)):
-        yield Rung("int8", sh_degree=degree, bytes=size, rgb=rgb)
+        yield Rung("int8", sh_degree=degree, max_size=size, rgb=rgb)
 
 
 def levels(field: SparseField) -> list[dict]:

@@ -16,7 +16,6 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds.editing import goes_by
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.trimming import smaller_shape, truncated
 
@@ -132,7 +131,7 @@ def without(field: VMField, names: set[str]) -> VMField | None:
     """The field without the blocks of those names and the tensors that only they used; None when nothing is
     left.
     """
-    kept = [b for b in field.blocks if not goes_by(b.name, names)]
+    kept = [b for b in field.blocks if not any(b.name == n or b.name.startswith(f"{n}/") for n in names)]
     if not kept:
         return None
     used = sorted({b.tensor for b in kept})

@@ -13,7 +13,6 @@ from fusedrf_cli.engine.fields.computed import BRICK
 from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
-from fusedrf_cli.engine.kinds.editing import Becoming, Edited, Part, Teach
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import (
     Contents,
@@ -111,21 +110,9 @@ class VMKind(Kind):
         bits = {end: sum(8 * s[0] for n, s in shapes.items() if n.endswith(end)) for end in (BLOCKS, BRICKS)}
         return decoded + 4 * bits[BLOCKS] * TOGETHER * WIDTH + bits[BRICKS] // 2 * BRICK**3
 
-    def counts(self, field: VMField) -> dict[str, int]:
-        """Its blocks."""
-        return {"blocks": len(field.blocks)}
-
-    def parts(self, field: VMField) -> list[Part]:
-        """Its named blocks."""
-        return editing.parts(field)
-
     def without(self, field: VMField, names: set[str]) -> VMField | None:
         """Without the blocks of those names."""
         return without(field, names)
-
-    def arranged(self, field: VMField, becoming: Becoming) -> VMField:
-        """Its named blocks, placed anew."""
-        return editing.arranged(field, becoming)
 
     def cut_out(self, field: VMField, selection: Selection) -> VMField | None:
         """See vm/editing.py."""
@@ -151,16 +138,6 @@ class VMKind(Kind):
     def tinted(self, field: VMField, tint: tuple[float, float, float]) -> VMField:
         """Each block has a tint of its own."""
         return editing.tinted(field, tint)
-
-    def added(self, field: VMField, objects: list[Placed], teach: Teach) -> Edited:
-        """Blocks appended."""
-        return editing.added(self, field, objects, teach)
-
-    def refilled(
-        self, field: VMField, box: np.ndarray, rest: list[Placed] | None, teach: Teach
-    ) -> Edited | None:
-        """Cells emptied, and a tensor for what the rest shows there."""
-        return editing.refilled(self, field, box, rest, teach)
 
 
 def place_of(background: Placed, plan: Plan, scene: ComposedField) -> VMField | None:

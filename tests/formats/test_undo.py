@@ -5,11 +5,11 @@ import os
 import numpy as np
 import pytest
 
-from formats import past
+from formats import undo as undoing
 from formats.bundle import sha256_of, single_field_bundle
 from formats.errors import BadSchema, FormatError, MissingFile, ResourceError
-from formats.past import check_past, history, keep, past_of, undo
 from formats.records import FieldRecord
+from formats.undo import check_past, history, keep, past_of, undo
 
 
 def write(path, value: int, *entries) -> bytes:
@@ -63,7 +63,7 @@ def test_where_nothing_can_be_linked_bytes_are_copied(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError("no links here")
 
-    monkeypatch.setattr(past.os, "link", refuse)
+    monkeypatch.setattr(undoing.os, "link", refuse)
     path = tmp_path / "one.rfpack"
     was = write(path, 0)
     edited(path, 1)
@@ -72,7 +72,7 @@ def test_where_nothing_can_be_linked_bytes_are_copied(tmp_path, monkeypatch):
 
 
 def test_the_oldest_go(tmp_path, monkeypatch):
-    monkeypatch.setattr(past, "KEPT", 3)
+    monkeypatch.setattr(undoing, "KEPT", 3)
     path = tmp_path / "one.rfpack"
     write(path, 0)
     entries = ()
@@ -114,7 +114,7 @@ def test_odd_histories_are_listed(tmp_path, entry):
 
 def test_what_others_put_there_stays_and_what_was_just_kept_too(tmp_path, monkeypatch):
     """Files beside it that are newer, a user's own bundle, and one that only looks like ours."""
-    monkeypatch.setattr(past, "KEPT", 2)
+    monkeypatch.setattr(undoing, "KEPT", 2)
     path, folder = tmp_path / "one.rfpack", tmp_path / "one.rfpack.history"
     folder.mkdir()
     for i in range(4):
@@ -137,7 +137,7 @@ def test_what_others_put_there_stays_and_what_was_just_kept_too(tmp_path, monkey
 
 def test_what_another_bundle_left_goes_first(tmp_path, monkeypatch):
     """Of an output that was replaced by something else: its own edits stay, however old their files."""
-    monkeypatch.setattr(past, "KEPT", 2)
+    monkeypatch.setattr(undoing, "KEPT", 2)
     path = tmp_path / "one.rfpack"
     write(path, 50)
     edited(path, 51)
@@ -156,7 +156,7 @@ def test_what_is_kept_is_on_the_disk(tmp_path, monkeypatch, linked):
     real = os.fsync
     monkeypatch.setattr(os, "fsync", lambda fd: (flushed.append(os.fstat(fd).st_ino), real(fd)))
     if not linked:
-        monkeypatch.setattr(past.os, "link", lambda *_: (_ for _ in ()).throw(OSError()))
+        monkeypatch.setattr(undoing.os, "link", lambda *_: (_ for _ in ()).throw(OSError()))
     path = tmp_path / "one.rfpack"
     write(path, 0)
     flushed.clear()

@@ -10,6 +10,7 @@ from pathlib import Path
 from formats.atomic import atomic_writer, check_space, check_writable, sync_file, sync_folder
 from formats.bundle import is_bundle, read_headers, sha256_of
 from formats.errors import BadSchema, FormatError, MissingFile, ResourceError
+from formats.history import names_of, psnr_of
 from formats.scene import SceneGraph
 
 KEPT = 64
@@ -163,21 +164,6 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
 def depth(folder: Path, bundle: Path | str) -> int:
     """How many edits of a bundle can be undone, one after the other."""
     return len(chain(folder, bundle))
-
-
-def names_of(entry: dict) -> list[str]:
-    """The objects that an entry of history tells of."""
-    nodes = entry.get("nodes") if isinstance(entry.get("nodes"), list) else []
-    said = entry.get("names") if isinstance(entry.get("names"), list) else []
-    names = [node.get("name") for node in nodes if isinstance(node, dict)]
-    return [name for name in dict.fromkeys([*said, *names]) if isinstance(name, str)]
-
-
-def psnr_of(entry: dict) -> float | None:
-    """The dB that an edit or a fuse reached, as its entry of history says."""
-    said = entry.get("psnr")
-    said = said.get("stored", said.get("psnr")) if isinstance(said, dict) else said
-    return float(said) if isinstance(said, int | float) else None
 
 
 def history(bundle: Path | str) -> dict:

@@ -1,0 +1,130 @@
+"""Edits of a scene graph: nodes taken out, placed, named, copied and shown otherwise. They change no field.
+
+A name means the node that has it, with all in it, and nodes that are named as parts of it, `NAME/...`.
+"""
+
+from collections.abc import Callable, Container, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from formats.errors import FormatError
+from formats.scene import Node, SceneGraph, check_name
+
+Becoming = Callable[[Node, np.ndarray], tuple[Node, ...]]
+"""What becomes of a node, whose parent's frame lies in the world by a (4, 4)."""
+
+
+def belongs(name: str, names: Container[str]) -> bool:
+    """Whether a node goes by one of some names, or is a part of one that does."""
+    return name in names or any(name[:i] in names for i, letter in enumerate(name) if letter == "/")
+
+
+def chosen(scene: SceneGraph, names: Container[str]) -> list[Node]:
+    """The topmost nodes that go by some names."""
+    found: list[Node] = []
+    changed(scene, names, lambda node, _: found.append(node) or (node,))
+    return found
+
+
+def leaf_names(nodes: Iterable[Node]) -> set[str]:
+    """Names of those nodes, of some and of those in them, that hold a field or a source."""
+    found, stack = set(), list(nodes)
+    while stack:
+        node = stack.pop()
+        stack += node.children
+        if node.field is not None or node.source is not None:
+            found.add(node.name)
+    return found
+
+
+def changed(scene: SceneGraph, names: Container[str], becoming: Becoming) -> SceneGraph:
+    """The scene after the topmost nodes that go by some names became others; groups that are left empty by
+    that go. Raises what a node or a scene that cannot be raises."""
+    return _changed(scene, lambda name: belongs(name, names), becoming)
+
+
+def with_field(scene: SceneGraph, name: str, member: str | None) -> SceneGraph:
+    """The scene whose node of a name has another field; None: without it."""
+
+    def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
+        if member is None and not node.children:
+            return ()
+        return (replace(node, field=member),)
+
+    return _changed(scene, lambda one: one == name, after)
+
+
+def _changed(scene: SceneGraph, goes: Callable[[str], bool], becoming: Becoming) -> SceneGraph:
+    def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
+        if goes(node.name):
+            return becoming(node, parent)
+        own = parent @ node.node_to_parent
+        children = tuple(one for child in node.children for one in after(child, own))
+        if node.children and not children and node.field is None and node.source is None:
+            return ()
+        return (node if children == node.children else replace(node, children=children),)
+
+    return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node, np.eye(4))))
+
+
+def without(scene: SceneGraph, names: Container[str]) -> SceneGraph:
+    """The scene without some nodes."""
+    return changed(scene, names, lambda node, _: ())
+
+
+def with_nodes(scene: SceneGraph, nodes: Iterable[Node]) -> SceneGraph:
+    """The scene with more nodes, behind those it has."""
+    return replace(scene, nodes=(*scene.nodes, *nodes))
+
+
+def moved(node: Node, parent: np.ndarray, matrix: np.ndarray) -> Node:
+    """A node to whose place in the world a (4, 4) was applied."""
+    at = np.linalg.solve(parent, matrix @ parent @ node.node_to_parent)
+    if np.array_equal(parent, np.eye(4)):
+        at = matrix @ node.node_to_parent  # without rounding
+    at[3] = 0, 0, 0, 1
+    return replace(node, placement=placement_of(at))
+
+
+def renamed(node: Node, name: str, new_name: str, apart: bool = False) -> Node:
+    """A node that goes by one name as it goes by another; so do nodes in it that are named as its parts.
+    apart: it is a copy, in which every node needs another name."""
+
+    def renaming(one: str) -> str:
+        if belongs(one, {name}):
+            return new_name + one.removeprefix(name)
+        return f"{new_name}/{one}" if apart else one
+
+    children = tuple(renamed(child, name, new_name, apart) for child in node.children)
+    return replace(node, name=renaming(node.name), children=children)
+
+
+def shown(node: Node, showing: dict) -> Node:
+    """A node with other words for what is shown of it; None takes one away."""
+    words = {**node.showing, **showing}
+    return replace(node, showing={key: value for key, value in words.items() if value is not None})
+
+
+def placement_of(matrix: np.ndarray) -> dict:
+    """What a node says of where it lies, by a (4, 4)."""
+    unit = float(matrix[0, 0])
+    if not np.array_equal(matrix[:3, :3], unit * np.eye(3)):
+        return {"matrix": matrix.tolist()}
+    words = {"translation": matrix[:3, 3].tolist()} if matrix[:3, 3].any() else {}
+    return words | ({} if unit == 1 else {"scale": [unit] * 3})
+
+
+def free_name(wanted: str, taken: set[str], otherwise: str = "object") -> str:
+    """A name that no node has, which is taken from now on: the wanted one, where a node may be called so, or
+    it with a number."""
+    try:
+        check_name(wanted)
+    except FormatError:
+        wanted = otherwise
+    found, number = wanted, 1
+    while found in taken:
+        number += 1
+        found = f"{wanted}-{number}"
+    taken.add(found)
+    return found

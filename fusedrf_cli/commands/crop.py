@@ -1,0 +1,26 @@
+"""`fusedrf crop`: a part of an object of a bundle."""
+
+import click
+
+from fusedrf_cli import options, verbs
+
+
+@click.command("crop")
+@click.argument("fused", type=options.INPUT)
+@click.argument("name")
+@click.argument("shape", type=options.CROP, required=False)
+@options.writing("The bundle to write, OUT.rfpack.")
+@options.keep_history
+@options.memory
+@options.reporting
+def command(**words):
+    """Show what of an object lies in a box or a sphere.
+
+    SHAPE is a box, xmin,ymin,zmin,xmax,ymax,zmax, or a sphere, x,y,z,r, in the object's own world, as it was
+    before it was placed. Its numbers stay: without SHAPE all of it is shown again.
+
+    \b
+    Example:
+      fusedrf crop fused.rfpack chair 0,0,0.5,1 -o part.rfpack
+    """
+    return verbs.crop(**words)
