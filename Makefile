@@ -18,7 +18,7 @@ ORDER ?=
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-order test-slow fuzz lint bench bench-paper bench-real ablation stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real ablation stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -46,6 +46,9 @@ fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole comm
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.commands --count $(RUNS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.fuzz_inputs --readers $(PACKS) --commands $(RUNS) --seed $(SEED)
 	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
+
+docs: $(VENV)  ## docs/commands.md, out of --help
+	$(PYTHON) -m docs.commands
 
 lint: $(VENV)  ## ruff
 	$(PYTHON) -m ruff check .

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, VMMLPField, weight_shapes
+from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, VMMLPField, VMMLPShape, weight_shapes
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
 
 SHAPE = VMShape(16, 8, 1)  # float32 kernels of it are compiled for the engine's tests too
@@ -99,7 +99,26 @@ def vm_mlp_field(
     into[3:6] = -into[:3]
     weights["1.weight"][:6, :6] = torch.eye(6)
     weights["2.weight"][:, :6] = torch.cat([torch.eye(3), -torch.eye(3)], 1)
-    return VMMLPField(vm, weights)
+    return with_network(vm, weights)
+
+
+def with_network(vm: VMField, weights: dict[str, torch.Tensor]) -> VMMLPField:
+    """A vm-mlp field of the factors and the basis of a vm field of one tensor, and of a network."""
+    (tensor,), shape = vm.tensors, VMMLPShape(
+        vm.shape.density_rank, vm.shape.colour_rank, vm.shape.sh_degree, len(weights["0.bias"])
+    )
+    occupancy = OccupancyGrid(tensor.occupancy.aabb, tensor.occupancy.occupied, tensor.space)
+    field = VMMLPField(
+        shape, tensor.aabb, tensor.resolution, tensor.scale, tensor.shift, occupancy=occupancy
+    )
+    field.params = field.params.to(vm.params.dtype)
+    for name, view in vm.sections(0).items():
+        if name != "colour_basis":
+            field.sections()[f"tensor_0.{name}"].copy_(view)
+    field.basis.copy_(vm.sections(0)["colour_basis"].flatten(0, 1))
+    for name, view in field.weights.items():
+        view.copy_(weights[name])
+    return field
 
 
 def sparse_field(field: AnalyticField, resolution: tuple[int, int, int] = (NOISE_NODES,) * 3) -> SparseField:

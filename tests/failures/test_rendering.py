@@ -17,7 +17,8 @@ from click.testing import CliRunner
 
 from formats.images import read_image
 from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.engine.distillation.fit import FitSettings, fit
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import fit
 from fusedrf_cli.engine.distillation.matter import occupancy_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
@@ -57,8 +58,16 @@ def as_trained(field):
     narrower one, whose products round by their row.
     """
     if isinstance(field, VMMLPField):
-        features, generator = 3 * field.shape.coefficients, torch.Generator().manual_seed(1)
-        return VMMLPField(field.factors, untrained(features, WIDTH, generator))
+        wide = VMMLPField(
+            replace(field.shape, width=WIDTH), field.box, field.resolution, field.scale, field.shift,
+            occupancy=field.occupancy,
+        )  # fmt: skip
+        factors = field.params[: int(field.starts[12]) + field.basis.numel()]
+        wide.params[: len(factors)] = factors
+        generator = torch.Generator().manual_seed(1)
+        for name, weight in untrained(field.shape.features, WIDTH, generator).items():
+            wide.weights[name].copy_(weight)
+        return wide
     return field
 
 
@@ -117,7 +126,7 @@ def trained():
         straight = found[..., :3] / np.maximum(found[..., 3:], 1e-9)
         pixels = np.concatenate([straight, found[..., 3:]], -1)
         pictures.append(np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
-    settings = FitSettings(way=way_of(SHAPE), longest=40, steps=200, samples=1 << 12)
+    settings = TrainConfig(way=way_of(SHAPE), longest=40, steps=200, samples=1 << 12)
     field = fit(cameras, np.stack(pictures), box, settings)
     unseen = scattered(box, 3, 40, 40, seed=9, lowest=-0.6)
     return field, unseen, np.stack([scene.image(camera) for camera in unseen])

@@ -1,6 +1,7 @@
 """What every kind of field does, whoever wrote it: fused, edited, trained and charted as whole commands."""
 
 import shutil
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -8,14 +9,14 @@ import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
-from fusedrf_cli.bridge.ladders import in_flags
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.commands.chart import fuse_request
-from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
+from fusedrf_cli.engine.kinds.student import Student
 from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.requests import FuseRequest
+from fusedrf_cli.verbs import checked
 from tests.bridge.conftest import TinySettings, done, write_scene_of
 from tests.bridge.test_edit import AT, blues, covered
 
@@ -29,7 +30,7 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 def short(tiny):  # noqa: F811
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        patch.setattr(distill, "POINTS_PER_STEP", 1 << 11)  # a network takes its time
+        patch.setattr(Student, "lesson", TinySettings(points_per_step=1 << 11))  # a network takes its time
         yield
 
 
@@ -121,10 +122,11 @@ def test_a_target_that_is_easy_takes_few_bytes(report, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_its_ladders_are_flags_of_fuse(kind):
+def test_its_ladders_are_keywords_of_fuse(kind):
     groups = registry.kind(kind).ladders(30.0)
-    first = [next(in_flags(kind, ladder)) for found in groups.values() for ladder in found]
-    assert first and all(fuse_request(flags).kind == kind for flags in first)
+    first = [asdict(next(ladder)) for found in groups.values() for ladder in found]
+    words = {"scene": "scene.json", "output": "fused.rfpack", "kind": kind}
+    assert first and all(checked(FuseRequest, words | rung) for rung in first)
 
 
 def test_a_kind_that_nobody_has_is_a_clear_sentence(run, folder):

@@ -5,20 +5,25 @@ import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 import trimesh
+
+from tests.engine.conftest import BOX
+from tests.engine.kernels.interpreted import assert_answers, assert_gradients
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "kinds.md"
 # The command line, but that a draft is some steps: no clock decides what is learnt.
 BRIEF = """
 import importlib
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.main import main
 training = importlib.import_module("fusedrf_cli.bridge.training")
-training.QUALITY = {"draft": FitSettings(longest=16, steps=300, samples=1 << 12)}
+training.QUALITY = {"draft": TrainConfig(longest=16, steps=300, samples=1 << 12)}
 main()
 """
 
@@ -37,7 +42,7 @@ def installed(folder: Path, name: str, files: dict[str, str], entry: str) -> Non
 def page_files() -> dict[str, str]:
     """The modules of the page, by path: a heading names one, the next block of Python is its text."""
     found = re.findall(r"## `(fusedrf_cubes/\w+\.py)`.*?```python\n(.*?)```", PAGE.read_text(), re.S)
-    assert [path for path, _ in found] == [f"fusedrf_cubes/{n}.py" for n in ("bodies", "field", "__init__")]
+    assert [path for path, _ in found] == [f"fusedrf_cubes/{n}.py" for n in ("encoding", "field", "__init__")]
     return dict(found)
 
 
@@ -55,6 +60,19 @@ def cubes(tmp_path):
     """A folder whose `site` has the page's kind."""
     installed(tmp_path / "site", "fusedrf_cubes", page_files(), "cubes = fusedrf_cubes")
     return tmp_path
+
+
+def test_the_page_s_encoding_answers_and_sends_back_as_its_reference(cubes, monkeypatch):
+    monkeypatch.syspath_prepend(str(cubes / "site"))
+    page = import_module("fusedrf_cubes.field")
+    field = page.CubesField(page.CubesShape(), BOX, (5, 4, 6), 3.0, 0.3)
+    generator = torch.Generator().manual_seed(0)
+    field = field.with_params(torch.randn(len(field.params), generator=generator, dtype=torch.float64))
+    assert_answers(field)
+    for shaded in (True, False):
+        assert_gradients(field, shaded)
+    for name in [name for name in sys.modules if name.startswith("fusedrf_cubes")]:
+        monkeypatch.delitem(sys.modules, name)
 
 
 @pytest.mark.slow

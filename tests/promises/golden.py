@@ -229,13 +229,15 @@ def sparse(unbounded: bool = False, depth: int = 1):
 
 def network(unbounded: bool = False):
     """A vm-mlp field, bounded or of all of space."""
-    from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
+    from fusedrf_cli.engine.kinds.vm.field import VMShape
+    from tests.analytic.export import with_network
     from tests.engine.kinds.cases import random_vm_mlp
 
     made = random_vm_mlp(torch.float32, cells=4)
     if not unbounded:
         return made
-    return VMMLPField(walls(replace(made.factors.shape), hashed=False), made.weights)
+    shape = VMShape(made.shape.density_rank, made.shape.colour_rank, made.shape.sh_degree)
+    return with_network(walls(shape, hashed=False), made.weights)
 
 
 def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):

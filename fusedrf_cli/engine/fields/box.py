@@ -186,9 +186,17 @@ class BoxField(ComputedField):
         ]
 
     def groups(self) -> list[Group]:
-        """See ComputedField."""
-        ends = zip(self.parts, self.starts, self.starts[1:], self.reached, strict=False)
-        return [Group(int(low), int(high), part.rate, lines) for part, low, high, lines in ends]
+        """See ComputedField: of a part each, or of neighbours that are learnt alike."""
+        groups: list[Group] = []
+        for part, low, high, lines in zip(
+            self.parts, self.starts, self.starts[1:], self.reached, strict=False
+        ):
+            last = groups[-1] if groups else None
+            if last and (last.rate, last.lines) == (part.rate, None) and lines is None:
+                groups[-1] = Group(last.low, int(high), part.rate)
+            else:
+                groups.append(Group(int(low), int(high), part.rate, lines))
+        return groups
 
     # -- storing -----------------------------------------------------------------------------------------
 

@@ -76,11 +76,15 @@ def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[
     modules = [loops, instances, space, *(family(bodies) if bodies else ())]
     names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
     own = {module.__name__ for module in modules}
-    return names, {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}
+    found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}
+    return names, found | getattr(bodies, "functions", {})
 
 
 def family(bodies: ModuleType) -> list[ModuleType]:
-    """The modules of other kinds that a kind's module takes functions from, and itself last."""
+    """The modules of other kinds that a kind's module takes functions from, and itself last; of an assembly
+    itself alone (kernels/assembled.py)."""
+    if hasattr(bodies, "functions"):
+        return [bodies]
     taken = {f.__module__ for f in vars(bodies).values() if isinstance(f, FunctionType)}
     others = [sys.modules[name] for name in sorted(taken - {bodies.__name__})]
     others = [module for module in others if hasattr(module, "Arrays")]

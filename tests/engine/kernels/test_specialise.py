@@ -7,13 +7,16 @@ from types import ModuleType
 
 import pytest
 
+from fusedrf_cli.engine.decoders import density_sum, sh_basis
+from fusedrf_cli.engine.encodings import line
 from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
+from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.kinds.sparse import bodies as sparse
 from fusedrf_cli.engine.kinds.vm import bodies as vm
-from fusedrf_cli.engine.kinds.vm_mlp import bodies as vm_mlp
 from fusedrf_cli.engine.spaces import SPACES, bounded
 from tests.engine.kinds.cases import KINDS
 
+CP = assemble(line, line, density_sum, sh_basis)
 SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
 
 SCRIPT = """
@@ -64,8 +67,8 @@ def ask(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
 
-    def run(*ranks: int, tinted: bool = False) -> list[str]:
-        script = SCRIPT.format(folder=str(tmp_path), tinted=tinted)
+    def run(*ranks: int, tinted: bool = False, script: str = SCRIPT) -> list[str]:
+        script = script.format(folder=str(tmp_path), tinted=tinted)
         command = [sys.executable, "-c", script, *map(str, ranks)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -87,6 +90,50 @@ def test_a_second_process_compiles_nothing_of_a_field_with_tints(ask):
     assert ask(8, tinted=True) == ["8.0 0.1", "0"]
 
 
+PARTS = """
+import numpy as np, sys
+from types import SimpleNamespace
+from fusedrf_cli.engine import kernels
+from fusedrf_cli.engine.decoders import density_sum, rgb
+from fusedrf_cli.engine.kernels.assembled import assemble
+from fusedrf_cli.engine.kernels.loops import Answers, Points
+from fusedrf_cli.engine.kernels.specialise import Loops
+from fusedrf_cli.engine.spaces import bounded
+sys.path.insert(0, {folder!r})
+import flat
+told, bodies = [], assemble(flat, flat, density_sum, rgb)
+sizes = {{"density": flat.sizes(), "colour": flat.sizes(), "sigma": density_sum.sizes(), "rgb": rgb.sizes(3)}}
+sizes = bodies.sizes(SimpleNamespace(slots={{name: SimpleNamespace(sizes=s) for name, s in sizes.items()}}))
+field = bodies.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
+grid = kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), np.zeros(3), np.ones(3), np.ones(3))
+with kernels.telling_of_compilation(lambda: told.append(1)):
+    found, asked = Answers(np.zeros(1), np.zeros((1, 3))), Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
+    Loops(bodies, sizes, bounded).each("query_point", field, grid, asked, 1, found)
+print(found.sigma[0], round(found.rgb[0, 0], 6))
+print(len(told))
+"""
+FLAT = """
+def sizes():
+    return {"WIDTH": 3}
+def forward(field, unit, scratch, out, base):
+    out[base] = 0.0
+    out[base + 1], out[base + 2] = 0.0, 0.0
+def backward(field, unit, d, base, scratch, grad):
+    pass
+def summed(field, unit, scratch):
+    return field.params[1]
+def summed_backward(field, unit, d, base, scratch, grad):
+    pass
+"""
+
+
+def test_a_second_process_compiles_nothing_of_an_assembled_field(ask):
+    """Its module is made while running: what is kept is found by the modules of its parts."""
+    (ask.folder / "flat.py").write_text(FLAT)
+    assert ask(script=PARTS) == ["21.0 0.5", "1"]
+    assert ask(script=PARTS) == ["21.0 0.5", "0"]
+
+
 def test_a_changed_file_of_a_plug_in_is_compiled_anew(ask):
     """Its functions are inlined into loops of another file, where numba looks for no change."""
     assert ask(8) == ["8.0 0.25", "1"]
@@ -101,7 +148,7 @@ def tag(bodies: ModuleType = vm, sizes: dict = SIZES, space: ModuleType = bounde
 def test_kinds_sizes_and_spaces_have_names_of_their_own():
     other_space = ModuleType("elsewhere")
     other_space.__dict__.update({k: v for k, v in vars(bounded).items() if k != "__name__"})
-    tags = [tag(), tag(sparse), tag(vm_mlp), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
+    tags = [tag(), tag(sparse), tag(CP), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
     assert len(set(tags)) == len(tags) and tag() == tags[0]
 
 
@@ -135,10 +182,10 @@ def test_no_name_means_two_things_in_a_namespace(name, space):
                 assert meanings.setdefault(key, value) is value, key
 
 
-def test_what_a_kind_leaves_out_has_a_default_and_what_it_takes_from_another_is_that():
+def test_what_a_kind_leaves_out_has_a_default():
     _, names = specialise.specialised(sparse, SIZES, bounded)
     assert names["end"].py_func.__code__ is loops.end.__code__
     assert names["advance"].py_func.__code__ is sparse.advance.__code__
-    _, names = specialise.specialised(vm_mlp, SIZES, bounded)
-    assert names["density"].py_func.__code__ is vm.density.__code__
-    assert names["colour"].py_func.__code__ is vm_mlp.colour.__code__
+    _, names = specialise.specialised(CP, SIZES, bounded)
+    assert names["advance"].py_func.__code__ is loops.advance.__code__
+    assert names["end"].py_func.__code__ is CP.end.__code__

@@ -16,6 +16,7 @@ from fusedrf_cli.engine.kinds.boxes import BoxKind
 from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, untrained
+from tests.analytic.export import with_network
 from tests.analytic.rays import affine, turn
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm
@@ -45,16 +46,14 @@ def random_detailed_blocks():
     return blocks_of([Placed("rough", rough, affine(turn(30))), Placed("plain", plain, np.eye(4))])
 
 
-def random_vm_mlp(
-    dtype=torch.float64, seed=0, cells=None, matrix=None, width=8
-) -> VMMLPField:
+def random_vm_mlp(dtype=torch.float64, seed=0, cells=None, width=8) -> VMMLPField:
     """A vm-mlp field of random numbers whose colours differ; one shape for each type, since each is
     compiled."""
     shape = replace(SIXTY_FOUR if dtype == torch.float64 else THIRTY_TWO, sh_degree=2)
     generator = torch.Generator().manual_seed(seed)
-    factors = random_vm(shape, dtype=dtype, seed=seed, cells=cells, matrix=matrix)
+    factors = random_vm(shape, dtype=dtype, seed=seed, cells=cells)
     weights = untrained(27, width, generator)
-    return VMMLPField(factors, {name: view.to(dtype) for name, view in weights.items()})
+    return with_network(factors, weights)
 
 
 def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
@@ -78,7 +77,7 @@ KINDS = {
     "vm, detail": random_detail,
     "blocks": random_blocks,
     "blocks, detail": random_detailed_blocks,
-    "vm-mlp": lambda: random_vm_mlp(cells=4, matrix=affine(turn(25) @ np.diag([1, -0.8, 1.1]), (0.1, 0, 0))),
+    "vm-mlp": lambda: random_vm_mlp(cells=4),
     "sparse": lambda: random_sparse(0, depth=0),
     "sparse, levels and bands": lambda: random_sparse(2, depth=2),
     **{name: partial(random_boxed, name) for name in BOXED},

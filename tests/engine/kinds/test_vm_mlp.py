@@ -1,11 +1,16 @@
 """The vm-mlp field: its network against a slow loop, storage, general rendering, gradients, a tiny fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, fit
+from fusedrf_cli.engine.decoders import tensorf_mlp
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun, fit
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -13,9 +18,7 @@ from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.vm.blocks import reshaped
 from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
-from fusedrf_cli.engine.kinds.vm.reference import vm_products
-from fusedrf_cli.engine.kinds.vm_mlp import bodies
-from fusedrf_cli.engine.kinds.vm_mlp.field import NETWORK_RATE, VMMLPField, untrained
+from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
@@ -27,14 +30,11 @@ from .cases import random_vm_mlp as random_field
 
 def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """rgb (3,) at one point, one neuron after the other."""
-    placement, box = field.blocks[0].object_to_field, field.tensors[0].aabb
-    inside = (np.linalg.solve(placement, [*point, 1.0])[:3] - box[:3]) / (box[3:] - box[:3])
-    sections = field.factors.sections(0)
-    products = vm_products(sections, "colour", torch.from_numpy(inside[None]))[0].numpy()
-    x = [float(row @ products) for row in field.basis.numpy()]
-    local = field.arrays.to_object[0] @ direction
-    local = local / np.linalg.norm(local)
-    x = [*x, *local]
+    box = field.box
+    inside = (point - box[:3]) / (box[3:] - box[:3])
+    factors = field.slot_sections()["colour"]
+    products = plane_line.reference(factors, torch.from_numpy(inside[None]), None, 16)[0].numpy()
+    x = [*(float(row @ products) for row in field.basis.numpy()), *direction]
     values = x + [np.sin(f * v) for f in (1, 2) for v in x] + [np.cos(f * v) for f in (1, 2) for v in x]
     for i in range(3):
         weights, bias = field.weights[f"{i}.weight"].numpy(), field.weights[f"{i}.bias"].numpy()
@@ -48,26 +48,17 @@ def test_is_a_stored_field_kind():
     assert isinstance(random_field(), RadianceField)
 
 
-@pytest.mark.parametrize("matrix", [None, np.diag([2.0, -1.5, 0.5, 1.0])])
-def test_query_equals_a_slow_loop(matrix):
-    field = random_field(matrix=matrix)
-    low, high = (
-        BOX[:3] * np.diag(field.blocks[0].object_to_field)[:3],
-        BOX[3:] * np.diag(field.blocks[0].object_to_field)[:3],
-    )
-    box = np.concatenate([np.minimum(low, high), np.maximum(low, high)])
-    field.factors.occupancy = OccupancyGrid.full(box)
-    points, dirs = (
-        points_in(box, 20, margin=0.05),
-        unit(points_in(np.array([-1.0] * 3 + [1.0] * 3), 20, seed=5)),
-    )
-    sigma, rgb = field.query(torch.from_numpy(points), torch.from_numpy(dirs))
-    alone = reshaped(field.factors, SIXTY_FOUR).query(torch.from_numpy(points), torch.from_numpy(dirs))[0]
+def test_query_equals_a_slow_loop():
+    field = random_field().with_occupancy(OccupancyGrid.full(BOX))
+    points = torch.from_numpy(points_in(BOX, 20, margin=0.05))
+    dirs = torch.from_numpy(unit(points_in(np.array([-1.0] * 3 + [1.0] * 3), 20, seed=5)))
+    sigma, rgb = field.query(points, dirs)
+    alone = reshaped(random_vm(replace(SIXTY_FOUR, sh_degree=2)), SIXTY_FOUR).query(points, dirs)[0]
     torch.testing.assert_close(sigma, alone, rtol=1e-12, atol=0)
     for i in range(20):
-        expected = slow_colour(field, points[i], dirs[i]) if sigma[i] > 0 else np.zeros(3)
+        expected = slow_colour(field, points[i].numpy(), dirs[i].numpy()) if sigma[i] > 0 else np.zeros(3)
         np.testing.assert_allclose(rgb[i], expected, atol=1e-9)
-    assert not field.query(torch.from_numpy(points), torch.from_numpy(dirs), with_colour=False)[1].any()
+    assert not field.query(points, dirs, with_colour=False)[1].any()
 
 
 def test_state_round_trip():
@@ -93,18 +84,33 @@ def test_an_array_that_does_not_fit_is_named(name):
             VMMLPField.from_state(bad, metadata)
 
 
-def test_several_blocks_are_refused():
-    field = random_vm()
-    field.blocks = field.blocks * 2
-    with pytest.raises(ValueError, match="one block, found 2"):
-        VMMLPField(field, untrained(27, 8, torch.Generator()))
+def test_what_a_vm_field_may_be_and_this_not_is_refused():
+    arrays, metadata = random_field(torch.float32).state()
+    (tensor,), (block,) = metadata["tensors"], metadata["blocks"]
+    for change, said in (
+        ({"blocks": [block, block]}, "one block, found 2"),
+        (
+            {"blocks": [block | {"object_to_field": np.diag([2.0, 1, 1, 1]).tolist()}]},
+            "should be the identity",
+        ),
+        ({"tensors": [tensor | {"hashed": {"spacings": [0.1], "rows": 64}}]}, "no hashed detail"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            VMMLPField.from_state(arrays, metadata | change)
+
+
+def test_the_name_of_what_it_is_stays():
+    field = random_field(torch.float32)
+    field.name = "lamp"
+    arrays, metadata = field.resampled(BOX, (6, 6, 6)).state()
+    assert metadata["blocks"][0]["name"] == "lamp" and VMMLPField.from_state(arrays, metadata).name == "lamp"
 
 
 def test_resampling_keeps_the_network_and_the_basis():
     field = random_field(torch.float32)
     box = BOX + np.array([0.1, 0.1, 0.1, -0.1, -0.1, -0.1])
     new = field.resampled(box, (9, 10, 11))
-    assert new.tensors[0].resolution == (9, 10, 11) and torch.equal(new.basis, field.basis)
+    assert new.resolution == (9, 10, 11) and torch.equal(new.basis, field.basis)
     for other in (new, new.with_occupancy(OccupancyGrid.full(box))):
         assert all(map(torch.equal, field.weights.values(), other.weights.values()))
 
@@ -154,8 +160,8 @@ def trained(field, batch) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture
 def every_sample(monkeypatch):
     """All samples are shaded: the loss jumps where a weight crosses the threshold."""
-    sizes = bodies.sizes
-    monkeypatch.setattr(bodies, "sizes", lambda field: sizes(field) | {"LEARN_FROM": 0.0})
+    sizes = tensorf_mlp.sizes
+    monkeypatch.setattr(tensorf_mlp, "sizes", lambda **options: sizes(**options) | {"LEARN_FROM": 0.0})
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -209,7 +215,7 @@ def test_what_fills_a_layer_up_stays_zero(every_sample):
     other = field.with_params(inside)
     for view in other.weights.values():
         view += 1
-    start = field.factors.params.numel()
+    start = int(field.starts[13])
     assert sum(view.numel() for view in views) == int(inside[start:].sum())
     optimiser, before = Adam(field, 2), field.params.clone()
     batch = batch_at(field)
@@ -222,9 +228,9 @@ def test_what_fills_a_layer_up_stays_zero(every_sample):
 
 def test_the_network_learns_at_a_rate_of_its_own():
     field = random_field(torch.float32)
-    *others, network = field.groups()
-    assert [g.rate for g in others] == [1.0, BASIS_RATE] and network.rate == NETWORK_RATE
-    assert network.low == field.factors.params.numel() == others[-1].high
+    factors, basis, network = field.groups()
+    assert (factors.rate, basis.rate) == (1.0, BASIS_RATE) and network.rate == pytest.approx(BASIS_RATE / 3)
+    assert (factors.low, basis.low, network.low) == (0, field.starts[12], field.starts[13])
     assert network.high == field.params.numel() and network.low % 16 == network.high % 16 == 0
 
 
@@ -249,7 +255,7 @@ def pictures_of_a_ball(count: int, size: int):
 @pytest.mark.slow
 def test_a_tiny_fit_learns_a_ball():
     cameras, images = pictures_of_a_ball(10, 40)
-    settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=32, steps=150, samples=1 << 14)
+    settings = TrainConfig("vm-mlp", way_of(THIRTY_TWO), longest=32, steps=150, samples=1 << 14)
     field = fit(cameras[1:], images[1:], BOX, settings)
     assert isinstance(field, VMMLPField)
     alpha = images[0, ..., 3:] / 255
@@ -262,7 +268,7 @@ def test_a_tiny_fit_learns_a_ball():
 @pytest.mark.slow
 def test_a_fit_taken_up_from_a_checkpoint_goes_on_as_before():
     cameras, images = pictures_of_a_ball(3, 24)
-    settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=24, steps=40, samples=1 << 11)
+    settings = TrainConfig("vm-mlp", way_of(THIRTY_TWO), longest=24, steps=40, samples=1 << 11)
     whole, again = (FitRun.start(cameras, images, BOX, settings, "") for _ in range(2))
     for _ in range(3):
         whole.step(0.0)

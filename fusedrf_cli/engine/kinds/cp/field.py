@@ -3,10 +3,9 @@ with spherical-harmonic colour. The smallest of all kinds: its numbers grow with
 
 from dataclasses import dataclass
 
-import torch
-
-from fusedrf_cli.engine.fields.box import BoxField, Part, largest
-from fusedrf_cli.engine.kinds.cp import bodies, reference
+from fusedrf_cli.engine.decoders import density_sum, sh_basis
+from fusedrf_cli.engine.encodings import line
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 
 FACTOR_SPREAD = 0.2  # TensoRF's, of lines
 BASIS_RATE = 0.05  # TensoRF: 1e-3 for the colour basis where lines learn at 2e-2
@@ -35,38 +34,19 @@ class CPShape:
         return (self.sh_degree + 1) ** 2
 
 
-class CPField(BoxField):
+class CPField(AssembledField):
     """Three lines per component over one box."""
 
     kind = "cp"
-    bodies = bodies
     shape_type = CPShape
 
     @classmethod
-    def parts_of(cls, shape: CPShape, resolution: tuple[int, int, int]) -> list[Part]:
-        """See BoxField."""
-        lines = [
-            Part(f"{what}_line_{axis}", (resolution[axis], rank), (axis,), spread=FACTOR_SPREAD)
-            for what, rank in (("density", shape.density_rank), ("colour", shape.colour_rank))
-            for axis in range(3)
-        ]
-        basis = 3, shape.coefficients, shape.colour_rank
-        return [*lines, Part("colour_basis", basis, rate=BASIS_RATE, spread=shape.colour_rank**-0.5)]
-
-    def kernel_arrays(self, params: object) -> bodies.Arrays:
-        """See ComputedField."""
-        return bodies.Arrays(params, self.starts[:-1], *self.corners, self.activation)
-
-    def reference(self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor):
-        """See reference.py."""
-        return reference.query(self, params, points, dirs)
-
-    def check_answers(self) -> None:
-        """See BoxField."""
-        peak = {name: largest(view, kept=1) for name, view in self.sections().items()}
-        density, colour = (
-            peak[f"{what}_line_0"] * peak[f"{what}_line_1"] * peak[f"{what}_line_2"]
-            for what in ("density", "colour")
-        )
-        self.check_density(float(density.sum()))
-        self.check_logit(self.shape.coefficients * float((colour * peak["colour_basis"]).sum()))
+    def slots_of(cls, shape: CPShape) -> dict[str, Slot]:
+        """See AssembledField."""
+        basis = {"width": shape.colour_rank, "coefficients": shape.coefficients}
+        return {
+            "density": Slot(line, {"rank": shape.density_rank}, "density_", spread=FACTOR_SPREAD),
+            "colour": Slot(line, {"rank": shape.colour_rank}, "colour_", spread=FACTOR_SPREAD),
+            "sigma": Slot(density_sum),
+            "rgb": Slot(sh_basis, basis, "colour_", rate=BASIS_RATE),
+        }

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import BoxField, Part, largest
-from fusedrf_cli.engine.kinds.dense import bodies, reference
+from fusedrf_cli.engine.decoders import density_sum, sh
+from fusedrf_cli.engine.encodings import grid
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 
 DENSITY_RATE, COLOUR_RATE = 60.0, 10.0  # a vertex is touched seldom; slower ones leave haze for long
 
@@ -39,35 +40,22 @@ class DenseShape:
         return -(-self.numbers // 8) * 8
 
 
-class DenseField(BoxField):
+class DenseField(AssembledField):
     """Vertices of a grid over one box."""
 
     kind = "dense"
-    bodies = bodies
     shape_type = DenseShape
 
     @classmethod
-    def parts_of(cls, shape: DenseShape, resolution: tuple[int, int, int]) -> list[Part]:
-        """See BoxField."""
-        rows = (*resolution, shape.width)
-        return [
-            Part("density", resolution, (0, 1, 2), DENSITY_RATE),
-            Part("colour", rows, (0, 1, 2), COLOUR_RATE, columns=shape.numbers),
-        ]
-
-    def kernel_arrays(self, params: object) -> bodies.Arrays:
-        """See ComputedField."""
-        return bodies.Arrays(params, int(self.starts[1]), *self.corners, self.activation)
-
-    def reference(self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor):
-        """See reference.py."""
-        return reference.query(self, params, points, dirs)
-
-    def check_answers(self) -> None:
-        """See BoxField."""
-        peak = {name: float(largest(view)) for name, view in self.sections().items()}
-        self.check_density(peak["density"])
-        self.check_logit(3 * self.shape.coefficients * peak["colour"])
+    def slots_of(cls, shape: DenseShape) -> dict[str, Slot]:
+        """See AssembledField."""
+        harmonics = {"width": shape.width, "coefficients": shape.coefficients}
+        return {
+            "density": Slot(grid, {"numbers": 1}, "density", DENSITY_RATE),
+            "colour": Slot(grid, {"numbers": shape.numbers}, "colour", COLOUR_RATE),
+            "sigma": Slot(density_sum),
+            "rgb": Slot(sh, harmonics),
+        }
 
     def fill_vertices(self, index: np.ndarray, features: np.ndarray, colours: np.ndarray) -> None:
         """See AskedStudent."""

@@ -3,11 +3,10 @@ own or one that it shares with other fields (Control-NeRF, Lazova et al., WACV 2
 
 from dataclasses import dataclass, replace
 
-import torch
-
-from fusedrf_cli.engine.fields.box import Part, largest
-from fusedrf_cli.engine.kinds.dense.field import DenseField
-from fusedrf_cli.engine.kinds.dense_mlp import bodies, reference
+from fusedrf_cli.engine.decoders import density_sum, sh_mlp
+from fusedrf_cli.engine.encodings import grid
+from fusedrf_cli.engine.fields.assembled import Slot
+from fusedrf_cli.engine.kinds.dense.field import COLOUR_RATE, DENSITY_RATE, DenseField
 
 DECODER_RATE = 0.05  # 1e-3 where features learn at 2e-2, as other networks of the kind
 FEATURE_SPREAD = 0.1  # features that were all alike would never come apart
@@ -31,40 +30,23 @@ class DenseMLPShape:
             if type(count) is not int or not 8 <= count <= most or count % 8:
                 raise ValueError(f"'{name}' should be a multiple of 8 up to {most}, found {count}")
 
-    @property
-    def numbers(self) -> int:
-        """Numbers of a vertex besides its density."""
-        return self.width
-
 
 class DenseMLPField(DenseField):
     """Vertices of a grid over one box, and a decoder."""
 
     kind = "dense-mlp"
-    bodies = bodies
     shape_type = DenseMLPShape
 
     @classmethod
-    def parts_of(cls, shape: DenseMLPShape, resolution: tuple[int, int, int]) -> list[Part]:
-        """See BoxField."""
-        inputs, rate = shape.width + bodies.HARMONICS, 0.0 if shape.shared else DECODER_RATE
-        density, rows = super().parts_of(shape, resolution)
-        return [
-            density,
-            replace(rows, spread=FEATURE_SPREAD),
-            Part("decoder.hidden.weight", (inputs, shape.hidden), rate=rate, spread=(2 / inputs) ** 0.5),
-            Part("decoder.hidden.bias", (shape.hidden,), rate=rate),
-            Part("decoder.out.weight", (shape.hidden, bodies.OUTPUTS), rate=rate, spread=shape.hidden**-0.5),
-            Part("decoder.out.bias", (bodies.OUTPUTS,), rate=rate),
-        ]
-
-    def kernel_arrays(self, params: object) -> bodies.Arrays:
-        """See ComputedField."""
-        return bodies.Arrays(*super().kernel_arrays(params), *map(int, self.starts[[2, 4]]))
-
-    def reference(self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor):
-        """See reference.py."""
-        return reference.query(self, params, points, dirs)
+    def slots_of(cls, shape: DenseMLPShape) -> dict[str, Slot]:
+        """See AssembledField."""
+        layers = {"width": shape.width, "hidden": shape.hidden}
+        return {
+            "density": Slot(grid, {"numbers": 1}, "density", DENSITY_RATE),
+            "colour": Slot(grid, {"numbers": shape.width}, "colour", COLOUR_RATE, FEATURE_SPREAD),
+            "sigma": Slot(density_sum),
+            "rgb": Slot(sh_mlp, layers, "decoder.", 0.0 if shape.shared else DECODER_RATE),
+        }
 
     def sharing(self, other: "DenseMLPField") -> "DenseMLPField":
         """This field with another one's decoder, which learns no further. Raises ValueError where it does not
@@ -85,13 +67,3 @@ class DenseMLPField(DenseField):
         """See BoxField; the decoder is a part that fields may have in common."""
         arrays, metadata = super().state()
         return arrays, metadata | {"shared": ["decoder"]}
-
-    def check_answers(self) -> None:
-        """See BoxField."""
-        sections = self.sections()
-        self.check_density(float(largest(sections["density"])))
-        most = max(float(largest(sections["colour"])), 1.0)
-        for layer in ("hidden", "out"):
-            weight, bias = (sections[f"decoder.{layer}.{part}"].abs().double() for part in ("weight", "bias"))
-            most = float((weight.sum(0) * most + bias).amax())
-        self.check_logit(most)

@@ -17,6 +17,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.encodings.plane_line import MODES
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples, sampling_step
 from fusedrf_cli.engine.fields.box import (
@@ -58,7 +59,6 @@ from fusedrf_cli.engine.kernels.loops import Rays
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm import bodies, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
-from fusedrf_cli.engine.kinds.vm.reference import MODES
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
 OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks

@@ -6,19 +6,17 @@ cube of a tensor.
 
 import torch
 
+from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, RUN, Hashed
 from fusedrf_cli.engine.kernels.reference import (
     EDGE,
-    bilinear,
     cell_at,
     density,
     exact,
-    linear,
     sh_basis,
     whole,
 )
 
-MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 NOBODY = -1  # in place of a block's number, where no block is asked
 
 
@@ -132,11 +130,8 @@ def block_colour(field, b: int, points: torch.Tensor, dirs: torch.Tensor) -> tor
 
 def vm_products(sections: dict[str, torch.Tensor], what: str, unit: torch.Tensor) -> torch.Tensor:
     """(N, 3 R) products P_r(a, b) L_r(c), mode after mode (TensoRF, eq. 5); what is "density" or "colour"."""
-    products = []
-    for m, (a, b, c) in enumerate(MODES):
-        plane = bilinear(sections[f"{what}_plane_{m}"], unit[:, a], unit[:, b])
-        products.append(plane * linear(sections[f"{what}_line_{m}"], unit[:, c]))
-    return torch.cat(products, 1)
+    own = {name.removeprefix(f"{what}_"): view for name, view in sections.items()}
+    return plane_line.reference(own, unit, None, 0)
 
 
 def vm_density_feature(sections: dict[str, torch.Tensor], unit: torch.Tensor) -> torch.Tensor:

@@ -1,240 +1,186 @@
-"""The `vm-mlp` field: colour by a shallow network over a VM tensor's features and view (TensoRF's MLP_Fea).
+"""The `vm-mlp` field: planes times lines, and colour by a network on features and view (TensoRF, Chen et al.,
+ECCV 2022, with MLP_Fea shading; decoders/tensorf_mlp.py).
 
-The factors are a `VMField` of one block, used for density, occupancy, resampling and storage. Its colour
-basis (3, 9, 3 rank), read as the (27, 3 rank) matrix B, makes the features f = B (P ∘ L); SH is not used.
+In files it is a `vm` field of one tensor in the field's own frame, whose colour basis (3, K, 3 rank), read as
+a matrix (3 K, 3 rank), makes the network's features, and the network's layers beside it.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.decoders import density_sum, tensorf_mlp
+from fusedrf_cli.engine.encodings import plane_line
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.base import FieldNeeds
-from fusedrf_cli.engine.fields.computed import ComputedField, Group, Reads
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.vm.field import MAX_ANSWER, VMField, VMShape, VMTensor, aligned
-from fusedrf_cli.engine.kinds.vm_mlp import bodies, reference
+from fusedrf_cli.engine.fields.computed import Reads
+from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE, VMShape
+from fusedrf_cli.engine.spaces import bounded, name_of
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
 MAX_WIDTH = 256  # of a stored field
-LAYERS = 3
-NETWORK_RATE = 0.05  # TensoRF: 1e-3 where factors learn at 2e-2
+FACTOR_SPREAD = 0.1  # TensoRF's, of planes and lines
+TENSOR = "tensor_0."  # in front of the names that a `vm` field's only tensor has
 
 
-class VMMLPField(ComputedField):
-    """One VM tensor and a colour network: x = [f, d] -> [x, sin x, sin 2x, cos x, cos 2x] -> width -> width
-    -> 3, ReLU, sigmoid at the end, with d the unit direction in the object's frame.
+@dataclass(frozen=True)
+class VMMLPShape(VMShape):
+    """Ranks; the degree stands for the number of features."""
 
-    The inputs are TensoRF's, in blocks as wide as x, where TensoRF interleaves frequencies and keeps f and d
-    apart: an importer permutes the columns of the first layer. `params` are the factors' and behind them the
-    network's, each layer transposed and filled up to whole runs of 8 (bodies.py).
-    """
+    sh_degree: int = FEATURE_DEGREE
+    width: int = WIDTH
+    """Outputs of the network's hidden layers."""
 
-    kind, bodies = "vm-mlp", bodies
+    def __post_init__(self):
+        """Refuse what the kernels were not written for."""
+        super().__post_init__()
+        if type(self.width) is not int or not 0 < self.width <= MAX_WIDTH:
+            raise ValueError(f"'width' should be 1 to {MAX_WIDTH}, found {self.width}")
 
-    def __init__(self, factors: VMField, weights: dict[str, torch.Tensor]):
-        """weights are the network's by name: `<layer>.weight` (out, in) and `<layer>.bias` (out,)."""
-        if len(factors.blocks) != 1:
-            raise ValueError(f"a vm-mlp field has one block, found {len(factors.blocks)}")
-        if factors.tensors[0].hashed:
-            raise ValueError("a vm-mlp field has no hashed detail")
-        self.width, self.factors = len(weights["0.bias"]), factors
-        packed = factors.params.new_zeros(self.network_size)
-        self._place(torch.cat([factors.params, packed]))
-        for name, view in self.weights.items():
-            view.copy_(weights[name])
+    @property
+    def features(self) -> int:
+        """That the matrix makes."""
+        return 3 * self.coefficients
 
-    def _place(self, params: torch.Tensor) -> None:
-        """Take other numbers, of which the factors hold a view."""
-        self.params = params
-        self.factors = self.factors.with_params(params[: self.factors.params.numel()])
 
-    # -- making ----------------------------------------------------------------------------------------------
+class VMMLPField(AssembledField):
+    """One VM tensor and a colour network."""
+
+    kind = "vm-mlp"
+    shape_type = VMMLPShape
+    name = ""
+    """Of the object that it is, as files say."""
+
+    @classmethod
+    def slots_of(cls, shape: VMMLPShape) -> dict[str, Slot]:
+        """See AssembledField."""
+        rank, density = {"rank": shape.colour_rank}, {"rank": shape.density_rank}
+        network = {"width": 3 * shape.colour_rank, "rows": shape.features, "hidden": shape.width}
+        return {
+            "density": Slot(plane_line, density, f"{TENSOR}density_", spread=FACTOR_SPREAD),
+            "colour": Slot(plane_line, rank, f"{TENSOR}colour_", spread=FACTOR_SPREAD),
+            "sigma": Slot(density_sum),
+            "rgb": Slot(tensorf_mlp, network, "network.", BASIS_RATE),
+        }
 
     @classmethod
     def create(
-        cls,
-        aabb: np.ndarray,
-        resolution: tuple[int, int, int],
-        shape: VMShape,
-        generator: torch.Generator,
-        name: str = "",
-        width: int = WIDTH,
+        cls, shape: VMMLPShape, box: np.ndarray, resolution: tuple[int, int, int], generator: torch.Generator
     ) -> "VMMLPField":
-        """An untrained field of the shape's ranks; its SH degree is not used."""
-        shape = replace(shape, sh_degree=FEATURE_DEGREE)
-        factors = VMField.create(aabb, resolution, shape, generator, name)
-        return cls(factors, untrained(3 * shape.coefficients, width, generator))
+        """See BoxField; matrix and layers are uniform as a linear layer's."""
+        field = super().create(shape, box, resolution, generator)
+        bound = field.basis.shape[1] ** -0.5
+        field.basis.uniform_(-bound, bound, generator=generator)
+        for name, weight in untrained(shape.features, shape.width, generator).items():
+            field.weights[name].copy_(weight)
+        return field
 
-    def with_params(self, params: torch.Tensor) -> "VMMLPField":
-        """The same field with other numbers."""
-        other = super().with_params(params)
-        other._place(params)
-        return other
-
-    def with_occupancy(self, occupancy: OccupancyGrid) -> "VMMLPField":
-        """The same numbers under another occupancy grid."""
-        other = super().with_params(self.params)
-        other.factors = self.factors.with_occupancy(occupancy)
-        return other
-
-    def resampled(self, aabb: np.ndarray, resolution: tuple[int, int, int]) -> "VMMLPField":
-        """The field on another box and resolution, with the same network."""
-        return VMMLPField(self.factors.resampled(aabb, resolution), self.weights)
-
-    # -- reading ---------------------------------------------------------------------------------------------
-
-    @property
-    def resolution(self) -> tuple[int, int, int]:
-        """Texels per axis."""
-        return self.factors.resolution
-
-    def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
-        """See ComputedField: the factors'."""
-        return self.factors.planes(numbers[: self.factors.params.numel()])
-
-    @property
-    def shape(self) -> VMShape:
-        """Ranks; the degree stands for the number of features."""
-        return self.factors.shape
-
-    @property
-    def tensors(self) -> tuple[VMTensor, ...]:
-        """The one tensor."""
-        return self.factors.tensors
-
-    @property
-    def blocks(self) -> tuple:
-        """The one block."""
-        return self.factors.blocks
-
-    @property
-    def occupancy(self) -> OccupancyGrid:
-        """The factors' grid."""
-        return self.factors.occupancy
-
-    @property
-    def voxel_size(self) -> float:
-        """Finest texel spacing, in the field's frame."""
-        return self.factors.voxel_size
-
-    @property
-    def layout(self) -> np.ndarray:
-        """(1, 13) int64 offsets of the factors' sections in params."""
-        return self.factors.layout
+    def resampled(self, box: np.ndarray, resolution: tuple[int, int, int]) -> "VMMLPField":
+        """See BoxField."""
+        new = super().resampled(box, resolution)
+        new.name = self.name
+        return new
 
     @property
     def basis(self) -> torch.Tensor:
-        """(27, 3 rank) view of the matrix that makes features of products."""
-        return self.factors.sections(0)["colour_basis"].flatten(0, 1)
-
-    @property
-    def wide(self) -> int:
-        """Outputs of a layer in memory."""
-        return -(-self.width // 8) * 8
-
-    @property
-    def layers(self) -> list[tuple[int, int, int, int]]:
-        """(inputs, outputs, and both as they lie in memory) of every layer."""
-        inputs = 5 * (3 * self.shape.coefficients + 3)
-        return [
-            (inputs, self.width, inputs, self.wide),
-            (self.width, self.width, self.wide, self.wide),
-            (self.width, 3, self.wide, bodies.OUTPUTS),
-        ]
-
-    @property
-    def network_size(self) -> int:
-        """Floats of the network in memory."""
-        return aligned(sum((rows + 1) * columns for _, _, rows, columns in self.layers))
+        """(features, 3 rank) view of the matrix that makes features of products."""
+        return self.sections()["network.basis"]
 
     @property
     def weights(self) -> dict[str, torch.Tensor]:
         """Views of the network's numbers by name: `<layer>.weight` (out, in) and `<layer>.bias` (out,)."""
-        found, start = {}, self.params.numel() - self.network_size
-        for i, (inputs, outputs, rows, columns) in enumerate(self.layers):
-            both = self.params[start : start + (rows + 1) * columns].view(rows + 1, columns)
-            found[f"{i}.weight"], found[f"{i}.bias"] = both[:inputs, :outputs].T, both[rows, :outputs]
-            start += both.numel()
-        return found
-
-    def kernel_arrays(self, params: object) -> bodies.Arrays:
-        """See ComputedField."""
-        factors = self.factors.kernel_arrays(params)
-        return bodies.Arrays(*factors, self.factors.params.numel())
-
-    def reference(
-        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """See ComputedField and vm_mlp/reference.py."""
-        return reference.query(self, params, points, dirs)
-
-    def groups(self) -> list[Group]:
-        """The factors' groups, and the network."""
-        start = self.factors.params.numel()
-        return [*self.factors.groups(), Group(start, self.params.numel(), NETWORK_RATE)]
+        views, sections = {}, self.sections()
+        for name, shape in weight_shapes(self.shape.features, self.shape.width).items():
+            layer = sections[f"network.layer_{name[0]}"]
+            views[name] = layer[: shape[1], : shape[0]].T if len(shape) == 2 else layer[-1, : shape[0]]
+        return views
 
     # -- storing ---------------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """The factors' arrays and metadata, and the network's weights."""
-        arrays, metadata = self.factors.state()
-        weights = {f"network.{name}": view.detach().cpu() for name, view in self.weights.items()}
-        return arrays | {name: np.ascontiguousarray(w.numpy()) for name, w in weights.items()}, metadata
+        """Arrays and metadata of a `vm` field of one tensor, and the network's weights."""
+        arrays, own = super().state()
+        basis = arrays.pop("network.basis").reshape(3, self.shape.coefficients, -1)
+        for i in range(tensorf_mlp.LAYERS):
+            arrays.pop(f"network.layer_{i}")
+        cells = [name for name in arrays if name.startswith("occupancy")]
+        arrays |= {TENSOR + name: arrays.pop(name) for name in cells} | {f"{TENSOR}colour_basis": basis}
+        for name, view in self.weights.items():
+            arrays[f"network.{name}"] = np.ascontiguousarray(view.detach().cpu().numpy())
+        shape = {name: own["shape"][name] for name in ("density_rank", "colour_rank", "sh_degree")}
+        tensor = {name: own[name] for name in ("resolution", "aabb", "scale", "shift")}
+        tensor["occupancy"] = own["cells"]["counts"]
+        if self.space is not bounded:
+            tensor["space"] = name_of(self.space)
+        block = {"tensor": 0, "object_to_field": np.eye(4).tolist(), "name": self.name}
+        needs = {"needs": own["needs"]} if "needs" in own else {}
+        box = self.occupancy.aabb.tolist()
+        return arrays, needs | {"aabb": box, "shape": shape, "tensors": [tensor], "blocks": [block]}
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
-        """See Kind.field_needs; the factors' numbers are copied once."""
-        factors = VMField.needs(metadata, shapes, array)
-        return FieldNeeds(factors.held, factors.held + factors.reading)
+        """See Kind.field_needs."""
+        return super().needs(box_metadata(metadata, shapes["network.0.bias"][0]), shapes, array)
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMMLPField":
         """Inverse of `state`; the network's width is that of its first bias."""
-        factors = VMField.from_state(arrays, metadata)
-        width = arrays.get("network.0.bias")
-        if width is None or width.ndim != 1 or len(width) > MAX_WIDTH:
+        bias = arrays.get("network.0.bias")
+        if bias is None or bias.ndim != 1 or not 0 < len(bias) <= MAX_WIDTH:
             raise ValueError(f"array 'network.0.bias' is no vector of at most {MAX_WIDTH} numbers")
-        weights = {}
-        for name, shape in weight_shapes(3 * factors.shape.coefficients, len(width)).items():
-            found = arrays.get(f"network.{name}")
-            if found is None or found.shape != shape:
-                have = "nothing" if found is None else list(found.shape)
-                raise ValueError(f"array 'network.{name}' should have shape {list(shape)}, found {have}")
-            weights[name] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
-        check_network(weights)
-        return cls(factors, weights)
+        own = box_metadata(metadata, len(bias))
+        shape = VMMLPShape(**own["shape"])
+        basis = f"{TENSOR}colour_basis"
+        expected = {basis: (3, shape.coefficients, 3 * shape.colour_rank)}
+        expected |= {f"network.{n}": s for n, s in weight_shapes(shape.features, shape.width).items()}
+        for name, size in expected.items():
+            if name not in arrays or arrays[name].shape != size:
+                have = list(arrays[name].shape) if name in arrays else "nothing"
+                raise ValueError(f"array '{name}' should have shape {list(size)}, found {have}")
+        cells = [name for name in arrays if name.startswith(f"{TENSOR}occupancy")]
+        boxed = arrays | {name.removeprefix(TENSOR): arrays[name] for name in cells}
+        boxed["network.basis"] = arrays[basis].reshape(shape.features, -1)
+        for i, (inputs, outputs) in enumerate(tensorf_mlp.layer_shapes(shape.features, shape.width)):
+            layer = boxed[f"network.layer_{i}"] = np.zeros((inputs + 1, outputs), np.float32)
+            weight, given = arrays[f"network.{i}.weight"], arrays[f"network.{i}.bias"]
+            layer[: weight.shape[1], : len(weight)], layer[-1, : len(given)] = weight.T, given
+        field = super().from_state(boxed, own)
+        field.name = str(metadata["blocks"][0]["name"])
+        return field
+
+
+def box_metadata(metadata: dict, width: int) -> dict:
+    """The metadata of a `vm` field of one tensor as BoxField's, with the network's width. Raises ValueError
+    where there are several tensors, or the one is placed anywhere but in the field's own frame."""
+    if len(metadata["tensors"]) != 1 or len(metadata["blocks"]) != 1:
+        raise ValueError(f"a vm-mlp field has one block, found {len(metadata['blocks'])}")
+    (tensor,), (block,) = metadata["tensors"], metadata["blocks"]
+    if not np.array_equal(block["object_to_field"], np.eye(4)):
+        raise ValueError("block 0: object_to_field of a vm-mlp field should be the identity")
+    if "hashed" in tensor:
+        raise ValueError("a vm-mlp field has no hashed detail")
+    cells = {"aabb": tensor["aabb"], "counts": tensor["occupancy"], "space": tensor.get("space", "bounded")}
+    own = {name: tensor[name] for name in ("resolution", "aabb", "scale", "shift")}
+    return own | {"cells": cells, "shape": metadata["shape"] | {"width": width}}
 
 
 def weight_shapes(features: int, width: int) -> dict[str, tuple[int, ...]]:
     """Names and shapes of a network's weights, (out, in), and biases, (out,)."""
     sizes = (5 * (features + 3), width, width, 3)
     shapes = {}
-    for i in range(LAYERS):
+    for i in range(tensorf_mlp.LAYERS):
         shapes[f"{i}.weight"], shapes[f"{i}.bias"] = (sizes[i + 1], sizes[i]), (sizes[i + 1],)
     return shapes
 
 
 def untrained(features: int, width: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Weights uniform as a linear layer's, the last bias 0."""
-    found = {}
+    weights = {}
     for name, shape in weight_shapes(features, width).items():
-        bound = (shape[1] if len(shape) == 2 else found[f"{name[0]}.weight"].shape[1]) ** -0.5
-        found[name] = torch.empty(shape).uniform_(-bound, bound, generator=generator)
-    found[f"{LAYERS - 1}.bias"].zero_()
-    return found
-
-
-def check_network(weights: dict[str, torch.Tensor]) -> None:
-    """Raise ValueError where inputs of size 1 could grow past float32 on their way through the network: the
-    product of its layers' largest row sums bounds them."""
-    largest = 1.0
-    for i in range(LAYERS):
-        weight, bias = weights[f"{i}.weight"].double(), weights[f"{i}.bias"].double()
-        largest = float((weight.abs().sum(1) * largest + bias.abs()).max())
-    if not largest <= MAX_ANSWER:
-        raise ValueError(
-            f"arrays 'network.*' multiply to {largest:.3g}, which should be at most {MAX_ANSWER:g}"
-        )
+        bound = (shape[1] if len(shape) == 2 else weights[f"{name[0]}.weight"].shape[1]) ** -0.5
+        weights[name] = torch.empty(shape).uniform_(-bound, bound, generator=generator)
+    weights[f"{tensorf_mlp.LAYERS - 1}.bias"].zero_()
+    return weights

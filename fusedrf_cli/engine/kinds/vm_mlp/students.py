@@ -1,15 +1,12 @@
 """A vm-mlp field as a student: one tensor and its network over a scene's box, learnt from nothing."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import Plan, Section, Way
-from fusedrf_cli.engine.kinds.vm.field import VMShape
-from fusedrf_cli.engine.kinds.vm.students import shape_of
-from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, WIDTH, VMMLPField
+from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, VMMLPShape, weight_shapes
 
 
 class VMMLPKind(Kind):
@@ -22,15 +19,16 @@ class VMMLPKind(Kind):
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """Those of the tensor, and the network's weights and biases."""
-        shape = features_of(way)
-        sizes = ((5 * (3 * shape.coefficients + 3), WIDTH), (WIDTH, WIDTH), (WIDTH, 3))
-        network = [(f"network.{i}.weight", (b, a)) for i, (a, b) in enumerate(sizes)]
-        network += [(f"network.{i}.bias", (b,)) for i, (_, b) in enumerate(sizes)]
+        shape = shape_in(way)
+        network = weight_shapes(shape.features, shape.width).items()
+        network = [(f"network.{name}", size) for name, size in network]
         return [Section(*named) for named in [*shape.sections(resolution), *network]]
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> VMMLPField:
         """One tensor and a network."""
-        return VMMLPField.create(plan.box, plan.resolution, features_of(plan.way), generator, name)
+        field = VMMLPField.create(shape_in(plan.way), plan.box, plan.resolution, generator)
+        field.name = name
+        return field
 
     def describe(self, field: VMMLPField) -> dict:
         """Texels per axis, and ranks."""
@@ -38,6 +36,6 @@ class VMMLPKind(Kind):
         return super().describe(field) | {"ranks": ranks}
 
 
-def features_of(way: Way) -> VMShape:
-    """The tensor's shape in a way: its degree stands for the number of features."""
-    return replace(shape_of(way), sh_degree=FEATURE_DEGREE)
+def shape_in(way: Way) -> VMMLPShape:
+    """The shape of a field in a way, VMMLPShape's where that leaves a choice."""
+    return VMMLPShape(*way.ranks) if way.ranks else VMMLPShape()

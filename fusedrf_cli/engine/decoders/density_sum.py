@@ -1,0 +1,54 @@
+"""Density of the sum of features (TensoRF, Chen et al., ECCV 2022, eq. 6): σ = scale a(Σ_r features_r +
+shift), `a` of activations.py."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.decoders import activations
+from fusedrf_cli.engine.decoders.activations import activated, activated_slope
+
+
+class Arrays(NamedTuple):
+    """What the functions read."""
+
+    activation: object  # (2,) float, scale (1/length) and shift
+
+
+def sizes(activation: str = "softplus") -> dict[str, int]:
+    """See decoders; scratch holds the gradient of the sum."""
+    return {"ACTIVATION": activations.NAMES.index(activation), "ROOM": 1}
+
+
+def arrays(field, starts: np.ndarray, activation: str = "softplus") -> Arrays:
+    """See decoders."""
+    return Arrays(field.activation)
+
+
+def reference(
+    field, sections: dict, features: torch.Tensor, activation: str = "softplus"
+) -> tuple[torch.Tensor, None]:
+    """See decoders."""
+    return field.scale * activations.reference(activation, features.sum(1) + field.shift), None
+
+
+def bound(field, sections: dict, features: torch.Tensor, activation: str = "softplus") -> tuple[float, None]:
+    """See decoders."""
+    return float(features.sum()), None
+
+
+# -- compiled ------------------------------------------------------------------------------------------------
+
+
+def forward(field, cell, scratch):
+    """See decoders."""
+    f = features_summed(field, cell, scratch)
+    return float(field.activation[0] * activated(f + field.activation[1])), float(f)
+
+
+def backward(field, cell, pre, d_sigma, scratch, grad):
+    """See decoders."""
+    scratch[AT] = d_sigma * field.activation[0] * activated_slope(pre + field.activation[1])
+    if scratch[AT] != 0:
+        features_summed_backward(field, cell, scratch, AT, scratch, grad)

@@ -1,0 +1,32 @@
+"""Encodings: what turns a point in a field's box into features; one file each, of the same functions.
+
+For the loops, compiled (kernels/assembled.py says how their names are read), with `unit` the point in the
+unit cube of the box, three float64:
+    locate(field, unit)        `cell`, what the others need to know of a point: an int or a tuple; left out:
+                               the point. None: the cell of the density's encoding
+    forward(field, cell, scratch, out, base)
+                               the WIDTH features into out[base:]
+    backward(field, cell, d, base, scratch, grad)
+                               adds to grad (P,) what d[base:], the features' gradient, sends back
+    summed(field, cell, scratch), summed_backward(field, cell, d, base, scratch, grad)
+                               the sum of the features, and its adjoint for d[base]: for decoders that need no
+                               more, without a way by memory; others need none
+    prefetch_at(field, array, cell)
+                               asks for what these read of an array laid out as the field's numbers; may be
+                               left out
+Points may lie a rounding outside the cube; no index may. A multiple of 8 features lets them use vectors.
+
+For Python, with `options` what a field's shape says of the encoding:
+    sizes(**options)           constants: WIDTH, ROOM (numbers of scratch, if any, which lie from AT on), and
+                               its own
+    sections(resolution, **options)
+                               its numbers, if any: a list of Parts (fields/box.py), whose names get a prefix
+    Arrays, arrays(field, starts, **options)
+                               what the functions read beside `field.params`, if anything: a NamedTuple, and
+                               that of a field where its sections begin at starts in `params`
+    reference(sections, unit, read, **options)
+                               (N, WIDTH) features of its sections at unit (N, 3), in plain torch; `read` is
+                               what the slot that it reads hands on (kernels/assembled.py), or None
+    bound(sections, read, **options)
+                               (WIDTH,) float64 the largest magnitude that each feature can reach
+"""

@@ -1,0 +1,43 @@
+"""Frequencies: with x the point in [-1, 1]³ of the box, x and sin(2^l x), cos(2^l x) for l < COUNT (NeRF,
+Mildenhall et al., ECCV 2020, eq. 4, without its π, as its code has it), filled up to a run of eight."""
+
+import math
+
+import torch
+
+
+def sizes(count: int) -> dict[str, int]:
+    """See encodings."""
+    return {"COUNT": count, "NUMBERS": 3 + 6 * count, "WIDTH": -(-(3 + 6 * count) // 8) * 8}
+
+
+def reference(sections: dict, unit: torch.Tensor, read: None, count: int) -> torch.Tensor:
+    """See encodings."""
+    x = 2 * unit - 1
+    waves = [wave(2.0**level * x) for level in range(count) for wave in (torch.sin, torch.cos)]
+    filled = x.new_zeros(len(x), sizes(count)["WIDTH"] - 3 - 6 * count)
+    return torch.cat([x, *waves, filled], 1)
+
+
+def bound(sections: dict, read: None, count: int) -> torch.Tensor:
+    """See encodings."""
+    return torch.ones(sizes(count)["WIDTH"], dtype=torch.float64)
+
+
+# -- compiled ------------------------------------------------------------------------------------------------
+
+
+def forward(field, unit, scratch, out, base):
+    """See encodings."""
+    for axis in range(3):
+        x = 2.0 * (unit[0] if axis == 0 else (unit[1] if axis == 1 else unit[2])) - 1.0
+        out[base + axis] = x
+        for level in range(COUNT):
+            out[base + 3 + 6 * level + axis] = math.sin(x * (1 << level))
+            out[base + 6 + 6 * level + axis] = math.cos(x * (1 << level))
+    for r in range(NUMBERS, WIDTH):
+        out[base + r] = 0
+
+
+def backward(field, unit, d, base, scratch, grad):
+    """Nothing is learnt."""

@@ -1,0 +1,39 @@
+"""What a trunk (decoders/trunk.py) hands on to the colour: all of its outputs, the density's included."""
+
+import numpy as np
+import torch
+
+
+def sizes(outputs: int) -> dict[str, int]:
+    """See encodings."""
+    return {"WIDTH": outputs}
+
+
+def reference(sections: dict, unit: torch.Tensor, read: torch.Tensor, outputs: int) -> torch.Tensor:
+    """See encodings."""
+    return read
+
+
+def bound(sections: dict, read: torch.Tensor, outputs: int) -> torch.Tensor:
+    """See encodings."""
+    return read
+
+
+locate = None  # the cell of the density's encoding serves
+
+
+# -- compiled ------------------------------------------------------------------------------------------------
+
+
+def forward(field, cell, scratch, out, base):
+    """See encodings."""
+    start, source = np.uint64(base), features_outputs_at(field, cell, scratch)
+    for r in range(np.uint64(WIDTH)):
+        out[start + r] = scratch[source + r]
+
+
+def backward(field, cell, d, base, scratch, grad):
+    """See encodings; the trunk sends it on."""
+    start, pending = np.uint64(base), features_pending_at(scratch)
+    for r in range(np.uint64(WIDTH)):
+        scratch[pending + r] += d[start + r]

@@ -1,0 +1,131 @@
+"""A field over one box that is assembled of an encoding for its density, one for its colour, and a decoder of
+each (kernels/assembled.py says how their functions become one namespace)."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import ModuleType
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.fields.box import BoxField, Part
+from fusedrf_cli.engine.kernels.assembled import assemble
+from fusedrf_cli.engine.kernels.reference import cell_at, exact
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What fills a slot of a field."""
+
+    module: ModuleType
+    """An encoding or a decoder."""
+    options: dict = field(default_factory=dict)
+    """What the module's functions for Python are called with."""
+    prefix: str = ""
+    """In front of the names of its sections, in files."""
+    rate: float = 1.0
+    """What its numbers learn at, relative to the optimiser's rate and to what the module says."""
+    spread: float | None = None
+    """Standard deviation of an untrained field's numbers; None: what the module says."""
+
+    @property
+    def sizes(self) -> dict[str, int | float]:
+        """Its constants."""
+        return self.module.sizes(**self.options)
+
+    def arrays(self, field: "AssembledField", starts: np.ndarray) -> tuple:
+        """Its arrays, of a field where its numbers begin at starts in `params`."""
+        return self.module.arrays(field, starts, **self.options) if hasattr(self.module, "arrays") else ()
+
+    def parts(self, resolution: tuple[int, int, int]) -> list[Part]:
+        """Its numbers."""
+        if not hasattr(self.module, "sections"):
+            return []
+        return [
+            replace(
+                part,
+                name=self.prefix + part.name,
+                rate=self.rate * part.rate,
+                spread=part.spread if self.spread is None else self.spread,
+            )
+            for part in self.module.sections(resolution, **self.options)
+        ]
+
+
+class AssembledField(BoxField):
+    """A field of four slots: `density` and `colour`, encodings, and `sigma` and `rgb`, which decode them.
+
+    A kind sets `kind` and `shape_type`, and defines `slots_of`; the rest follows from the slots' modules.
+    """
+
+    @classmethod
+    def slots_of(cls, shape: object) -> dict[str, Slot]:
+        """What fills the slots, by name, in the order of `kernels.assembled.READS`."""
+        raise NotImplementedError
+
+    @cached_property
+    def slots(self) -> dict[str, Slot]:
+        """What fills its slots."""
+        return self.slots_of(self.shape)
+
+    @property
+    def bodies(self) -> ModuleType:
+        """See ComputedField."""
+        return assemble(**{name: slot.module for name, slot in self.slots.items()})
+
+    @classmethod
+    def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[Part]:
+        """See BoxField: those of each slot in turn."""
+        return [part for slot in cls.slots_of(shape).values() for part in slot.parts(resolution)]
+
+    def kernel_arrays(self, params: object) -> tuple:
+        """See ComputedField."""
+        _, lo, side = self.corners
+        values, first = [params, lo, side], 0
+        for slot in self.slots.values():
+            last = first + len(slot.parts(self.resolution))
+            values += slot.arrays(self, self.starts[first:last])
+            first = last
+        return self.bodies.Arrays(*values)
+
+    def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
+        """See ComputedField."""
+        sections = self.with_params(numbers).sections()
+        return [sections[part.name] for part in self.parts if len(part.axes) == 2]
+
+    def slot_sections(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Views of the numbers of each slot, by the names that its module gives them."""
+        sections = self.sections()
+        return {
+            name: {
+                part.name.removeprefix(slot.prefix): sections[part.name]
+                for part in slot.parts(self.resolution)
+            }
+            for name, slot in self.slots.items()
+        }
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ComputedField: the references of the slots, one after the other."""
+        kind, own = params.dtype, self.with_params(params).slot_sections()
+        points, dirs = exact(points, params.device), exact(dirs, params.device)
+        box = exact(self.box, params.device)
+        unit = ((points - box[:3]) / (box[3:] - box[:3])).to(kind)
+        density, colour, sigma, rgb = self.slots.values()
+        features = density.module.reference(own["density"], unit, None, **density.options)
+        values, outputs = sigma.module.reference(self, own["sigma"], features, **sigma.options)
+        values = torch.where(cell_at(self.occupancy, points)[1], values, 0)
+        features = colour.module.reference(own["colour"], unit, outputs, **colour.options)
+        colours = rgb.module.reference(self, own["rgb"], features, dirs, **rgb.options)
+        return values, torch.where((values > 0)[:, None], colours, 0)
+
+    def check_answers(self) -> None:
+        """See BoxField."""
+        own = self.slot_sections()
+        density, colour, sigma, rgb = self.slots.values()
+        features = density.module.bound(own["density"], None, **density.options)
+        largest, outputs = sigma.module.bound(self, own["sigma"], features, **sigma.options)
+        self.check_density(largest)
+        features = colour.module.bound(own["colour"], outputs, **colour.options)
+        self.check_logit(rgb.module.bound(self, own["rgb"], features, **rgb.options))

@@ -1,0 +1,221 @@
+"""Device functions of fields that are assembled of encodings and decoders.
+
+A field has four *slots*: `density` and `colour` hold encodings, `sigma` and `rgb` the decoders that read
+them. Each is filled by a module of scalar functions (engine/encodings, engine/decoders). `assemble` makes of
+four of them what kernels/loops.py expects of a kind: one flat namespace, in which the names of a slot have
+its prefix. That is done by replacing names in the code of its functions, so that one module can fill two
+slots and numba sees plain functions, which it can keep on disk and which kernels/cuda.py can bind again.
+
+In a slot's functions these names get the prefix of the slot: its own functions, names in capitals (the
+constants of its `sizes`, and of its module), and the fields of its `Arrays`, read as `field.NAME`.
+`features_NAME` means NAME of the slot that is read: sigma reads density, rgb reads colour, and colour may
+read sigma, whose outputs can be the features of the colour.
+"""
+
+from functools import cache
+from types import FunctionType, ModuleType
+from typing import NamedTuple
+
+from fusedrf_cli.engine.kernels.parts import LINE
+
+READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
+"""Every slot, in the order of a field's numbers, and the slot that it reads."""
+HOOKS = (
+    "locate", "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward"
+)  # fmt: skip
+"""What the loops below and other slots call; the rest of a module is reached from there."""
+BASE = "params", "lo", "side"  # fields of every assembly's Arrays: numbers (P,), corner (3,) and sides (3,)
+OF_LOOPS = "KEPT", "LEARN_FROM", "SHADING_COST", "COLOUR_FROM"  # constants that loops.py reads
+NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
+EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
+
+
+# -- what the loops ask of a kind ----------------------------------------------------------------------------
+
+
+def unit_of(field, p):
+    """The coordinates of a point in the unit cube of the field's box, and whether it lies inside."""
+    u, v = (p[0] - field.lo[0]) / field.side[0], (p[1] - field.lo[1]) / field.side[1]
+    w = (p[2] - field.lo[2]) / field.side[2]
+    return (u, v, w), min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE
+
+
+def density(field, grid, k, p, d, scratch):
+    """See loops.py; a place is (unit coordinates, what the density's encoding located there)."""
+    unit, inside = unit_of(field, p)
+    cell = density_locate(field, unit)
+    if not inside:
+        return 0.0, 0.0, 0, (unit, cell)
+    sigma, pre = sigma_forward(field, cell, scratch)
+    return sigma, pre, 1, (unit, cell)
+
+
+def again(field, held, p):
+    """See loops.py."""
+    unit = unit_of(field, p)[0]
+    return unit, density_locate(field, unit)
+
+
+def shared_cell(field, place):
+    """What the colour's encoding located, where that is the density's as well."""
+    return place[1]
+
+
+def own_cell(field, place):
+    """The same, where it is another."""
+    return colour_locate(field, place[0])
+
+
+def begin(field, frame, d, scratch):
+    """See loops.py."""
+    rgb_ray_setup(field, d, scratch)
+
+
+def end(field, frame, d, scratch, grad):
+    """See loops.py."""
+    rgb_ray_backward(field, d, scratch, grad)
+
+
+def colour(field, place, p, d, scratch, memory, at):
+    """See loops.py."""
+    return rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+
+
+def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
+    """See loops.py; colour first, since it may send back to what sigma hands on."""
+    if shaded:
+        rgb_backward(field, colour_cell(field, place), d, rgb, d_rgb, scratch, memory, at, grad)
+    sigma_backward(field, place[1], pre, d_sigma, scratch, grad)
+
+
+def ahead_density(field, array, held, p):
+    """See loops.py."""
+    density_prefetch_at(field, array, density_locate(field, unit_of(field, p)[0]))
+
+
+def ahead_colour(field, array, held, p):
+    """See loops.py."""
+    colour_prefetch_at(field, array, colour_cell(field, again(field, held, p)))
+
+
+TEMPLATES = unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
+
+
+# -- what a module may leave out -----------------------------------------------------------------------------
+
+
+class NoArrays(NamedTuple):
+    """Nothing is read beside `params`."""
+
+
+def locate(field, unit):
+    """The point itself."""
+    return unit
+
+
+def prefetch_at(field, array, cell):
+    """Nothing: what is read is near at hand."""
+
+
+def ray_setup(field, d, scratch):
+    """Nothing is known of a ray."""
+
+
+def ray_backward(field, d, scratch, grad):
+    """Nothing is gathered for a ray."""
+
+
+DEFAULTS = {f.__name__: f for f in (locate, prefetch_at, ray_setup, ray_backward)}
+
+
+# -- one namespace of four slots -----------------------------------------------------------------------------
+
+
+@cache
+def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: ModuleType) -> ModuleType:
+    """A module as kinds' `bodies.py`, with functions, `Arrays` and `sizes`, of these encodings and decoders.
+    Raises ValueError where a slot reads what another lacks, or two slots give one name two meanings."""
+    slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
+    label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
+    assembly = ModuleType(f"{__name__}.{label}.bodies")
+    names = vars(assembly) | {"EDGE": EDGE}
+    names |= {template.__name__: renamed(template, template.__name__, assembly, {}) for template in TEMPLATES}
+    shared = colour is density or getattr(colour, "locate", locate) is None
+    names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", assembly, {})
+    for slot, module in slots.items():
+        for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
+            if names.setdefault(name, value) is not value:
+                raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
+    functions = {name: value for name, value in names.items() if isinstance(value, FunctionType)}
+    vars(assembly).update(names, Arrays=arrays_type(slots), functions=functions, sizes=constants)
+    return assembly
+
+
+def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly: ModuleType) -> dict:
+    """What the functions of a slot need, by the name that it has in the one namespace."""
+    names, fields = {}, set(arrays_of(module)._fields)
+    if fields & NOT_PREFIXED:
+        raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
+    hooks = {name: getattr(module, name, DEFAULTS.get(name)) for name in HOOKS}
+    pending = {name: hook for name, hook in hooks.items() if hook is not None}
+    while pending:
+        name, function = pending.popitem()
+        new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
+        for used in function.__code__.co_names:
+            value = known.get(used)
+            if used.startswith("features_"):
+                needed = used.removeprefix("features_")
+                if not isinstance(getattr(read, needed, None), FunctionType):
+                    raise ValueError(f"'{module.__name__}' reads '{needed}', which '{read.__name__}' lacks")
+                new[used] = f"{READS[slot]}_{needed}"
+            elif isinstance(value, FunctionType) or used.isupper() or used in fields:
+                new[used] = f"{slot}_{used}"
+                if isinstance(value, FunctionType) and new[used] not in names:
+                    pending[used] = value
+                elif used.isupper() and used in known:
+                    names[new[used]] = value
+            elif used in known and names.setdefault(used, value) is not value:  # numpy, kernels/parts.py
+                raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
+        names[f"{slot}_{name}"] = renamed(function, f"{slot}_{name}", assembly, new)
+    return names
+
+
+def renamed(function: FunctionType, name: str, assembly: ModuleType, new: dict[str, str]) -> FunctionType:
+    """A function of an assembly under a name, in whose code globals and attributes have `new` names."""
+    code = function.__code__
+    code = code.replace(co_names=tuple(new.get(n, n) for n in code.co_names))
+    other = FunctionType(code, vars(assembly), name, function.__defaults__)
+    # code that is kept is found in another process by a module that can be imported
+    other.__module__, other.__doc__ = function.__module__, function.__doc__
+    return other
+
+
+def arrays_of(module: ModuleType) -> type:
+    """The type of the arrays of an encoding or a decoder."""
+    return getattr(module, "Arrays", NoArrays)
+
+
+def arrays_type(slots: dict[str, ModuleType]) -> type:
+    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
+    that is kept by its types must find it (kernels/tinting.py)."""
+    name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
+    if name not in globals():
+        prefixed = [
+            f"{slot}_{field}" for slot, module in slots.items() for field in arrays_of(module)._fields
+        ]
+        arrays = NamedTuple(name, [(field, object) for field in (*BASE, *prefixed)])
+        arrays.__module__ = __name__
+        globals()[name] = arrays
+    return globals()[name]
+
+
+def constants(field) -> dict[str, int | float]:
+    """The constants of a field's namespace by name: those of each slot (engine/fields/assembled.py) with its
+    prefix, and AT, where its ROOM numbers of scratch begin, on a cache line."""
+    named, start = {}, 0
+    for slot, filled in field.slots.items():
+        own = filled.sizes
+        named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in own.items()}
+        named[f"{slot}_AT"] = start
+        start += -(-own.get("ROOM", 0) // LINE) * LINE
+    return {"KEPT": 0, **named, "SCRATCH": start}

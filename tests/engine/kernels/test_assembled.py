@@ -1,0 +1,176 @@
+"""Fields assembled of encodings and decoders: products of them against the torch references of their parts.
+The loops' functions are run by Python, so that nothing is compiled."""
+
+from dataclasses import dataclass
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import torch
+
+from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
+from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, trunk_features
+from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
+from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
+from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
+from fusedrf_cli.engine.spaces import bounded, unbounded
+
+from ..conftest import BOX, points_in
+from .interpreted import assert_answers, assert_gradients, interpreted, samples
+
+HASHED = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
+DENSITIES = {
+    "line": (line, {"rank": 8}),
+    "plane_line": (plane_line, {"rank": 8}),
+    "grid": (grid, {"numbers": 1}),
+    "hash_grid": (hash_grid, HASHED),
+    "frequencies": (frequencies, {"count": 2}),
+}
+FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
+FEATURES |= {name: (trunk_features, {"outputs": count}) for name, count in (("of 16", 16), ("of 8", 8))}
+SIGMAS = {
+    "density_sum": lambda width: (density_sum, {}),
+    "exp": lambda width: (density_sum, {"activation": "exp"}),
+    "relu": lambda width: (density_sum, {"activation": "relu"}),
+    "trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 16}),
+    "exp_trunk": lambda width: (trunk, {"width": width, "hidden": 8, "outputs": 8, "activation": "exp"}),
+}
+COLOURS = {
+    "rgb": lambda width: (rgb, {"width": width}),
+    "sh_basis": lambda width: (sh_basis, {"width": width, "coefficients": 4}),
+    "sh": lambda width: (sh, {"width": width, "coefficients": 4 if width >= 12 else 1}),
+    "sh_mlp": lambda width: (sh_mlp, {"width": width, "hidden": 8}),
+    "tensorf_mlp": lambda width: (tensorf_mlp, {"width": width, "rows": 5, "hidden": 11}),
+}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Names of what fills the slots."""
+
+    density: str
+    colour: str
+    sigma: str
+    rgb: str
+
+
+class Product(AssembledField):
+    """A field of any encodings and decoders."""
+
+    kind, shape_type = "product", Recipe
+
+    @classmethod
+    def slots_of(cls, shape: Recipe) -> dict[str, Slot]:
+        density, colour = DENSITIES[shape.density], FEATURES[shape.colour]
+        width = colour[0].sizes(**colour[1])["WIDTH"]
+        sigma = SIGMAS[shape.sigma](density[0].sizes(**density[1])["WIDTH"])
+        return {
+            "density": Slot(*density, "density_"),
+            "colour": Slot(*colour, "colour_"),
+            "sigma": Slot(*sigma, "sigma_"),
+            "rgb": Slot(*COLOURS[shape.rgb](width), "rgb_"),
+        }
+
+
+PRODUCTS = [Recipe(e, e, "density_sum", c) for e in ("line", "plane_line", "grid") for c in COLOURS]
+PRODUCTS += [
+    Recipe("line", "grid", "exp", "sh_basis"),
+    Recipe("grid", "line", "relu", "sh"),
+    Recipe("hash_grid", "of 16", "trunk", "sh_mlp"),
+    Recipe("hash_grid", "hash_grid", "exp_trunk", "sh_mlp"),
+    Recipe("frequencies", "of 8", "exp_trunk", "sh_mlp"),
+    Recipe("plane_line", "frequencies", "density_sum", "sh_mlp"),
+]
+
+
+@pytest.fixture(params=PRODUCTS, ids=lambda recipe: "-".join(vars(recipe).values()))
+def field(request):
+    made = Product(request.param, BOX, (5, 8, 7), 3.0, 0.3)
+    generator = torch.Generator().manual_seed(0)
+    return made.with_params(0.5 * torch.randn(len(made.params), generator=generator, dtype=torch.float64))
+
+
+def test_device_functions_answer_as_the_references_of_their_parts(field):
+    assert_answers(field)
+
+
+@pytest.mark.parametrize("shaded", [True, False])
+def test_device_functions_send_back_what_autograd_does(field, shaded):
+    assert_gradients(field, shaded)
+
+
+def test_references_are_differentiable_in_numbers_points_and_directions(field):
+    points, dirs = (torch.from_numpy(values).requires_grad_() for values in samples(field, 8))
+    leaves = field.params.clone().requires_grad_(), points, dirs
+    assert torch.autograd.gradcheck(field.reference, leaves, fast_mode=True, eps=1e-7, atol=1e-6, rtol=1e-5)
+
+
+def test_no_answer_is_beyond_the_bound(field):
+    """`check_answers` keeps the answers of a file's numbers finite: its bounds hold at random points, and are
+    not far from what is reached."""
+    bounds = {}
+    field.check_density, field.check_logit = (
+        lambda most: bounds.update(density=most), lambda most: bounds.update(logit=most)
+    )  # fmt: skip
+    field.check_answers()
+    points, dirs = (torch.from_numpy(values) for values in samples(field, 500))
+    sigma, rgb = field.reference(field.params, points, dirs)
+    if field.slots["sigma"].sizes["ACTIVATION"] == 0:
+        raw = torch.expm1(sigma / field.scale).log() - field.shift
+        assert raw.abs().max() <= bounds["density"] < 1e4
+    assert rgb[sigma > 0].logit().abs().max() <= bounds["logit"] < 1e6
+
+
+def test_what_is_prefetched_lies_in_the_numbers(field):
+    """Also at points outside the box, where nobody answers."""
+    names = interpreted(field)
+    for p in points_in(BOX, 50, margin=0.05).tolist():
+        names["ahead_density"](field.arrays, field.arrays.params, 0, tuple(p))
+        names["ahead_colour"](field.arrays, field.arrays.params, 0, tuple(p))
+
+
+def test_one_assembly_and_one_type_of_arrays_for_the_same_parts(field):
+    slots = [slot.module for slot in field.slots.values()]
+    assert assemble(*slots) is assemble(*slots) and type(field.arrays) is assemble(*slots).Arrays
+
+
+@pytest.mark.parametrize("space", [bounded, unbounded])
+def test_no_two_parts_of_a_namespace_define_one_name(field, space):
+    """The namespace is flat and the later name wins: a name of a slot that hides one of the loops, of the
+    space or of kernels/parts.py would be called in its place. Hooks of loops.py are there to be hidden."""
+    bodies = vars(field.bodies)
+    own = {name for name in {*bodies, *field.bodies.sizes(field)} if not name.startswith("__")}
+    hooks, settings = {template.__name__ for template in TEMPLATES}, {"LEARN_FROM", "SHADING_COST"}
+    for module, allowed in ((loops, hooks | settings), (space, settings), (parts, set()), (instances, set())):
+        others = {name for name in own & set(vars(module)) if bodies.get(name) is not vars(module)[name]}
+        assert others <= allowed
+
+
+def test_names_get_the_prefix_of_their_slot(field):
+    names, functions = specialise.namespace(field.bodies, bounded)
+    for slot in READS:
+        assert f"{slot}_forward" in names
+    assert "sigma_activation" in functions["sigma_forward"].__code__.co_names
+    for name, function in functions.items():
+        assert not [used for used in function.__code__.co_names if used.startswith("features_")], name
+
+
+def module_of(text: str, base: ModuleType) -> ModuleType:
+    """A module as `base`, with other functions beside its own."""
+    other = ModuleType("other")
+    vars(other).update({k: v for k, v in vars(base).items() if k != "__name__"})
+    exec(text, vars(other))
+    return other
+
+
+def test_what_does_not_fit_is_named():
+    lacking = module_of("", line)
+    del lacking.summed
+    with pytest.raises(ValueError, match="density_sum' reads 'summed', which 'other' lacks"):
+        assemble(lacking, line, density_sum, sh_basis)
+    hidden = module_of("def prefetch_at(field, array, unit):\n    np.zeros(1)\nnp = 3", line)
+    with pytest.raises(ValueError, match="'np' of '.*' has two meanings"):
+        assemble(hidden, line, density_sum, sh_basis)
+    unreadable = module_of("", line)
+    unreadable.Arrays = SimpleNamespace(_fields=("shape",))
+    with pytest.raises(ValueError, match="may not call its arrays"):
+        assemble(unreadable, line, density_sum, sh_basis)
