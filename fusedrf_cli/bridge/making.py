@@ -21,7 +21,7 @@ from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.student import NOTHING, DistilConfig, MadeStudent, Plan, Student, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -72,6 +72,16 @@ def same_texels(field: StoredField, other: StoredField) -> bool:
     return field.voxel_size == other.voxel_size and np.array_equal(field.aabb, other.aabb)
 
 
+def as_written(field: StoredField) -> RadianceField:
+    """A field as its bundle is drawn: one that holds several objects as the nodes that they become."""
+    blocks = getattr(field, "blocks", ())
+    if len(blocks) < 2:
+        return field
+    pairs = zip(blocks, field.alone, strict=True)
+    nodes = [Placed(block.name, alone, block.object_to_field) for block, alone in pairs]
+    return as_composite(ComposedField(nodes, origin=np.zeros(3)))
+
+
 class Maker:
     """Makes the students of one scene."""
 
@@ -105,12 +115,13 @@ class Maker:
 
     def measured(self, field: StoredField, way: Way) -> float:
         """PSNR (dB) of the field as it will be read back."""
-        return self.judge(stored(field, way.precision).to(self.place))
+        return self.judge(as_written(stored(field, way.precision).to(self.place)))
 
     def verdict(self, kept: Kept) -> dict:
         """What the report says of the views of a try as it will be read back: how many there are, the PSNR of
         what the scene covers of them, and the object that is shown worst in a view of its own."""
-        found = self.judge.verdict(stored(kept.field, kept.tried.way.precision).to(self.place))
+        field = stored(kept.field, kept.tried.way.precision).to(self.place)
+        found = self.judge.verdict(as_written(field))
         said = {"views": len(self.looks), "covered": found.covered, "covered_share": found.share}
         objects = [(v, look.of) for v, look in zip(found.views, self.looks, strict=True) if look.of]
         if not objects:
@@ -120,7 +131,7 @@ class Maker:
 
     def judged_whole(self, field: StoredField) -> float:
         """PSNR (dB) of the whole field, in float32, that a student is part of."""
-        return self.judge(self.student.whole(field).to(self.place))
+        return self.judge(as_written(self.student.whole(field).to(self.place)))
 
     def offer(self, kept: Kept) -> None:
         """Keep a finished try where it is the best so far: what was measured is what will be written."""
