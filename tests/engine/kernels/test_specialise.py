@@ -175,6 +175,7 @@ def test_no_name_means_two_things_in_a_namespace(name, space):
     field = KINDS[name]()
     ours = [vars(module) for module in (parts, loops, instances, space)]
     theirs = {k: v for module in specialise.family(field.bodies) for k, v in vars(module).items()}
+    theirs |= getattr(field.bodies, "functions", {})
     meanings: dict[str, object] = {}
     for names in (*ours, theirs, field.bodies.sizes(field)):
         for key, value in names.items():
