@@ -13,10 +13,12 @@ RUNS ?= 1000
 KILLS ?= 200
 SEED ?= 0
 
+SLOW ?=
+ORDER ?=
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-slow fuzz lint bench bench-paper bench-real ablation stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real ablation stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -29,16 +31,24 @@ demo: $(VENV)  ## two small scenes, fused and rendered
 test: export NUMBA_NUM_THREADS = 1
 test: export OMP_NUM_THREADS = 1
 test: $(VENV)  ## the quick tests
-	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile
+	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-test-slow: $(VENV)  ## every test
-	$(PYTHON) -m pytest -q
+test-order: export NUMBA_NUM_THREADS = 1
+test-order: export OMP_NUM_THREADS = 1
+test-order: $(VENV)  ## the quick tests in random order, which is said and can be repeated: ORDER=--random-order-seed=N
+	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile --random-order $(ORDER)
+
+test-slow: $(VENV)  ## the slow tests, two files at a time, and how long each takes; SLOW=--third: a third of them
+	$(PYTHON) -m tests.slow $(SLOW)
 
 fuzz: $(VENV)  ## 10,000 hostile packs, captures and meshes, 1,000 by whole commands, and 200 kills of every command; PACKS=, RUNS=, KILLS=, SEED=
 	$(PYTHON) -m tests.promises.fuzz --count $(PACKS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.commands --count $(RUNS) --seed $(SEED)
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(PYTHON) -m tests.promises.fuzz_inputs --readers $(PACKS) --commands $(RUNS) --seed $(SEED)
 	$(PYTHON) -m tests.promises.kills --kills $(KILLS) --seed $(SEED) --calls --adds 16
+
+docs: $(VENV)  ## docs/commands.md, out of --help
+	$(PYTHON) -m docs.commands
 
 lint: $(VENV)  ## ruff
 	$(PYTHON) -m ruff check .

@@ -12,7 +12,7 @@ import argparse
 import csv
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -25,11 +25,10 @@ from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, R
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.distillation.losses import OPAQUE
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.distillation.schedule import RATE_DECAY, Schedule
+from fusedrf_cli.engine.distillation.schedule import Schedule
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds.student import TOLD_NUMBERS, DistillSettings, Way
+from fusedrf_cli.engine.kinds.student import TOLD_NUMBERS, DistilConfig, Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
-from fusedrf_cli.engine.kinds.vm.field import VMField
 
 VIEWS, VIEW_SIZE, VIEWS_SEED = 8, (200, 200), 11
 TRAINED = ("--quality", "draft", "--views", "40", "--size", "200", "--max-size", "4MB")
@@ -47,6 +46,8 @@ class Variant:
 
     name: str
     recipe: Recipe = Recipe()
+    config: dict = field(default_factory=dict)
+    """What it changes of how a student learns."""
     from_scratch: bool = False
     rgb: bool = True
     rays: float = 1.0
@@ -68,7 +69,7 @@ class Steady(Schedule):
 
     def factor(self, share: float) -> float:
         """An exponential fall."""
-        return RATE_DECAY**share
+        return self.config.rate_decay**share
 
 
 def evenly(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
@@ -99,13 +100,9 @@ def capped_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tenso
     return off**2, 2 * off
 
 
-def never(student: VMField) -> bool:
-    """No student starts at half its resolution."""
-    return False
-
-
 WHOLE = Recipe()
-PAPER = Recipe(evenly, raw_depth, all_alike, 0.02, 0.002, never, Steady)
+PAPER = Recipe(evenly, raw_depth, all_alike, Steady)
+LOW = {"rate": 0.02, "rgb_rate": 0.002, "coarse_from": None}
 VARIANTS = (
     *(Variant(f"nothing, seed {seed}", seed=seed) for seed in range(5)),
     Variant("the pictures", rgb=False),
@@ -121,10 +118,10 @@ VARIANTS = (
     Variant("log1p of depth: raw depth", replace(WHOLE, density_loss=raw_depth)),
     Variant("log1p of depth: depth up to opaque", replace(WHOLE, density_loss=capped_depth)),
     Variant("log1p of depth: alpha", replace(WHOLE, density_loss=opacity)),
-    Variant("the high rate: a quarter", replace(WHOLE, rate=0.25 * WHOLE.rate)),
-    Variant("half the resolution first", replace(WHOLE, coarse=never)),
+    Variant("the high rate: a quarter", config={"rate": 0.25 * DistilConfig.rate}),
+    Variant("half the resolution first", config={"coarse_from": None}),
     Variant("the schedule: a steady fall", replace(WHOLE, schedule=Steady)),
-    Variant("all of it: points evenly, raw depth, one resolution, a steady fall of a low rate", PAPER),
+    Variant("all of it: points evenly, raw depth, one resolution, a steady fall of a low rate", PAPER, LOW),
 )
 
 
@@ -152,7 +149,7 @@ class Task:
     composed: ComposedField
     background: Placed
     sampler: RaySampler
-    settings: DistillSettings
+    settings: DistilConfig
     judge: Judge
 
     @classmethod
@@ -165,7 +162,7 @@ class Task:
         background = Placed(name, opened(placed.field), placed.object_to_world)
         looks = looks_of(loaded, composed, VIEWS, VIEW_SIZE, VIEWS_SEED)
         judge = Judge(composed, [look.camera for look in looks], composed.origin)
-        whole = DistillSettings()
+        whole = DistilConfig()
         fewer = {name: round(share * getattr(whole, name)) for name in ("rays", "steps", "rgb_steps")}
         settings = replace(whole, **fewer)
         return cls(composed, background, RaySampler.of(composed), settings, judge)
@@ -173,7 +170,7 @@ class Task:
     def distilled(self, variant: Variant) -> DistillReport:
         """What distilling by a variant's recipe gives."""
         told = round(variant.rays * self.settings.rays), round(variant.steps * self.settings.steps)
-        settings = replace(self.settings, seed=variant.seed, rays=told[0], steps=told[1])
+        settings = replace(self.settings, seed=variant.seed, rays=told[0], steps=told[1], **variant.config)
         most = round(variant.numbers * TOLD_NUMBERS)
         plan = VM.plan(self.composed.aabb, self.composed.voxel_size, Way(), most)
         generator, student = torch.Generator().manual_seed(settings.seed), None

@@ -23,8 +23,8 @@ from benchmarks.paper.table import markdown
 from benchmarks.paper.work import Kept, fusedrf, tell
 from formats.bundle import read_headers
 from formats.captures import write_capture
+from formats.history import distilled
 from formats.views import View
-from fusedrf_cli.bridge.history import graph_nodes
 from fusedrf_cli.bridge.rendering import renderable, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.distillation.judging import meets
@@ -42,6 +42,7 @@ SHUFFLED = 6
 SIDE, VIEWS = 300, 4
 POINTS = 200_000
 FRAME = np.array([-0.6, -0.6, -0.6, 9.7, 4.5, 0.6])
+FRAME_SIDES = FRAME[3:] - FRAME[:3]
 """Of the lattice, which pictures show."""
 EXTRA = "extra", "fuze.rfpack", ["-t", "4.55,0.1,0", "-r", "0,0,20", "-s", "4"]
 """One more object, between two others and reaching into their boxes."""
@@ -58,8 +59,7 @@ ABOUT = (
     f"and scaled. All PSNR is of {VIEWS} pictures of the whole. *One by one* is the PSNR to the composed "
     "scene of a field that all were added to, *at once* that of one fuse. To what was fused at once "
     "another object is added, between two and into their boxes: *outside* is the largest change of "
-    "density, in parts of the largest, at points outside of the region that this touched (of `sparse`, "
-    "with the top cells whose numbers share scales with new ones), and the PSNR "
+    "density, in parts of the largest, at points outside of the region that this touched, and the PSNR "
     "to before of the pixels whose rays miss it. *Deleted again*: the PSNR to before once it is "
     f"deleted, with all sources known; and with none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} "
     "pixels of the scene before (`--refit`, half a minute). *Fused in, deleted*: of an object that was "
@@ -110,12 +110,13 @@ def put(folder: Path, bundle: str, one, output: str) -> tuple[float, dict]:
 
 def changed_box(said: dict) -> list[float]:
     """(6,) outside of which an edit changed nothing, as it reported."""
-    return said["touched"].get("rounded_in", said["touched"]["aabb"])
+    return said["touched"]["aabb"]
 
 
 def held(bundle: Path) -> set[str]:
     """Names of the objects in a bundle."""
-    return {node["name"] for node in graph_nodes(read_headers(bundle)[0])}
+    scene = read_headers(bundle)[0]
+    return {leaf.name for leaf in scene.leaves()} | distilled(scene.history).keys()
 
 
 def begun(folder: Path, kind: str, one, output: str) -> None:
@@ -165,7 +166,7 @@ def likeness(folder: Path, one: str, other: str) -> float:
 
 def densities(folder: Path, bundle: str, points: np.ndarray) -> np.ndarray:
     """(N,) at world points."""
-    field, origin = load_scene(str(folder / bundle)).lone()
+    field, origin = renderable(load_scene(str(folder / bundle)))
     ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(len(points), 3)
     return field.query(torch.from_numpy(points - origin), ahead, False)[0].numpy()
 
@@ -221,7 +222,8 @@ def shuffled(folder: Path, kind: str, objects) -> float:
 def timed(folder: Path, bundle: str, one) -> tuple[float, float]:
     """Median seconds of adding an object, and the share that it touches of the scene's box."""
     tried = [put(folder, bundle, one, "more.rfpack") for _ in range(REPEATS)]
-    return float(np.median([seconds for seconds, _ in tried])), tried[0][1]["touched"]["share_of_box"]
+    low, high = np.array(tried[0][1]["touched"]["aabb"]).reshape(2, 3)
+    return float(np.median([seconds for seconds, _ in tried])), float(np.prod((high - low) / FRAME_SIDES))
 
 
 def row(folder: Path, kind: str) -> tuple[dict, list[list]]:

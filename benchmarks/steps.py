@@ -10,6 +10,7 @@ import argparse
 import statistics
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -17,7 +18,9 @@ import numpy as np
 
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell
+from fusedrf_cli.bridge.training import QUALITY
 from fusedrf_cli.engine.distillation import fit
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.kernels.parts import LINE
@@ -62,7 +65,7 @@ def measured(capture: Path, seconds: float, light: float) -> dict:
     tell(f"{capture.name}: {light:g}")
     with (
         tempfile.TemporaryDirectory() as folder,
-        mock.patch.object(fit, "LIGHT", light),
+        mock.patch.dict(QUALITY, {name: replace(how, light=light) for name, how in QUALITY.items()}),
         mock.patch.object(fit.FitRun, "learn", counted),
         mock.patch.object(fit.FitRun, "step", timed(taken, "step", fit.FitRun.step)),
         mock.patch.object(ComputedField, "train_rays", timed(taken, "pass", ComputedField.train_rays)),
@@ -87,7 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.steps", description=__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--light", type=float, nargs="+", default=[0.0, fit.LIGHT])
+    parser.add_argument("--light", type=float, nargs="+", default=[0.0, TrainConfig.light])
     asked = parser.parse_args()
     print(markdown([measured(asked.capture, asked.seconds, light) for light in asked.light]))
 

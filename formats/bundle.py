@@ -261,8 +261,7 @@ def read_summary(path: Path | str) -> dict:
     `objects` are what a fused field was made of (formats/contents.py); a plain scene has nodes alone.
     """
     if _is_json(path):
-        summary = _scene_summary(read_scene(path), {})
-        return {"path": str(path), "format": "scene", "bytes": _size(path), **summary, "fields": []}
+        return summary_of(read_scene(path), str(path), _size(path))
     views = read_archive(path)
     read = _unfolded(views, str(path), verify=False)
     fields = [_field_summary(name, header) for name, header in sorted(read.headers.items())]
@@ -274,6 +273,11 @@ def read_summary(path: Path | str) -> dict:
         **_scene_summary(read.scene, read.headers),
         "fields": fields,
     }
+
+
+def summary_of(scene: SceneGraph, path: str, size: int) -> dict:
+    """`read_summary` of a scene that was read from `path`, in so many bytes."""
+    return {"path": path, "format": "scene", "bytes": size, **_scene_summary(scene, {}), "fields": []}
 
 
 def is_bundle(path: Path | str) -> bool:

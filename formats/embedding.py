@@ -25,10 +25,11 @@ class Embedding:
         """The scene of a bundle or a scene.json, whose nodes name members of the writer alone. Raises what
         reading them raises, and BadSchema where a source is no bundle."""
         path = Path(path)
-        if is_bundle(path):
-            scene = self.bundle(path).scene
-        else:
-            scene = expand_scene(path, self.allow_outside)
+        scene = self.bundle(path).scene if is_bundle(path) else expand_scene(path, self.allow_outside)
+        return self.of(scene, path)
+
+    def of(self, scene: SceneGraph, path: Path) -> SceneGraph:
+        """The same, of a scene that was read from a path."""
         nodes = tuple(self.node(node, path, "", scene.composition) for node in scene.nodes)
         return replace(scene, nodes=nodes)
 

@@ -3,6 +3,7 @@
 import itertools
 import os
 from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,8 @@ def check_film(path: Path | str) -> None:
     """Before any work: can a film of this name be written here? Raises BadImage or MissingExtra."""
     if Path(path).suffix.lower() not in FILMS:
         raise BadImage(f"{path}: a film is written as .gif or .mp4; choose a name that ends so")
-    if Path(path).suffix.lower() == ".mp4":
-        _ffmpeg(path)
+    if Path(path).suffix.lower() == ".mp4" and not find_spec("imageio_ffmpeg"):
+        raise MissingExtra(f'{path}: films as .mp4 need an extra: pip install "fusedrf[video]"')
 
 
 def write_film(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> None:
@@ -56,24 +57,11 @@ def _write_gif(path: Path | str, file, frames: Iterator[np.ndarray], fps: float)
 
 
 def _write_mp4(path: Path | str, file, frames: Iterator[np.ndarray], fps: float) -> None:
-    even = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames)
-    first = next(even)
-    writer = _ffmpeg(path).write_frames(
-        file.name, first.shape[1::-1], fps=fps, macro_block_size=1, output_params=list(MP4_OPTIONS)
-    )
-    writer.send(None)
-    try:
-        for frame in itertools.chain([first], even):
-            writer.send(np.ascontiguousarray(frame))
-    finally:
-        writer.close()
+    from imageio import v2
+
+    how = {"quality": 5, "macro_block_size": 1, "ffmpeg_log_level": "warning"}
+    with v2.get_writer(file.name, ".mp4", "I", fps=fps, output_params=[*MP4_OPTIONS], **how) as writer:
+        for f in frames:
+            writer.append_data(np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge"))
     if os.path.getsize(file.name) == 0:
         raise BadImage(f"{path}: ffmpeg wrote nothing; try a .gif")
-
-
-def _ffmpeg(path: Path | str):
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise MissingExtra(f'{path}: films as .mp4 need an extra: pip install "fusedrf[video]"') from error
-    return imageio_ffmpeg

@@ -1,4 +1,8 @@
-"""Rotations as unit quaternions (x, y, z, w) and as matrices that act on columns."""
+"""Rotations as unit quaternions (x, y, z, w) and as matrices that act on columns.
+
+scipy does the same; loading it would take longer than all else that quick commands do, so that what is read
+is done here.
+"""
 
 import numpy as np
 
@@ -15,14 +19,7 @@ def matrices(quaternions: np.ndarray) -> np.ndarray:
 
 
 def quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(N, 4) unit quaternions, w not negative, of the rotations nearest to (N, 3, 3) matrices (Bar-Itzhack:
-    the eigenvector of the largest eigenvalue)."""
-    r = np.moveaxis(np.asarray(rotations, np.float64), 0, -1)
-    rows = [
-        [r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]],
-        [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
-        [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
-        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
-    ]
-    found = np.linalg.eigh(np.moveaxis(np.array(rows), -1, 0))[1][:, :, -1]
-    return np.where(found[:, 3:] < 0, -found, found)
+    """(N, 4) unit quaternions, w not negative, of the rotations nearest to (N, 3, 3) matrices."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotations).as_quat(canonical=True)

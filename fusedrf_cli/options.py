@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterator
 import click
 from click.shell_completion import CompletionItem
 
-from formats.errors import FormatWarning, MissingFile, printable
+from formats.errors import FormatWarning, MissingFile
 from fusedrf_cli.errors import FusedRFError, UsageProblem
 from fusedrf_cli.progress import Progress
 from fusedrf_cli.report import emit
+from fusedrf_cli.requests import STDIO
 
 DEBUG = "fusedrf.debug"  # key in click's context.meta
-STDIO = "-"
 MAX_PIXELS_PER_SIDE = 32768
 MAX_AFFINE_TEXT = 65536
 
@@ -478,56 +478,9 @@ running = _stack(_RUNNING)
 seeded = _stack((*_RUNNING, _seed))
 
 
-def writing(
-    what: str,
-    *,
-    folders: bool = False,
-    stdout: bool = False,
-    edits: str | None = None,
-    beside: Callable[[str, dict], dict[str, bool]] = lambda output, words: {},
-) -> Callable:
-    """-o/--output (`what` it is, a folder too with `folders`, with `stdout` a - as well) and -w.
-
-    Before any work an output that is in the way, cannot be written, or is being written is refused, and so
-    are the other ones that a command line has: `beside(output, words)`, which of them are folders. A command
-    whose argument `edits` is its output waits instead, and reads it only then: no edit is lost.
-    """
-
-    def decorate(command: Callable) -> Callable:
-        @functools.wraps(command)
-        def checked(*, output: str, overwrite: bool, **words):
-            if stdout and output == STDIO:
-                return command(output=output, overwrite=overwrite, **words)
-            from formats.atomic import check_writable
-            from formats.locks import output_lock
-
-            others = beside(output, words)
-            outputs = {output: folders} | others
-            if len({os.path.realpath(path) for path in outputs}) <= len(others):
-                raise UsageProblem(f"{output}: two outputs go there; give them different names")
-            in_place = edits is not None and os.path.realpath(words[edits]) == os.path.realpath(output)
-            with contextlib.ExitStack() as locks:
-                for path, folder in outputs.items():
-                    check_writable(path, overwrite, folders=folder)
-                for path in outputs:
-                    waiting = _tell if in_place and path == output else None
-                    locks.enter_context(output_lock(path, waiting))
-                for path, folder in outputs.items():  # it may have come while we waited
-                    check_writable(path, overwrite, folders=folder)
-                if words.get("keep_history"):
-                    from formats.undo import check_past
-
-                    check_past(words[edits], output)
-                return command(output=output, overwrite=overwrite, **words)
-
-        return click.option("-o", "--output", required=True, type=click.Path(), help=what)(overwrite(checked))
-
-    return decorate
-
-
-def _tell(sentence: str) -> None:
-    with contextlib.suppress(OSError):
-        click.echo(printable(sentence), err=True)
+def writing(what: str) -> Callable:
+    """-o/--output (`what` it is) and -w."""
+    return _stack((click.option("-o", "--output", required=True, type=click.Path(), help=what), overwrite))
 
 
 def reporting(
@@ -558,14 +511,6 @@ def reporting(
         tell(report)
 
     return _stack(_REPORTING)(run)
-
-
-def stdin_scene():
-    """The scene graph on stdin, and its bytes; sources in it are relative to the current folder."""
-    from formats.scene import MAX_SCENE_BYTES, parse_scene
-
-    data = sys.stdin.buffer.read(MAX_SCENE_BYTES + 1)
-    return parse_scene(data, "standard input"), data
 
 
 @contextlib.contextmanager

@@ -1,285 +1,523 @@
-"""What every command asks of the bridge: its words, checked by the command line, in one object each.
+"""What every verb is asked, with its defaults, in one object each: of the command line and of Python alike.
 
-Sizes are bytes, times seconds, lengths world units.
+Sizes are bytes, times seconds, lengths world units, angles degrees. None is left to choose.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+import math
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from msgspec import Meta
+
+from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli.placement import node_words
+
+STDIO = "-"
+Positive = Annotated[float, Meta(gt=0)]
+Count = Annotated[int, Meta(ge=1)]
+Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Vector = tuple[float, float, float]
+Box = tuple[float, float, float, float, float, float]
+Sphere = tuple[float, float, float, float]
+Shape = Annotated[tuple[float, ...], Meta(min_length=4, max_length=6)]
+"""A box, or a sphere's centre and radius."""
+Row = tuple[float, float, float, float]
+Size = tuple[Count, Count]
+Precision = Literal["float32", "float16", "int8", "int4"]
+ShDegree = Annotated[int, Meta(ge=0, le=3)]
+
+
+# --- what several verbs share -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
 class Running:
     """Where to compute."""
 
-    device: str
-    threads: int | None
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    threads: Annotated[int, Meta(ge=1, le=4096)] | None = None
+    """None: all cores."""
+    memory: Count | None = None
+    """None: 80 % of what is free."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learning(Running):
     """How to learn."""
 
-    time_budget: float | None
+    time_budget: Positive | None = None
     """Seconds of learning in the whole command, all tries together."""
-    seed: int
+    seed: Seed = 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseRequest:
+class Writing:
+    """What is written, as `output`, and what may not be replaced unasked."""
+
+    folders: ClassVar[bool] = False
+    """Whether the output may be a folder."""
+    stdout: ClassVar[bool] = False
+    """Whether an output of "-" is stdout."""
+    overwrite: bool = False
+
+    def beside(self) -> dict[str, bool]:
+        """The other outputs, and which of them are folders."""
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizing:
+    """How large a field is to be, and how good."""
+
+    max_size: Count | None = None
+    target_psnr: Positive | None = None
+    precision: Precision | None = None
+    ranks: tuple[Count, Count] | None = None
+    """Components per mode of density and of colour at most."""
+    sh_degree: ShDegree | None = None
+
+
+class Node:
+    """An object that gets a name, `node_name`; and a place by `Placing`, which comes after this."""
+
+    def __post_init__(self):
+        self.object_to_world  # noqa: B018  (what is none is refused before any work)
+
+    @cached_property
+    def object_to_world(self):
+        """(4, 4) float64. Raises BadSchema and its like for what is none."""
+        from formats.scene import make_node
+
+        return make_node(self.node_name, **self.words).node_to_parent
+
+    @property
+    def words(self) -> dict[str, tuple]:
+        """Keywords of `formats.scene.make_node`."""
+        return {}
+
+    @property
+    def absolute(self) -> bool:
+        """Whether it turns and scales about the world's origin, not about the middle of the object."""
+        return "matrix" in self.words
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placing(Node):
+    """Where an object is put: scaled, then turned, then moved; or by an affine alone."""
+
+    translate: Vector | None = None
+    rotate: Vector | None = None
+    """About the world's x, then y, then z axis."""
+    scale: float | Vector | None = None
+    matrix: tuple[Row, Row, Row, Row] | None = None
+    """By rows; columns act on points."""
+
+    @property
+    def words(self) -> dict[str, tuple]:
+        """The same of where it is put. Raises UsageProblem where `matrix` is not alone."""
+        scale = (self.scale,) * 3 if isinstance(self.scale, float) else self.scale
+        return node_words(self.translate, self.rotate, scale, self.matrix)
+
+
+# --- one for each verb --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PoseRequest(Writing):
     """Photos to a capture, which says where they were taken."""
 
+    folders: ClassVar[bool] = True
     photos: str
     output: str
-    overwrite: bool
-    threads: int | None
+    _: KW_ONLY
+    threads: Annotated[int, Meta(ge=1, le=4096)] | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrainRequest(Learning):
+@dataclass(frozen=True)
+class TrainRequest(Writing, Learning, Sizing):
     """Photos or a mesh to one field."""
 
     source: str
     output: str
-    overwrite: bool
-    kind: str
-    quality: str | None
+    _: KW_ONLY
+    kind: str = "vm"
+    quality: Literal["draft", "normal", "high", "best"] | None = None
     """None: as the time budget allows."""
-    ranks: tuple[int, int] | None
-    sh_degree: int | None
-    precision: str | None
-    """None: as suits the space."""
-    max_size: int | None
-    target_psnr: float | None
-    holdout: int | None
-    views: int
-    size: int
-    aabb: tuple[float, ...] | None
-    unbounded: bool | None
+    holdout: Annotated[int, Meta(ge=2)] | None = None
+    """Every so many-th photo is kept to measure with."""
+    views: Annotated[int, Meta(ge=2, le=1000)] = 100
+    """Of a mesh."""
+    size: Annotated[int, Meta(ge=16, le=4096)] = 400
+    """Pixels a side of them."""
+    aabb: Box | None = None
+    unbounded: bool | None = None
     """Whether the field is to fill all of space; None: as the capture needs."""
-    centre: tuple[float, float, float] | None
-    radius: float | None
+    centre: Vector | None = None
+    radius: Positive | None = None
     """Of the core of unbounded space, whose detail is finest."""
-    downscale: int | None
+    downscale: Annotated[int, Meta(ge=1, le=64)] | None = None
     """How many times smaller a side of photos is made; None: until it is no longer than photos need be."""
-    masks: str
-    """What the pixels mean that masks exclude: "ignore" or "alpha"."""
-    refine_poses: bool
+    masks: Literal["ignore", "alpha"] = "ignore"
+    """Whether the pixels that masks exclude are left out, or learnt as transparent."""
+    refine_poses: bool = False
     """Whether to look for where the photos were taken from, near where they are said to have been."""
-    memory: int | None
-    resume: bool
+    resume: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class FuseRequest(Learning):
-    """A scene to one field; None is left to choose."""
+class Input(Placing):
+    """A bundle or a scene in a composed one."""
+
+    path: str
+    name: str | None = None
+    """None: the file's stem."""
+    background_node: bool = False
+    crop: Shape | None = None
+    opacity: Annotated[float, Meta(gt=0, le=1)] | None = None
+    tint: Vector | None = None
+    hidden: bool = False
+
+    @property
+    def node_name(self) -> str:
+        return self.name or Path(self.path).stem
+
+
+@dataclass(frozen=True)
+class ComposeRequest(Writing):
+    """Bundles and scenes to one scene graph."""
+
+    stdout: ClassVar[bool] = True
+    inputs: tuple[str | Input, ...]
+    output: str
+    _: KW_ONLY
+    composition: Literal["max", "add"] = "max"
+    allow_outside: bool = False
+
+
+@dataclass(frozen=True)
+class FuseRequest(Writing, Learning, Sizing):
+    """A scene to one field."""
 
     scene: str
     output: str
-    overwrite: bool
-    kind: str
-    max_size: int | None
-    target_psnr: float | None
-    precision: str | None
-    ranks: tuple[int, int] | None
-    """Components per mode of density and of colour at most."""
-    sh_degree: int | None
-    rgb: bool
+    _: KW_ONLY
+    kind: str = "auto"
+    rgb: bool = True
     """Whether to finish on rendered rays."""
-    from_scratch: bool
-    keep_sources: bool
-    memory: int | None
-    allow_outside: bool
-    resume: bool
-    sources: str | None
+    from_scratch: bool = False
+    keep_sources: bool = False
+    allow_outside: bool = False
+    resume: bool = False
+    sources: str | None = None
     """A folder in which sources of a fused bundle are looked for."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConvertRequest(Learning):
-    """A field to one of another kind; None is left to choose."""
+@dataclass(frozen=True)
+class ConvertRequest(Writing, Learning, Sizing):
+    """A field to one of another kind."""
 
     field: str
     output: str
-    overwrite: bool
+    _: KW_ONLY
     kind: str
-    max_size: int | None
-    target_psnr: float | None
-    precision: str | None
-    ranks: tuple[int, int] | None
-    sh_degree: int | None
-    memory: int | None
 
 
 @dataclass(frozen=True, kw_only=True)
-class EditRequest:
-    """What edits have in common."""
+class EditRequest(Writing):
+    """A bundle that is changed; `fused` is read, and may be the output itself."""
 
-    fused: str
-    output: str
-    overwrite: bool
-    memory: int | None
-    keep_history: bool
+    keep_history: bool = False
     """Whether to keep the bundle as it was, for `undo`."""
+    memory: Count | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class AddRequest(EditRequest):
+@dataclass(frozen=True)
+class AddRequest(EditRequest, Placing):
     """One more object."""
 
-    precision: str | None
-    """None: as it is stored in its source."""
+    fused: str
     source: str
+    output: str
+    _: KW_ONLY
     name: str
-    object_to_world: Any
-    """(4, 4) float64."""
+    precision: Precision | None = None
+    """None: as it is stored in its source."""
+
+    @property
+    def node_name(self) -> str:
+        return self.name
 
 
 @dataclass(frozen=True, kw_only=True)
-class MendingRequest(Learning):
+class MendingRequest(Writing, Learning):
     """What becomes of the hole that an object leaves."""
 
-    output: str
-    overwrite: bool
-    memory: int | None
-    refit: str | None
+    refit: str | None = None
     """A capture of what was behind it."""
-    fill: bool
+    fill: bool = False
     """Whether what is seen nowhere is filled smoothly."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class DeleteRequest(EditRequest, MendingRequest):
     """Objects to be taken out."""
 
+    fused: str
     names: tuple[str, ...]
-    rgb: bool
+    output: str
+    _: KW_ONLY
+    rgb: bool = True
     """Whether what fills a hole finishes on pictures."""
-    allow_outside: bool
+    allow_outside: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ReplaceRequest(EditRequest):
     """Another object in the place of one."""
 
+    fused: str
     name: str
     source: str
-    precision: str | None
+    output: str
+    _: KW_ONLY
+    precision: Precision | None = None
     """None: as it is stored in its source."""
-    allow_outside: bool
+    allow_outside: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
 class ShowRequest(EditRequest):
-    """An object that is shown otherwise."""
+    """An object that is shown otherwise: `event` of the history, and words of a node, `showing`
+    (formats/scene.py: SHOWING_KEYS), of which None takes one away."""
 
+
+@dataclass(frozen=True)
+class CropRequest(ShowRequest):
+    """What of an object is shown."""
+
+    event: ClassVar[str] = "cropped"
+    fused: str
     name: str
-    event: str
-    """Of the history."""
-    showing: dict
-    """Words of a node (formats/scene.py: SHOWING_KEYS); None takes one away."""
+    output: str
+    _: KW_ONLY
+    shape: Shape | None = None
+    """Of the object's own world; None: all of it."""
+
+    @property
+    def showing(self) -> dict:
+        return {"crop": self.shape and list(self.shape)}
+
+
+@dataclass(frozen=True)
+class TintRequest(ShowRequest):
+    """What an object's colours and density are multiplied by; None: nothing."""
+
+    event: ClassVar[str] = "tinted"
+    fused: str
+    name: str
+    output: str
+    _: KW_ONLY
+    colour: Vector | None = None
+    opacity: Annotated[float, Meta(gt=0, le=1)] | None = None
+
+    @property
+    def showing(self) -> dict:
+        return {"tint": self.colour and list(self.colour), "opacity": self.opacity}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArrangeRequest(EditRequest):
     """An object that is moved, copied or renamed."""
 
+    @property
+    def node_name(self) -> str:
+        return self.name if self.new_name is None else self.new_name
+
+
+@dataclass(frozen=True)
+class MoveRequest(ArrangeRequest, Placing):
+    """An object somewhere else."""
+
+    fused: str
     name: str
-    new_name: str | None
-    """None: the same."""
-    matrix: Any
-    """(4, 4) float64 of the world."""
-    absolute: bool
-    """Whether that turns and scales about the world's origin, not about the middle of the object."""
+    output: str
+    new_name: ClassVar[None] = None
+
+    def __post_init__(self):
+        if not self.words:
+            raise UsageProblem("say where to: -t, -r, -s or --matrix")
+        super().__post_init__()
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
+class DuplicateRequest(ArrangeRequest, Placing):
+    """An object once more, placed from where it stands."""
+
+    fused: str
+    name: str
+    new_name: str
+    output: str
+
+
+@dataclass(frozen=True)
+class RenameRequest(ArrangeRequest, Node):
+    """Another name for an object."""
+
+    fused: str
+    name: str
+    new_name: str
+    output: str
+
+
+@dataclass(frozen=True)
+class UndoRequest(Writing):
+    """A bundle as it was before its last edit."""
+
+    fused: str
+    output: str
+
+
+@dataclass(frozen=True)
 class ExtractRequest(MendingRequest):
     """An object out of a field; what tells of it is in world units and pixels."""
 
     field: str
-    boxes: tuple[tuple[float, ...], ...]
-    """Each (6,)."""
-    spheres: tuple[tuple[float, ...], ...]
-    """Each (4,): centre and radius."""
-    mesh: str | None
+    output: str
+    _: KW_ONLY
+    boxes: tuple[Box, ...] = ()
+    spheres: tuple[Sphere, ...] = ()
+    """Each a centre and a radius."""
+    mesh: str | None = None
     """A closed hull."""
-    masks: str | None
+    masks: str | None = None
     """A folder."""
-    cameras: str | None
+    cameras: str | None = None
     """Of the masked pictures; None: those that the bundle keeps."""
-    points: tuple[tuple[str, float, float, bool], ...]
+    points: tuple[tuple[str, float, float, bool], ...] = ()
     """Each the name of a view, column and row of a pixel, and whether it shows the object."""
-    name: str | None
+    name: str | None = None
     """Of a part that the field holds apart."""
-    invert: bool
+    invert: bool = False
     """Write what is left instead."""
-    preview: str | None
+    preview: str | None = None
     """A folder of pictures."""
-    precision: str | None
+    precision: Precision | None = None
     """None: the field's own, where an object's numbers stay what they are by it, else float16."""
-    max_size: int | None
+    max_size: Count | None = None
+
+    def beside(self) -> dict[str, bool]:
+        return {self.preview: True} if self.preview else {}
 
 
-@dataclass(frozen=True, kw_only=True)
-class RenderRequest(Running):
+@dataclass(frozen=True)
+class RenderRequest(Writing, Running):
     """Pictures or a film of a scene."""
 
+    folders: ClassVar[bool] = True
     scene: str
     output: str
-    overwrite: bool
-    cameras: str | None
-    path: str | None
-    views: str | None
-    """"capture" or "heldout": the cameras of the capture that the scene keeps."""
-    orbit: int | None
-    look_at: tuple[float, float, float] | None
-    direction: tuple[float, float] | None
+    _: KW_ONLY
+    cameras: str | None = None
+    path: str | None = None
+    views: Literal["capture", "heldout"] | None = None
+    """The cameras of the capture that the scene keeps, or those of them that were held out."""
+    orbit: Count | None = None
+    look_at: Vector | None = None
+    direction: tuple[float, float] | None = None
     """From where to look: azimuth and elevation in degrees."""
-    zoom: float
+    zoom: Positive = 1.0
     """How many times nearer than the default."""
-    up: tuple[float, float, float] | None
+    up: Vector | None = None
     """Which way of the world is up, of any length but 0; None: as the scene tells."""
-    near: float
+    near: Annotated[float, Meta(ge=0)] = 0.0
     """Distance from a camera, in the world's units, from which what stands there is shown."""
-    far: float
+    far: Positive = math.inf
     """Distance up to which it is shown."""
-    size: tuple[int, int] | None
-    background: tuple[float, float, float] | None
+    size: Size | None = None
+    background: Vector | None = (1.0, 1.0, 1.0)
     """None: transparent."""
-    depth: bool
-    fps: float
-    naive: bool
+    depth: bool = False
+    fps: Positive = 24.0
+    naive: bool = False
     """Ask every source of a scene at every sample."""
-    memory: int | None
-    allow_outside: bool
+    allow_outside: bool = False
+
+    def __post_init__(self):
+        chosen = [name for name in ("cameras", "path", "views", "orbit") if getattr(self, name) is not None]
+        if len(chosen) > 1:
+            raise UsageProblem(
+                "--cameras, --path, --views and --orbit each choose the views; give one of them"
+            )
+        aimed = any(part is not None for part in (self.look_at, self.direction, self.up)) or self.zoom != 1
+        if aimed and chosen and chosen != ["orbit"]:
+            raise UsageProblem(
+                f"--look-at, --from, --zoom and --up do not apply to --{chosen[0]}; leave them out"
+            )
+        if self.near >= self.far:
+            raise UsageProblem(
+                f"--near {self.near:g} leaves nothing before --far {self.far:g}; give a greater --far"
+            )
+
+    def beside(self) -> dict[str, bool]:
+        from formats.filenames import depth_of
+
+        single = Path(self.output).suffix.lower() == ".png"
+        return {str(depth_of(Path(self.output))): False} if self.depth and single else {}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class EvaluateRequest(Running):
     """A bundle against photos or another scene."""
 
     bundle: str
     against: str
-    split: str
-    size: tuple[int, int] | None
-    memory: int | None
-    allow_outside: bool
+    _: KW_ONLY
+    split: Literal["test", "train", "all"] = "test"
+    """Of a capture."""
+    size: Size | None = None
+    allow_outside: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class ChartRequest(Running):
+@dataclass(frozen=True)
+class ChartRequest(Writing, Running):
     """A scene fused in the ways that are worth it."""
 
+    folders: ClassVar[bool] = True
     scene: str
     output: str
-    overwrite: bool
-    budget: float
-    kinds: tuple[str, ...]
-    least_psnr: float
-    size: tuple[int, int]
-    memory: int | None
-    allow_outside: bool
-    seed: int
-    fuse_request: Callable[[tuple[str, ...]], FuseRequest]
-    """What `fusedrf fuse` makes of flags: so every label is the flags that gave the point."""
+    _: KW_ONLY
+    budget: Positive = 300.0
+    kinds: tuple[str, ...] = ("blocks", "sparse", "vm")
+    least_psnr: Positive = 30.0
+    size: Size = (400, 400)
+    allow_outside: bool = False
+    seed: Seed = 0
+
+
+@dataclass(frozen=True)
+class ValidateRequest:
+    """Bundles and scenes to be checked, byte for byte."""
+
+    scenes: tuple[str, ...]
+    _: KW_ONLY
+    allow_outside: bool = False
+
+
+@dataclass(frozen=True)
+class InfoRequest:
+    """What is in a bundle or a scene, or what `train` would read."""
+
+    scene: str
+
+
+@dataclass(frozen=True)
+class HistoryRequest:
+    """What was done to a bundle."""
+
+    fused: str
+
+
+@dataclass(frozen=True)
+class KindsRequest:
+    """The kinds of field."""

@@ -6,7 +6,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from formats.atomic import atomic_folder, temporary_sibling
 from formats.errors import ResourceError
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
-from fusedrf_cli.bridge.ladders import Flags, Ladder, ladders
+from fusedrf_cli.bridge.ladders import flags_of
 from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
 from fusedrf_cli.bridge.pictures import WHITE
@@ -26,6 +26,8 @@ from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.bridge.sources import as_it_is
 from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
 from fusedrf_cli.engine.fields.occupancy import placed_box
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -168,7 +170,7 @@ def chart(request: ChartRequest, progress) -> dict:
         run = Charting(benchmark, paths, request, progress)
         progress.phase("fusing", budget)
         try:
-            waiting = {kind: ladders(kind, request.least_psnr) for kind in request.kinds}
+            waiting = {kind: registry.kind(kind).ladders(request.least_psnr) for kind in request.kinds}
         except ValueError as error:
             raise unusable_kind(error) from error
         with run.kept():
@@ -224,15 +226,15 @@ class Climber:
     """How far one ladder was climbed."""
 
     ladder: Ladder
-    flags: Flags
-    """Of the next rung."""
+    rung: Rung
+    """The next one."""
     points: list[Point] = field(default_factory=list)
 
     def climb(self, point: Point | None) -> bool:
         """Take what the rung gave, if anything; whether there is another one."""
         self.points += [point] if point is not None else []
         with contextlib.suppress(StopIteration):
-            self.flags = self.ladder.send(point and (point.bytes, point.psnr))
+            self.rung = self.ladder.send(point and (point.bytes, point.psnr))
             return True
         return False
 
@@ -296,7 +298,7 @@ class Charting:
             group = min(due, key=due.get)
             own = [p for c in climbers[group] for p in c.points]
             climber = min(climbers[group], key=lambda c: (c.behind(own), len(c.points)))
-            point = self.try_flags(group, climber.flags)
+            point = self.try_rung(group, climber.rung)
             if not climber.climb(point):
                 climbers[group].remove(climber)
             spent[group] += time.monotonic() - started - now
@@ -309,47 +311,36 @@ class Charting:
         """Whether every ladder of a group is behind the points that there are."""
         return all(climber.behind(self.points) for climber in climbers)
 
-    def try_flags(self, group: tuple[str, str], flags: Flags) -> Point | None:
-        """The point of some flags, or None and a warning where the scene cannot be fused so; group is the
-        kind, and a name of what loads the same kernels.
+    def try_rung(self, group: tuple[str, str], rung: Rung) -> Point | None:
+        """The point of a rung, or None and a warning where the scene cannot be fused so; group is the kind,
+        and a name of what loads the same kernels.
         """
-        kind, _ = group
-        if self.request.seed:
-            flags = (*flags, "--seed", str(self.request.seed))
-        wanted, path = self.request.fuse_request(flags), next(self.paths)
+        kind, path, own = group[0], next(self.paths), self.request
+        flags = flags_of(kind, rung, own.seed)
+        same = {name: getattr(own, name) for name in ("memory", "allow_outside", "seed", "device", "threads")}
+        wanted = FuseRequest(own.scene, str(path), kind=kind, overwrite=True, **same, **asdict(rung))
         try:
             if group not in self.warm:  # the first of a group also loads kernels, so the second one counts
-                self.fuse(path, wanted)
+                self.fuse(wanted)
                 self.warm.add(group)
-            report, warnings = self.fuse(path, wanted)
+            report, warnings = self.fuse(wanted)
         except FusedRFError as error:
             if isinstance(error, InvalidInput):  # this scene never becomes that kind
                 self.refused[kind] = error
-            self.progress.warn(f"left out {' '.join(flags)}: {error}")
+            self.progress.warn(f"left out {flags}: {error}")
             return None
         quality = self.benchmark.quality(path)
         cost = {"seconds": report["total_seconds"], "bytes": report["bytes"]}
-        point = Point(" ".join(flags), kind, **quality, **cost)
+        point = Point(flags, kind, **quality, **cost)
         point.warnings = warnings
         self.points.append(point)
         self.bundles.append(path)
         self.progress.note(f"{point.flags}: {point.psnr:.2f} dB, {point.bytes:,} bytes")
         return point
 
-    def fuse(self, path: Path, wanted: FuseRequest) -> tuple[dict, list[str]]:
+    def fuse(self, wanted: FuseRequest) -> tuple[dict, list[str]]:
         """A fuse's report, and what it warned of."""
-        heard, own = NullProgress(), self.request
-        wanted = replace(
-            wanted,
-            scene=self.benchmark.scene,
-            output=str(path),
-            overwrite=True,
-            memory=own.memory,
-            allow_outside=own.allow_outside,
-            seed=own.seed,
-            device=own.device,
-            threads=own.threads,
-        )
+        heard = NullProgress()
         return fuse(wanted, heard, as_it_is, lambda output, write: write(output)), heard.warnings
 
 

@@ -195,7 +195,7 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
         draft.check_node(name)
         if request.new_name is not None:
             draft.check_free(request.new_name)
-        matrix, copies = request.matrix, event == "duplicated"
+        matrix, copies = request.object_to_world, event == "duplicated"
         if not request.absolute and not np.array_equal(matrix[:3, :3], np.eye(3)):
             box = draft.box({name})
             if box is None:
@@ -215,7 +215,7 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
 
 
 def show(request: ShowRequest, progress) -> dict:
-    """Show an object otherwise: cropped, tinted, thinner, or not at all."""
+    """Show an object otherwise: cropped, tinted, or thinner."""
     with engine("cpu", None, progress):
         edit = Edit(request, progress)
         draft, name = edit.draft, request.name

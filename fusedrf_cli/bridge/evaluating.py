@@ -7,9 +7,9 @@ import numpy as np
 
 from formats.captures import is_capture, read_capture
 from fusedrf_cli.bridge.looks import looks_of
-from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
+from fusedrf_cli.bridge.memory import Memory, measured, sources
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
-from fusedrf_cli.bridge.rendering import picture_memory, renderable, tell_of_work
+from fusedrf_cli.bridge.rendering import in_memory, picture_memory, renderable, tell_of_work
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
@@ -44,6 +44,8 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
             camera = pair.camera
             if i == 0:
                 side = camera.width, camera.height
+                needed = picture_memory(None, [camera], film=False) | measured(*side)
+                field = in_memory(loaded, field, needed, budget)
                 needed = picture_memory(field, [camera], film=False) | measured(*side)
                 budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
                 tell_of_work(bundle, field, total * side[0] * side[1], progress)
@@ -134,10 +136,10 @@ def scene_pairs(
     loaded = load_scene(against, allow_outside, budget, place)
     field, origin = renderable(loaded)
     width, height = size or SCENE_SIZE
-    composed = not hasattr(field, "render_rays")
-    needed = sources(loaded.resident) | picture(width, height, composed) | measured(width, height)
-    budget.expect(needed, advice="give a smaller --size")
     views = looks_of(loaded, loaded.composed(), SCENE_VIEWS, (width, height), SCENE_SEED)
+    cameras = [look.camera for look in views]
+    needed = sources(loaded.resident) | picture_memory(field, cameras, film=False) | measured(width, height)
+    budget.expect(needed, advice="give a smaller --size")
     for look in views:
         shot = render_image(field, look.camera, origin=origin)
         every = np.ones(shot.opacity.shape, bool)

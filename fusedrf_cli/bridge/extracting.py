@@ -611,10 +611,8 @@ def within_size(
     if overhead + BundleSizes().exactly(piece.field, piece.precision) <= request.max_size:
         return piece, {}
     wanted = FuseRequest(
-        scene=request.field, output=request.output, overwrite=request.overwrite, kind=registry.AUTO,
-        max_size=request.max_size, target_psnr=None, precision=request.precision, ranks=None,
-        sh_degree=None, rgb=True, from_scratch=False, keep_sources=False, memory=request.memory,
-        allow_outside=False, resume=False, sources=None, time_budget=request.time_budget,
+        request.field, request.output, overwrite=request.overwrite, max_size=request.max_size,
+        precision=request.precision, memory=request.memory, time_budget=request.time_budget,
         seed=request.seed, device=request.device, threads=request.threads,
     )  # fmt: skip
     scene = Scene.of(alone(fused, piece, bundle))

@@ -3,8 +3,12 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from pathlib import Path
 
-from formats.bundle import OpenBundle
+from formats.bundle import BundleWriter, OpenBundle
+from formats.embedding import Embedding
+from formats.scene import dump_scene
+from fusedrf_cli import __version__
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
@@ -36,13 +40,14 @@ from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Det
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import DistillSettings, Student, StudentRequest, TooSmall
+from fusedrf_cli.engine.kinds.student import DistilConfig, Student, StudentRequest, TooSmall
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
 
 DEFAULT_MAX_SIZE = 25_000_000  # and what the places among the sources take
 FUSED = "fused"  # the node of the field
+NODES = "blocks"  # the word by which nothing is learnt: every source stays a node with a field of its own
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -63,6 +68,8 @@ def fuse(
         loaded = load(request, memory, place, progress)
         loaded = without_empty(loaded, request.scene, progress)
         scene = Scene.of(loaded)
+        if request.kind == NODES and registry.kind(NODES).suits(scene.composed).score is None:
+            return as_nodes(request, loaded, scene.composed, memory, progress)
         kind, suits = choose_kind(request.kind, loaded, scene.composed)
         refuse_options(kind, request)
         started = time.monotonic()
@@ -71,7 +78,7 @@ def fuse(
         cameras = kept_cameras(loaded, progress)
         framing = kept_framing(loaded, scene.composed, cameras)
         check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
-        pixels = VIEWS_TO_CHOOSE_BY * DistillSettings.view_size**2
+        pixels = VIEWS_TO_CHOOSE_BY * DistilConfig.view_size**2
         tell_of_work(request.scene, scene.composed, pixels, progress)
         overhead = graph_bytes(nodes, cameras)
         found, student, figures_of_it = best_of(
@@ -123,6 +130,48 @@ def fuse(
     }
     check_target(report, request.target_psnr, request.output)
     return report
+
+
+def as_nodes(
+    request: FuseRequest, loaded: LoadedScene, composed: ComposedField, memory: Memory, progress
+) -> dict:
+    """Write a scene whose fields are kept whole, whatever their kinds and rules: the graph, and the bytes of
+    every field that it places. UsageProblem where that takes more than is allowed."""
+    started = time.monotonic()
+    for word in ("ranks", "sh_degree", "target_psnr"):
+        if getattr(request, word) is not None:
+            option = f"--{word.replace('_', '-')}"
+            raise UsageProblem(f"{option} applies to scenes of vm fields by 'max' alone; leave it out")
+    writer = BundleWriter()
+    graph = Embedding(writer, request.allow_outside, request.precision).of(loaded.graph, loaded.path)
+    cameras = kept_cameras(loaded, progress)
+    framing = kept_framing(loaded, composed, cameras)
+    entry = {"event": "fused", "kind": NODES, "objects": [node.name for node in graph.nodes]}
+    graph = replace(
+        graph,
+        history=(entry,),
+        generator=f"fusedrf {__version__}",
+        framing=None if framing is None else tuple(float(number) for number in framing),
+        cameras=cameras,
+    )
+    size = sum(len(data) for data in writer.members.values()) + len(dump_scene(graph))
+    if request.max_size is not None and size > request.max_size:
+        raise UsageProblem(
+            f"--max-size is too small: the fields as they are take {readable_size(size)}, and only fields of "
+            "kind vm are made smaller, by 'max' composition; give more, or another --kind"
+        )
+    writer.write(request.output, graph, overwrite=request.overwrite)
+    return {
+        "output": request.output,
+        "bytes": Path(request.output).stat().st_size,
+        "source_bytes": source_bytes(loaded),
+        "kind": NODES,
+        "nodes": len(graph.leaves()),
+        "fields": len(writer.members),
+        "why": "every field as its source has it",
+        "total_seconds": time.monotonic() - started,
+        "memory": memory.report(),
+    }
 
 
 def best_of(

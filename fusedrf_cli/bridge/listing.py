@@ -1,9 +1,10 @@
 """`kinds`: what kinds of field there are."""
 
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.requests import KindsRequest
 
 
-def list_kinds(progress) -> dict:
+def list_kinds(request: KindsRequest, progress) -> dict:
     """Every kind: what it is good for, what it does, and the package it comes from. One that does not load is
     named in a warning."""
     found = []

@@ -17,13 +17,13 @@ from fusedrf_cli.bridge.training import warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import as_composite
-from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillReport, DistillRun, Recipe
+from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds.student import NOTHING, DistillSettings, MadeStudent, Plan, Student, Way
+from fusedrf_cli.engine.kinds.student import NOTHING, DistilConfig, MadeStudent, Plan, Student, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.requests import FuseRequest
 
@@ -88,7 +88,7 @@ class Maker:
         self.student, self.scene, self.request = student, scene, request
         self.place, self.progress = place, progress
         self.budget = Budget(request.time_budget)
-        lesson = student.lesson or DistillSettings()
+        lesson = student.lesson or DistilConfig()
         compares = request.target_psnr is not None and student.lesson is None
         self.views = VIEWS_TO_CHOOSE_BY if compares else lesson.views
         size = lesson.view_size, lesson.view_size
@@ -228,11 +228,11 @@ class Maker:
         for i, plan in enumerate(plans):
             if before is not None and self.budget.over:
                 return
-            begun, start, recipe = self.begun(plan, before)
+            begun, start, changes = self.begun(plan, before)
             grown = self.saved is not None and self.saved[1].get("numbers") != begun.params.numel()
             if grown and len(plans) > 1:
                 continue  # the run that was interrupted had grown further
-            field, did = self.taught(begun.to(self.place), start, recipe, len(plans) - i)
+            field, did = self.taught(begun.to(self.place), start, changes, len(plans) - i)
             before = field.to("cpu")
             whole = self.student.whole(before)
             for way in ways:
@@ -250,8 +250,8 @@ class Maker:
         """Bytes of the file that were allowed."""
         return self.student.request.limit
 
-    def begun(self, plan: Plan, before: StoredField | None) -> tuple[StoredField, str, Recipe]:
-        """A student before it learns, what it starts from, and how it is to learn."""
+    def begun(self, plan: Plan, before: StoredField | None) -> tuple[StoredField, str, dict]:
+        """A student before it learns, what it starts from, and what that changes of how it learns."""
         generator = torch.Generator().manual_seed(self.request.seed)
         wanted = before is None and self.student.kind.takes_over and not self.request.from_scratch
         background = self.scene.background() if wanted else None
@@ -261,19 +261,18 @@ class Maker:
                 f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
                 "nothing"
             )
-        recipe = DEFAULT_RECIPE
-        if wanted and start != NOTHING and same_texels(field, background.field):
-            recipe = replace(recipe, coarse=lambda student: False, rate=RATE_IN_PLACE)
-        return field, start, recipe
+        taken_over = wanted and start != NOTHING and same_texels(field, background.field)
+        return field, start, {"coarse_from": None, "rate": RATE_IN_PLACE} if taken_over else {}
 
     def taught(
-        self, field: StoredField, start: str, recipe: Recipe, tries: int
+        self, field: StoredField, start: str, changes: dict, tries: int
     ) -> tuple[StoredField, DistillReport]:
         """A student that has learnt; an interrupt saves a checkpoint."""
         request, seconds = self.request, self.budget.part(tries)
-        settings = replace(self.student.lesson_of(field.params.numel(), seconds), seed=request.seed)
+        config = self.student.lesson_of(field.params.numel(), seconds)
+        config = replace(config, seed=request.seed, **changes)
         sampler = RaySampler.of(self.student.scene, self.scene.views)
-        run = DistillRun(self.teacher, field, sampler, settings, request.rgb, recipe, self.judged_whole)
+        run = DistillRun(self.teacher, field, sampler, config, request.rgb, judge=self.judged_whole)
         # one that grows to a target goes on from whatever it started from
         made_with = {"kind": self.student.kind.name, "start": start if request.target_psnr is None else None}
         with self.resumed(run, made_with, sampler.boxes) as uninterrupted:

@@ -5,23 +5,23 @@ here has to grow with it (tests/bridge/test_memory.py holds each against the pea
 """
 
 import contextlib
-import os
 import resource
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import SLOTS_AT_ONCE, Composite
-from fusedrf_cli.engine.distillation.finish import RAYS
+from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
-from fusedrf_cli.engine.kinds.student import DistillSettings, Plan, Student
+from fusedrf_cli.engine.kinds.student import DistilConfig, Plan, Student
 from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
 from fusedrf_cli.errors import ResourceProblem
 from fusedrf_cli.report import readable_size
@@ -83,11 +83,8 @@ class Memory:
 
 
 def resident() -> int:
-    """What this process holds now; where the system does not say, the most it ever held."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
-        return peak()
+    """What this process holds now."""
+    return psutil.Process().memory_info().rss
 
 
 def peak() -> int:
@@ -100,11 +97,7 @@ def peak() -> int:
 
 def available() -> int:
     """What can be had without swapping, by the system's own estimate, within a control group's limit."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        found = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    found = psutil.virtual_memory().available
     for folder, most, used in (
         ("/sys/fs/cgroup", "memory.max", "memory.current"),
         ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
@@ -185,7 +178,7 @@ def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str
     return {**learns, "its occupancy": float(grid) * PER_TRIED_CELL}
 
 
-def teaching(settings: DistillSettings, points: int) -> dict[str, float]:
+def teaching(settings: DistilConfig, points: int) -> dict[str, float]:
     """What is asked of the teachers."""
     return {"the teachers' answers": settings.rays * PER_RAY + points * PER_POINT}
 
@@ -202,9 +195,9 @@ def stages(
     copies of the largest source, and bytes by what they are for."""
     needs = student.needs()
     numbers, learnt, grids = needs.numbers, needs.numbers - needs.settled, ownership(scene.aabb)
-    settings = student.lesson_of(learnt, request.time_budget) or DistillSettings()
+    settings = student.lesson_of(learnt, request.time_budget) or DistilConfig()
     if student.lesson is None:
-        taught = lesson(RAYS)
+        taught = lesson(RayLesson.config.rays)
     else:
         points = needs.points
         if points is None:
@@ -232,7 +225,7 @@ def stages(
 def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
     """Rays that a made student learns from, while they are asked of sources that are read one by one."""
     made = result(student.needs().numbers, measured=False)
-    return made | lesson(RAYS) | ownership(scene.aabb) | picture(256, 256, composed=True)
+    return made | lesson(RayLesson.config.rays) | ownership(scene.aabb) | picture(256, 256, composed=True)
 
 
 def learning_is_asked(student: Student, request: FuseRequest) -> bool:
@@ -242,4 +235,4 @@ def learning_is_asked(student: Student, request: FuseRequest) -> bool:
 
 def judged() -> dict[str, float]:
     """Looking at a scene to measure; some views are filled by one of its objects."""
-    return picture(DistillSettings.view_size, DistillSettings.view_size, composed=True)
+    return picture(DistilConfig.view_size, DistilConfig.view_size, composed=True)

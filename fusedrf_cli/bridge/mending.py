@@ -19,7 +19,7 @@ from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.training import fit_memory, fit_settings, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.distill import DEFAULT_RECIPE, DistillRun
+from fusedrf_cli.engine.distillation.distill import DistillRun
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.distillation.sampler import RaySampler
@@ -27,7 +27,7 @@ from fusedrf_cli.engine.distillation.visibility import shown_cells
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.kinds import registry, splitting
-from fusedrf_cli.engine.kinds.student import DistillSettings, Way
+from fusedrf_cli.engine.kinds.student import DistilConfig, Way
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.kinds.vm.trimming import without_unasked
 from fusedrf_cli.engine.rendering.cameras import Camera
@@ -46,7 +46,7 @@ GROWN = 4
 """Pixels around those that are left out too: what the object's rim colours."""
 LEARNT, FILLED = "restored/refit", "restored/filled"
 """Names of nodes of what is put into the hole."""
-SETTINGS = DistillSettings(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+SETTINGS = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
 NUMBERS = 2_000_000
 """Of the tensor that a smooth surface is learnt into, at most."""
 
@@ -77,7 +77,7 @@ class Teacher:
         self.tries -= 1
         settings = replace(SETTINGS, seed=self.seed, time_budget=seconds)
         rays = RaySampler([teacher.occupancy.subject])
-        run = DistillRun(teacher, student.to(self.place), rays, settings, self.rgb, DEFAULT_RECIPE)
+        run = DistillRun(teacher, student.to(self.place), rays, settings, self.rgb)
         learnt, _ = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
         self.budget.spent += run.learnt_seconds
         return learnt.to("cpu")
@@ -219,11 +219,9 @@ def wanted_of(request: MendingRequest) -> TrainRequest:
     """A training as `train` without options would do it."""
     seconds = SHARE * request.time_budget if request.time_budget else SECONDS
     return TrainRequest(
-        source=request.refit, output=request.output, overwrite=request.overwrite, kind=registry.DEFAULT,
-        quality=None, ranks=None, sh_degree=None, precision="float16", max_size=None, target_psnr=None,
-        holdout=None, views=0, size=0, aabb=None, unbounded=None, centre=None, radius=None, downscale=None,
-        masks="ignore", refine_poses=False, memory=request.memory, resume=False, time_budget=seconds,
-        seed=request.seed, device=request.device, threads=request.threads,
+        request.refit, request.output, overwrite=request.overwrite, precision="float16",
+        memory=request.memory, time_budget=seconds, seed=request.seed, device=request.device,
+        threads=request.threads,
     )  # fmt: skip
 
 

@@ -11,6 +11,8 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
+from platformdirs import user_cache_path
+
 from formats.captures import poses_elsewhere, read_capture
 from formats.errors import NoPoses, ResourceError
 from formats.locks import temporary_folder
@@ -101,8 +103,7 @@ def _cached(source: str, photos: Sequence[Path]) -> Path:
     check_extra(source)
     stated = [(os.path.realpath(photo), *_stamp(photo)) for photo in photos]
     facts = json.dumps([__version__, version("pycolmap"), stated])
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(home) / "fusedrf" / "poses" / hashlib.sha256(facts.encode()).hexdigest()[:16]
+    return user_cache_path("fusedrf") / "poses" / hashlib.sha256(facts.encode()).hexdigest()[:16]
 
 
 def _stamp(photo: Path) -> tuple[int, int]:

@@ -292,7 +292,8 @@ class _Loader:
         if scene.cameras is not None:
             self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
-        leaf = replace(leaf, groups=(*leaf.groups, (leaf.name, scene.composition)))
+        if len(inner) > 1:
+            leaf = replace(leaf, groups=(*leaf.groups, (leaf.name, scene.composition)))
         return [
             (replace(node.inside(leaf), name=name), self.bundles[path], node.field)
             for name, node in zip(named, inner, strict=True)

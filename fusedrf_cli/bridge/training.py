@@ -1,7 +1,7 @@
 """`train`: photos or a mesh to one field."""
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,8 @@ from fusedrf_cli.bridge.running import (
 )
 from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
 from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
@@ -45,46 +46,68 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
 
-UNBOUNDED_TEXELS = 2.0  # times those of a box, along an axis of all of space: half lie outside the core
-PATIENCE, FOR_MORE, MOST_MORE = 120, 0.23, 1.5
-"""Seconds of learning from which a place has more texels, by which power of the time, and times how many at
-most: on two cores ten minutes with 1.45 times as many reach 0.5 dB more, two minutes less."""
-PLACE_PRECISION = "int8"
-"""Of a place, where none is asked for: half the bytes of float16 for 0.0001 dB."""
-HASHED = Hashed((2 * REACH / 256, 2 * REACH / 512, 2 * REACH / 1024), 1 << 20)
-"""What the texels of a place cannot tell apart. The first level is coarser than they are: after as many steps
-a park shows 0.4 dB more with it than without; one more, of 128, takes half a dB."""
-HASHED_FROM, HASHED_STEPS, HASHED_TEXELS = 360.0, 4000, 1.5
-"""Seconds and steps of learning from which a place has that detail, and times the texels of a box that it has
-then. After ten minutes a park shows up to 1 dB more than with any number of texels without it. After four it
-shows 0.4 dB more, a cup 0.6 less."""
-HASHED_SHARE = 0.5  # of a file, that it may take
-LARGEST_PLACE = 95_000_000
-"""Bytes of a place, stored as its kind is by default, where no size is asked for: voxels of all of space, as
-fine as planes are, would take a hundred times those of the planes."""
-FEWER_TEXELS = 4  # steps in which a size is looked for that fits
 QUALITY = {
-    "draft": FitSettings(longest=128, steps=1500, samples=1 << 15),
-    "normal": FitSettings(longest=224, steps=4000, samples=1 << 15),
-    "high": FitSettings(longest=256, steps=9000, samples=1 << 15),
-    "best": FitSettings(longest=256, steps=24000, samples=1 << 15),
+    "draft": TrainConfig(longest=128, steps=1500, samples=1 << 15),
+    "normal": TrainConfig(longest=224, steps=4000, samples=1 << 15),
+    "high": TrainConfig(longest=256, steps=9000, samples=1 << 15),
+    "best": TrainConfig(longest=256, steps=24000, samples=1 << 15),
 }
-PATIENT = {"best": 200.0, "high": 90.0, "normal": 0.0}
-"""Seconds of a time budget from which an object is learnt so where no quality is asked for. Of places the
-texels follow the time budget (PATIENCE)."""
-MORE_SAMPLES = 2
-"""Times the samples of a step, in as many fewer steps, of the best quality of an object and of a place that
-learns its hashed detail for long: looking through all gradients of so many numbers would take two fifths of a
-step, and a quarter. By HASHED_STEPS a park shows 23.2 dB, and in half as many of twice the samples 23.0."""
-GPU_SAMPLES = 4
-"""Times the samples of a step on a GPU, whose threads wait for work otherwise: its steps hardly take longer.
-After 60 s of an H100 a park shows 22.99 dB by steps of two cores, 23.59 by four times the samples, 23.55 by
-eight times."""
-GPU_PACE = 6
-"""Seconds of two cores that one of a GPU counts as, where the time decides how to learn: an H100 does in a
-minute what they do in ten."""
-PER_PIXEL, FINEST_OBJECT = 0.7, 512
-"""Texels, of the best quality, for each pixel of the photos that an object's box is wide, and at most."""
+
+
+@dataclass(frozen=True)
+class Presets:
+    """How a TrainConfig follows from the quality, the time and the bytes that are asked for."""
+
+    patient: tuple[tuple[str, float], ...] = (("best", 200.0), ("high", 90.0), ("normal", 0.0))
+    """Seconds of a time budget from which an object is learnt so where no quality is asked for. Of unbounded
+    scenes the texels follow the time budget."""
+    texels_per_pixel: float = 0.7
+    """Of the best quality, for each pixel of the photos that an object's box is wide."""
+    finest_object: int = 512
+    """Texels, at most."""
+    unbounded_texels: float = 2.0
+    """Times those of a box, along an axis of all of space: half lie outside the core."""
+    more_texels_from: float = 120
+    """Seconds of learning from which an unbounded scene has more texels, ..."""
+    more_texels_power: float = 0.23
+    """... by this power of the time, ..."""
+    most_texels: float = 1.5
+    """... and times how many at most: on two cores ten minutes with 1.45 times as many reach 0.5 dB more, two
+    minutes less."""
+    unbounded_precision: str = "int8"
+    """Where none is asked for: half the bytes of float16 for 0.0001 dB."""
+    largest_unbounded: int = 95_000_000
+    """Bytes, stored as its kind is by default, where no size is asked for: voxels of all of space, as fine as
+    planes are, would take a hundred times those of the planes."""
+    hashed: Hashed = Hashed((2 * REACH / 256, 2 * REACH / 512, 2 * REACH / 1024), 1 << 20)
+    """What the texels of an unbounded scene cannot tell apart. The first level is coarser than they are:
+    after as many steps a park shows 0.4 dB more with it than without; one more, of 128, takes half a dB."""
+    hashed_from: float = 360.0
+    """Seconds of learning from which there is a hash grid. After ten minutes a park shows up to 1 dB more
+    than with any number of texels without it. After four it shows 0.4 dB more, a cup 0.6 less."""
+    hashed_steps: int = 4000
+    """Steps from which there is one."""
+    hashed_texels: float = 1.5
+    """Times the texels of a box that there are then."""
+    hashed_share: float = 0.5
+    """Of a file, that it may take."""
+    fewer_texels: int = 4
+    """Steps in which a size is looked for that fits."""
+    more_samples: int = 2
+    """Times the samples of a step, in as many fewer steps, of the best quality of an object and of an
+    unbounded scene that learns its hash grid for long: looking through all gradients of so many numbers would
+    take two fifths of a step, and a quarter. By `hashed_steps` a park shows 23.2 dB, and in half as many of
+    twice the samples 23.0."""
+    gpu_samples: int = 4
+    """Times the samples of a step on a GPU, whose threads wait for work otherwise: its steps hardly take
+    longer. After 60 s of an H100 a park shows 22.99 dB by steps of two cores, 23.59 by four times the
+    samples, 23.55 by eight times."""
+    gpu_pace: float = 6
+    """Seconds of two cores that one of a GPU counts as, where the time decides how to learn: an H100 does in
+    a minute what they do in ten."""
+
+
+PRESETS = Presets()
 
 
 def train(request: TrainRequest, progress) -> dict:
@@ -99,7 +122,7 @@ def train(request: TrainRequest, progress) -> dict:
         cut_out = cuts_out(request, capture)
         extent = extent_of(request, capture, cut_out)
         check_flatness(extent)
-        suits = PLACE_PRECISION if extent.unbounded else "float16"
+        suits = PRESETS.unbounded_precision if extent.unbounded else "float16"
         request = replace(request, precision=request.precision or suits)
         kept = cameras_of_capture(capture, cut_out, progress)
         check_graph(request.output, Path(request.output).stem, extent.origin, None, kept)
@@ -234,38 +257,38 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
 
 def paced(seconds: float | None, place: str) -> float | None:
     """Seconds of two cores that a time budget at a place to compute counts as."""
-    return seconds and seconds * (GPU_PACE if place == "cuda" else 1)
+    return seconds and seconds * (PRESETS.gpu_pace if place == "cuda" else 1)
 
 
-def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> FitSettings:
+def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> TrainConfig:
     """The settings of the asked quality, or, of an object, of the one that the time budget is enough for; the
     best of an object has texels as fine as the photos' pixels ask for, and fewer but larger steps."""
     name = request.quality or "normal"
     budget = paced(request.time_budget, place)
     if request.quality is None and budget and not extent.unbounded:
-        name = next(name for name, seconds in PATIENT.items() if budget >= seconds)
+        name = next(name for name, seconds in PRESETS.patient if budget >= seconds)
     settings = QUALITY[name]
     if place == "cuda":
-        settings = replace(settings, samples=settings.samples * GPU_SAMPLES)
+        settings = replace(settings, samples=settings.samples * PRESETS.gpu_samples)
     if name != "best" or extent.unbounded:
         return settings
     centre, side = (extent.box[:3] + extent.box[3:]) / 2, (extent.box[3:] - extent.box[:3]).max()
     cameras = [extent.camera(camera_of(view)) for view in capture.train]
     away = [np.linalg.norm(camera.camera_to_world[:3, 3] - centre) for camera in cameras]
     pixels = np.median([c.fl_x * side / max(d, side / 2) for c, d in zip(cameras, away, strict=True)])
-    longest = int(np.clip(round(PER_PIXEL * pixels), settings.longest, FINEST_OBJECT))
+    longest = int(np.clip(round(PRESETS.texels_per_pixel * pixels), settings.longest, PRESETS.finest_object))
     return with_larger_steps(replace(settings, longest=longest))
 
 
-def with_larger_steps(settings: FitSettings) -> FitSettings:
-    """MORE_SAMPLES in a step, in as many fewer steps."""
-    steps, samples = settings.steps // MORE_SAMPLES, settings.samples * MORE_SAMPLES
+def with_larger_steps(settings: TrainConfig) -> TrainConfig:
+    """More samples in a step, in as many fewer steps."""
+    steps, samples = settings.steps // PRESETS.more_samples, settings.samples * PRESETS.more_samples
     return replace(settings, steps=steps, samples=samples)
 
 
 def fit_settings(
     request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str, besides: int = 0
-) -> FitSettings:
+) -> TrainConfig:
     """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
     bytes in its bundle."""
     settings = replace(
@@ -289,27 +312,27 @@ def fit_settings(
     if request.max_size or not extent.unbounded:
         longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     else:  # however its numbers are stored
-        longest = fitting_longest(kind, extent.box, settings, LARGEST_PLACE, kind.faithful)
+        longest = fitting_longest(kind, extent.box, settings, PRESETS.largest_unbounded, kind.faithful)
     plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)
 
 
-def of_place(settings: FitSettings, kind: Kind, box: np.ndarray, room: int | None) -> FitSettings:
+def of_place(settings: TrainConfig, kind: Kind, box: np.ndarray, room: int | None) -> TrainConfig:
     """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
     learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
     longer they learn."""
     budget = paced(settings.time_budget, settings.device)
-    takes = section_bytes(Section("detail", HASHED.shape), settings.way.precision)
-    fits = room is None or takes <= HASHED_SHARE * room
-    patient = budget is None or budget >= HASHED_FROM
-    if kind.hashes and fits and patient and settings.steps >= HASHED_STEPS:
-        longest = texels_of_place(box, HASHED_TEXELS * settings.longest)
-        way = replace(settings.way, hashed=HASHED)
+    takes = section_bytes(Section("detail", PRESETS.hashed.shape), settings.way.precision)
+    fits = room is None or takes <= PRESETS.hashed_share * room
+    patient = budget is None or budget >= PRESETS.hashed_from
+    if kind.hashes and fits and patient and settings.steps >= PRESETS.hashed_steps:
+        longest = texels_of_place(box, PRESETS.hashed_texels * settings.longest)
+        way = replace(settings.way, hashed=PRESETS.hashed)
         settings = replace(settings, longest=longest, way=way)
-        return with_larger_steps(settings) if budget or settings.steps > HASHED_STEPS else settings
-    patience = max(1.0, (budget or 0) / PATIENCE)
-    more = UNBOUNDED_TEXELS * min(MOST_MORE, patience**FOR_MORE)
+        return with_larger_steps(settings) if budget or settings.steps > PRESETS.hashed_steps else settings
+    patience = max(1.0, (budget or 0) / PRESETS.more_texels_from)
+    more = PRESETS.unbounded_texels * min(PRESETS.most_texels, patience**PRESETS.more_texels_power)
     return replace(settings, longest=texels_of_place(box, more * settings.longest))
 
 
@@ -328,7 +351,7 @@ def loading(capture: Capture) -> dict[str, float]:
     return decoding(pixels, masked, 0 if capture.kind == "mesh" else loading_bytes(capture.train))
 
 
-def fit_memory(capture: Capture, plan: Plan, settings: FitSettings) -> dict[str, float]:
+def fit_memory(capture: Capture, plan: Plan, settings: TrainConfig) -> dict[str, float]:
     """What a fit to a capture's photos needs."""
     pixels = max(view.width * view.height for view in capture.train)
     cameras = len({camera_of(v).intrinsics for v in capture.train})
@@ -364,7 +387,7 @@ def warn_of_numbers(figures: dict[str, int], progress) -> None:
 
 
 def fitting_longest(
-    kind: Kind, box: np.ndarray, settings: FitSettings, max_size: int | None, precision: str
+    kind: Kind, box: np.ndarray, settings: TrainConfig, max_size: int | None, precision: str
 ) -> int:
     """Texels on the longest axis, fewer than the settings' where the file would grow past max_size
     (bytes).
@@ -375,7 +398,7 @@ def fitting_longest(
         and longest > LEAST_TEXELS
         and bytes_of(kind.untrained(box, longest, settings.way), precision) > max_size
     ):
-        longest -= FEWER_TEXELS
+        longest -= PRESETS.fewer_texels
     return longest
 
 

@@ -2,22 +2,20 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.placement import node_words
-from fusedrf_cli.requests import AddRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("add")
 @click.argument("fused", type=options.INPUT)
 @click.argument("source", metavar="OBJECT", type=options.INPUT)
-@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @click.option("--name", required=True, help="The object's name in the scene.")
 @options.placement
 @options.keep_history
 @options.memory
 @options.added_precision
 @options.reporting
-def command(fused, source, output, name, translate, rotate, scale, matrix, progress, **words):
+def command(**words):
     """Put one more object into a bundle.
 
     OBJECT, of any kind, is scaled, then turned, then moved, and becomes a node of FUSED. All fields keep
@@ -27,11 +25,4 @@ def command(fused, source, output, name, translate, rotate, scale, matrix, progr
     Example:
       fusedrf add fused.rfpack lamp.rfpack --name lamp -t 0,0,1 -r 0,0,45 -o more.rfpack
     """
-    from formats.scene import make_node
-
-    node = make_node(name, source=source, **node_words(translate, rotate, scale, matrix))
-    from fusedrf_cli import bridge
-
-    where = node.node_to_parent
-    request = AddRequest(fused=fused, source=source, output=output, name=name, object_to_world=where, **words)
-    return bridge.add(request, progress)
+    return verbs.add(**words)

@@ -2,20 +2,8 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ChartRequest, FuseRequest
-
-DEFAULT_KINDS = ("blocks", "vm", "sparse")
-REPORTING = ("as_json", "quiet", "verbose")
-
-
-def fuse_request(flags: tuple[str, ...]) -> FuseRequest:
-    """What `fusedrf fuse` asks of the bridge with these flags."""
-    from fusedrf_cli.commands.fuse import command as fuse
-
-    line = [options.STDIO, "-o", options.STDIO, *flags]
-    words = fuse.make_context("fuse", line).params
-    return FuseRequest(**{name: value for name, value in words.items() if name not in REPORTING})
+from fusedrf_cli import options, verbs
+from fusedrf_cli.requests import ChartRequest
 
 
 def shown(report: dict) -> dict:
@@ -25,19 +13,19 @@ def shown(report: dict) -> dict:
 
 @click.command("chart")
 @click.argument("scene", type=options.INPUT)
-@options.writing("The folder for chart.png, chart.svg and chart.csv.", folders=True)
+@options.writing("The folder for chart.png, chart.svg and chart.csv.")
 @click.option(
     "--budget",
     type=options.POSITIVE,
     metavar="S",
-    default=300.0,
+    default=ChartRequest.budget,
     show_default=True,
     help="Start no new point after S seconds.",
 )
 @click.option(
     "--kinds",
     type=options.KindsType(),
-    default=",".join(DEFAULT_KINDS),
+    default=",".join(ChartRequest.kinds),
     show_default=True,
     help="Kinds to try, separated by commas.",
 )
@@ -45,18 +33,21 @@ def shown(report: dict) -> dict:
     "--least-psnr",
     type=options.POSITIVE,
     metavar="DB",
-    default=30.0,
+    default=ChartRequest.least_psnr,
     show_default=True,
     help="Go no smaller once a point falls below it.",
 )
 @click.option(
-    "--size", type=options.SIZE, default=(400, 400), help="Size of the pictures compared; default: 400x400."
+    "--size",
+    type=options.SIZE,
+    default=ChartRequest.size,
+    help="Size of the pictures compared; default: 400x400.",
 )
 @options.memory
 @options.allow_outside
 @options.seeded
 @options.reporting(brief=shown)
-def command(scene, output, progress, **words):
+def command(**words):
     """Chart PSNR against seconds, bytes and time per frame.
 
     SCENE, a scene.json or a bundle, is fused in many ways; each is compared with the scene as composed, on
@@ -66,7 +57,4 @@ def command(scene, output, progress, **words):
     Example:
       fusedrf chart scene.json -o chart --budget 120
     """
-    from fusedrf_cli import bridge
-
-    request = ChartRequest(scene=scene, output=output, fuse_request=fuse_request, **words)
-    return bridge.chart(request, progress)
+    return verbs.chart(**words)

@@ -1,13 +1,10 @@
 """`fusedrf compose`: writes a scene graph that places bundles; nothing is optimised or copied."""
 
-import os
-from pathlib import Path
-
 import click
 
-from fusedrf_cli import __version__, options
+from fusedrf_cli import options, verbs
 from fusedrf_cli.errors import UsageProblem
-from fusedrf_cli.placement import node_words
+from fusedrf_cli.requests import ComposeRequest
 
 
 class PlacedOption(click.Option):
@@ -59,11 +56,11 @@ def _placed_options(command):
 @click.command("compose")
 @click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=options.INPUT)
 @_placed_options
-@options.writing("The scene to write, scene.json, or - for stdout.", stdout=True)
+@options.writing("The scene to write, scene.json, or - for stdout.")
 @click.option(
     "--composition",
     type=click.Choice(["max", "add"]),
-    default="max",
+    default=ComposeRequest.composition,
     show_default=True,
     help="Where fields overlap: the densest wins, or they mix.",
 )
@@ -80,68 +77,17 @@ def command(inputs, output, overwrite, composition, allow_outside, progress, **p
     Example:
       fusedrf compose table.rfpack --background-node chair.rfpack -t 0.4,0,0 -r 0,0,45 -s 0.5 -o scene.json
     """
-    from formats.bundle import read_summary
-    from formats.scene import SceneGraph, dump_scene, inline_scenes, write_scene
-
-    summaries = [read_summary(path) for path in inputs]
-    nodes = tuple(_nodes(inputs, output, allow_outside, _by_input(inputs, placed)))
-    scene = SceneGraph(nodes, composition, generator=f"fusedrf {__version__}")
-    inline_scenes(scene, output, allow_outside)
-    if output == options.STDIO:
-        click.echo(dump_scene(scene), nl=False)
-        return {}
-    write_scene(output, scene, overwrite=overwrite)
-    return {
-        "output": output,
-        "bytes": os.path.getsize(output),
-        "nodes": [
-            {"name": node.name, "source": node.source, "source_bytes": summary["bytes"]}
-            for node, summary in zip(nodes, summaries, strict=True)
-        ],
-    }
+    given = _by_input(inputs, placed)
+    words = {"composition": composition, "allow_outside": allow_outside, "overwrite": overwrite}
+    return verbs.compose(given, output, progress=progress, **words)
 
 
 def _by_input(inputs: tuple[str, ...], placed: dict[str, tuple]) -> list[dict]:
-    """The options of each input, from the values of each option."""
-    words = [dict.fromkeys(placed) for _ in inputs]
+    """The words of each input, from the values of each option."""
+    words = [{"path": path} for path in inputs]
     for option, pairs in placed.items():
         for index, value in pairs or ():
-            if words[index][option] is not None:
+            if option in words[index]:
                 raise UsageProblem(f"{inputs[index]}: --{option.replace('_', '-')} is given twice")
             words[index][option] = value
     return words
-
-
-def _nodes(inputs, output, allow_outside, words):
-    from formats.scene import make_node, resolve_source
-
-    names = _names(inputs, [given.pop("name") for given in words])
-    for path, name, given in zip(inputs, names, words, strict=True):
-        source = _relative(path, output)
-        resolve_source(output, source, allow_outside)
-        background, hidden = bool(given.pop("background_node")), bool(given.pop("hidden"))
-        showing = {key: value for key in ("crop", "opacity", "tint") if (value := given.pop(key)) is not None}
-        showing |= {"visible": False} if hidden else {}
-        words = node_words(**given)
-        yield make_node(name, source=source, background=background, showing=showing, **words)
-
-
-def _names(inputs: tuple[str, ...], given: list[str | None]) -> list[str]:
-    """A name for each input: the one given, else the file's stem, numbered where that is taken."""
-    taken = {name for name in given if name is not None}
-    names = []
-    for path, name in zip(inputs, given, strict=True):
-        stem, count = Path(path).stem, 1
-        while name is None:
-            candidate = stem if count == 1 else f"{stem}-{count}"
-            name, count = (None if candidate in taken else candidate), count + 1
-        taken.add(name)
-        names.append(name)
-    return names
-
-
-def _relative(path: str, output: str) -> str:
-    """`path` as the scene at `output` names it. Links are resolved, as from a link `..` leads elsewhere."""
-    folder = os.path.realpath(os.path.dirname(output))
-    real = os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
-    return Path(os.path.relpath(real, folder)).as_posix()

@@ -2,8 +2,7 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ConvertRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("convert")
@@ -21,16 +20,14 @@ from fusedrf_cli.requests import ConvertRequest
 @options.sh_degree
 @options.seeded
 @options.reporting
-def command(field, output, progress, **words):
+def command(**words):
     """Turn a field into one of another kind that shows the same.
 
-    FIELD is a bundle with one field, trained or fused. The report gives PSNR and SSIM against it on views
+    FIELD is a bundle, trained or fused. The report gives PSNR and SSIM against it on views
     that nothing was learnt from, and bytes before and after.
 
     \b
     Example:
       fusedrf convert chair.rfpack -o small.rfpack --kind cp
     """
-    from fusedrf_cli import bridge
-
-    return bridge.convert(ConvertRequest(field=field, output=output, **words), progress)
+    return verbs.convert(**words)

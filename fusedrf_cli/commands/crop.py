@@ -2,19 +2,18 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ShowRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("crop")
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("shape", type=options.CROP, required=False)
-@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @options.keep_history
 @options.memory
 @options.reporting
-def command(fused, name, shape, progress, **words):
+def command(**words):
     """Show what of an object lies in a box or a sphere.
 
     SHAPE is a box, xmin,ymin,zmin,xmax,ymax,zmax, or a sphere, x,y,z,r, in the object's own world, as it was
@@ -24,8 +23,4 @@ def command(fused, name, shape, progress, **words):
     Example:
       fusedrf crop fused.rfpack chair 0,0,0.5,1 -o part.rfpack
     """
-    from fusedrf_cli import bridge
-
-    showing = {"crop": None if shape is None else list(shape)}
-    request = ShowRequest(fused=fused, name=name, event="cropped", showing=showing, **words)
-    return bridge.show(request, progress)
+    return verbs.crop(**words)

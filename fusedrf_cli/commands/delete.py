@@ -2,14 +2,13 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import DeleteRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("delete")
 @click.argument("fused", type=options.INPUT)
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
-@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @options.mending
 @options.keep_history
 @options.time_budget
@@ -18,7 +17,7 @@ from fusedrf_cli.requests import DeleteRequest
 @options.allow_outside
 @options.seeded
 @options.reporting
-def command(fused, names, output, progress, **words):
+def command(**words):
     """Take objects out of a bundle.
 
     An object that is a node goes as it is. Of one that was distilled into a field with others the region is
@@ -29,6 +28,4 @@ def command(fused, names, output, progress, **words):
     Example:
       fusedrf delete fused.rfpack lamp chair-2 -o less.rfpack
     """
-    from fusedrf_cli import bridge
-
-    return bridge.delete(DeleteRequest(fused=fused, names=names, output=output, **words), progress)
+    return verbs.delete(**words)

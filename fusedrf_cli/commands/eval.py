@@ -2,7 +2,7 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 from fusedrf_cli.requests import EvaluateRequest
 
 
@@ -12,7 +12,7 @@ from fusedrf_cli.requests import EvaluateRequest
 @click.option(
     "--split",
     type=click.Choice(["test", "train", "all"]),
-    default="test",
+    default=EvaluateRequest.split,
     show_default=True,
     help="Which photos of a capture.",
 )
@@ -21,7 +21,7 @@ from fusedrf_cli.requests import EvaluateRequest
 @options.allow_outside
 @options.running
 @options.reporting
-def command(bundle, against, progress, **words):
+def command(**words):
     """Measure PSNR and SSIM against photos or a scene.
 
     BUNDLE (or a scene.json, or - for a scene on stdin) is rendered from the views of --against.
@@ -30,6 +30,4 @@ def command(bundle, against, progress, **words):
     Example:
       fusedrf eval chair.rfpack --against photos/ --json
     """
-    from fusedrf_cli import bridge
-
-    return bridge.evaluate(EvaluateRequest(bundle=bundle, against=against, **words), progress)
+    return verbs.eval(**words)

@@ -2,16 +2,12 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ExtractRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("extract")
 @click.argument("field", type=options.INPUT)
-@options.writing(
-    "The object to write, OUT.rfpack.",
-    beside=lambda output, words: {words["preview"]: True} if words["preview"] else {},
-)
+@options.writing("The object to write, OUT.rfpack.")
 @click.option(
     "--masks",
     type=options.INPUT,
@@ -43,7 +39,7 @@ from fusedrf_cli.requests import ExtractRequest
 @options.memory
 @options.seeded
 @options.reporting
-def command(field, output, points, progress, **words):
+def command(**words):
     """Cut an object out of a field.
 
     The object is told by masks of a few views, by points, by a box, a sphere or a mesh around it, or by any
@@ -56,6 +52,4 @@ def command(field, output, points, progress, **words):
     Example:
       fusedrf extract fused.rfpack --masks masks -o object.rfpack --preview look
     """
-    from fusedrf_cli import bridge
-
-    return bridge.extract(ExtractRequest(field=field, output=output, points=points, **words), progress)
+    return verbs.extract(**words)

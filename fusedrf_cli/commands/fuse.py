@@ -2,7 +2,7 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 from fusedrf_cli.requests import FuseRequest
 
 
@@ -17,7 +17,7 @@ def brief(report: dict) -> dict:
 @click.option(
     "--kind",
     type=options.KindType("auto"),
-    default="auto",
+    default=FuseRequest.kind,
     show_default=True,
     help="Kind of field, or way of fusing; auto: what suits the scene best.",
 )
@@ -43,7 +43,7 @@ def brief(report: dict) -> dict:
 @options.allow_outside
 @options.seeded
 @options.reporting(brief=brief)
-def command(scene, output, progress, **words):
+def command(**words):
     """Turn a whole scene into one field.
 
     SCENE is a scene.json, a bundle, or - for a scene on stdin. A fused bundle is built anew from its sources,
@@ -53,6 +53,4 @@ def command(scene, output, progress, **words):
     Example:
       fusedrf fuse scene.json -o fused.rfpack
     """
-    from fusedrf_cli import bridge
-
-    return bridge.fuse(FuseRequest(scene=scene, output=output, **words), progress)
+    return verbs.fuse(**words)

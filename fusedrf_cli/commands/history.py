@@ -2,7 +2,7 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 
 
 def _brief(report: dict) -> dict:
@@ -17,7 +17,7 @@ def _brief(report: dict) -> dict:
 @click.command("history")
 @click.argument("fused", type=options.INPUT)
 @options.reporting(brief=_brief)
-def command(fused, progress):
+def command(**words):
     """List what was done to a fused field.
 
     It says too how many of its edits can be undone.
@@ -26,6 +26,4 @@ def command(fused, progress):
     Example:
       fusedrf history fused.rfpack
     """
-    from formats.undo import history
-
-    return history(fused)
+    return verbs.history(**words)

@@ -2,7 +2,7 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 
 MOST_ROWS = 8
 """Of a table about a capture, for people."""
@@ -78,7 +78,7 @@ def _scalars(event: dict) -> dict:
 @click.command("info")
 @click.argument("scene", type=options.SCENE)
 @options.reporting(brief=_brief)
-def command(scene, progress):
+def command(**words):
     """List what a bundle or scene holds, or what `train` would read.
 
     SCENE is a bundle, a scene.json, - for a scene on stdin, or a capture or mesh as `fusedrf train` takes it:
@@ -91,43 +91,4 @@ def command(scene, progress):
     Example:
       fusedrf info fused.rfpack --json
     """
-    from formats.bundle import read_summary
-    from formats.overview import overview
-
-    if scene == options.STDIO:
-        return _of_stdin()
-    return overview(scene) or read_summary(scene)
-
-
-def _of_stdin() -> dict:
-    """The same as `formats.bundle.read_summary` gives for a scene.json."""
-    from formats.rig import read_rig
-
-    scene, data = options.stdin_scene()
-    nodes = [
-        {
-            "name": node.name,
-            "depth": depth,
-            "field": None,
-            "source": node.source,
-            "kind": None,
-            "background": node.background,
-            "object_to_world": object_to_world.tolist(),
-            "aabb": None,
-            "world_aabb": None,
-        }
-        for node, depth, object_to_world in scene.walk()
-    ]
-    facts = {key: getattr(scene, key) for key in ("version", "generator", "composition")}
-    return {
-        "path": options.STDIO,
-        "format": "scene",
-        "bytes": len(data),
-        **facts,
-        "framing": scene.framing and list(scene.framing),
-        "cameras": scene.cameras and read_rig(scene.cameras).summary(),
-        "nodes": nodes,
-        "history": list(scene.history),
-        "objects": [],
-        "fields": [],
-    }
+    return verbs.info(**words)

@@ -2,7 +2,7 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 
 
 @click.command("kinds")
@@ -14,6 +14,4 @@ def command(**words):
     Example:
       fusedrf kinds
     """
-    from fusedrf_cli import bridge
-
-    return bridge.list_kinds(**words)
+    return verbs.kinds(**words)

@@ -2,16 +2,15 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import PoseRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("pose")
 @click.argument("photos", type=options.INPUT)
-@options.writing("The folder to write, CAPTURE.", folders=True)
+@options.writing("The folder to write, CAPTURE.")
 @options.threads
 @options.reporting
-def command(photos, output, progress, **words):
+def command(**words):
     """Find out where photos were taken.
 
     PHOTOS is a folder of overlapping photos without poses, or the frames of a film. CAPTURE gets a
@@ -23,6 +22,4 @@ def command(photos, output, progress, **words):
     Example:
       fusedrf pose photos/ -o garden
     """
-    from fusedrf_cli import bridge
-
-    return bridge.pose(PoseRequest(photos=photos, output=output, **words), progress)
+    return verbs.pose(**words)

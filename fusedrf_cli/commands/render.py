@@ -1,28 +1,14 @@
 """`fusedrf render`: pictures and films of a field or scene."""
 
-import math
-from pathlib import Path
-
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli import options, verbs
 from fusedrf_cli.requests import RenderRequest
-
-
-def beside(output: str, words: dict) -> dict[str, bool]:
-    """The depth of a single picture, where that is asked for."""
-    from formats.filenames import depth_of
-
-    single = Path(output).suffix.lower() == ".png"
-    return {str(depth_of(Path(output))): False} if words["depth"] and single else {}
 
 
 @click.command("render")
 @click.argument("scene", type=options.SCENE)
-@options.writing(
-    "A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).", folders=True, beside=beside
-)
+@options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).")
 @click.option("--cameras", type=options.INPUT, help="Views of a transforms.json.")
 @click.option("--path", type=options.INPUT, help="Views of a nerfstudio camera_path.json.")
 @click.option(
@@ -39,7 +25,11 @@ def beside(output: str, words: dict) -> dict[str, bool]:
     help="Look from this side: degrees from +x about the upward axis, and above the horizon.",
 )
 @click.option(
-    "--zoom", type=options.POSITIVE, default=1.0, show_default=True, help="2: from half as far away."
+    "--zoom",
+    type=options.POSITIVE,
+    default=RenderRequest.zoom,
+    show_default=True,
+    help="2: from half as far away.",
 )
 @click.option(
     "--up",
@@ -63,7 +53,9 @@ def beside(output: str, words: dict) -> dict[str, bool]:
     help="white, black, transparent or #rrggbb.",
 )
 @click.option("--depth", is_flag=True, help="Write 16-bit depth pictures as well.")
-@click.option("--fps", type=options.POSITIVE, default=24.0, show_default=True, help="Frames per second.")
+@click.option(
+    "--fps", type=options.POSITIVE, default=RenderRequest.fps, show_default=True, help="Frames per second."
+)
 @click.option(
     "--naive",
     is_flag=True,
@@ -73,7 +65,7 @@ def beside(output: str, words: dict) -> dict[str, bool]:
 @options.allow_outside
 @options.running
 @options.reporting
-def command(scene, output, progress, **words):
+def command(**words):
     """Render pictures or a film.
 
     SCENE is a bundle, a scene.json, or - for a scene on stdin. What was learnt from photos of a place is
@@ -88,17 +80,6 @@ def command(scene, output, progress, **words):
     Example:
       fusedrf render fused.rfpack --orbit 60 --size 400x400 -o turn.gif
     """
-    chosen = [name for name in ("cameras", "path", "views", "orbit") if words[name] is not None]
-    if len(chosen) > 1:
-        raise UsageProblem("--cameras, --path, --views and --orbit each choose the views; give one of them")
-    aimed = any(words[name] is not None for name in ("look_at", "direction", "up")) or words["zoom"] != 1
-    if aimed and chosen and chosen != ["orbit"]:
-        raise UsageProblem(
-            f"--look-at, --from, --zoom and --up do not apply to --{chosen[0]}; leave them out"
-        )
-    near, far = words.pop("near") or 0.0, words.pop("far") or math.inf
-    if near >= far:
-        raise UsageProblem(f"--near {near:g} leaves nothing before --far {far:g}; give a greater --far")
-    from fusedrf_cli import bridge
-
-    return bridge.render(RenderRequest(scene=scene, output=output, near=near, far=far, **words), progress)
+    limits = {name: words.pop(name) for name in ("near", "far")}
+    words |= {name: limit for name, limit in limits.items() if limit is not None}
+    return verbs.render(**words)

@@ -2,21 +2,20 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ReplaceRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("replace")
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("source", metavar="WITH", type=options.INPUT)
-@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @options.keep_history
 @options.memory
 @options.added_precision
 @options.allow_outside
 @options.reporting
-def command(fused, name, source, output, progress, **words):
+def command(**words):
     """Put another object in the place of one.
 
     WITH stands as NAME stood, by the same move, turn and scale, and goes by its name.
@@ -25,7 +24,4 @@ def command(fused, name, source, output, progress, **words):
     Example:
       fusedrf replace fused.rfpack chair lamp.rfpack -o other.rfpack
     """
-    from fusedrf_cli import bridge
-
-    request = ReplaceRequest(fused=fused, name=name, source=source, output=output, **words)
-    return bridge.replace(request, progress)
+    return verbs.replace(**words)

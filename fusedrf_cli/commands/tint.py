@@ -2,20 +2,19 @@
 
 import click
 
-from fusedrf_cli import options
-from fusedrf_cli.requests import ShowRequest
+from fusedrf_cli import options, verbs
 
 
 @click.command("tint")
 @click.argument("fused", type=options.INPUT)
 @click.argument("name")
 @click.argument("colour", metavar="[R,G,B]", type=options.TINT, required=False)
-@options.writing("The bundle to write, OUT.rfpack.", edits="fused")
+@options.writing("The bundle to write, OUT.rfpack.")
 @click.option("--opacity", type=options.SHARE, help="Its density times this, above 0 and at most 1.")
 @options.keep_history
 @options.memory
 @options.reporting
-def command(fused, name, colour, opacity, progress, **words):
+def command(**words):
     """Multiply the colours of an object.
 
     By red, green and blue from 0 to 1. Its numbers stay: without a colour, or an opacity, it is shown as it
@@ -25,8 +24,4 @@ def command(fused, name, colour, opacity, progress, **words):
     Example:
       fusedrf tint fused.rfpack chair 1,0.5,0.5 -o red.rfpack
     """
-    from fusedrf_cli import bridge
-
-    showing = {"tint": None if colour is None else list(colour), "opacity": opacity}
-    request = ShowRequest(fused=fused, name=name, event="tinted", showing=showing, **words)
-    return bridge.show(request, progress)
+    return verbs.tint(**words)

@@ -2,14 +2,16 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 from fusedrf_cli.requests import TrainRequest
 
 
 @click.command("train")
 @click.argument("source", type=options.INPUT)
 @options.writing("The field to write, FIELD.rfpack.")
-@click.option("--kind", type=options.KindType(), default="vm", show_default=True, help="Kind of field.")
+@click.option(
+    "--kind", type=options.KindType(), default=TrainRequest.kind, show_default=True, help="Kind of field."
+)
 @options.ranks
 @options.sh_degree
 @options.max_size
@@ -21,12 +23,16 @@ from fusedrf_cli.requests import TrainRequest
 )
 @options.time_budget
 @click.option(
-    "--views", type=click.IntRange(2, 1000), default=100, show_default=True, help="Views taken of a mesh."
+    "--views",
+    type=click.IntRange(2, 1000),
+    default=TrainRequest.views,
+    show_default=True,
+    help="Views taken of a mesh.",
 )
 @click.option(
     "--size",
     type=click.IntRange(16, 4096),
-    default=400,
+    default=TrainRequest.size,
     show_default=True,
     help="Pixels a side of a mesh's views.",
 )
@@ -49,7 +55,7 @@ from fusedrf_cli.requests import TrainRequest
 @click.option(
     "--masks",
     type=click.Choice(["ignore", "alpha"]),
-    default="ignore",
+    default=TrainRequest.masks,
     show_default=True,
     help="Leave what masks exclude out of training, or learn it as transparent.",
 )
@@ -61,7 +67,7 @@ from fusedrf_cli.requests import TrainRequest
 @options.resume
 @options.seeded
 @options.reporting
-def command(source, output, progress, **words):
+def command(**words):
     """Learn one field from photos or a mesh.
 
     SOURCE is the folder of a capture (Blender, instant-ngp, nerfstudio, COLMAP, LLFF and others), its
@@ -72,6 +78,4 @@ def command(source, output, progress, **words):
     Example:
       fusedrf train photos/ -o chair.rfpack
     """
-    from fusedrf_cli import bridge
-
-    return bridge.train(TrainRequest(source=source, output=output, **words), progress)
+    return verbs.train(**words)

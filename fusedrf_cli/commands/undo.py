@@ -2,14 +2,14 @@
 
 import click
 
-from fusedrf_cli import options
+from fusedrf_cli import options, verbs
 
 
 @click.command("undo")
 @click.argument("fused", type=options.INPUT)
-@options.writing("The field to write, OUT.rfpack.", edits="fused")
+@options.writing("The field to write, OUT.rfpack.")
 @options.reporting
-def command(fused, output, overwrite, progress):
+def command(**words):
     """Undo the last edit of a fused field.
 
     What is written has the bytes that were there before. The edit must have been made with --keep-history,
@@ -19,6 +19,4 @@ def command(fused, output, overwrite, progress):
     Example:
       fusedrf undo fused.rfpack -o fused.rfpack -w
     """
-    from formats.undo import undo
-
-    return undo(fused, output)
+    return verbs.undo(**words)

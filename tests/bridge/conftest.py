@@ -19,13 +19,13 @@ from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.composition import composed
-from fusedrf_cli.engine.distillation import distill, finish, fit
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
-from fusedrf_cli.engine.kinds.student import DistillSettings, Student
+from fusedrf_cli.engine.kinds.student import DistilConfig, Student
 from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.engine.kinds.vm import students
 from fusedrf_cli.engine.kinds.vm.field import VMField
@@ -38,11 +38,12 @@ from tests.analytic.fields import Box, Tint
 
 
 @dataclass(frozen=True)
-class TinySettings(DistillSettings):
+class TinySettings(DistilConfig):
     """A distillation of a second."""
 
     rays: int = 3000
     steps: int = 50
+    points_per_step: int = 1 << 13
     rgb_steps: int = 10
     rgb_samples: int = 1 << 12
     views: int = 2
@@ -100,24 +101,20 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     """Coarse grids, few steps, small pictures: what is tested here is the way, not the quality."""
     patch.setattr(vm, "OWNERSHIP_CELLS", 48)
     patch.setattr(composed, "OCCUPANCY_CELLS", 48)
-    patch.setattr(distill, "POINTS_PER_STEP", 1 << 13)
     patch.setattr(part("looks"), "WHOLE", 2)
     patch.setattr(part("looks"), "MOST_OBJECTS", 0)
     patch.setattr(Student, "lesson", TinySettings())
-    patch.setattr(part("making"), "DistillSettings", TinySettings)  # for students that are not taught
+    patch.setattr(part("making"), "DistilConfig", TinySettings)  # for students that are not taught
     for made in (SparseStudent, AskedStudent):
-        patch.setattr(made, "lesson", replace(made.lesson, views=2, view_size=32))
+        patch.setattr(made, "lesson", replace(made.lesson, points_per_step=1 << 13, views=2, view_size=32))
     patch.setattr(students, "SHAPE", SHAPE)
     patch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     patch.setattr(part("making"), "VIEWS_TO_CHOOSE_BY", 2)
-    patch.setattr(finish, "RAYS_PER_STEP", 500)
-    patch.setattr(finish, "STEPS", 30)
-    patch.setattr(finish.RayLesson.__init__, "__defaults__", (15_000,))  # as many as those steps take
+    patch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
     patch.setattr(part("mending"), "SETTINGS", TinySettings())
     patch.setattr(part("mending"), "NUMBERS", SHAPE.size((20, 20, 20)))
-    draft = FitSettings(longest=24, steps=60, samples=1 << 13)
+    draft = TrainConfig(longest=24, steps=60, samples=1 << 13, steps_to_show=1)
     patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high", "best"), draft))
-    patch.setattr(fit, "STEPS_TO_SHOW", 1)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -178,15 +175,16 @@ def report(folder):
 
 @pytest.fixture
 def picture(folder, report):
-    """picture("fused.rfpack") -> (H, W, 3) in [0, 1] of a scene from one camera over white."""
+    """picture("fused.rfpack", …) -> (H, W, 3) in [0, 1] of a scene from one camera over white, with more
+    words for `render`."""
     transforms = folder / "eye.json"
     c = orbit(np.array([-1.4, -0.8, -0.9, 1.4, 0.8, 0.4]), 1, 48, 48)[0]
     content = {"fl_x": c.fl_x, "fl_y": c.fl_y, "cx": c.cx, "cy": c.cy, "w": 48, "h": 48}
     frame = {"file_path": "eye", "transform_matrix": c.camera_to_world.tolist()}
     transforms.write_text(json.dumps({**content, "frames": [frame]}))
 
-    def picture(scene: str) -> np.ndarray:
-        report("render", scene, "--cameras", "eye.json", "-o", "eye.png", "-w")
+    def picture(scene: str, *words: str) -> np.ndarray:
+        report("render", scene, "--cameras", "eye.json", "-o", "eye.png", "-w", *words)
         return read_image(folder / "eye.png")[..., :3] / 255
 
     return picture

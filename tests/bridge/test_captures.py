@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from formats.images import read_image, write_png
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from tests.bridge.conftest import part
 from tests.formats.test_captures import looking_at
 from tests.formats.test_readers import binary_model
@@ -17,7 +17,7 @@ DRAFT = ("--quality", "draft")
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
     """Steps, not seconds, decide, so that a busy machine changes nothing."""
-    settings = FitSettings(longest=16, steps=300, samples=1 << 12)
+    settings = TrainConfig(longest=16, steps=300, samples=1 << 12)
     monkeypatch.setattr(part("training"), "QUALITY", {"draft": settings})
 
 

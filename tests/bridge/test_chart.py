@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,12 +14,11 @@ import numpy as np
 import pytest
 
 from fusedrf_cli import plots
-from fusedrf_cli.bridge.ladders import in_flags, in_words, ladders
-from fusedrf_cli.commands.chart import fuse_request
+from fusedrf_cli.bridge.ladders import flags_of, in_words
+from fusedrf_cli.commands.fuse import command as fuse_command
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.blocks import students as blocks
-from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor
-from fusedrf_cli.engine.kinds.ladders import shrinking as shrinking_rungs
+from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor, shrinking
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
 from fusedrf_cli.options import BYTES
 from fusedrf_cli.progress import NullProgress
@@ -126,26 +126,7 @@ def test_an_interrupt_leaves_nothing(run, folder, monkeypatch):
 # --- frontiers ----------------------------------------------------------------------------------------------
 
 
-CHARTED = ChartRequest(
-    scene="scene.json",
-    output="chart",
-    overwrite=False,
-    budget=60.0,
-    kinds=(),
-    least_psnr=30.0,
-    size=(24, 24),
-    memory=None,
-    allow_outside=False,
-    seed=0,
-    device="cpu",
-    threads=None,
-    fuse_request=fuse_request,
-)
-
-
-def shrinking(kind: str, least_psnr: float):
-    """The ladder of flags that shrinks what a kind gives."""
-    return in_flags(kind, shrinking_rungs(Rung(), least_psnr))
+CHARTED = ChartRequest(scene="scene.json", output="chart", budget=60.0, kinds=(), size=(24, 24), device="cpu")
 
 
 def point(**values):
@@ -204,7 +185,7 @@ def climbing(
         return {"bytes": int(size), "total_seconds": seconds[kind]}
 
     monkeypatch.setattr(module, "fuse", fuse)
-    waiting = {k: {k: [shrinking(k, 0)]} for k in seconds}
+    waiting = {k: {k: [shrinking(Rung(), 0)]} for k in seconds}
     return lambda budget: (run.climb(waiting, budget), run.points, heard.warnings)
 
 
@@ -223,7 +204,7 @@ def test_a_kind_that_others_surpass_gets_a_third_of_the_time(monkeypatch):
 def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
     """The second one's first rung shows 2 dB less than the other in more bytes, its next ones are as good."""
     chart = part("charting")
-    ahead, slow = chart.Climber(shrinking("a", 30), ("a",)), chart.Climber(shrinking("b", 30), ("b",))
+    ahead, slow, new = (chart.Climber(shrinking(Rung(), 30), Rung()) for _ in range(3))
     for climber, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
         climber.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
     found = [*ahead.points, *slow.points]
@@ -231,7 +212,7 @@ def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
     slow.points.append(point(psnr=46.9, bytes=6, seconds=1.0))
     found = [*ahead.points, *slow.points]
     assert not slow.behind(found)
-    assert not chart.Climber(shrinking("c", 30), ()).behind(found)
+    assert not new.behind(found)
 
 
 def test_a_kind_that_does_not_fit_leaves_the_others(monkeypatch):
@@ -250,8 +231,8 @@ def test_where_nothing_fits_the_reason_is_told(monkeypatch):
 # --- ladders ------------------------------------------------------------------------------------------------
 
 
-def climbed(ladder, give) -> list[tuple[str, ...]]:
-    """All flags of a ladder, where give(flags) is (bytes, PSNR) or None."""
+def climbed(ladder, give) -> list[Rung]:
+    """All rungs of a ladder, where give(rung) is (bytes, PSNR) or None."""
     rungs = [next(ladder)]
     while True:
         try:
@@ -262,18 +243,16 @@ def climbed(ladder, give) -> list[tuple[str, ...]]:
 
 def test_a_ladder_shrinks_until_quality_is_lost():
     psnrs = iter((50.0, 45.0, 40.0, 29.0))
-    rungs = climbed(shrinking("blocks", 30), lambda flags: (18_400_000, next(psnrs)))
-    assert rungs[0] == ("--kind", "blocks")
-    assert [r[-1] for r in rungs[1:]] == ["12MB", "8MB", "5.3MB"]
-    assert climbed(shrinking("vm", 30), lambda flags: None) == [("--kind", "vm")]
-    smallest = climbed(shrinking("vm", 30), lambda flags: (400_000, 99.0))[-1]
-    assert smallest[-1] == "48kB"
+    rungs = climbed(shrinking(Rung(), 30), lambda rung: (18_400_000, next(psnrs)))
+    assert [r.max_size for r in rungs] == [None, 12_000_000, 8_000_000, 5_300_000]
+    assert climbed(shrinking(Rung(), 30), lambda rung: None) == [Rung()]
+    assert climbed(shrinking(Rung(), 30), lambda rung: (400_000, 99.0))[-1].max_size == 48_000
 
 
 def test_a_distilled_ladder_goes_on_past_what_does_not_fit():
-    rungs = climbed(in_flags("vm", by_sizes()), lambda flags: None)
+    rungs = climbed(by_sizes(), lambda rung: None)
     assert len(rungs) == len(set(rungs)) == 24
-    assert all("--time-budget" not in r for r in rungs[-6:])
+    assert all(rung.time_budget is None for rung in rungs[-6:])
 
 
 @pytest.mark.parametrize("size", [1, 9, 10, 99, 100, 51_234, 949_999, 999_999, 1_000_000, 12_345_678.9])
@@ -284,9 +263,13 @@ def test_sizes_are_rounded_down_to_what_the_flag_reads_back(size):
 
 
 @pytest.mark.parametrize("kind", registry.names())
-def test_fuse_takes_what_a_ladder_begins_with(kind):
-    found = [ladder for group in ladders(kind, 30).values() for ladder in group]
-    assert all(fuse_request(next(ladder)).kind == kind for ladder in found)
+def test_the_flags_of_a_rung_are_its_keywords(kind):
+    for ladder in itertools.chain(*registry.kind(kind).ladders(30).values()):
+        rung = next(ladder)
+        line = ["-", "-o", "-", *flags_of(kind, rung, seed=7).split()]
+        words = fuse_command.make_context("fuse", line).params
+        assert {name: words[name] for name in asdict(rung)} == asdict(rung)
+        assert (words["kind"], words["seed"]) == (kind, 7)
 
 
 # --- the drawing --------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """What of unbounded space a capture's photos are learnt in."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,8 @@ from fusedrf_cli.bridge import training
 from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.refined import with_poses
-from fusedrf_cli.bridge.training import fit_settings, quality_of, texels_of_place
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.bridge.training import PRESETS, fit_settings, quality_of, texels_of_place
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.fields.occupancy import ORDINARY, placed_box
 from fusedrf_cli.engine.kinds import registry
@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def request() -> TrainRequest:
     """`train` with unbounded space asked for."""
-    known = {name: None for name, field in TrainRequest.__dataclass_fields__.items()}
+    known = {field.name: None for field in fields(TrainRequest)}
     return TrainRequest(**known | {"source": "photos", "output": "out.rfpack", "unbounded": True})
 
 
@@ -127,8 +127,8 @@ def test_views_of_what_lies_before_cameras_look_there():
 
 def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(monkeypatch):
     """At 4 units of distance a pixel of these lenses is 4/87 wide."""
-    known = {"normal": FitSettings(longest=224), "high": FitSettings(longest=256)}
-    monkeypatch.setattr(part("training"), "QUALITY", known | {"best": FitSettings(longest=256)})
+    known = {"normal": TrainConfig(longest=224), "high": TrainConfig(longest=256)}
+    monkeypatch.setattr(part("training"), "QUALITY", known | {"best": TrainConfig(longest=256)})
     capture = photos([(4, 0, 0), (0, 4, 0), (-4, 0, 0), (0, -4, 0), (0, 0.1, 4)])
     words = replace(request(), unbounded=False, aabb=(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0))
     extent = extent_of(words, capture, False)
@@ -144,11 +144,11 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     assert [longest(s) for s in (None, 20, 100, 300)] == [224, 224, 256, 256]
     assert longest(300, None, 10) == round(0.7 * 870 * 2 / 4) == longest(None, "best", 10)
     assert longest(300, None, 100) == 512 and longest(300, "normal", 100) == 224
-    best, plain = found(300), FitSettings()
+    best, plain = found(300), TrainConfig()
     assert best.samples > plain.samples and best.samples * best.steps == plain.samples * plain.steps
-    there = found(300 / training.GPU_PACE, place="cuda")  # in larger steps, and sooner
+    there = found(300 / PRESETS.gpu_pace, place="cuda")  # in larger steps, and sooner
     assert (there.longest, there.steps) == (best.longest, best.steps)
-    assert there.samples == best.samples * training.GPU_SAMPLES
+    assert there.samples == best.samples * PRESETS.gpu_samples
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():
@@ -180,21 +180,21 @@ def test_planes_over_a_part_of_space_have_as_many_texels_as_over_all_of_it():
 def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch):
     """And fewer texels then; no object does, nor a kind that has none."""
     for name, steps in (("draft", 1500), ("normal", 4000), ("best", 24000)):
-        monkeypatch.setitem(training.QUALITY, name, FitSettings(longest=224, steps=steps))
+        monkeypatch.setitem(training.QUALITY, name, TrainConfig(longest=224, steps=steps))
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
 
-    def settings(kind: str = "vm", bounded: bool = False, place: str = "cpu", **words) -> FitSettings:
+    def settings(kind: str = "vm", bounded: bool = False, place: str = "cpu", **words) -> TrainConfig:
         asked = replace(request(), precision="int8", unbounded=not bounded, **words)
         extent = extent_of(asked, capture, False)
         return fit_settings(asked, registry.kind(kind), capture, extent, place)
 
     plain = settings(time_budget=60.0)
     assert plain.way.hashed is None
-    assert settings(time_budget=60.0, place="cuda").way.hashed is training.HASHED
+    assert settings(time_budget=60.0, place="cuda").way.hashed is PRESETS.hashed
     for words in ({"time_budget": 600.0}, {}, {"quality": "best"}, {"max_size": 30_000_000}):
         found = settings(**words)
-        assert found.way.hashed is training.HASHED
+        assert found.way.hashed is PRESETS.hashed
         assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
         larger = "time_budget" in words or "quality" in words
         named = training.QUALITY[words.get("quality", "normal")]
@@ -207,7 +207,7 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
 @pytest.mark.parametrize("precision", ("float16", "float32"))
 def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, monkeypatch):
     """Where no size is asked for, however the numbers are stored; and within one that is."""
-    monkeypatch.setitem(training.QUALITY, "normal", FitSettings(longest=256))
+    monkeypatch.setitem(training.QUALITY, "normal", TrainConfig(longest=256))
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
     asked = replace(request(), quality="normal", precision=precision, ranks=(16, 24))

@@ -15,16 +15,17 @@ VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
 
 def test_a_scene_becomes_blocks_that_look_the_same(report, folder, picture):
     said = report("fuse", "scene.json", "-o", "fused.rfpack")
-    assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] > 45
+    assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] > 40  # as made, on another lattice
     assert said["bytes"] == (folder / "fused.rfpack").stat().st_size
-    assert psnr(picture("fused.rfpack"), picture("scene.json")) > 45
+    assert psnr(picture("fused.rfpack"), picture("scene.json")) > 40
+    assert psnr(picture("fused.rfpack"), picture("scene.json", "--naive")) > 45
     scene = read_bundle(folder / "fused.rfpack").scene
     (entry,) = scene.history
-    assert entry["event"] == "fused" and [n["name"] for n in entry["nodes"]] == ["floor", "red", "blue"]
-    assert [n["source"] for n in entry["nodes"]] == ["floor.rfpack", "red.rfpack", "blue.rfpack"]
-    assert (
-        not any(n["kept"] for n in entry["nodes"]) and len(read_bundle(folder / "fused.rfpack").fields) == 1
-    )
+    names = ["floor", "red", "blue"]
+    assert entry["event"] == "fused" and entry["objects"] == names and "nodes" not in entry
+    assert [node.name for node in scene.nodes] == names and scene.nodes[0].background
+    own = set().union(*(read_bundle(folder / f"{name}.rfpack").fields for name in names))
+    assert read_bundle(folder / "fused.rfpack").fields.keys() == own  # their very bytes
 
 
 def test_the_same_scene_gives_the_same_bytes(report, folder):
@@ -60,8 +61,13 @@ def test_the_file_is_no_larger_than_asked(report, folder, kind):
 def test_add_composition_is_distilled(report, run, folder):
     write_scene_of(folder, "floor", "red", file="fog.json", composition="add")
     assert report("fuse", "fog.json", "-o", "fog.rfpack", "--no-rgb")["kind"] == "vm"
-    result = run("fuse", "fog.json", "-o", "blocks.rfpack", "--kind", "blocks")
-    assert result.exit_code == 3 and "--kind vm" in result.stderr
+    report("fuse", "fog.json", "-o", "nodes.rfpack", "--kind", "blocks")  # which learns nothing
+    scene, sources = read_bundle(folder / "nodes.rfpack").scene, ("floor", "red")
+    assert scene.composition == "add" and [node.name for node in scene.nodes] == list(sources)
+    own = set().union(*(read_bundle(folder / f"{name}.rfpack").fields for name in sources))
+    assert read_bundle(folder / "nodes.rfpack").fields.keys() == own
+    result = run("fuse", "fog.json", "-o", "x.rfpack", "--kind", "blocks", "--max-size", "2kB")
+    assert result.exit_code == 2 and "--max-size is too small" in result.stderr
 
 
 def test_a_missed_target_is_exit_7_and_the_output_is_there(run, folder):

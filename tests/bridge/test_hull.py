@@ -1,15 +1,15 @@
 """The visual hull of a ball whose masks are known in closed form."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from formats.images import write_png
 from formats.views import Capture, View
-from fusedrf_cli.bridge import hull
 from fusedrf_cli.bridge.extent import extent_of
-from fusedrf_cli.bridge.hull import cropped, projected, visual_hull
+from fusedrf_cli.bridge.hull import HullConfig, cropped, projected, visual_hull
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, placed_box
 from fusedrf_cli.requests import TrainRequest
@@ -18,14 +18,14 @@ from tests.formats.test_captures import looking_at
 CENTRE, RADIUS = np.array([0.2, -0.1, 0.3]), 0.5
 BOX = np.concatenate([CENTRE - 1, CENTRE + 1])
 SIDE = 64
+COARSE = HullConfig(coarse=12, fine=24)
 BENT = (-0.2, 0.05, 0.0, 0.01, -0.01)
 FISHEYE = (0.05, -0.01, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    monkeypatch.setattr(hull, "COARSE", 12)
-    monkeypatch.setattr(hull, "FINE", 24)
+    monkeypatch.setattr("fusedrf_cli.bridge.extent.visual_hull", partial(visual_hull, config=COARSE))
 
 
 def views_of(folder, count=16, distortion=(0.0,) * 5, fisheye=False, aside=0.0) -> list[View]:
@@ -64,7 +64,7 @@ def holds_the_ball(grid) -> bool:
 )
 def test_the_hull_of_a_ball(tmp_path, lens):
     """It holds the ball, and little else. In the last case every picture cuts the ball off."""
-    grid = visual_hull(views_of(tmp_path, **lens), BOX)
+    grid = visual_hull(views_of(tmp_path, **lens), BOX, config=COARSE)
     assert holds_the_ball(grid)
     ball = 4 / 3 * np.pi * RADIUS**3
     assert grid.occupied.sum() * grid.cell.prod() < (4 if "aside" in lens else 2) * ball
@@ -88,22 +88,21 @@ def test_pixels_of_a_lens_are_where_its_rays_go(tmp_path):
 
 def test_a_wrong_mask_takes_nothing_away(tmp_path):
     views = views_of(tmp_path)
-    right = visual_hull(views, BOX)
+    right = visual_hull(views, BOX, config=COARSE)
     write_png(views[3].mask_path, np.full((SIDE, SIDE, 3), 0, np.uint8))  # says nothing
     levels = np.zeros((SIDE, SIDE, 3), np.uint8)
     levels[:4, :4] = 255
     write_png(views[5].mask_path, levels)  # excludes the ball
-    wrong = visual_hull(views, BOX)
+    wrong = visual_hull(views, BOX, config=COARSE)
     volume, before = (grid.occupied.sum() * grid.cell.prod() for grid in (wrong, right))
     assert holds_the_ball(wrong) and volume < 1.5 * before
 
 
-def test_large_masks_are_looked_at_in_part(tmp_path, monkeypatch):
+def test_large_masks_are_looked_at_in_part(tmp_path):
     """Every third row and column: the hull holds the ball still, and is not much larger."""
     views = views_of(tmp_path)
-    whole = visual_hull(views, BOX)
-    monkeypatch.setattr(hull, "LOOKED_AT", SIDE // 3)
-    part = visual_hull(views, BOX)
+    whole = visual_hull(views, BOX, config=COARSE)
+    part = visual_hull(views, BOX, config=replace(COARSE, pixels=SIDE // 3))
     volume, before = (grid.occupied.sum() * grid.cell.prod() for grid in (part, whole))
     assert holds_the_ball(part) and volume < 1.5 * before
 
@@ -114,7 +113,7 @@ def test_masks_that_agree_on_nothing_keep_all(tmp_path):
         levels = np.zeros((SIDE, SIDE, 3), np.uint8)
         levels[(0 if i % 2 else 60) :][:4, (0 if i % 3 else 60) :][:, :4] = 255
         write_png(one.mask_path, levels)
-    found = visual_hull(views, BOX)
+    found = visual_hull(views, BOX, config=COARSE)
     assert found.occupied.all()
     np.testing.assert_allclose(found.aabb, BOX)
 
@@ -134,7 +133,7 @@ def test_the_hull_of_an_object_far_away_is_that_of_the_same_at_the_origin(tmp_pa
     moved = [replace(view, camera_to_world=view.camera_to_world.copy()) for view in views]
     for view in moved:
         view.camera_to_world[:3, 3] = unit * view.camera_to_world[:3, 3] + at
-    words = {name: None for name in TrainRequest.__dataclass_fields__}
+    words = {field.name: None for field in fields(TrainRequest)}
     found = []
     for chosen, box in ((views, BOX), (moved, unit * BOX + np.tile(at, 2))):
         capture = Capture(tmp_path, "transforms", tuple(chosen), (), box, True, object_aabb=box)

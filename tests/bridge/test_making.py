@@ -15,13 +15,14 @@ from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite
-from fusedrf_cli.engine.distillation.distill import POINTS_PART, DistillRun
+from fusedrf_cli.engine.distillation.distill import DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.sparse import KIND as SPARSE
 from fusedrf_cli.engine.kinds.student import (
     NUMBERS_PER_SECOND,
     TOLD_NUMBERS,
+    DistilConfig,
     Made,
     MadeStudent,
     Student,
@@ -118,7 +119,7 @@ def test_rays_show_the_scene_whether_or_not_its_sources_are_in_memory_at_once(mo
 def test_a_student_that_learns_from_nothing_is_taught_by_the_sources_put_together(monkeypatch):
     taught_by = []
 
-    def run(teacher, *words):
+    def run(teacher, *words, **more):
         taught_by.append(teacher)
         raise InterruptedError
 
@@ -162,7 +163,7 @@ def test_all_sizes_together_keep_to_the_budget(run, monkeypatch):
     assert sum(seconds for seconds, _ in learnt) <= 3.0 + 2 * len(learnt) * longest_step + 0.5
 
 
-@pytest.mark.parametrize("steps, part", [(0, 1.0), (10, POINTS_PART)])
+@pytest.mark.parametrize("steps, part", [(0, 1.0), (10, DistilConfig.points_part)])
 def test_a_phase_without_steps_takes_no_time_from_the_other(steps, part):
     student = VM.empty(SCENE, way_of(SHAPE), SHAPE.size((16,) * 3), torch.Generator().manual_seed(0), "")
     settings = TinySettings(steps=steps, rgb_steps=10, time_budget=8.0)

@@ -164,6 +164,35 @@ def test_a_bundle_of_nodes_is_placed_whole(folder, report):
     np.testing.assert_array_equal(placed(folder / "all.rfpack")["both/a/cp"][:3, 3], [0, 0, 4])
 
 
+def test_fields_of_any_kinds_are_fused_without_learning(folder, report, run):
+    """A bundle of its own, which says what the scene says, groups of another rule too."""
+    pair = [
+        make_node(kind, source=f"{kind}.rfpack", translation=(i, 0, 0)) for i, kind in enumerate(("cp", "vm"))
+    ]
+    write_scene(folder / "pair.json", SceneGraph(tuple(pair), "add"))
+    shown = {"tint": [1, 0.5, 0], "crop": [0, 0, 0, 5]}
+    nodes = (
+        make_node("moving", source="pair.json", translation=(0, 1, 0), showing=shown),
+        make_node("still", source="dense.rfpack", scale=(2, 2, 2), background=True),
+        make_node("twin", source="dense.rfpack"),
+    )
+    write_scene(folder / "scene.json", SceneGraph(nodes))
+    said = report("fuse", "scene.json", "--kind", "blocks", "-o", "all.rfpack")
+    assert (said["kind"], said["nodes"], said["fields"]) == ("blocks", 4, 3)
+    assert members(folder / "all.rfpack") == set().union(
+        *(members(folder / f"{k}.rfpack") for k in ("cp", "vm", "dense"))
+    )
+    scene = read_bundle(folder / "all.rfpack").scene
+    assert scene.version == "1.4" and scene.nodes[0].composition == "add" and scene.nodes[1].background
+    one, other = (load_scene(str(folder / name)) for name in ("scene.json", "all.rfpack"))
+    assert [p.name for p in one.placed] == [p.name for p in other.placed]
+    for a, b in zip(one.fields, other.fields, strict=True):
+        np.testing.assert_allclose(a.placed.object_to_world, b.placed.object_to_world, atol=1e-12)
+        assert (a.member, a.whole, a.groups) == (b.member, b.whole, b.groups)
+    result = run("fuse", "scene.json", "--kind", "blocks", "--ranks", "8,16", "-o", "x.rfpack")
+    assert result.exit_code == 2 and "--ranks applies to" in result.stderr
+
+
 @pytest.mark.slow
 def test_answers_are_those_of_the_composition_before_and_after(folder, report):
     """σ(x, d) of a moved node is that at M⁻¹ x along M⁻¹ d, times |M⁻¹ d|; all other nodes answer as they

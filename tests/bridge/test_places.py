@@ -84,7 +84,7 @@ def blues(image: np.ndarray) -> int:
 
 
 def test_a_fused_place_shows_what_its_composition_does(picture, report):
-    assert psnr(picture("fused.rfpack"), picture("place.json")) > 45
+    assert psnr(picture("fused.rfpack"), picture("place.json", "--naive")) > 45
     assert report("eval", "fused.rfpack", "--against", "place.json", "--size", "16x16")["mean"]["psnr"] > 45
     assert "unbounded" in json.dumps(report("info", "fused.rfpack"))
     report("validate", "fused.rfpack")
@@ -239,7 +239,7 @@ def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, 
     red = (wanted[..., 0] > 0.6) & (wanted[..., 2] < 0.4)
     near = np.pad(red, 2)
     near = np.any([np.roll(near, (a, b), (0, 1)) for a in range(-2, 3) for b in range(-2, 3)], 0)[2:-2, 2:-2]
-    assert red.sum() > 5 and psnr(one[~near], wanted[~near]) > 28
+    assert red.sum() > 5 and psnr(one[~near], wanted[~near]) > 34
     assert ((one[red][:, 0] > 0.5) & (one[red][:, 2] < 0.5)).mean() > 0.6
 
 
@@ -263,7 +263,7 @@ def test_one_place_in_the_core_of_another(folder, picture, report):
     ]
     write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
     report("fuse", "two.json", "-o", "two.rfpack")
-    assert psnr(picture("two.rfpack"), picture("two.json")) > 40
+    assert psnr(picture("two.rfpack"), picture("two.json", "--naive")) > 40
 
 
 def test_the_python_face_answers_in_the_world(folder, picture, monkeypatch):

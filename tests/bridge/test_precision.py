@@ -10,7 +10,7 @@ from formats.bundle import read_bundle, read_headers
 from formats.records import PRECISIONS
 from fusedrf_cli import options
 from fusedrf_cli.bridge.scene import load_scene, stored, write_field
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.vm import KIND
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -71,7 +71,7 @@ def test_training_in_8_bits(report, folder, picture):
 
 def test_fewer_bits_leave_room_for_more_texels():
     train, box, longest = part("training"), np.array([0, 0, 0, 2.0, 1, 1]), {}
-    settings = FitSettings(longest=256)
+    settings = TrainConfig(longest=256)
     for precision in PRECISIONS:
         found = longest[precision] = train.fitting_longest(KIND, box, settings, 1_000_000, precision)
         sizes = [train.bytes_of(KIND.untrained(box, n, settings.way), precision) for n in (found, found + 4)]

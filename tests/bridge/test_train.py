@@ -18,13 +18,14 @@ from formats.bundle import read_bundle
 from formats.checkpoints import read_checkpoint, write_checkpoint
 from formats.rig import read_rig
 from fusedrf_cli import signals
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.poses import changed_each, turns
 from fusedrf_cli.engine.fields.computed import ComputedField
 from tests.bridge.conftest import done, part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
-LONGER = {"normal": FitSettings(longest=24, steps=300, samples=1 << 13)}
+LONGER = {"normal": TrainConfig(longest=24, steps=300, samples=1 << 13)}
 
 
 def train(report, output="out.rfpack", *more):

@@ -22,7 +22,7 @@ from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera, azimuth_of, framing_camera, orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -411,7 +411,7 @@ def test_a_picture_from_a_side(report, folder):
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(part("training"), "QUALITY", {"draft": FitSettings(longest=64, steps=5, samples=512)})
+    monkeypatch.setattr(part("training"), "QUALITY", {"draft": TrainConfig(longest=64, steps=5, samples=512)})
 
 
 def speckled_capture(folder, count: int = 6) -> list[View]:

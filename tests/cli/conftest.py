@@ -1,5 +1,6 @@
 """A folder with two small bundles, a way to run a command line in it, and a bridge that only takes notes."""
 
+import dataclasses
 import subprocess
 import sys
 import types
@@ -17,8 +18,13 @@ from fusedrf_cli.main import cli
 ROOT = Path(__file__).parents[2]
 BRIDGE_VERBS = (
     *("pose", "train", "fuse", "convert", "add", "delete", "move", "duplicate", "rename", "render"),
-    *("evaluate", "chart", "extract", "replace"),
+    *("evaluate", "chart", "extract", "replace", "show"),
 )
+
+
+def names_of(request) -> list[str]:
+    """What a request is made of."""
+    return [field.name for field in dataclasses.fields(request)]
 
 
 @pytest.fixture
@@ -50,7 +56,8 @@ def bridge(monkeypatch) -> types.ModuleType:
 
     def verb(name):
         def note(request, progress):
-            stub.call = (name, dict(vars(request)))
+            words = {word: getattr(request, word) for word in names_of(request)}
+            stub.call, stub.request = (name, words), request
             if stub.error is not None:
                 raise stub.error
             return stub.report
@@ -59,7 +66,7 @@ def bridge(monkeypatch) -> types.ModuleType:
 
     for name in BRIDGE_VERBS:
         setattr(stub, name, verb(name))
-    stub.list_kinds = lambda progress: stub.report
+    stub.list_kinds = lambda request, progress: stub.report
     monkeypatch.setitem(sys.modules, "fusedrf_cli.bridge", stub)
     monkeypatch.setattr(fusedrf_cli, "bridge", stub, raising=False)
     return stub

@@ -1,5 +1,7 @@
+import importlib
 import re
 import shlex
+from pathlib import Path
 
 import click
 import pytest
@@ -84,6 +86,11 @@ def test_a_missing_input_is_one_line_and_code_3(run, bridge, name):
     assert result.exit_code == MissingFile.exit_code
     assert result.stderr.startswith("Error: nowhere.rfpack: ") and result.stderr.count("\n") == 1
     assert bridge.call is None
+
+
+def test_the_page_of_commands_is_what_help_says():
+    page = (Path(__file__).parents[2] / "docs/commands.md").read_text(encoding="utf-8")
+    assert page == importlib.import_module("docs.commands").page(), "run `make docs`"
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -76,7 +76,7 @@ def test_an_affine_may_lie_in_a_file(tmp_path, text):
 def test_an_affine_may_come_by_pipe(run, bridge):
     words = ("add", "chair.rfpack", "table.rfpack", "-o", "out", "--name", "a", "--matrix", "-")
     assert run(*words, stdin=SPELLED.replace("1,0,0,0,", "1,0,0,5,")).exit_code == 0
-    assert bridge.call[1]["object_to_world"][0].tolist() == [1, 0, 0, 5]
+    assert bridge.request.object_to_world[0].tolist() == [1, 0, 0, 5]
 
 
 # --- placement ----------------------------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def test_a_matrix_goes_with_no_other_word():
 
 # --- commands and their bridge ------------------------------------------------------------------------------
 
-EDIT = ("fused", "output", "precision", "rgb", "time_budget", "keep_history")
+EDIT = ("fused", "output", "overwrite", "memory", "keep_history")
 COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False, "memory": None}
 
 
@@ -177,7 +177,7 @@ def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
 def test_add_hands_on_one_matrix(run, bridge):
     run("add", "chair.rfpack", "table.rfpack", "-o", "out", "--name", "a", "-t", "1,0,0", "-s", "2")
     name, asked = bridge.call
-    matrix = asked.pop("object_to_world")
+    matrix = bridge.request.object_to_world
     assert (name, asked["fused"], asked["source"], asked["output"]) == (
         "add",
         "chair.rfpack",
@@ -185,14 +185,15 @@ def test_add_hands_on_one_matrix(run, bridge):
         "out",
     )
     assert matrix.tolist() == [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
-    assert set(asked) == {*COMMON, *EDIT, "source", "name"}
+    assert set(asked) == {*EDIT, "source", "name", "precision", "translate", "rotate", "scale", "matrix"}
 
 
 def test_delete_hands_on_its_names(run, bridge):
     run("delete", "chair.rfpack", "a", "b", "-o", "out")
     name, asked = bridge.call
     assert (name, asked["fused"], asked["names"]) == ("delete", "chair.rfpack", ("a", "b"))
-    assert set(asked) == {*COMMON, *EDIT, "names", "allow_outside", "refit", "fill"}
+    more = {"names", "allow_outside", "refit", "fill", "rgb", "time_budget"}
+    assert set(asked) == {*COMMON, *EDIT, *more}
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,8 @@ COMMANDS = {
     "duplicate": Writes(("duplicate", "chair.rfpack", "n", "m", "-o", "out.rfpack"), **EDITED),
     "rename": Writes(("rename", "chair.rfpack", "n", "m", "-o", "out.rfpack"), **EDITED),
     "replace": Writes(("replace", "chair.rfpack", "n", "table.rfpack", "-o", "out.rfpack"), **EDITED),
+    "crop": Writes(("crop", "chair.rfpack", "n", "0,0,0,1", "-o", "out.rfpack"), **EDITED),
+    "tint": Writes(("tint", "chair.rfpack", "n", "1,0,0", "-o", "out.rfpack"), **EDITED),
     "extract": Writes(
         ("extract", *FUSED, "--box", "0,0,0,1,1,1", "--preview", "look"), ("out.rfpack",), ("look",)
     ),
@@ -42,7 +44,7 @@ COMMANDS = {
     "a film": Writes(("render", *FUSED[:2], "out.gif", "--orbit", "2"), files=("out.gif",)),
     "chart": Writes(("chart", *FUSED[:2], "out"), folders=("out",)),
 }
-HISTORY = ("add", "delete", "move", "duplicate", "rename", "replace")
+HISTORY = ("add", "delete", "move", "duplicate", "rename", "replace", "crop", "tint")
 OUTPUTS = [(name, output) for name, writes in COMMANDS.items() for output in writes.files + writes.folders]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Student
@@ -77,14 +77,11 @@ def quick(monkeypatch) -> None:
     """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 48)
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 48)
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.distill.POINTS_PER_STEP", 1 << 13)
     monkeypatch.setattr(Student, "lesson", TinySettings())
-    monkeypatch.setattr("fusedrf_cli.bridge.making.DistillSettings", TinySettings)  # for what is not taught
+    monkeypatch.setattr("fusedrf_cli.bridge.making.DistilConfig", TinySettings)  # for what is not taught
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.students.SHAPE", SHAPE)
     monkeypatch.setattr(blocks, "RANKS", (None,))  # others would be compiled
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.RAYS_PER_STEP", 500)
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.finish.STEPS", 30)
-    monkeypatch.setattr(RayLesson.__init__, "__defaults__", (15_000,))  # as many as those steps take
+    monkeypatch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
     monkeypatch.setattr("fusedrf_cli.bridge.looks.WHOLE", 2)
     monkeypatch.setattr("fusedrf_cli.bridge.looks.MOST_OBJECTS", 0)
 

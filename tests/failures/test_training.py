@@ -15,16 +15,8 @@ import torch
 
 from fusedrf_cli.bridge.training import QUALITY
 from fusedrf_cli.engine.distillation import fit as module
-from fusedrf_cli.engine.distillation.fit import (
-    CALM_AFTER,
-    RATE,
-    RESOLUTION_STAGES,
-    RETRY_AFTER,
-    STEPS_TO_SHOW,
-    FitRun,
-    FitSettings,
-    fit,
-)
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun, fit
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
@@ -38,10 +30,11 @@ from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO
 from tests.engine.distillation.test_fit import pictures
 
-BRIEF = FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
+SHOWS = TrainConfig.steps_to_show
+BRIEF = TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
 LONG = replace(BRIEF, longest=32, steps=300)
 CAMERAS = orbit(BOX, 14, 24, 24) + orbit(BOX, 8, 24, 24, elevation=-0.5)
-UNSEEN = scattered(BOX, 4, 24, 24, seed=3)
+UNSEEN = scattered(BOX, 4, 24, 24, seed=3)  # of which a picture of the mean colour shows 16 dB
 
 
 def over_white(images: np.ndarray) -> np.ndarray:
@@ -86,27 +79,30 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
         return nothing(field) if len(boxes) <= 2 else find(field, *box)
 
     monkeypatch.setattr(module, "occupancy_of", blind_twice)
-    run = FitRun.start(CAMERAS, images, BOX, replace(BRIEF, steps=2 * STEPS_TO_SHOW))
+    run = FitRun.start(CAMERAS, images, BOX, replace(BRIEF, steps=2 * SHOWS))
     field = run.finish()
     assert run.found_nothing >= 2 and run.found_matter
     moved = max(abs(box - BOX).max() for box in boxes[:3])
     row.check("T1", "largest move of the box", moved, 0, at_most=True)
-    row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 20, unit="dB")
+    row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 28, unit="dB")
 
 
 def test_t1_tries_again_soon_but_not_twice(images, monkeypatch):
     monkeypatch.setattr(module, "occupancy_of", nothing)
     run = FitRun.start(CAMERAS, images, BOX, replace(BRIEF, steps=320))
-    run.steps, run.optimiser.steps, run.refreshes = 128, CALM_AFTER, [0.4, 0.9]
+    run.steps, run.optimiser.steps, run.refreshes = 128, TrainConfig.calm_after, [0.4, 0.9]
     run.refresh(run.share())
-    assert run.refreshes == [pytest.approx(0.4 + RETRY_AFTER), 0.9]
-    run.steps, run.optimiser.steps = 280, CALM_AFTER
+    assert run.refreshes == [pytest.approx(0.4 + TrainConfig.retry_after), 0.9]
+    run.steps, run.optimiser.steps = 280, TrainConfig.calm_after
     run.refreshes = [0.5, 0.88]
     run.refresh(run.share())
     assert run.refreshes == [0.88]
 
 
-@pytest.mark.parametrize(("steps", "due"), [(STEPS_TO_SHOW, CALM_AFTER), (STEPS_TO_SHOW - 12, 12)])
+@pytest.mark.parametrize(
+    ("steps", "due"),
+    [(SHOWS, TrainConfig.calm_after), (SHOWS - 12, 12)],
+)
 def test_t1_nothing_is_cut_off_while_a_field_or_its_optimiser_is_new(images, monkeypatch, steps, due):
     """It is waited for, and then what was to be done by then is done once."""
     searches = []
@@ -188,7 +184,7 @@ def test_t4_finer_texels_cost_nothing(row, monkeypatch):
         return gains
 
     found = np.mean([gains_of(seed) for seed in range(4)], 0)
-    assert len(found) == len(RESOLUTION_STAGES) - 1
+    assert len(found) == len(TrainConfig.resolution_stages) - 1
     row.check("T4", "PSNR 100 steps after a resolution step", found.min(), -0.5, unit="dB")
 
 
@@ -201,7 +197,7 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
     run.guard.keep()
     good = run.field.params.clone()
     run.field.params[11] = float("nan")
-    run.steps, run.optimiser.steps = STEPS_TO_SHOW, CALM_AFTER
+    run.steps, run.optimiser.steps = SHOWS, TrainConfig.calm_after
     run.refresh(0.04)
     assert run.guard.roll_backs == 1 and run.field.params.shape == good.shape
     row.check("T7", "numbers that are not finite", (~torch.isfinite(run.field.params)).sum(), 0, at_most=True)
@@ -256,7 +252,7 @@ def test_t9_poisoned_numbers_are_recovered_from(row, images, unseen_psnr, value)
     run.step = poisoning
     field = run.finish()
     assert run.guard.roll_backs >= 1 and torch.isfinite(field.params).all()
-    row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 18, unit="dB")
+    row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 21, unit="dB")
 
 
 def test_t11_rays_without_samples(row, images):
@@ -277,15 +273,14 @@ def test_t12_no_seed_fails(row, images, unseen_psnr):
 
 
 @pytest.mark.slow
-def test_t13_the_rate_may_be_a_third_or_thrice(row, images, unseen_psnr, monkeypatch):
-    """Over as many steps as the shortest preset has, PSNR of unseen views differs by 3 dB at most."""
+def test_t13_the_rate_may_be_a_third_or_thrice(row, images, unseen_psnr):
+    """Over as many steps as the shortest preset has; two seeds of one rate are up to 2 dB apart."""
     settings = replace(LONG, steps=QUALITY["draft"].steps)
     found = []
     for factor in (1 / 3, 1, 3):
-        monkeypatch.setattr(module, "RATE", RATE * factor)
-        found.append(unseen_psnr(fit(CAMERAS, images, BOX, settings)))
-    spread = max(found) - min(found)
-    row.check("T13", "PSNR between rates of 1/3 and 3", spread, 3, at_most=True, unit="dB")
+        changed = replace(settings, rate=factor * settings.rate)
+        found.append(unseen_psnr(fit(CAMERAS, images, BOX, changed)))
+    row.check("T13", "worst PSNR of rates of 1/3, 1 and 3", min(found), 27, unit="dB")
 
 
 @pytest.mark.parametrize("opaque", [60.0, 1e3])

@@ -1,6 +1,7 @@
 """What every kind of field does, whoever wrote it: fused, edited, trained and charted as whole commands."""
 
 import shutil
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -8,14 +9,14 @@ import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
-from fusedrf_cli.bridge.ladders import in_flags
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.commands.chart import fuse_request
-from fusedrf_cli.engine.distillation import distill
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
+from fusedrf_cli.engine.kinds.student import Student
 from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.requests import FuseRequest
+from fusedrf_cli.verbs import checked
 from tests.bridge.conftest import TinySettings, done, write_scene_of
 from tests.bridge.test_edit import AT, blues, covered
 
@@ -29,7 +30,7 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 def short(tiny):  # noqa: F811
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        patch.setattr(distill, "POINTS_PER_STEP", 1 << 11)  # a network takes its time
+        patch.setattr(Student, "lesson", TinySettings(points_per_step=1 << 11))  # a network takes its time
         yield
 
 
@@ -61,7 +62,7 @@ def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
     assert fused["chosen"]["why"] and f"--kind {kind}" in fused["chosen"]["flags"]
     own = registry.kind(kind).field
     assert own is None or type(opened(load_scene(str(folder / "fused.rfpack")).placed[0].field)) is own
-    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 13
+    assert psnr(picture("fused.rfpack"), picture("pair.json")) > 18
     assert fused["memory"]["predicted_bytes"] > 0
 
 
@@ -110,21 +111,22 @@ def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, ki
     said = report(*PHOTOS, "--kind", kind)
     assert said["kind"] == kind and said["steps"] == 60
     assert said["bytes"] == (folder / "out.rfpack").stat().st_size
-    assert np.isfinite(said["training_psnr"]) and said["training_psnr"] > 5
+    assert np.isfinite(said["training_psnr"])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_target_that_is_easy_takes_few_bytes(report, kind):
-    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "12", "--no-rgb")
+    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "16", "--no-rgb")
     said = report("fuse", "pair.json", "-o", "small.rfpack", *words)
-    assert said["psnr"]["stored"] >= 12 and said["bytes"] < SIZE
+    assert said["psnr"]["stored"] >= 16 and said["bytes"] < SIZE
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_its_ladders_are_flags_of_fuse(kind):
+def test_its_ladders_are_keywords_of_fuse(kind):
     groups = registry.kind(kind).ladders(30.0)
-    first = [next(in_flags(kind, ladder)) for found in groups.values() for ladder in found]
-    assert first and all(fuse_request(flags).kind == kind for flags in first)
+    first = [asdict(next(ladder)) for found in groups.values() for ladder in found]
+    words = {"scene": "scene.json", "output": "fused.rfpack", "kind": kind}
+    assert first and all(checked(FuseRequest, words | rung) for rung in first)
 
 
 def test_a_kind_that_nobody_has_is_a_clear_sentence(run, folder):

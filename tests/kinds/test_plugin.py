@@ -20,10 +20,10 @@ PAGE = ROOT / "docs" / "kinds.md"
 # The command line, but that a draft is some steps: no clock decides what is learnt.
 BRIEF = """
 import importlib
-from fusedrf_cli.engine.distillation.fit import FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.main import main
 training = importlib.import_module("fusedrf_cli.bridge.training")
-training.QUALITY = {"draft": FitSettings(longest=16, steps=300, samples=1 << 12)}
+training.QUALITY = {"draft": TrainConfig(longest=16, steps=300, samples=1 << 12)}
 main()
 """
 

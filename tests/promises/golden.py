@@ -32,8 +32,9 @@ from tests.promises.packs import GOLDEN
 
 KEPT = GOLDEN / "kept"
 POINTS = 96
-SIDE = 20  # pixels of the pictures
-STEP = 0.004  # of their samples, so small that they show what a bundle holds, not how it is drawn
+SIDE = 16  # pixels of the pictures
+SAMPLES = 400  # of their rays
+SHORT = 0.005  # step in all of space, in units of the field's frame
 FAR = np.array([-7e11, 5411200.0, 1e12])
 
 
@@ -66,13 +67,39 @@ def answers(path: Path, points: np.ndarray, dirs: np.ndarray) -> tuple[np.ndarra
     return sigma.detach().numpy().astype(np.float64), rgb.detach().numpy().astype(np.float64)
 
 
+def view(case: Case) -> Camera:
+    """The camera of a case's pictures."""
+    pose = look_at(np.array(case.eye), np.array(case.at), np.array([0.0, 0.0, 1.0]))
+    return Camera(pose, 1.2 * SIDE, 1.2 * SIDE, SIDE / 2, SIDE / 2, SIDE, SIDE)
+
+
 def picture(path: Path, case: Case) -> np.ndarray:
-    """(SIDE, SIDE, 4) float64 premultiplied colours and opacity of a bundle."""
-    eye, at = np.array(case.eye), np.array(case.at)
-    pose = look_at(eye, at, np.array([0.0, 0.0, 1.0]))
-    camera = Camera(pose, 1.2 * SIDE, 1.2 * SIDE, SIDE / 2, SIDE / 2, SIDE, SIDE)
-    shown = open_scene(path).render(camera, step=STEP * np.linalg.norm(eye - at) / 3)
+    """(SIDE, SIDE, 4) float64 premultiplied colours and opacity: the sum Σ T (1 - exp(-σ δ)) (rgb, 1) over
+    SAMPLES of what the bundle answers, however it is drawn."""
+    camera, away = view(case), np.linalg.norm(np.subtract(case.eye, case.at))
+    directions = camera.local_directions().reshape(-1, 3) @ camera.camera_to_world[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ends = away * (np.geomspace(0.01, 1000, SAMPLES + 1) if case.spread else np.linspace(0, 2, SAMPLES + 1))
+    middles, spans = (ends[1:] + ends[:-1]) / 2, np.diff(ends)
+    at = camera.camera_to_world[:3, 3] + middles[:, None, None] * directions
+    sigma, rgb = answers(path, at.reshape(-1, 3), np.tile(directions, (SAMPLES, 1)))
+    depths = sigma.reshape(SAMPLES, -1) * spans[:, None]
+    left = np.exp(-np.concatenate([np.zeros((1, depths.shape[1])), np.cumsum(depths, 0)]))
+    weights = left[:-1] - left[1:]
+    colours = (weights[..., None] * rgb.reshape(SAMPLES, -1, 3)).sum(0)
+    return np.concatenate([colours, 1 - left[-1][:, None]], 1).reshape(SIDE, SIDE, 4)
+
+
+def drawn(path: Path, case: Case) -> np.ndarray:
+    """(SIDE, SIDE, 4) float64: the same as the program draws it; of all of space by short steps, since by its
+    own the farthest sample of a toy's fog stands for all that is behind it."""
+    shown = open_scene(path).render(view(case), step=SHORT if case.spread else None)
     return torch.cat([shown.rgb, shown.opacity[..., None]], 2).double().numpy()
+
+
+def decibels(one: np.ndarray, other: np.ndarray) -> float:
+    """PSNR of two pictures."""
+    return float(-10 * np.log10(max(np.mean((one - other) ** 2), 1e-12)))
 
 
 def edited(path: Path, words: tuple[str, ...], output: Path) -> dict:
@@ -122,11 +149,13 @@ def keep(name: str, case: Case) -> None:
             shutil.copytree(past, KEPT / f"{name}.rfpack.history", dirs_exist_ok=True)
         points, dirs = asked(path, case, Path(folder))
         sigma, rgb = answers(path, points, dirs)
-        found = {"points": points, "dirs": dirs, "sigma": sigma, "rgb": rgb, "picture": picture(path, case)}
+        shown = picture(path, case)
+        found = {"points": points, "dirs": dirs, "sigma": sigma, "rgb": rgb, "picture": shown}
         for edit, words in case.edits.items():
             out = Path(folder) / f"{edit}.rfpack"
             edited(path, words, out)
             found[f"{edit} sigma"], found[f"{edit} rgb"] = answers(out, points, dirs)
+    found["drawn"] = np.array(decibels(drawn(path, case), shown))  # by grids as fine as they are in use
     exact = ("points", "dirs")
     np.savez_compressed(
         KEPT / f"{name}.npz", **{k: v if k in exact else v.astype(np.float32) for k, v in found.items()}
@@ -465,9 +494,19 @@ def small_sources(folder: Path) -> None:
         )
 
 
+def sunk(folder: Path) -> None:
+    """pair.json of the floor and the red box, which stands in it and hides a part of it."""
+    small_sources(folder)
+    nodes = (
+        node("floor", source="floor.rfpack", background=True),
+        node("red", source="red.rfpack", translation=(-0.3, 0.1, 0.25)),
+    )
+    write_scene(folder / "pair.json", SceneGraph(nodes), overwrite=True)
+
+
 def restored(folder: Path) -> None:
     """A distilled field out of which an object was cut: a small tensor shows what it hid."""
-    small_sources(folder)
+    sunk(folder)
     learnt("vm", "--keep-sources", size="120kB")(folder)
     done("delete", "kept.rfpack", "red", "-o", "kept.rfpack", "-w", "--keep-history", "--no-rgb")
 
@@ -494,7 +533,7 @@ def learnt_place(folder: Path) -> None:
 
 def filled(folder: Path) -> None:
     """A hole of a distilled field that goes on smoothly with what is around it."""
-    small_sources(folder)
+    sunk(folder)
     learnt("vm", size="120kB")(folder)
     (folder / "red.rfpack").unlink()
     (folder / "floor.rfpack").unlink()

@@ -291,10 +291,8 @@ class Waves:
         """The shared segments of rays (M,)."""
         found, counts = self.segments, self.segments.n_meeting[shared]
         start = np.concatenate([[0], np.cumsum(counts)])
-        there, meeting = np.arange(found.meeting.shape[1]) < counts[:, None], found.meeting[shared]
-        if len(self.scene.groups) > 1:  # those of a group lie side by side
-            meeting = np.sort(np.where(there, meeting, len(self.steps)), 1)
-        slots = np.arange(start[-1]), np.repeat(shared, counts), meeting[there]
+        there = np.arange(found.meeting.shape[1]) < counts[:, None]
+        slots = np.arange(start[-1]), np.repeat(shared, counts), found.meeting[shared][there]
         traces = self.scene.traces if start[-1] <= SLOTS_AT_ONCE else room_for_traces(start[-1])
         ends, groups = (found.begin, found.end), self.scene.rules(slots[2])
         self.each("trace_ray", *slots, ends, traces)

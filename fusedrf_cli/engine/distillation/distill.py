@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.epochs import Epochs
-from fusedrf_cli.engine.distillation.fit import EARLY_STOP
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.judging import HeldOut, scattered_judge
 from fusedrf_cli.engine.distillation.losses import (
@@ -26,8 +25,9 @@ from fusedrf_cli.engine.distillation.losses import (
 )
 from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, without_haze
 from fusedrf_cli.engine.distillation.optimiser import Adam, alike
+from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.distillation.schedule import LOOK_EVERY, Schedule
+from fusedrf_cli.engine.distillation.schedule import Schedule
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import (
     Chance,
@@ -37,16 +37,8 @@ from fusedrf_cli.engine.distillation.teacher import (
     matter_first,
 )
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
-from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.kinds.student import DistillSettings
-
-RATE = 0.08  # four times what pictures are learnt at: points say at once where all is
-OPACITY_WEIGHT = 0.1
-POINTS_PER_STEP = 1 << 15
-COARSE_UNTIL = 0.3  # of the points' phase: at half the resolution a step is cheaper and reaches farther
-RAYS_AT_FIRST = 1024
-POINTS_PART = 0.75  # of a time budget
+from fusedrf_cli.engine.kinds.student import DistilConfig
 
 
 @dataclass(frozen=True)
@@ -56,11 +48,6 @@ class Recipe:
     chance: Chance = matter_first
     density_loss: DensityLoss = log_depth
     visibility: Visibility = mostly_seen
-    rate: float = RATE
-    rgb_rate: float | None = None
-    """None: the settings' own."""
-    coarse: Callable[[RadianceField], bool] = starts_coarse
-    """Whether a student begins at half its resolution."""
     schedule: type[Schedule] = Schedule
 
 
@@ -89,7 +76,7 @@ def distill(
     teacher: RadianceField,
     student: StoredField,
     sampler: RaySampler,
-    settings: DistillSettings,
+    config: DistilConfig,
     rgb: bool = True,
     phase: Callable[[str], None] = lambda name: None,
     advance: Callable[[float, dict], None] = lambda share, figures: None,
@@ -98,7 +85,7 @@ def distill(
 
     Raises FloatingPointError when the student's numbers do not stay finite.
     """
-    return DistillRun(teacher, student, sampler, settings, rgb).finish(phase, advance)
+    return DistillRun(teacher, student, sampler, config, rgb).finish(phase, advance)
 
 
 class DistillRun:
@@ -112,17 +99,17 @@ class DistillRun:
         teacher: RadianceField,
         student: StoredField,
         sampler: RaySampler,
-        settings: DistillSettings,
+        config: DistilConfig,
         rgb: bool = True,
         recipe: Recipe = DEFAULT_RECIPE,
         judge: Callable[[StoredField], float] | None = None,
     ):
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge
-        says how near a student comes, in dB; None: one of the same teacher and settings.
+        says how near a student comes, in dB; None: one of the same teacher and config.
         """
         self.teacher, self.sampler, self.rgb, self.judge = teacher, sampler, rgb, judge
-        self.settings, self.recipe, self.step = settings, recipe, sampling_step(student)
-        coarse = settings.steps > 0 and recipe.coarse(student)
+        self.config, self.recipe, self.step = config, recipe, sampling_step(student)
+        coarse = config.steps > 0 and starts_coarse(student, config.coarse_from)
         self.student, self.refined = (halved(student), student) if coarse else (student, None)
         """What learns now, and, while that is coarse, the student whose resolution it will take."""
         self.generator = torch.Generator()
@@ -133,11 +120,11 @@ class DistillRun:
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.learnt_seconds = 0.0
         """That this process has learnt for."""
-        self.schedule = recipe.schedule()
+        self.schedule = recipe.schedule(config)
         self.began = working_time()
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
-        self.epochs, self.count = Epochs(settings.rays, self.generator), RAYS_AT_FIRST
+        self.epochs, self.count = Epochs(config.rays, self.generator), config.rays_at_first
         self.held: tuple[dict[str, np.ndarray], dict] | None = None
         """What `checkpoint` says between the steps, where other things may take long."""
         self.asked, self.random = False, None
@@ -151,34 +138,34 @@ class DistillRun:
     ) -> tuple[StoredField, DistillReport]:
         """Run to the end. Every step happens inside an `uninterrupted()`, which may hold an interrupt
         back."""
-        report, settings = self.report, self.settings
+        report, config = self.report, self.config
         self.began = working_time() - (report.curve[-1][0] if report.curve else 0.0)
         clock = _Clock(report.seconds)
         self.held = self.checkpoint()
         phase("asking the teachers")
-        self.generator.manual_seed(settings.seed + 1)
-        judge = self.judge or scattered_judge(self.teacher, settings.views, settings.view_size, settings.seed)
-        rays_o, rays_d = self.sampler.draw(settings.rays, self.generator)
-        if settings.steps:
+        self.generator.manual_seed(config.seed + 1)
+        judge = self.judge or scattered_judge(self.teacher, config.views, config.view_size, config.seed)
+        rays_o, rays_d = self.sampler.draw(config.rays, self.generator)
+        if config.steps:
             pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)
         else:
             pool = looked_at(self.teacher, rays_o, rays_d)
-        held_out = HeldOut(self.teacher, self.sampler, self.step, settings.seed)
+        held_out = HeldOut(self.teacher, self.sampler, self.step, config.seed)
         if self.random is not None:
             self.generator.set_state(self.random)
         self.asked = True
         clock.lap("teachers")
         if self.phase == "points":
             phase("points")
-            if len(pool.points) and settings.steps:
-                self._learn(PointPass(pool, self), settings.steps, held_out, advance, uninterrupted)
+            if len(pool.points) and config.steps:
+                self._learn(PointPass(pool, self), config.steps, held_out, advance, uninterrupted)
             with uninterrupted():
                 self._begin_pictures()
                 report.psnr_before_rgb = judge(self.student)
             clock.lap("points")
         if self.rgb:
             phase("pictures")
-            self._learn(RayPass(pool, self), settings.rgb_steps, held_out, advance, uninterrupted)
+            self._learn(RayPass(pool, self), config.rgb_steps, held_out, advance, uninterrupted)
             report.steps["pictures"] = self.steps
             report.psnr_after_rgb = judge(self.student)
             report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
@@ -198,12 +185,12 @@ class DistillRun:
         self.guard.check()
         self.before = self.student.params.clone()
         self._prune()
-        if self.settings.steps:  # else nothing was learnt before
+        if self.config.steps:  # else nothing was learnt before
             self.optimiser = Adam.of(self.student)
             self.guard.renew()
         self.report.steps["points"] = self.steps
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
-        self.schedule = self.recipe.schedule()
+        self.schedule = self.recipe.schedule(self.config)
 
     def _refine(self) -> None:
         """Go on at the full resolution, with moments that start anew."""
@@ -214,7 +201,7 @@ class DistillRun:
 
     def _has_cells_to_give(self) -> bool:
         """Whether the student learnt where there is nothing; only one on one grid over its own box did."""
-        return self.student.resolution is not None and self.settings.steps > 0
+        return self.student.resolution is not None and self.config.steps > 0
 
     def _leave_haze_out(self, pool: TeacherPool) -> None:
         """Leave out the room that cells had for matter to grow into, as `without_haze` does; what it shows is
@@ -247,14 +234,13 @@ class DistillRun:
         self.held = None
         while (share := self._share(steps, working_time() - started)) < self.schedule.end:
             with uninterrupted():
-                if self.refined is not None and share >= COARSE_UNTIL:
+                if self.refined is not None and share >= self.config.coarse_until:
                     self._refine()
                 self.guard.keep()
                 sums, figures = gradient()
-                if self.guard.accepts(sums, self.optimiser):
-                    self.optimiser.step(gradient.rate * self.schedule.factor(share) * self.guard.rate)
+                self.guard.step(sums, self.optimiser, gradient.rate * self.schedule.factor(share))
                 self.steps += 1
-                if self.steps % LOOK_EVERY == 0:
+                if self.steps % self.config.look_every == 0:
                     self._look(held_out, share)
                 self.elapsed = working_time() - started
             if self.steps % 20 == 1:
@@ -273,17 +259,17 @@ class DistillRun:
 
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given, of
-        which points have POINTS_PART where pictures follow."""
+        which points have a part where pictures follow."""
         if not steps:
             return self.schedule.end
-        settings = self.settings
-        if settings.time_budget is None:
+        config = self.config
+        if config.time_budget is None:
             return self.steps / steps
-        if settings.time_budget <= 0:
+        if config.time_budget <= 0:
             return self.schedule.end
-        part = POINTS_PART if self.phase == "points" else 1 - POINTS_PART
-        alone = not settings.steps or not (self.rgb and settings.rgb_steps)
-        return seconds / (settings.time_budget * (1.0 if alone else part))
+        part = config.points_part if self.phase == "points" else 1 - config.points_part
+        alone = not config.steps or not (self.rgb and config.rgb_steps)
+        return seconds / (config.time_budget * (1.0 if alone else part))
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
@@ -312,7 +298,7 @@ class DistillRun:
         return arrays, state
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict) -> None:
-        """Take up a run that `checkpoint` saved, over the same teacher and settings. Raises ValueError,
+        """Take up a run that `checkpoint` saved, over the same teacher and config. Raises ValueError,
         KeyError, TypeError or RuntimeError for what is none."""
         if state["phase"] != ("pictures" if "before" in arrays else "points"):
             raise ValueError(f"the phase {state['phase'][:40]!r}, but pictures begin with the numbers before")
@@ -355,12 +341,12 @@ class PointPass:
     """The 3D losses at the points of the pool, in its random order (losses.py)."""
 
     def __init__(self, pool: TeacherPool, run: DistillRun):
-        self.pool, self.run, self.rate = pool, run, run.recipe.rate
+        self.pool, self.run, self.rate = pool, run, run.config.rate
 
     def __call__(self) -> tuple[np.ndarray, dict]:
         """Leave the gradient of the next points with the optimiser; the losses, and figures to tell."""
         run, recipe = self.run, self.run.recipe
-        points = self.pool.points.batch(run.steps, POINTS_PER_STEP)
+        points = self.pool.points.batch(run.steps, run.config.points_per_step)
         how = recipe.density_loss, recipe.visibility
         loss = point_step(run.student, points, run.step, run.optimiser, *how)
         return np.array([loss]), {"loss": loss}
@@ -370,23 +356,14 @@ class RayPass:
     """The RGB loss over the teacher's own rays, colour over white and opacity."""
 
     def __init__(self, pool: TeacherPool, run: DistillRun):
-        self.pool, self.run = pool, run
-        own = run.recipe.rgb_rate
-        self.rate = run.settings.rgb_rate if own is None else own
-        self.target = pool.pixels.clone()
-        self.target[:, :3] += 1 - self.target[:, 3:]
+        self.run, self.rate = run, run.config.rgb_rate
+        self.rays = ShownRays(pool.rays_o, pool.rays_d, pool.pixels.numpy(), run.epochs)
 
     def __call__(self) -> tuple[np.ndarray, dict]:
         """Leave the gradient of the next rays with the optimiser; the losses, and figures to tell."""
-        run, pool = self.run, self.pool
-        chosen = run.epochs.draw(run.count).numpy()
-        jitter = torch.rand(len(chosen), generator=run.generator, dtype=torch.float64).numpy()
-        loss = np.zeros((run.optimiser.parts, 3))
-        white = np.ones((len(chosen), 3), np.float32)
-        rays = pool.rays_o[chosen], pool.rays_d[chosen], jitter, self.target[chosen].numpy(), white
-        batch = Batch(*rays, OPACITY_WEIGHT, 0.0, run.step, EARLY_STOP)
-        run.student.train_rays(batch, run.optimiser.grads, loss)
-        sums = loss.sum(0)
-        wanted = run.settings.rgb_samples * len(chosen) / max(sums[2], 1)
+        run, config = self.run, self.run.config
+        batch = self.rays.batch(run.count, run.step, config.opacity_weight, config.early_stop)
+        sums, count = run.optimiser.learn_rays(batch), len(batch.rays_o)
+        wanted = config.rgb_samples * count / max(sums[2], 1)
         run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))
-        return sums, {"psnr": float(-10 * np.log10(max(sums[0] / len(chosen), 1e-10)))}
+        return sums, {"psnr": float(-10 * np.log10(max(sums[0] / count, 1e-10)))}

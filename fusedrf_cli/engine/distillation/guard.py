@@ -40,6 +40,11 @@ class Guard:
                 self.roll_back()
         return sound
 
+    def step(self, sums: np.ndarray, optimiser: Adam, rate: float) -> None:
+        """Make a step at `rate` times the guard's own, where it may be made."""
+        if self.accepts(sums, optimiser):
+            optimiser.step(rate * self.rate)
+
     def keep(self) -> None:
         """Before every step: copy the numbers when that is due, or go back where they are not finite."""
         if not self.kept or self.age >= KEPT_EVERY:

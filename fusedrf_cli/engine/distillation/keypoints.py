@@ -1,5 +1,6 @@
 """Pixels of pictures that are known to show a point: what structure from motion found in them."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -8,12 +9,23 @@ import torch
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.rendering.cameras import Camera, projected
 
-# Share of the run in which matter is brought to known points. What photos show in detail, which comes later,
-# is truer than points are: held to them throughout, a cup shows 0.3 dB less after 90 s.
-UNTIL = 0.5
-SHARE = 1 / 16  # of the rays of a step; with 1/8 or 1/32 the cup shows 0.1 and 0.2 dB less
-APART = 32  # steps between two times that a pixel comes, at least: few would be learnt by heart
-DEPTH_WEIGHT = 0.05  # of that loss; with twice that the cup shows 0.2 dB less
+
+@dataclass(frozen=True)
+class DepthConfig:
+    """How pixels with known points are learnt from."""
+
+    until: float = 0.5
+    """Share of the run in which density is brought to known points. What photos show in detail, which comes
+    later, is truer than points are: held to them throughout, a cup shows 0.3 dB less after 90 s."""
+    share: float = 1 / 16
+    """Of the rays of a step; with 1/8 or 1/32 the cup shows 0.1 and 0.2 dB less."""
+    apart: int = 32
+    """Steps between two times that a pixel comes, at least: few would be learnt by heart."""
+    weight: float = 0.05
+    """Of that loss; with twice that the cup shows 0.2 dB less."""
+
+
+DEFAULT = DepthConfig()
 
 
 class Known(NamedTuple):
@@ -29,9 +41,15 @@ class KeyPoints:
     """Pixels with a point that they show, in random order."""
 
     def __init__(
-        self, cameras: list[Camera], known: Known, ignored: np.ndarray | None, generator: torch.Generator
+        self,
+        cameras: list[Camera],
+        known: Known,
+        ignored: np.ndarray | None,
+        generator: torch.Generator,
+        config: DepthConfig = DEFAULT,
     ):
         """ignored (P,) bool: pixels, counted picture after picture, that must not be drawn."""
+        self.config = config
         first = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
         pixels = np.full(len(known.points), -1)
         for i, camera in enumerate(cameras):
@@ -48,7 +66,9 @@ class KeyPoints:
 
     def wanted(self, rays: int, share: float) -> int:
         """How many of them a step of so many rays takes after a share of the run."""
-        return min(round(SHARE * rays), -(-len(self.points) // APART)) if share < UNTIL else 0
+        if share >= self.config.until:
+            return 0
+        return min(round(self.config.share * rays), -(-len(self.points) // self.config.apart))
 
     def draw(self, count: int) -> tuple[torch.Tensor, np.ndarray]:
         """Pixels (count,) int64, counted picture after picture, and the points (count, 3) that they show; or

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.computed import ComputedField
+from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 
 BETA1, BETA2, EPS = 0.9, 0.99, 1e-15  # TensoRF's; a gradient here can be tiny, so eps must not damp it
 
@@ -61,6 +61,13 @@ class Adam:
     def _kept(self) -> list[tuple[str, torch.Tensor]]:
         moments = zip(("moment1", "moment2"), self.moments, strict=True)
         return [(name, moment) for name, moment in moments if len(moment)]
+
+    def learn_rays(self, batch: Batch) -> np.ndarray:
+        """Add the gradients of a batch of rays; the sums (3,) of its losses and samples, as
+        `ComputedField.train_rays` gives them."""
+        sums = np.zeros((self.parts, 3))
+        self.field.train_rays(batch, self.grads, sums)
+        return sums.sum(0)
 
     def step(self, rate: float) -> None:
         """Apply and clear the gradients: each group of numbers at `rate` times its own."""

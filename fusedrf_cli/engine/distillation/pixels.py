@@ -1,4 +1,4 @@
-"""Pictures as rays with the colours that they should show, in random order."""
+"""Rays with the colours that they should show, in random order: of pictures, or of a teacher."""
 
 from typing import NamedTuple
 
@@ -7,6 +7,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.poses import Poses, poses_of
+from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels.drawing import rays_of_pixels
 from fusedrf_cli.engine.rendering.cameras import Camera
 
@@ -84,3 +85,22 @@ class RayPool:
     def place(self, poses: Poses) -> None:
         """Have the pictures taken from elsewhere."""
         self.rotation, self.position = (torch.from_numpy(part.copy()) for part in poses)
+
+
+class ShownRays:
+    """Rays with what a teacher shows along them, over white, in random order."""
+
+    def __init__(self, rays_o: np.ndarray, rays_d: np.ndarray, shown: np.ndarray, epochs: Epochs):
+        """rays_o, rays_d (R, 3) float64, unit directions; shown (R, 4) float32, premultiplied."""
+        self.rays_o, self.rays_d, self.epochs = rays_o, rays_d, epochs
+        self.target = shown.copy()
+        self.target[:, :3] += 1 - self.target[:, 3:]
+
+    def batch(self, count: int, step: float, opacity_weight: float, early_stop: float) -> Batch:
+        """The next rays, with samples so far apart, jittered."""
+        chosen = self.epochs.draw(count).numpy()
+        generator = self.epochs.generator
+        jitter = torch.rand(len(chosen), generator=generator, dtype=torch.float64).numpy()
+        white = np.ones((len(chosen), 3), np.float32)
+        rays = self.rays_o[chosen], self.rays_d[chosen], jitter, self.target[chosen], white
+        return Batch(*rays, opacity_weight, 0.0, step, early_stop)

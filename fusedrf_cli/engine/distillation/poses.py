@@ -1,38 +1,48 @@
 """Where photos were taken from, found anew by how a field shows what they show: structure from motion, or a
 phone's own tracking, is off by some pixels, which would be learnt as blur."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_rays
 
-RAYS_OF_ALL = 20_000
-"""That one round renders seven times, and once more."""
-RAYS_OF_ONE = (150, 400)
-"""Of each photo: at least, at most."""
-REFINED_AT = (0.08, 0.11, 0.14, 0.18, 0.23, 0.29, 0.36, 0.44, 0.53, 0.63)
-"""Shares of a run: while the field is coarse, poses are found from afar."""
-TRIED_BY = (4.0, 1.0)
-"""Pixels by which a pose is changed to see what that changes in its picture: at first, at last."""
-OPAQUE = 0.98
-"""Opacity of a ray that shows the field, and no edge before what lies behind it."""
-FEW = 48
-"""Rays that tell too little."""
-DAMPING = 0.02
-"""Of the squared slopes, that are added to them: a parameter that changes little stays."""
-FAIR = 0.2
-"""Difference of colours that counts half: a photo shows things that the field does not hold."""
-SURE = 2.0
-"""Times what the noise of so few rays alone would change, under which a pose stays as it is; what is more is
-drawn towards that (the positive part of James and Stein's estimate)."""
-PARTS = (1.0, 0.3)
-"""Of a step that are tried, one after the other, until one helps."""
-LARGEST = 8.0
-"""Probes by which a pose changes in one round at most."""
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """How poses are refined."""
+
+    at: tuple[float, ...] = (0.08, 0.11, 0.14, 0.18, 0.23, 0.29, 0.36, 0.44, 0.53, 0.63)
+    """Shares of a run: while the field is coarse, poses are found from afar."""
+    rays: int = 20_000
+    """That one round renders seven times, and once more."""
+    rays_of_each: tuple[int, int] = (150, 400)
+    """Of each photo, at least and at most."""
+    tried_by: tuple[float, float] = (4.0, 1.0)
+    """Pixels by which a pose is changed to see what that changes in its picture: at first, at last."""
+    opaque: float = 0.98
+    """Opacity of a ray that shows the field, and no edge before what lies behind it."""
+    few: int = 48
+    """Rays that tell too little."""
+    damping: float = 0.02
+    """Of the squared slopes, that are added to them: a parameter that changes little stays."""
+    fair: float = 0.2
+    """Difference of colours that counts half: a photo shows things that the field does not hold."""
+    sure: float = 2.0
+    """Times what the noise of so few rays alone would change, under which a pose stays as it is; what is more
+    is drawn towards that (the positive part of James and Stein's estimate)."""
+    parts: tuple[float, ...] = (1.0, 0.3)
+    """Of a step that are tried, one after the other, until one helps."""
+    largest: float = 8.0
+    """Probes by which a pose changes in one round at most."""
+
+
+DEFAULT = PoseConfig()
 
 
 class Poses(NamedTuple):
@@ -56,6 +66,7 @@ def refined(
     photos: torch.Tensor,
     near: float,
     probe: np.ndarray,
+    config: PoseConfig = DEFAULT,
 ) -> np.ndarray:
     """(n, 6) float64: by which angles about the frame's axes (3, radians) each of n photos' cameras is to be
     turned, and by how much moved (3), so that the field shows their colours better: one damped step of Gauss
@@ -77,25 +88,25 @@ def refined(
 
     every = np.arange(n)
     now = shown(np.zeros((n, 6)), every)
-    counts = np.isfinite(truth).all(2) & (now[..., 3] > OPAQUE)
+    counts = np.isfinite(truth).all(2) & (now[..., 3] > config.opaque)
     truth = np.nan_to_num(truth)
     missed = np.where(counts[..., None], now[..., :3] - truth, 0)
-    fair = counts / (1 + (missed**2).sum(2) / FAIR**2)
+    fair = counts / (1 + (missed**2).sum(2) / config.fair**2)
     # moved by so much, what is seen moves about as if turned by one radian
     afar = np.array(
         [np.median(row[c, 4] / row[c, 3]) if c.any() else 1.0 for row, c in zip(now, counts, strict=True)]
     )
     scale = np.concatenate([np.tile(probe[:, None], 3), np.tile((probe * afar)[:, None], 3)], 1)
     slopes = np.stack([shown(scale * axis, every)[..., :3] - now[..., :3] for axis in np.eye(6)], -1)
-    step = scale * step_of(slopes, missed, fair)
+    step = scale * step_of(slopes, missed, fair, config)
 
     def error(colours: np.ndarray, which: np.ndarray) -> np.ndarray:
         """(k,) of those photos, robust."""
         return (fair[which] * ((colours - truth[which]) ** 2).sum(2)).sum(1)
 
     before = error(now[..., :3], every)
-    change, untold = np.zeros((n, 6)), np.flatnonzero(counts.sum(1) >= FEW)
-    for part in PARTS:
+    change, untold = np.zeros((n, 6)), np.flatnonzero(counts.sum(1) >= config.few)
+    for part in config.parts:
         if len(untold):
             helps = error(shown(part * step, untold)[..., :3], untold) < before[untold]
             change[untold[helps]] = part * step[untold[helps]]
@@ -103,30 +114,28 @@ def refined(
     return change
 
 
-def step_of(slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray) -> np.ndarray:
+def step_of(
+    slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray, config: PoseConfig = DEFAULT
+) -> np.ndarray:
     """(n, 6) of n photos, in probes: by how much all six parameters change, damped, drawn towards none by as
-    much as noise alone would change, and held to LARGEST.
+    much as noise alone would change, and held to `largest`.
 
     slopes (n, m, 3, 6) of the colours of their m rays, missed (n, m, 3) by how much these are off, fair
     (n, m) how much each ray counts.
     """
     square = np.einsum("nm,nmcp,nmcq->npq", fair, slopes, slopes)
-    square += DAMPING * np.einsum("npp->np", square)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
+    square += config.damping * np.einsum("npp->np", square)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
     step = -np.linalg.solve(square, np.einsum("nm,nmcp,nmc->np", fair, slopes, missed)[..., None])[..., 0]
     told = np.einsum("np,npq,nq->n", step, square, step)
     left = np.maximum((fair * (missed**2).sum(2)).sum(1) - told, 0)
     noise = left / np.maximum(3 * (fair > 0).sum(1) - 6, 1)
-    step *= np.maximum(0, 1 - SURE * 6 * noise / np.maximum(told, 1e-300))[:, None]
-    return step * np.minimum(1, LARGEST / np.maximum(abs(step).max(1, keepdims=True), 1e-12))
+    step *= np.maximum(0, 1 - config.sure * 6 * noise / np.maximum(told, 1e-300))[:, None]
+    return step * np.minimum(1, config.largest / np.maximum(abs(step).max(1, keepdims=True), 1e-12))
 
 
 def turns(angles: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) rotations about axes (n, 3) whose lengths are the angles, in radians (Rodrigues)."""
-    angle = np.maximum(np.linalg.norm(angles, axis=1), 1e-300)[:, None, None]
-    x, y, z = (angles / angle[..., 0]).T
-    none = np.zeros_like(x)
-    across = np.array([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
-    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+    """(n, 3, 3) rotations about axes (n, 3) whose lengths are the angles, in radians."""
+    return Rotation.from_rotvec(angles).as_matrix()
 
 
 def changed_each(poses: Poses, change: np.ndarray) -> Poses:
@@ -146,5 +155,4 @@ def changed(poses: Poses, change: np.ndarray) -> Poses:
 
 def angles_between(one: Poses, other: Poses) -> np.ndarray:
     """(n,) by how many radians cameras are turned against each other."""
-    cosine = (np.einsum("nij,nij->n", one.rotation, other.rotation) - 1) / 2
-    return np.arccos(np.clip(cosine, -1, 1))
+    return (Rotation.from_matrix(one.rotation).inv() * Rotation.from_matrix(other.rotation)).magnitude()

@@ -1,42 +1,39 @@
 """When a phase of learning slows down, and when it ends."""
 
-COOLING = 0.4  # of a phase that is not cut short: the share at its end in which the rate falls
-RATE_DECAY = 0.1  # the last step's rate over the first's
-LOOK_EVERY = 100  # steps between two looks at what nothing is trained on
-PATIENCE = 3  # looks that the best one may be old
-LEAST_GAIN = 0.1  # dB above the best so far that make a look a better one
+from fusedrf_cli.engine.kinds.student import DistilConfig
 
 
 class Schedule:
-    """The rate while a held-out PSNR rises, then a fall to RATE_DECAY of it, then the end.
+    """The rate while a held-out PSNR rises, then a fall to `rate_decay` of it, then the end.
 
-    Time is the share of the phase that is done, of its steps or of its seconds. The fall begins COOLING
-    before the end, or as soon as PATIENCE looks have brought no more than LEAST_GAIN, and then takes as much
-    less time as it begins earlier: it is COOLING of all that was done in either case.
+    Time is the share of the phase that is done, of its steps or of its seconds. The fall begins `cooling`
+    before the end, or as soon as `patience` looks have brought no more than `least_gain`, and then takes as
+    much less time as it begins earlier: it is `cooling` of all that was done in either case.
     """
 
-    def __init__(self):
+    def __init__(self, config: DistilConfig):
+        self.config = config
         self.best, self.looks_since = float("-inf"), 0
-        self.cooling_from = 1 - COOLING
+        self.cooling_from = 1 - config.cooling
 
     def look(self, share: float, psnr: float) -> None:
         """Take note of the held-out PSNR at a share of the phase."""
-        if psnr > self.best + LEAST_GAIN:
+        if psnr > self.best + self.config.least_gain:
             self.best, self.looks_since = psnr, 0
             return
         self.looks_since += 1
-        if self.looks_since >= PATIENCE:
+        if self.looks_since >= self.config.patience:
             self.cooling_from = min(self.cooling_from, share)
 
     @property
     def end(self) -> float:
         """The share at which the phase is over."""
-        return self.cooling_from / (1 - COOLING)
+        return self.cooling_from / (1 - self.config.cooling)
 
     def factor(self, share: float) -> float:
         """What the phase's first rate is multiplied by at a share of it."""
         fallen = (share - self.cooling_from) / (self.end - self.cooling_from)
-        return RATE_DECAY ** min(max(fallen, 0.0), 1.0)
+        return self.config.rate_decay ** min(max(fallen, 0.0), 1.0)
 
     def state(self) -> dict:
         """JSON-able state for `restore`."""

@@ -4,13 +4,12 @@ from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, depths_across
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
 
-COARSE_FROM = 64  # texels along a student's longest axis from which it starts at half of them
 LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
 
 
-def starts_coarse(student: StoredField) -> bool:
-    """Whether a student is on one grid large enough to have half its resolution first."""
-    return student.resolution is not None and max(student.resolution) >= COARSE_FROM
+def starts_coarse(student: StoredField, coarse_from: int | None) -> bool:
+    """Whether a student is on one grid large enough, in texels, to have half its resolution first."""
+    return None not in (student.resolution, coarse_from) and max(student.resolution) >= coarse_from
 
 
 def halved(student: StoredField) -> StoredField:

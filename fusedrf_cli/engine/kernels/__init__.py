@@ -16,6 +16,7 @@ from types import ModuleType
 
 import numba
 from numba.core import event
+from platformdirs import user_cache_path
 
 from fusedrf_cli.engine.kernels import locator
 from fusedrf_cli.engine.kernels.threads import ONE_THREAD
@@ -32,8 +33,7 @@ def kernel_cache() -> Path:
     """
     bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined())).hexdigest()[:12]
     bodies += "-one" if ONE_THREAD else ""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    wanted = Path(home) / "fusedrf" / "kernels" / bodies
+    wanted = user_cache_path("fusedrf") / "kernels" / bodies
     try:
         wanted.mkdir(parents=True, exist_ok=True)
         probe = tempfile.TemporaryFile(dir=wanted)

@@ -24,6 +24,7 @@ from fusedrf_cli.engine.kernels.parts import FACE_TOLERANCE, along, cell_of, exi
 MAX_TRACED = 24  # samples of a slot: what does not fit is left to the ray's next segment
 FARTHEST = 1e30  # farther than any ray goes
 ANYWHERE = -1.0  # for a gap: where occupied cells begin
+DENSER = 1 + 1e-6  # times as dense at least, to be denser: else the first instance shows, not a rounding
 
 
 class Instances(NamedTuple):
@@ -283,7 +284,7 @@ def densest_at(field, grid, query, i, scratch, memory, out):
         sigma *= rate(p) * length
         if steps > 0 and query.adds:
             out.sigma[j] += sigma
-        elif steps > 0 and sigma > out.sigma[j]:
+        elif steps > 0 and sigma > DENSER * out.sigma[j]:
             out.sigma[j], out.densest[j], out.cell[j] = sigma, query.instance, keep(place)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from fusedrf_cli.engine.kernels.instances import ANYWHERE, FARTHEST
+from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER, FARTHEST
 from fusedrf_cli.engine.kernels.parts import along, body
 from fusedrf_cli.engine.kernels.plain import loop, task
 from fusedrf_cli.engine.kernels.specialise import loops_for
@@ -39,7 +39,7 @@ class Segments(NamedTuple):
     begin: object  # (N,) where it begins
     end: object  # (N,) where it ends
     n_meeting: object  # (N,) int64, how many instances meet in it, if it is SHARED
-    meeting: object  # (N, W) int64, the first W of them
+    meeting: object  # (N, W) int64, they in order, where that is room enough
 
 
 next_in_box, next_in_space = (loops_for(None, (), s).names["next_change"] for s in (bounded, unbounded))
@@ -158,13 +158,17 @@ def end_of_meeting(rays, instances, r, two, far):
 
 @body
 def note_meeting(rays, instances, r, near, count, begin, end, segments):
-    """Enter those of instances near[:count] that have occupied cells on ray r between two distances."""
-    found = 0
+    """Enter those of instances near[:count] that have occupied cells on ray r between two distances, in
+    order."""
+    found, room = 0, segments.meeting.shape[1]
     for c in range(count):
         at, _ = occupied_from(rays, instances, near[c], r, begin, end)
         if at < end:
-            if found < segments.meeting.shape[1]:
-                segments.meeting[r, found] = near[c]
+            k = min(found, room - 1)
+            while k > 0 and segments.meeting[r, k - 1] > near[c]:
+                segments.meeting[r, k] = segments.meeting[r, k - 1]
+                k -= 1
+            segments.meeting[r, k] = near[c]
             found += 1
     segments.n_meeting[r] = found
 
@@ -269,7 +273,7 @@ def group_at(traces, group, adds, s, behind, t, end):
             following = min(following, traces.high[s, q] if stands else traces.low[s, q])
         if stands:
             total += sigma
-            if sigma > densest:
+            if sigma > DENSER * densest:
                 densest, winner = sigma, s
         s += 1
     return s, total if adds[g] else densest, winner, following
@@ -303,7 +307,7 @@ def merge_ray(traces, group, adds, all_add, s0, s1, r, early_stop, segment_end, 
             this = s
             s, sigma, _, change = group_at(traces, group, adds, s, s1, t, end)
             following, total = min(following, change), total + sigma
-            if sigma > densest:
+            if sigma > DENSER * densest:
                 densest, first = sigma, this
         if following >= FARTHEST:
             break

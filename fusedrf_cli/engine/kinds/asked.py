@@ -25,7 +25,7 @@ from fusedrf_cli.engine.kinds.asking import (
     seen_colours,
 )
 from fusedrf_cli.engine.kinds.boxes import GridStudent
-from fusedrf_cli.engine.kinds.student import DistillSettings, Made, MadeStudent, Needs, Plan, TooSmall, Way
+from fusedrf_cli.engine.kinds.student import DistilConfig, Made, MadeStudent, Needs, Plan, TooSmall, Way
 
 SMOOTHED = 0.7  # voxels: standard deviation of the opacity whose slope says where a surface faces
 DEEPEST = -40.0  # density feature of nothing at all, where a field is copied
@@ -112,7 +112,7 @@ class AskedStudent(MadeStudent, GridStudent):
                             softplus(f), and harmonics of their colours' logits (V, 3 coefficients)
     """
 
-    lesson = DistillSettings(rays=400_000, steps=0, rgb_steps=1000, rgb_rate=0.0006)
+    lesson = DistilConfig(rays=400_000, steps=0, rgb_steps=1000, rgb_rate=0.0006)
     compares = False
     finer = 0.6  # a lattice that lies across a teacher's own needs finer voxels to hold as much
     _shown: OccupancyGrid | None = None

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from scipy import sparse
+from scipy.sparse.linalg import LinearOperator, cg
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
@@ -133,35 +134,14 @@ def density_features(
     def adjoint(rest: np.ndarray) -> np.ndarray:
         return scatter @ (rest @ weights).ravel()
 
-    found = conjugate_gradients(
-        lambda x: x[corners] @ weights.T,
-        adjoint,
-        scatter @ np.tile((weights**2).sum(0), len(corners)),
-        wanted,
-        found,
-    )
+    count = (len(found), len(found))
+    normal = LinearOperator(count, lambda x: adjoint(x[corners] @ weights.T), dtype=np.float64)
+    diagonal = scatter @ np.tile((weights**2).sum(0), len(corners))
+    inverse = sparse.diags(1 / np.maximum(diagonal, 1e-12))
+    exact = {"rtol": 0.0, "atol": np.finfo(float).tiny}  # until there is no more to be gained
+    found, _ = cg(normal, adjoint(wanted), found, **exact, maxiter=FIT_STEPS, M=inverse)
     most = np.clip(inverse_softplus(sigma / scale), None, MOST)
     return np.where(found > own + 0.9 * REACH, np.maximum(found, most), found)
-
-
-def conjugate_gradients(
-    apply, adjoint, diagonal: np.ndarray, wanted: np.ndarray, start: np.ndarray
-) -> np.ndarray:
-    """x that makes the squares of apply(x) - wanted small, in FIT_STEPS steps from a start; the diagonal is
-    that of adjoint(apply(.))."""
-    x, diagonal = start, np.maximum(diagonal, 1e-12)
-    rest = adjoint(wanted - apply(x))
-    along = rest / diagonal
-    size = rest @ along
-    for _ in range(FIT_STEPS):
-        if size <= 0:
-            break
-        curved = adjoint(apply(along))
-        length = size / (along @ curved)
-        x, rest = x + length * along, rest - length * curved
-        new = rest @ (rest / diagonal)
-        along, size = rest / diagonal + new / size * along, new
-    return x
 
 
 def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:

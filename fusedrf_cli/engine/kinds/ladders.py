@@ -13,16 +13,15 @@ SECONDS = (5.0, 15.0, 45.0, None)
 
 @dataclass(frozen=True)
 class Rung:
-    """What fusing is asked for; None is left to it."""
+    """Keywords of `fuse` besides the kind; None is left to it."""
 
     precision: str | None = None
     ranks: tuple[int, int] | None = None
     sh_degree: int | None = None
-    bytes: int | None = None
+    max_size: int | None = None
     rgb: bool = True
     """Whether to finish on rendered rays."""
-    seconds: float | None = None
-    """Of learning."""
+    time_budget: float | None = None
 
 
 Ladder = Generator[Rung, tuple[int, float] | None, None]
@@ -34,13 +33,13 @@ def shrinking(rung: Rung, least_psnr: float) -> Ladder:
     found, size = (yield rung), math.inf
     while found is not None and found[1] >= least_psnr and min(size, found[0]) > SMALLEST:
         size = readable_floor(min(size, found[0]) / SHRINK)
-        found = yield replace(rung, bytes=size)
+        found = yield replace(rung, max_size=size)
 
 
 def by_sizes() -> Ladder:
     """Few sizes; the seconds decide last, since that takes longest."""
     for seconds, size, rgb in itertools.product(SECONDS, SIZES, (False, True)):
-        yield Rung(bytes=size, rgb=rgb, seconds=seconds)
+        yield Rung(max_size=size, rgb=rgb, time_budget=seconds)
 
 
 def readable_floor(size: float) -> int:

@@ -86,21 +86,45 @@ class StoredSizes(Protocol):
 
 
 @dataclass(frozen=True)
-class DistillSettings:
-    """How a student learns from a teacher."""
+class DistilConfig:
+    """How a student learns from a teacher: from points on rays, then from the pictures that the rays make."""
 
     rays: int = 800_000
     """That the teacher is asked for."""
     steps: int = 800
     """From the points on those rays; 0 where the student knows already what they would teach it."""
+    points_per_step: int = 1 << 15
+    rate: float = 0.08
+    """Of points: four times what pictures are learnt at, since points say at once where all is."""
+    coarse_from: int | None = 64
+    """Texels along a student's longest axis from which it starts at half of them; None: never."""
+    coarse_until: float = 0.3
+    """Share of the points' phase in which it is coarse: a step is cheaper then and reaches farther."""
     rgb_steps: int = 600
     """From the pictures that the rays make."""
     rgb_samples: int = 1 << 15
     """Samples per step that the number of rays is steered to."""
     rgb_rate: float = 0.003
+    rays_at_first: int = 1024
+    """Of a step."""
+    opacity_weight: float = 0.1
+    """Against the colour."""
+    early_stop: float = 1e-3
+    """Transmittance at which a ray ends."""
     time_budget: float | None = None
-    """Seconds of learning, three quarters of them for points where both phases have steps. None: the steps
-    decide, and equal seeds give equal bytes."""
+    """Seconds of learning. None: the steps decide, and equal seeds give equal bytes."""
+    points_part: float = 0.75
+    """Of that, where both phases have steps."""
+    cooling: float = 0.4
+    """Of a phase that is not cut short: the share at its end in which the rate falls."""
+    rate_decay: float = 0.1
+    """The last step's rate over the first's."""
+    look_every: int = 100
+    """Steps between two looks at what nothing is trained on."""
+    patience: int = 3
+    """Looks that the best one may be old."""
+    least_gain: float = 0.1
+    """dB above the best so far that make a look a better one."""
     seed: int = 0
     views: int = 4
     view_size: int = 160
@@ -224,14 +248,14 @@ class Student:
 
     learnt = True
     """Whether it learns from nothing; else it is made (MadeStudent) and learning only finishes it."""
-    lesson: DistillSettings | None = DistillSettings()
+    lesson: DistilConfig | None = DistilConfig()
     """None: rays drawn once for all tries (distillation/finish.py)."""
 
     def __init__(self, kind: "Kind", scene: ComposedField, request: StudentRequest):
         """scene: what it learns from."""
         self.kind, self.scene, self.request = kind, scene, request
 
-    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistillSettings | None:
+    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistilConfig | None:
         """How a student of so many numbers learns, in so many seconds where they are given: the more numbers
         there are, the more it is told, up to MOST_TOLD times, but no more than there is time to learn
         from."""

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.kernels.instances import MAX_TRACED
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import unbounded
 from tests.analytic.export import exported
-from tests.analytic.fields import Gaussian, Tint
+from tests.analytic.fields import Box, Gaussian, Tint
 from tests.analytic.rays import affine, moved_rays, points_in, rays_at, turn, unit
 from tests.engine.conftest import BOX
 
@@ -308,3 +308,19 @@ def test_what_cannot_be_a_composite_says_so():
     assert can_be_composite(deep, "max")
     with pytest.raises(TypeError):
         Composite(analytic)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_of_equal_densities_the_first_shows(order):
+    """Not now this and now that one, as roundings have it."""
+    tints = [exported(Box(8.0, tint=t), "vm", (9, 9, 9)) for t in TINTS.values()]
+    spots = affine(1.0, (0, 0, 0)), affine(turn(30, (0, 0, 1)), (0.1, 0.05, 0))
+    scene = Composite([Placed(str(i), tints[i], m) for i, m in zip(order, spots, strict=True)])
+    rays_o, rays_d = rays_at(np.array([-0.1, -0.1, -0.4, 0.1, 0.1, 0.4]), 200)
+    found = render_rays(scene, *same_rays(scene, rays_o, rays_d))
+    down = np.abs(rays_d[:, 2]) > 0.98  # by the common top or bottom, where both begin
+    points = torch.from_numpy(points_in(np.array([-0.2, -0.2, -0.4, 0.2, 0.2, 0.4]), 500) - scene.origin)
+    _, rgb = scene.query(points, torch.zeros(500, 3).double() + 0.6)
+    first = 0 if order[0] == 0 else 2
+    assert (rgb[:, first] > 0.8).all()
+    assert down.sum() >= 3 and (found[down, first] > 0.8).all()

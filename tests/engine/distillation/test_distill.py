@@ -17,7 +17,7 @@ from fusedrf_cli.engine.distillation.judging import scattered_judge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
-from fusedrf_cli.engine.kinds.student import DistillSettings, finest_within
+from fusedrf_cli.engine.kinds.student import DistilConfig, finest_within
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from tests.analytic.export import way_of
@@ -26,23 +26,22 @@ from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, u
 
 TEACHER = Ball(density=40.0, radius=0.7).occupy(16)
 SAMPLER = RaySampler([TEACHER.occupancy.tight_aabb(0)])
-SETTINGS = DistillSettings(
-    rays=4000, steps=60, rgb_steps=30, rgb_samples=1 << 13, views=2, view_size=32
-)  # fmt: skip
+SETTINGS = DistilConfig(
+    rays=4000, steps=60, points_per_step=1 << 13, rgb_steps=30, rgb_samples=1 << 13, views=2, view_size=32
+)
 NUMBERS = THIRTY_TWO.size(texels(BOX, 32))
 WAY = way_of(THIRTY_TWO)
 
 
 @pytest.fixture(autouse=True)
 def small_steps(monkeypatch):
-    """Fewer points per step, and coarse grids: seconds, not minutes."""
-    monkeypatch.setattr(module, "POINTS_PER_STEP", 1 << 13)
+    """Coarse grids: seconds, not minutes."""
     monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
 
 
-def taught(settings: DistillSettings, rgb: bool = True, recipe: module.Recipe = module.DEFAULT_RECIPE):
+def taught(settings: DistilConfig, rgb: bool = True):
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
-    return DistillRun(TEACHER, student, SAMPLER, settings, rgb, recipe).finish()
+    return DistillRun(TEACHER, student, SAMPLER, settings, rgb).finish()
 
 
 def test_a_ball_is_learnt():
@@ -88,8 +87,8 @@ def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
 
 def test_a_harmful_rgb_phase_is_not_kept():
     """At a rate of 3 the pictures spoil what the points taught; the student is the one of before."""
-    brief = replace(SETTINGS, rays=2000, rgb_steps=10)
-    student, report = taught(brief, recipe=module.Recipe(rgb_rate=3.0))
+    brief = replace(SETTINGS, rays=2000, rgb_steps=10, rgb_rate=3.0)
+    student, report = taught(brief)
     plain, before = taught(brief, rgb=False)
     assert report.psnr_after_rgb < report.psnr_before_rgb - 3 and report.rgb_kept is False
     assert report.psnr_before_rgb == before.psnr_before_rgb and torch.equal(student.params, plain.params)
@@ -139,9 +138,7 @@ def test_a_student_that_holds_nothing_yet_keeps_its_cells(monkeypatch):
 def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
     """Stopped before the first step, in the points (20 steps, of which the first six may be coarse), in the
     pictures (10) and after the last; the schedule looks every fourth step."""
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", coarse_from)
-    monkeypatch.setattr(module, "LOOK_EVERY", 4)
-    brief = replace(SETTINGS, rays=1000, steps=20, rgb_steps=10)
+    brief = replace(SETTINGS, rays=1000, steps=20, rgb_steps=10, coarse_from=coarse_from, look_every=4)
     straight, told = taught(brief)
 
     class Stop(Exception):
@@ -174,26 +171,22 @@ def test_a_restored_run_goes_on_to_the_same_bits(monkeypatch, at, coarse_from):
 def test_a_phase_ends_on_a_plateau(monkeypatch):
     """With a look every other step and a gain that no look can bring, the third one is the last at full rate,
     and two thirds of its steps more follow."""
-    monkeypatch.setattr(module, "LOOK_EVERY", 2)
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.schedule.LEAST_GAIN", 1e3)
-    report = taught(replace(SETTINGS, rays=1000), rgb=False)[1]
+    report = taught(replace(SETTINGS, rays=1000, look_every=2, least_gain=1e3), rgb=False)[1]
     assert report.steps["points"] < 20 and len(report.curve) == report.steps["points"] // 2
 
 
 def test_the_curve_rises_and_is_of_rays_of_its_own(monkeypatch):
-    monkeypatch.setattr(module, "LOOK_EVERY", 10)
-    report = taught(SETTINGS)[1]
+    report = taught(replace(SETTINGS, look_every=10))[1]
     seconds, steps, values = zip(*report.curve, strict=True)
     assert steps == tuple(range(10, 91, 10)) and values[5] > values[0] + 3
     assert list(seconds) == sorted(seconds) and report.steps == {"points": 60, "pictures": 30}
 
 
-def test_pictures_alone_go_on_from_the_student_that_is_there(monkeypatch):
+def test_pictures_alone_go_on_from_the_student_that_is_there():
     """Without steps on points a student keeps what it knows, and its resolution, until the pictures."""
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", 16)
     known = taught(SETTINGS, rgb=False)[0]
     start = known.params.clone()
-    settings = replace(SETTINGS, steps=0, rgb_steps=0)
+    settings = replace(SETTINGS, steps=0, rgb_steps=0, coarse_from=16)
     run = DistillRun(TEACHER, known, SAMPLER, settings)
     student, report = run.finish()
     assert torch.equal(student.params, start) and report.psnr_before_rgb == report.psnr_after_rgb > 20
@@ -217,22 +210,19 @@ def test_several_blocks_are_finished_on_pictures():
 def test_half_the_resolution_first_ends_at_all_of_it(monkeypatch):
     """What comes out has the resolution that was asked, and is no worse."""
     straight, told = taught(SETTINGS, rgb=False)
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", 16)
-    student, report = taught(SETTINGS, rgb=False)
+    student, report = taught(replace(SETTINGS, coarse_from=16), rgb=False)
     assert student.tensors[0].resolution == straight.tensors[0].resolution
     assert student.params.shape == straight.params.shape
     assert report.psnr_before_rgb > told.psnr_before_rgb - 0.5
 
 
 def test_the_coarse_student_learns_too(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.engine.distillation.student.COARSE_FROM", 16)
-    monkeypatch.setattr(module, "LOOK_EVERY", 1)
-    brief = replace(SETTINGS, rays=2000, steps=60)
+    brief = replace(SETTINGS, rays=2000, steps=60, coarse_from=16, look_every=1)
     curve = [psnr for _, _, psnr in taught(brief, rgb=False)[1].curve]
     assert curve[16] > curve[0] + 3  # of the 18 steps that are made at half the resolution
 
 
-def a_run(settings: DistillSettings) -> module.DistillRun:
+def a_run(settings: DistilConfig) -> module.DistillRun:
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(settings.seed), "ball")
     return module.DistillRun(TEACHER, student, SAMPLER, settings)
 
@@ -289,9 +279,9 @@ def test_pruned_drops_empty_cells_only():
 
 def test_points_have_three_quarters_of_the_seconds_and_all_where_nothing_else_is_learnt():
     def share(phase: str, rgb: bool = True, **words) -> float:
-        settings = DistillSettings(time_budget=8.0, **words)
-        run = SimpleNamespace(settings=settings, rgb=rgb, phase=phase)
-        return DistillRun._share(run, settings.steps if phase == "points" else settings.rgb_steps, 3.0)
+        config = DistilConfig(time_budget=8.0, **words)
+        run = SimpleNamespace(config=config, rgb=rgb, phase=phase)
+        return DistillRun._share(run, config.steps if phase == "points" else config.rgb_steps, 3.0)
 
     assert share("points") == pytest.approx(3 / 6) and share("pictures") == pytest.approx(3 / 2)
     assert share("points", rgb=False) == share("pictures", steps=0) == pytest.approx(3 / 8)

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.exposure import FEW, fitted, gauged, identity, matched, measured, undone
-from fusedrf_cli.engine.distillation.fit import FINE_SAMPLES, FitRun
+from fusedrf_cli.engine.distillation.exposure import (
+    ExposureConfig,
+    fitted,
+    gauged,
+    identity,
+    matched,
+    measured,
+    undone,
+)
+from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import poses_of
 from fusedrf_cli.engine.rendering.cameras import look_at, orbit
@@ -75,7 +83,7 @@ def test_pixels_that_tell_nothing_do_not_count():
     photos = as_photos(truth, gain, offset)
     assert (photos[0] == 1).double().mean() > 0.2
     photos[1, ::3] = torch.nan
-    photos[2, FEW - 1 :] = torch.nan
+    photos[2, ExposureConfig.few - 1 :] = torch.nan
     photos[3, ::7] = 0.0
     maps = fitted(truth, photos)
     np.testing.assert_allclose(maps[:2, 0] / maps[2, 0], gain[:2], rtol=0.06)
@@ -178,7 +186,7 @@ def spread(gains: np.ndarray) -> float:
 
 def run(cameras, photos, exposure: bool) -> FitRun:
     """A fit in a box, with as many samples at full resolution as a place, which alone has exposure, takes."""
-    settings = replace(LONG, samples=LONG.samples // FINE_SAMPLES, exposure=exposure)
+    settings = replace(LONG, samples=LONG.samples // LONG.fine_samples, exposure=exposure)
     fitting = FitRun.start(cameras, photos, BOX, settings)
     fitting.finish()
     return fitting

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.volume import render_rays
@@ -56,5 +58,6 @@ def test_the_same_seed_teaches_the_same(pair):
 def test_what_the_teacher_shows_is_over_white(pair):
     whole, _ = pair
     lesson = RayLesson(whole, RaySampler([whole.aabb]), seed=0, rays=500)
-    empty = lesson.target[:, 3] == 0
-    assert empty.any() and np.array_equal(lesson.target[empty, :3], np.ones((empty.sum(), 3)))
+    empty = lesson.shown[:, 3] == 0
+    rays = ShownRays(lesson.rays_o, lesson.rays_d, lesson.shown, Epochs(500, torch.Generator()))
+    assert empty.any() and np.array_equal(rays.target[empty, :3], np.ones((empty.sum(), 3)))

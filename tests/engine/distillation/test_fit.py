@@ -7,19 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.fit import (
-    FADE,
-    FALL,
-    FALLS_FROM,
-    FINE_SAMPLES,
-    MOST_FADED,
-    UNBOUNDED_SAMPLES,
-    FitRun,
-    FitSettings,
-    decay,
-    fit,
-    occupancy_of,
-)
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun, fit, occupancy_of
 from fusedrf_cli.engine.distillation.keypoints import Known
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.fields.hashed import Hashed
@@ -30,7 +19,7 @@ from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, random_vm
 
-SETTINGS = FitSettings(way=way_of(THIRTY_TWO), longest=32, steps=200, samples=1 << 13)
+SETTINGS = TrainConfig(way=way_of(THIRTY_TWO), longest=32, steps=200, samples=1 << 13)
 
 
 def pictures(cameras) -> np.ndarray:
@@ -123,12 +112,17 @@ def test_points_are_known_of_a_part_of_the_rays_in_the_first_half(capture):
 
 
 def test_the_rate_holds_and_then_falls_by_equal_factors():
-    assert decay(0) == decay(FALLS_FROM) == 1 and decay(1) == pytest.approx(FALL)
-    late = [decay(FALLS_FROM + part * (1 - FALLS_FROM)) for part in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    assert np.diff(np.log(late)) == pytest.approx([np.log(FALL) / 4] * 4)
+    assert SETTINGS.decay(0) == SETTINGS.decay(SETTINGS.falls_from) == 1 and SETTINGS.decay(
+        1
+    ) == pytest.approx(SETTINGS.fall)
+    late = [
+        SETTINGS.decay(SETTINGS.falls_from + part * (1 - SETTINGS.falls_from))
+        for part in (0.0, 0.25, 0.5, 0.75, 1.0)
+    ]
+    assert np.diff(np.log(late)) == pytest.approx([np.log(SETTINGS.fall) / 4] * 4)
 
 
-@pytest.mark.parametrize("unbounded, factor", [(False, FINE_SAMPLES), (True, 1)])
+@pytest.mark.parametrize("unbounded, factor", [(False, SETTINGS.fine_samples), (True, 1)])
 def test_steps_take_more_samples_at_full_resolution_of_a_box(capture, unbounded, factor):
     """Rays of eight samples each are as many as make up what a step is to take."""
     run = FitRun.start(*capture, BOX, replace(SETTINGS, samples=1 << 14, unbounded=unbounded))
@@ -139,7 +133,7 @@ def test_steps_take_more_samples_at_full_resolution_of_a_box(capture, unbounded,
         return run.rays
 
     coarse = steered()
-    assert coarse == pytest.approx((1 << 14) / 8 * (UNBOUNDED_SAMPLES if unbounded else 1), rel=0.01)
+    assert coarse == pytest.approx((1 << 14) / 8 * (SETTINGS.unbounded_samples if unbounded else 1), rel=0.01)
     run.stages.clear()
     assert steered() == pytest.approx(factor * coarse, rel=0.01)
 
@@ -154,9 +148,9 @@ def test_a_detail_fades_where_photos_say_little_of_it(capture, monkeypatch):
         settings = replace(SETTINGS, way=way, unbounded=True)
         return FitRun.start(cameras[:count], images[:count], BOX, settings).faded
 
-    assert faded(8, 1 << 10) == pytest.approx(FADE * (4 * 1024 / (8 * 24 * 24)) ** 2)
+    assert faded(8, 1 << 10) == pytest.approx(SETTINGS.fade * (4 * 1024 / (8 * 24 * 24)) ** 2)
     assert faded(4, 1 << 10) == pytest.approx(4 * faded(8, 1 << 10))
-    assert faded(1, 1 << 16) == MOST_FADED and faded(1, 0) == 0
+    assert faded(1, 1 << 16) == SETTINGS.most_faded and faded(1, 0) == 0
 
 
 def test_the_same_seed_gives_the_same_bits(capture):
@@ -164,7 +158,7 @@ def test_the_same_seed_gives_the_same_bits(capture):
         return fit(
             *capture,
             BOX,
-            FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=25, samples=1 << 12, seed=seed),
+            TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=25, samples=1 << 12, seed=seed),
         ).params
 
     first, again, other = numbers(1), numbers(1), numbers(2)

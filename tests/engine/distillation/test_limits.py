@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import orbit
@@ -49,7 +50,7 @@ def test_a_fit_stays_inside():
     pixels[:, :3] = 90
     rays = [camera.rays() for camera in cameras]
     away = np.concatenate([np.linalg.norm(np.cross(o, d), axis=1) for o, d in rays])
-    settings = FitSettings(way=way_of(THIRTY_TWO), longest=24, steps=60, samples=1 << 12)
+    settings = TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=60, samples=1 << 12)
     limits = ball(32)
     field = FitRun.start(cameras, Pictures(pixels, away > 0.5), BOX, settings, limits=limits).finish()
     middles = field.occupancy.centres()

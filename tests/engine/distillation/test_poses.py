@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation import poses
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import RayPool
 from fusedrf_cli.engine.distillation.poses import (
+    PoseConfig,
     Poses,
     angles_between,
     changed,
@@ -97,7 +97,7 @@ def test_poses_of_which_little_is_seen_stay():
     images = pictures_of_ball(cameras)
     pool = RayPool(shaken(cameras, 3.0), images, torch.Generator())
     *rays, colours = pool.sample(1500, torch.Generator())
-    colours[1, poses.FEW - 1 :] = torch.nan
+    colours[1, PoseConfig.few - 1 :] = torch.nan
     away = rays[0].copy()
     away.reshape(3, 1500, 3)[2] += 100  # from there the field does not show
     change = refined(BALL, (away, rays[1]), colours, 0.0, pool.pixel)

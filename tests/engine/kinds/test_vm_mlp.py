@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.decoders import tensorf_mlp
-from fusedrf_cli.engine.distillation.fit import FitRun, FitSettings, fit
+from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.fit import FitRun, fit
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.fields.base import RadianceField
@@ -254,7 +255,7 @@ def pictures_of_a_ball(count: int, size: int):
 @pytest.mark.slow
 def test_a_tiny_fit_learns_a_ball():
     cameras, images = pictures_of_a_ball(10, 40)
-    settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=32, steps=150, samples=1 << 14)
+    settings = TrainConfig("vm-mlp", way_of(THIRTY_TWO), longest=32, steps=150, samples=1 << 14)
     field = fit(cameras[1:], images[1:], BOX, settings)
     assert isinstance(field, VMMLPField)
     alpha = images[0, ..., 3:] / 255
@@ -267,7 +268,7 @@ def test_a_tiny_fit_learns_a_ball():
 @pytest.mark.slow
 def test_a_fit_taken_up_from_a_checkpoint_goes_on_as_before():
     cameras, images = pictures_of_a_ball(3, 24)
-    settings = FitSettings("vm-mlp", way_of(THIRTY_TWO), longest=24, steps=40, samples=1 << 11)
+    settings = TrainConfig("vm-mlp", way_of(THIRTY_TWO), longest=24, steps=40, samples=1 << 11)
     whole, again = (FitRun.start(cameras, images, BOX, settings, "") for _ in range(2))
     for _ in range(3):
         whole.step(0.0)

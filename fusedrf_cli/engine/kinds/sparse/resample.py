@@ -83,7 +83,12 @@ def fitted(
     for attempt in range(MOST_ATTEMPTS):
         if attempt >= ATTEMPTS and best is not None:
             break
-        found = occupied(teacher, widening)
+        try:
+            found = occupied(teacher, widening)
+        except EmptyField:
+            if not tried:
+                raise
+            break  # so wide that nothing shows
         count = number_count(found[0], shape) + per_brick * len(found[0].tree.level)
         tried.append((np.log(widening), np.log(count)))
         if count <= max_numbers and (best is None or widening < best[0]):

@@ -22,7 +22,7 @@ from fusedrf_cli.engine.kinds.sparse.seen import as_seen
 from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
 from fusedrf_cli.engine.kinds.student import (
     Contents,
-    DistillSettings,
+    DistilConfig,
     Made,
     MadeStudent,
     Needs,
@@ -126,10 +126,10 @@ class SparseStudent(MadeStudent):
     """Bricks about as fine as each object of a scene needs, all wider by one factor under a limit."""
 
     # what was asked needs no learning from points
-    lesson = DistillSettings(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
+    lesson = DistilConfig(rays=150_000, steps=0, rgb_steps=400, rgb_rate=0.015)
     compares = False
 
-    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistillSettings:
+    def lesson_of(self, numbers: int, seconds: float | None = None) -> DistilConfig:
         """See Student: the more numbers, the more rays, steps and samples."""
         lesson, rays, more = self.lesson, *(max(1.0, numbers / n) for n in (TOLD_BY_RAYS, TOLD_BY_STEPS))
         return replace(
@@ -210,7 +210,7 @@ def bricks(resolution: tuple[int, int, int]) -> list[int]:
 def bricks_ladder() -> Ladder:
     """From few bricks to more, since many take minutes."""
     for rgb, size, degree in product((False, True), LADDER_BYTES, (1, 0)):
-        yield Rung("int8", sh_degree=degree, bytes=size, rgb=rgb)
+        yield Rung("int8", sh_degree=degree, max_size=size, rgb=rgb)
 
 
 def levels(field: SparseField) -> list[dict]:

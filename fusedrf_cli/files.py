@@ -1,0 +1,178 @@
+"""Verbs that read and write files alone: nothing is computed, and nothing slow is loaded."""
+
+import os
+import sys
+from pathlib import Path
+
+from formats import undo as past
+from formats.bundle import OpenBundle, is_bundle, read_summary, summary_of
+from formats.errors import FormatError
+from formats.overview import overview
+from formats.scene import (
+    MAX_SCENE_BYTES,
+    Node,
+    SceneGraph,
+    dump_scene,
+    inline_scenes,
+    make_node,
+    parse_scene,
+    read_scene,
+    resolve_source,
+    write_scene,
+)
+from fusedrf_cli import __version__
+from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.requests import (
+    STDIO,
+    ComposeRequest,
+    HistoryRequest,
+    InfoRequest,
+    Input,
+    UndoRequest,
+    ValidateRequest,
+)
+
+SHOWING = ("crop", "opacity", "tint")
+
+
+# --- compose ------------------------------------------------------------------------------------------------
+
+
+def compose(request: ComposeRequest, progress) -> dict:
+    """Write the scene graph of the inputs; their names are relative to its folder. The graph itself goes to
+    stdout where the output is "-", and the report is empty then."""
+    inputs = [Input(path=given) if isinstance(given, str) else given for given in request.inputs]
+    summaries = [read_summary(given.path) for given in inputs]
+    named = zip(inputs, _names(inputs), strict=True)
+    nodes = tuple(_node(given, name, request) for given, name in named)
+    scene = SceneGraph(nodes, request.composition, generator=f"fusedrf {__version__}")
+    inline_scenes(scene, request.output, request.allow_outside)
+    if request.output == STDIO:
+        sys.stdout.buffer.write(dump_scene(scene))
+        sys.stdout.flush()
+        return {}
+    write_scene(request.output, scene, overwrite=request.overwrite)
+    return {
+        "output": request.output,
+        "bytes": os.path.getsize(request.output),
+        "nodes": [
+            {"name": node.name, "source": node.source, "source_bytes": summary["bytes"]}
+            for node, summary in zip(nodes, summaries, strict=True)
+        ],
+    }
+
+
+def _node(given: Input, name: str, request: ComposeRequest) -> Node:
+    source = _relative(given.path, request.output)
+    resolve_source(request.output, source, request.allow_outside)
+    showing = {key: value for key in SHOWING if (value := getattr(given, key)) is not None}
+    showing |= {"visible": False} if given.hidden else {}
+    background = given.background_node
+    return make_node(name, source=source, background=background, showing=showing, **given.words)
+
+
+def _names(inputs: list[Input]) -> list[str]:
+    """A name for each input: the one given, else the file's stem, numbered where that is taken."""
+    taken = {given.name for given in inputs if given.name is not None}
+    names = []
+    for given in inputs:
+        stem, count, name = Path(given.path).stem, 1, given.name
+        while name is None:
+            candidate = stem if count == 1 else f"{stem}-{count}"
+            name, count = (None if candidate in taken else candidate), count + 1
+        taken.add(name)
+        names.append(name)
+    return names
+
+
+def _relative(path: str, output: str) -> str:
+    """`path` as the scene at `output` names it. Links are resolved, as from a link `..` leads elsewhere."""
+    folder = os.path.realpath(os.path.dirname(output))
+    real = os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
+    return Path(os.path.relpath(real, folder)).as_posix()
+
+
+# --- info, history and undo ---------------------------------------------------------------------------------
+
+
+def info(request: InfoRequest, progress) -> dict:
+    """What is in a bundle or a scene, without decoding arrays, or what `train` would read."""
+    if request.scene == STDIO:
+        scene, size = _stdin_scene()
+        return summary_of(scene, STDIO, size)
+    return overview(request.scene) or read_summary(request.scene)
+
+
+def history(request: HistoryRequest, progress) -> dict:
+    """What was done to a bundle."""
+    return past.history(request.fused)
+
+
+def undo(request: UndoRequest, progress) -> dict:
+    """Write the bytes that a bundle had before its last edit."""
+    return past.undo(request.fused, request.output)
+
+
+def _stdin_scene() -> tuple[SceneGraph, int]:
+    """The scene graph on stdin, and its bytes; sources in it are relative to the current folder."""
+    data = sys.stdin.buffer.read(MAX_SCENE_BYTES + 1)
+    return parse_scene(data, "standard input"), len(data)
+
+
+# --- validate -----------------------------------------------------------------------------------------------
+
+
+def validate(request: ValidateRequest, progress) -> dict:
+    """Check every byte of bundles, and of scenes and all that they name. Raises InvalidInput, which carries
+    the report, where one is not valid."""
+    problems = [_problem(path, request.allow_outside) for path in request.scenes]
+    files = [
+        {"path": path, "valid": not problem, "problem": problem and str(problem)}
+        for path, problem in zip(request.scenes, problems, strict=True)
+    ]
+    wrong = [problem for problem in problems if problem is not None]
+    report = {"valid": not wrong, "files": files}
+    if wrong:
+        raise _verdict(wrong, report)
+    return report
+
+
+def _verdict(problems: list[FormatError], report: dict) -> InvalidInput:
+    """One error for all; its exit code is that of the first problem."""
+    count = len(report["files"])
+    many = f"{len(problems)} of {count} files are not valid; see the report"
+    sentence = str(problems[0]) if count == 1 else many
+    verdict = InvalidInput(sentence, report=report)
+    verdict.exit_code = problems[0].exit_code
+    return verdict
+
+
+def _problem(path: str, allow_outside: bool) -> FormatError | None:
+    try:
+        _check(path, allow_outside, set())
+    except FormatError as error:
+        return error
+    return None
+
+
+def _check(path: str, allow_outside: bool, seen: set[str]) -> None:
+    """Raise what is wrong with `path` or a file it names; each file is read once."""
+    seen.add(os.path.realpath(path))
+    scene = inline_scenes(_scene(path), path, allow_outside)
+    for leaf in scene.leaves():
+        if leaf.source is not None:
+            target = resolve_source(path, leaf.source, allow_outside)
+            if os.path.realpath(target) not in seen:
+                _check(str(target), allow_outside, seen)
+
+
+def _scene(path: str) -> SceneGraph:
+    """The scene at `path`; of a bundle every array and checksum is read as well."""
+    if path == STDIO:
+        return _stdin_scene()[0]
+    if not is_bundle(path):
+        return read_scene(path)
+    bundle = OpenBundle(path)
+    for member in bundle.headers:  # one at a time is in memory
+        bundle.field(member)
+    return bundle.scene

@@ -1,0 +1,122 @@
+"""The verbs of fusedrf. Each takes what its request says (requests.py), in order or by keyword, checks it and
+its outputs before any work, writes its output whole or not at all, and returns its report, a JSON-able dict.
+
+Nothing slow is imported until a verb needs it.
+"""
+
+import contextlib
+import functools
+import importlib
+import inspect
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+
+from fusedrf_cli import requests
+from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli.progress import NullProgress
+from fusedrf_cli.requests import STDIO, EditRequest, Writing
+
+__all__ = [
+    *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
+    *("replace", "crop", "tint", "extract", "history", "undo"),
+    *("render", "eval", "chart", "info", "kinds", "validate"),
+]
+
+
+def verb(name: str, request: type, does: str = "", module: str = "bridge") -> Callable[..., dict]:
+    """The verb of a name, which hands a request to a function of a module of this package, by default of that
+    name."""
+    signature = inspect.signature(request)
+
+    def run(*words: Any, progress: NullProgress | None = None, **options: Any) -> dict:
+        asked = checked(request, signature.bind(*words, **options).arguments)
+        progress = progress or NullProgress()
+        with held_outputs(asked, progress) if isinstance(asked, Writing) else contextlib.nullcontext():
+            work = getattr(importlib.import_module(f"fusedrf_cli.{module}"), does or name)
+            report = work(asked, progress)
+        return report and {**report, "warnings": report.get("warnings", progress.warnings)}
+
+    how = inspect.Parameter("progress", inspect.Parameter.KEYWORD_ONLY, default=None)
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), how])
+    run.__name__ = run.__qualname__ = name
+    run.__doc__ = request.__doc__
+    return run
+
+
+def checked(request: type, words: dict[str, Any]):
+    """The request of those words. Raises UsageProblem for a value that is none of its kind."""
+    try:
+        return msgspec.convert({name: _plain(value) for name, value in words.items()}, request)
+    except msgspec.ValidationError as error:
+        what, _, where = str(error).partition(" - at `$.")
+        raise UsageProblem(f"{where.rstrip('`')}: {what}" if where else what) from error
+
+
+def _plain(value: Any) -> Any:
+    """Paths as text, and arrays as lists."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+@contextlib.contextmanager
+def held_outputs(asked: Writing, progress: NullProgress) -> Iterator[None]:
+    """A block in which nobody else writes the outputs. An output that is in the way, cannot be written, or is
+    being written is refused before any work, and so are those beside it. An edit in place waits instead, and
+    reads only then: no edit is lost."""
+    if asked.stdout and asked.output == STDIO:
+        yield
+        return
+    from formats.atomic import check_writable
+    from formats.locks import output_lock
+
+    others = asked.beside()
+    outputs = {asked.output: asked.folders} | others
+    if len({os.path.realpath(path) for path in outputs}) <= len(others):
+        raise UsageProblem(f"{asked.output}: two outputs go there; give them different names")
+    edited = getattr(asked, "fused", None)
+    in_place = edited is not None and os.path.realpath(edited) == os.path.realpath(asked.output)
+    check_all = functools.partial(_check_all, check_writable, outputs, asked.overwrite)
+    with contextlib.ExitStack() as locks:
+        check_all()
+        for path in outputs:
+            waiting = progress.tell if in_place and path == asked.output else None
+            locks.enter_context(output_lock(path, waiting))
+        check_all()  # one may have come while we waited
+        if isinstance(asked, EditRequest) and asked.keep_history:
+            from formats.undo import check_past
+
+            check_past(edited, asked.output)
+        yield
+
+
+def _check_all(check: Callable, outputs: dict[str, bool], overwrite: bool) -> None:
+    for path, folder in outputs.items():
+        check(path, overwrite, folders=folder)
+
+
+pose = verb("pose", requests.PoseRequest)
+train = verb("train", requests.TrainRequest)
+compose = verb("compose", requests.ComposeRequest, module="files")
+fuse = verb("fuse", requests.FuseRequest)
+convert = verb("convert", requests.ConvertRequest)
+add = verb("add", requests.AddRequest)
+delete = verb("delete", requests.DeleteRequest)
+move = verb("move", requests.MoveRequest)
+duplicate = verb("duplicate", requests.DuplicateRequest)
+rename = verb("rename", requests.RenameRequest)
+replace = verb("replace", requests.ReplaceRequest)
+crop = verb("crop", requests.CropRequest, does="show")
+tint = verb("tint", requests.TintRequest, does="show")
+extract = verb("extract", requests.ExtractRequest)
+history = verb("history", requests.HistoryRequest, module="files")
+undo = verb("undo", requests.UndoRequest, module="files")
+render = verb("render", requests.RenderRequest)
+eval = verb("eval", requests.EvaluateRequest, does="evaluate")
+chart = verb("chart", requests.ChartRequest)
+info = verb("info", requests.InfoRequest, module="files")
+kinds = verb("kinds", requests.KindsRequest, does="list_kinds")
+validate = verb("validate", requests.ValidateRequest, module="files")
