@@ -68,6 +68,7 @@ def test_the_page_s_encoding_answers_and_sends_back_as_its_reference(cubes, monk
     field = page.CubesField(page.CubesShape(), BOX, (5, 4, 6), 3.0, 0.3)
     generator = torch.Generator().manual_seed(0)
     field = field.with_params(torch.randn(len(field.params), generator=generator, dtype=torch.float64))
+    assert [group.rate for group in field.groups()] == [40.0, 40.0]
     assert_answers(field)
     for shaded in (True, False):
         assert_gradients(field, shaded)

@@ -192,7 +192,7 @@ class BoxField(ComputedField):
             self.parts, self.starts, self.starts[1:], self.reached, strict=False
         ):
             last = groups[-1] if groups else None
-            if last and (last.rate, last.lines) == (part.rate, None) and lines is None:
+            if last and last.lines is None and lines is None and last.rate == part.rate:
                 groups[-1] = Group(last.low, int(high), part.rate)
             else:
                 groups.append(Group(int(low), int(high), part.rate, lines))

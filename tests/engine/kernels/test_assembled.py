@@ -4,6 +4,7 @@ The loops' functions are run by Python, so that nothing is compiled."""
 from dataclasses import dataclass
 from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -82,11 +83,16 @@ PRODUCTS += [
 ]
 
 
+def product(recipe: Recipe) -> Product:
+    """A field of random numbers in float64."""
+    bare = Product(recipe, BOX, (5, 8, 7), 3.0, 0.3)
+    generator = torch.Generator().manual_seed(0)
+    return bare.with_params(0.5 * torch.randn(len(bare.params), generator=generator, dtype=torch.float64))
+
+
 @pytest.fixture(params=PRODUCTS, ids=lambda recipe: "-".join(vars(recipe).values()))
 def field(request):
-    made = Product(request.param, BOX, (5, 8, 7), 3.0, 0.3)
-    generator = torch.Generator().manual_seed(0)
-    return made.with_params(0.5 * torch.randn(len(made.params), generator=generator, dtype=torch.float64))
+    return product(request.param)
 
 
 def test_device_functions_answer_as_the_references_of_their_parts(field):
@@ -96,6 +102,23 @@ def test_device_functions_answer_as_the_references_of_their_parts(field):
 @pytest.mark.parametrize("shaded", [True, False])
 def test_device_functions_send_back_what_autograd_does(field, shaded):
     assert_gradients(field, shaded)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(1, 5))
+def test_compiled_products_answer_and_send_back_as_their_references(number):
+    """Of parts that no kind is made of, which nothing else compiles."""
+    field = product(PRODUCTS[-number])
+    points, dirs = (torch.from_numpy(values) for values in samples(field, 200))
+    params = field.params.clone().requires_grad_()
+    expected = field.reference(params, points, dirs)
+    answers = field.query(points, dirs)
+    torch.testing.assert_close(answers, tuple(value.detach() for value in expected), rtol=1e-7, atol=1e-9)
+    sent = torch.randn(200, dtype=torch.float64), torch.randn(200, 3, dtype=torch.float64)
+    torch.autograd.backward(expected, sent)
+    rows = np.zeros((1, len(params)))
+    field.query_backward(points, dirs, *sent, rows)
+    np.testing.assert_allclose(rows[0], params.grad, rtol=1e-6, atol=1e-8)
 
 
 def test_references_are_differentiable_in_numbers_points_and_directions(field):
