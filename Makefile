@@ -14,10 +14,11 @@ KILLS ?= 200
 SEED ?= 0
 
 SLOW ?=
+ORDER ?=
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-slow fuzz docs lint bench bench-paper bench-real ablation stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real ablation stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -30,7 +31,12 @@ demo: $(VENV)  ## two small scenes, fused and rendered
 test: export NUMBA_NUM_THREADS = 1
 test: export OMP_NUM_THREADS = 1
 test: $(VENV)  ## the quick tests
-	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile
+	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
+test-order: export NUMBA_NUM_THREADS = 1
+test-order: export OMP_NUM_THREADS = 1
+test-order: $(VENV)  ## the quick tests in random order, which is said and can be repeated: ORDER=--random-order-seed=N
+	$(PYTHON) -m pytest -q -m 'not slow' -n auto --maxprocesses 4 --dist loadfile --random-order $(ORDER)
 
 test-slow: $(VENV)  ## the slow tests, two files at a time, and how long each takes; SLOW=--third: a third of them
 	$(PYTHON) -m tests.slow $(SLOW)

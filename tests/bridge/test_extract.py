@@ -156,7 +156,9 @@ def test_the_object_keeps_its_cameras_and_stands_free(report, folder):
     assert scene.framing[3] < 0.1
 
 
-@pytest.mark.parametrize("kind", ["blocks", "vm", "sparse", "dense"])
+@pytest.mark.parametrize(
+    "kind", ["blocks", "vm", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("sparse", "dense"))]
+)
 def test_no_more_bytes_than_allowed(report, run, folder, kind):
     words = ("extract", f"{kind}.rfpack", "--box", AROUND, "-o", "object.rfpack", "-w")
     whole = report(*words)["bytes"]
