@@ -215,7 +215,7 @@ def arrange(request: ArrangeRequest, event: str, progress) -> dict:
 
 
 def show(request: ShowRequest, progress) -> dict:
-    """Show an object otherwise: cropped, tinted, thinner, or not at all."""
+    """Show an object otherwise: cropped, tinted, or thinner."""
     with engine("cpu", None, progress):
         edit = Edit(request, progress)
         draft, name = edit.draft, request.name

@@ -17,7 +17,7 @@ def test_a_scene_becomes_blocks_that_look_the_same(report, folder, picture):
     said = report("fuse", "scene.json", "-o", "fused.rfpack")
     assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] > 40  # as made, on another lattice
     assert said["bytes"] == (folder / "fused.rfpack").stat().st_size
-    assert psnr(picture("fused.rfpack"), picture("scene.json")) > 42
+    assert psnr(picture("fused.rfpack"), picture("scene.json")) > 40
     assert psnr(picture("fused.rfpack"), picture("scene.json", "--naive")) > 45
     scene = read_bundle(folder / "fused.rfpack").scene
     (entry,) = scene.history

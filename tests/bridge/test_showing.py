@@ -117,7 +117,7 @@ def test_a_fused_scene_keeps_tints_through_edits(report, folder, picture):
     report("compose", "red.rfpack", *words, "-o", "s.json")
     for kind in ("blocks", "vm"):
         said = report("fuse", "s.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-rgb", "-w")
-        assert said["psnr"]["before_rgb"] > (45 if kind == "blocks" else 20)
+        assert said["psnr"]["before_rgb"] > (30 if kind == "blocks" else 20)
     report("move", "blocks.rfpack", "dark", "-t", "0,0.4,0", "-o", "moved.rfpack")
     report("compose", "red.rfpack", *words[:4], "0.8,0.4,0", *words[5:], "-o", "there.json")
     assert alike(picture("moved.rfpack"), picture("there.json"))

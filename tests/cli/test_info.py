@@ -49,21 +49,23 @@ def test_info_of_rubbish_is_one_line(run, folder):
 
 
 def test_info_lists_the_objects_of_a_fused_bundle(run, folder):
-    """Names and bytes of blocks, the place of what was distilled; --json has the same in full."""
+    """Nodes, of old fields of blocks too, and the place of what was distilled; --json has all of it."""
     place = [[1, 0, 0, 2.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     nodes = [{"name": n, "object_to_world": place, "aabb": [0, 0, 0, 1, 2, 3]} for n in ("cup", "jug")]
     history = ({"event": "fused", "nodes": nodes}, {"event": "deleted", "names": ["jug"]})
-    arrays = {"tensor_0.plane": np.ones((4, 4), np.float32), "plane": np.ones((4, 4), np.float32)}
+    arrays = {"tensor_0.plane": np.ones((4, 4), np.float32)}
     block = {"name": "cup", "tensor": 0, "object_to_field": place}
-    for name, metadata in (("blocks", {"blocks": [block]}), ("distilled", {})):
-        record = FieldRecord("lamp", arrays, {"aabb": [0, 0, 0, 9, 9, 9], **metadata})
+    blocks = {"blocks": [block], "tensors": [{"aabb": [0, 0, 0, 9, 9, 9]}]}
+    for name, kind, metadata in (("blocks", "vm", blocks), ("distilled", "lamp", {})):
+        record = FieldRecord(kind, arrays, {"aabb": [0, 0, 0, 9, 9, 9], **metadata})
         single_field_bundle(record, "fused", history=history).write(folder / f"{name}.rfpack")
     lines = run("info", "blocks.rfpack").stdout.splitlines()
-    start = lines.index("objects:")
-    assert [line.split() for line in lines[start + 1 : start + 3]] == [
-        ["name", "kind", "at", "bytes"],
-        ["cup", "lamp", "2.5", "0", "0", "32", "bytes"],
+    start = lines.index("nodes:")
+    assert [line.split()[:5] for line in lines[start + 1 : start + 3]] == [
+        ["name", "kind", "at", "box"],
+        ["cup", "vm", "2.5", "0", "0"],
     ]
+    assert "objects:" not in lines  # which are the nodes
     assert "  deleted  jug" in lines
     lines = run("info", "distilled.rfpack").stdout.splitlines()
     assert lines[lines.index("objects:") + 2].split() == ["cup", "lamp", "2.5", "0", "0", "1", "2", "3"]
