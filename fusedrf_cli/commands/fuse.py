@@ -44,10 +44,11 @@ def brief(report: dict) -> dict:
 @options.seeded
 @options.reporting(brief=brief)
 def command(**words):
-    """Turn a whole scene into one field.
+    """Turn a whole scene into one bundle.
 
-    SCENE is a scene.json, a bundle, or - for a scene on stdin. A fused bundle is built anew from its sources,
-    where these are found as they were.
+    SCENE is a scene.json, a bundle, or - for a scene on stdin. By --kind blocks its sources stay nodes, each
+    with a field of its own; by any other kind one field is learnt from all of them. A fused bundle is built
+    anew from its sources, where these are found as they were.
 
     \b
     Example:

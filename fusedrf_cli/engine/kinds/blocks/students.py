@@ -33,7 +33,7 @@ class BlocksKind(Kind):
 
     name = "blocks"
     good_for = (
-        "Scenes of vm fields by 'max': what fits is kept as it is, turned and stretched objects stay exact."
+        "Scenes of any fields: they stay nodes with their own numbers, vm ones by 'max' smaller where asked."
     )
     trains = False
     takes = frozenset({"ranks", "sh_degree"})
