@@ -105,7 +105,7 @@ class Deletion:
                 )
             self.restored &= rest is not None
             widest = max(self.empty(leaf, box) for leaf in holders)
-            self.boxes.append(box)
+            self.boxes.append(box + widest * np.repeat([-1.0, 1.0], 3))
             for one, precision in rest or ():
                 self.fill(one, precision, box, widest)
         if request is not None and request.refit and "photos" not in self.told:
@@ -127,7 +127,7 @@ class Deletion:
         """Empty the cells of a node's field that reach into a box (6,) of the world; the side of such a
         cell."""
         one = self.placed(leaf)
-        left = self.cropped(one, lambda at: ((at < box[:3]) | (at > box[3:])).any(1))
+        left = self.part(one, "restricted", lambda at: ((at < box[:3]) | (at > box[3:])).any(1))
         precision = self.draft.fields.headers[leaf.field].precision
         member = None if left is None else self.draft.put(left, precision)
         self.draft.graph = with_field(self.draft.graph, leaf.name, member)
@@ -137,17 +137,18 @@ class Deletion:
         """Add a node that shows what a field has in a box (6,) of the world, and in cells that reach into it;
         widest: the side of those that were emptied."""
         grown = box + (widest + OVERLAP * side_of(one)) * np.repeat([-1, 1], 3)
-        part = self.cropped(one, lambda at: ((at >= grown[:3]) & (at <= grown[3:])).all(1))
+        part = self.part(one, "cropped", lambda at: ((at >= grown[:3]) & (at <= grown[3:])).all(1))
         if part is not None:
             part = registry.kind(part.kind).trimmed(part)
             name = one.name if belongs(one.name, (RESTORED,)) else f"{RESTORED}/{one.name}"
             self.draft.add_node(name, part, one.object_to_world, precision)
 
-    def cropped(self, one: Placed, holds: Callable[[np.ndarray], np.ndarray]) -> StoredField | None:
-        """What of a field lies where `holds` says so of points (N, 3) of the world."""
-        matrix, kind = one.object_to_world, registry.kind(one.field.kind)
+    def part(self, one: Placed, how: str, holds: Callable[[np.ndarray], np.ndarray]) -> StoredField | None:
+        """What of a field lies where `holds` says so of points (N, 3) of the world: `cropped` or `restricted`
+        by its kind."""
+        matrix, part_of = one.object_to_world, getattr(registry.kind(one.field.kind), how)
         try:
-            return kind.cropped(one.field, lambda at: holds(at @ matrix[:3, :3].T + matrix[:3, 3]))
+            return part_of(one.field, lambda at: holds(at @ matrix[:3, :3].T + matrix[:3, 3]))
         except ValueError as error:
             raise InvalidInput(f"{self.draft.path}: {error}") from error
 

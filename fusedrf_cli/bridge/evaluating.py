@@ -132,7 +132,8 @@ def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Ite
 def scene_pairs(
     against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory, place: str
 ) -> Iterator[tuple[Pair, int]]:
-    """The same of another scene, from where it and its objects were photographed; every pixel counts."""
+    """The same of another scene, as `render` draws it, from where it and its objects were photographed; every
+    pixel counts."""
     loaded = load_scene(against, allow_outside, budget, place)
     field, origin = renderable(loaded)
     width, height = size or SCENE_SIZE
@@ -140,6 +141,7 @@ def scene_pairs(
     cameras = [look.camera for look in views]
     needed = sources(loaded.resident) | picture_memory(field, cameras, film=False) | measured(width, height)
     budget.expect(needed, advice="give a smaller --size")
+    field = in_memory(loaded, field, picture_memory(field, cameras, film=False), budget)
     for look in views:
         shot = render_image(field, look.camera, origin=origin)
         every = np.ones(shot.opacity.shape, bool)

@@ -85,7 +85,7 @@ def test_a_target_takes_the_fewest_bytes_that_reach_it(report, folder, picture):
     assert said["bytes"] == (folder / "small.rfpack").stat().st_size
     chosen = said["chosen"]
     assert chosen["precision"] == "int4" and "smallest" in chosen["why"]
-    assert chosen["next_larger"]["bytes"] > said["bytes"] > 0.9 * chosen["next_smaller"]["bytes"]
+    assert chosen["next_larger"]["bytes"] > said["bytes"] > 0.8 * chosen["next_smaller"]["bytes"]  # at most
     assert psnr(picture("small.rfpack"), picture("pair.json")) > 28
     report("fuse", "pair.json", "-o", "again.rfpack", *chosen["flags"].split())
     same = [list(read_bundle(folder / f"{name}.rfpack").fields) for name in ("again", "small")]

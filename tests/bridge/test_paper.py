@@ -147,9 +147,9 @@ def test_thirty_two_things_find_places_on_the_ground():
 
 
 def test_a_command_that_fails_says_why(folder):
-    with pytest.raises(RuntimeError, match="blocks need vm sources"):
+    with pytest.raises(RuntimeError, match="ranks applies to scenes of vm fields"):
         write_scene_of(folder, "floor", "red", file="fog.json", composition="add")
-        fusedrf(folder, "fuse", "fog.json", "-o", "fog.rfpack", "--kind", "blocks")
+        fusedrf(folder, "fuse", "fog.json", "-o", "fog.rfpack", "--kind", "blocks", "--ranks", "8,16")
 
 
 def test_every_measure_is_somebodys():

@@ -153,6 +153,11 @@ class Kind:
         None where there is nothing. Raises ValueError as `cut_out`."""
         return splitting.cropped(self.on_one_grid(field), field.box, holds)
 
+    def restricted(self, field: StoredField, holds: Holds) -> StoredField | None:
+        """The whole field without those of its cells that do not lie wholly where `holds` says so; None where
+        nothing is left. Raises ValueError as `cut_out`."""
+        return splitting.restricted(self.on_one_grid(field), holds)
+
     def trimmed(self, field: StoredField) -> StoredField:
         """The same field without the numbers that none of its cells asks, where that makes its files
         smaller."""

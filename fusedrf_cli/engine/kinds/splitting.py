@@ -3,6 +3,7 @@ that together they show what it showed."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -119,14 +120,27 @@ def common_box(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def cropped(field, box: np.ndarray, holds: Holds):
     """What of a field as in `cut_out` lies where `holds` says so of points of its frame: cells of a voxel
     that lie there wholly. None where there is nothing."""
+    inside = partial(wholly, field, holds)
+    return within(field, box, field.voxel_size, inside, field.occupancy.aabb)
 
-    def wholly(middles: np.ndarray, size: np.ndarray) -> np.ndarray:
-        kept = np.ones(len(middles), bool)
-        for corner in CORNERS:
-            kept[kept] = holds(placed(middles[kept] + corner * size, field.space))
-        return kept
 
-    return within(field, box, field.voxel_size, wholly, field.occupancy.aabb)
+def restricted(field, holds: Holds):
+    """A field, with all its texels, without the cells that do not lie wholly where `holds` says so; they are
+    parts of its own cells, so that nothing shows that was empty before. None where nothing is left."""
+    grid = refined(field.occupancy, field.voxel_size)
+    index, kept = np.argwhere(grid.occupied), grid.occupied.copy()
+    for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
+        kept[tuple(part.T)] = wholly(field, holds, grid.aabb[:3] + (part + 0.5) * grid.cell, grid.cell)
+    return field.with_occupancy(grid.marked(kept)) if kept.any() else None
+
+
+def wholly(field, holds: Holds, middles: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """(N,) bool: which cells of a size (3,) around middles (N, 3) have all their corners where `holds` says
+    so."""
+    kept = np.ones(len(middles), bool)
+    for corner in CORNERS:
+        kept[kept] = holds(placed(middles[kept] + corner * size, field.space))
+    return kept
 
 
 def within(field, box: np.ndarray, narrowest: float, inside, looked_in: np.ndarray):

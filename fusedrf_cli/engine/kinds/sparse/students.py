@@ -117,6 +117,10 @@ class SparseKind(Kind):
         """The voxels that lie there wholly."""
         return field.with_voxels(lambda corners: holds(splitting.placed(corners, field.space)))
 
+    def restricted(self, field: SparseField, holds: splitting.Holds) -> SparseField | None:
+        """A voxel is kept or not."""
+        return self.cropped(field, holds)
+
     def thinned(self, field: SparseField, factor: float) -> SparseField:
         """The same vertices, with another scale."""
         return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)

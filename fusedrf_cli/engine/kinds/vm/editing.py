@@ -33,12 +33,22 @@ def cut_away(field: VMField, selection: Selection) -> VMField | None:
 
 def cropped(field: VMField, holds: splitting.Holds) -> VMField | None:
     """What of each block lies where `holds` says so of points of the field's frame, see splitting.py."""
+    return in_blocks(field, holds, lambda own, held: splitting.cropped(own, own.tensors[0].aabb, held))
+
+
+def restricted(field: VMField, holds: splitting.Holds) -> VMField | None:
+    """Each block as splitting.py restricts it."""
+    return in_blocks(field, holds, splitting.restricted)
+
+
+def in_blocks(field: VMField, holds: splitting.Holds, part_of: Callable) -> VMField | None:
+    """What `part_of` leaves of each block, given its tensor alone and `holds` in its object's frame."""
 
     def part(own: VMField, block: Block) -> VMField | None:
         def held(points: np.ndarray) -> np.ndarray:
             return holds(points @ block.object_to_field[:3, :3].T + block.object_to_field[:3, 3])
 
-        return splitting.cropped(own, own.tensors[0].aabb, held)
+        return part_of(own, held)
 
     return apart(field, part)
 

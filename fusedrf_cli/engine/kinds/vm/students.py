@@ -126,6 +126,10 @@ class VMKind(Kind):
         """See vm/editing.py."""
         return editing.cropped(field, holds)
 
+    def restricted(self, field: VMField, holds: splitting.Holds) -> VMField | None:
+        """See vm/editing.py."""
+        return editing.restricted(field, holds)
+
     def trimmed(self, field: VMField) -> VMField:
         """See vm/trimming.py."""
         return without_unasked(field)
