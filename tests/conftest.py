@@ -1,6 +1,11 @@
-"""The files that take longest come first, so that no process is left alone with one of them at the end."""
+"""The files that take longest come first, so that no process is left alone with one of them at the end; and no
+test hears of an interrupt that another one made."""
 
 from pathlib import Path
+
+import pytest
+
+from fusedrf_cli import signals
 
 LONGEST = (
     *("bridge/test_extract.py", "bridge/test_fuse.py", "formats/test_posing.py", "promises/test_kills.py"),
@@ -15,3 +20,9 @@ def pytest_collection_modifyitems(items):
     place."""
     places = {TESTS / file: place for place, file in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+@pytest.fixture(autouse=True)
+def not_interrupted(monkeypatch):
+    """As a process begins."""
+    monkeypatch.setattr(signals, "_raised", None)
