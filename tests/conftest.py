@@ -1,5 +1,5 @@
-"""The files that take longest come first, so that no process is left alone with one of them at the end; and no
-test hears of an interrupt that another one made."""
+"""The files that take longest come first, so that no process is left alone with one of them at the end; and
+no test hears of an interrupt that another one made."""
 
 from pathlib import Path
 
