@@ -11,7 +11,6 @@ import argparse
 import statistics
 import tempfile
 import time
-from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from fusedrf_cli.bridge.looks import share_seen, subjects_of
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import rig_of
-from fusedrf_cli.bridge.scene import LoadedScene, load_scene
+from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.volume import render_image
 
 SOURCES = {
@@ -108,7 +107,7 @@ def frame_seconds(bundles: list[Path]) -> list[float]:
     """The median seconds of a frame of each, taking turns after one that loads kernels."""
     loaded = [load_scene(str(path)) for path in bundles]
     camera = camera_of(rig_of(loaded[-1]).typical.reframed(*FRAME))
-    fields = [looked_at(scene) for scene in loaded]
+    fields = [renderable(scene) for scene in loaded]
     took: list[list[float]] = [[] for _ in bundles]
     for _ in range(1 + FRAMES):
         for (shown, origin), times in zip(fields, took, strict=True):
@@ -116,12 +115,6 @@ def frame_seconds(bundles: list[Path]) -> list[float]:
             render_image(shown, camera, origin=origin)
             times.append(time.perf_counter() - started)
     return [statistics.median(times[1:]) for times in took]
-
-
-def looked_at(scene: LoadedScene) -> tuple[object, np.ndarray]:
-    """A fused scene as `render` makes pictures of it, and where its frame lies."""
-    field, origin = renderable(scene)
-    return field.for_pictures(prod(FRAME)), origin
 
 
 def write_page(out: Path, rows: list[dict]) -> None:

@@ -35,7 +35,6 @@ RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself,
 PER_PIXEL = 350  # of a band: rays in float64, before and after turning, those of one block apart, pixels
 PER_SAMPLE = 300  # of a wave through the general renderer: distances, points in each field, σ, colour
 PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
-PER_KNOWN_CELL = 30  # of a scene's grid: the bits of its parts, strides and distances
 PER_SEGMENT = 400  # of a ray of a composite: its segments, their ends, and the numbers that sort them
 PER_SLOT = 1400  # of an instance in a segment that several share: its samples
 PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
@@ -128,11 +127,6 @@ def segments(rays: int) -> dict[str, float]:
     """Rays of a picture of a Composite, so many in all, and the samples of several instances."""
     rays = min(rays, Composite.rays_at_once)
     return {"segments of rays": rays * PER_SEGMENT + SLOTS_AT_ONCE * PER_SLOT}
-
-
-def insides(aabb: np.ndarray) -> dict[str, float]:
-    """Telling those of the cells (engine/fields/insides.py) of a scene's grid over its box (6,)."""
-    return {"the insides of cells": PER_KNOWN_CELL * float(np.prod(cell_counts(aabb, SCENE_CELLS)))}
 
 
 def measured(width: int, height: int) -> dict[str, float]:

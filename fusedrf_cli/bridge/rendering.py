@@ -12,14 +12,13 @@ from formats.atomic import atomic_folder
 from formats.filenames import DEPTH, depth_of, distinct
 from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
-from fusedrf_cli.bridge.memory import Memory, insides, picture, segments, sources
+from fusedrf_cli.bridge.memory import Memory, picture, segments, sources
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite, as_composite
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
-from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
 from fusedrf_cli.errors import UsageProblem
@@ -59,8 +58,6 @@ def render(request: RenderRequest, progress) -> dict:
         loaded.shelf.resize(sum(loaded.sizes) if held else budget.room(needed))
         advice = "use --naive" if held else "give a smaller --size"
         budget.expect(sources(loaded.resident, loaded.shelf.room) | needed, advice=advice)
-        if hasattr(field, "for_pictures"):
-            field = field.for_pictures(rays_of(views))
         tell_of_work(request.scene, field, rays_of(views), progress)
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
@@ -89,8 +86,6 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     needed = picture(largest.width, largest.height, composed=composed)
     if field is None or isinstance(field, Composite):
         needed |= segments(pixels)
-    if len(getattr(field, "blocks", ())) > 1 and rays_of(views) >= WORTH_TELLING:
-        needed |= insides(field.aabb)
     return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
 
 

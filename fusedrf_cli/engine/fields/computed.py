@@ -21,7 +21,6 @@ from fusedrf_cli.engine.kernels.loops import (
     Answers,
     Cells,
     Points,
-    Rays,
     Sent,
     Voting,
     Weighed,
@@ -250,11 +249,6 @@ class ComputedField:
         """The occupancy's arrays."""
         return self.device_loops.on_device(self.occupancy.arrays)
 
-    def for_pictures(self, rays: int) -> "ComputedField":
-        """The field for pictures of so many rays in all, perhaps under a grid that skips more and shows the
-        numbers as they are now."""
-        return self
-
     @property
     def real(self) -> np.dtype:
         """The type of the field's numbers."""
@@ -288,16 +282,12 @@ class ComputedField:
     ) -> None:
         """March, shade and composite in one pass, each ray from and to its distances reach (N, 2): the fast
         path of `render_rays` in volume.py, with the same columns in out (N, 5)."""
-        self.show(Rays(exact(rays_o), exact(rays_d), exact(reach), float(step), float(early_stop)), out)
-
-    def show(self, rays: Rays, out: np.ndarray) -> None:
-        """`render_rays` of rays as the loops take them."""
         count = len(out)
-        each, reach = np.arange(count), np.minimum(rays.reach, FARTHEST)
+        each, reach = np.arange(count), np.minimum(exact(reach), FARTHEST)
         first, (begin, end) = np.zeros(count, np.int64), np.ascontiguousarray(reach.T)
         slots = Slots(
-            rays.rays_o, rays.rays_d, reach, each, each, first, begin, end, np.eye(4)[None, :3], rays.step,
-            rays.early_stop, out,
+            exact(rays_o), exact(rays_d), reach, each, each, first, begin, end, np.eye(4)[None, :3],
+            float(step), float(early_stop), out,
         )  # fmt: skip
         out[:] = 0
         self.each("show_ray", slots, count, out, RAYS_PER_TASK)

@@ -79,16 +79,6 @@ class Sent(NamedTuple):
     d_rgb: object  # (N, 3)
 
 
-class Rays(NamedTuple):
-    """What `ComputedField.show` follows."""
-
-    rays_o: object  # (N, 3) float64
-    rays_d: object  # (N, 3) float64, unit length
-    reach: object  # (N, 2) float64, from which distance to which
-    step: object  # float
-    early_stop: object  # float, the transmittance at which a ray ends
-
-
 class Weighed(NamedTuple):
     """What `weigh_ray` follows."""
 

@@ -16,7 +16,6 @@ body = njit(fastmath=True, error_model="numpy", cache=True, forceinline=True, _n
 careful = njit(error_model="numpy", cache=True, forceinline=True, _nrt=False)  # where NaN must stay NaN
 
 LINE = 16  # floats in a cache line
-MIXED = 1 << 15  # added to a stride
 NEWTON_STEPS = 50
 CLIPPED = 0.97  # a photo's colour from which on more light would not have shown
 NEWTON_NEAR = 1e-13  # focal lengths, or radians
@@ -25,18 +24,14 @@ FACE_TOLERANCE = 1e-6  # steps: a sample on the face of an occupied cell must no
 
 class GridArrays(NamedTuple):
     """The occupancy grid: `skip` is 0 in an occupied cell, else the Chebyshev distance in cells to the next
-    one. Samples in a cell may be `stride` times `unit` apart; without strides they are a step apart. Where
-    the insides of cells are known, parts of a cell without matter are skipped or have a stride of their own;
-    with strides, that is so of cells that say MIXED."""
+    one. Samples in a cell may be `stride` times `unit` apart; without strides they are a step apart."""
 
     skip: object  # (X, Y, Z) uint8
     lo: object  # (3,) float, lower corner
     hi: object  # (3,) float, upper corner
     cell: object  # (3,) float, size of a cell
-    stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least 1 in occupied cells, + MIXED
+    stride: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, at least 1 in occupied cells
     unit: object = 0.0  # float
-    inner: object = np.zeros((0, 0, 0), np.uint64)  # (X, Y, Z) uint64, see `bit_of`; empty: not known
-    coarse: object = np.zeros((0, 0, 0), np.uint16)  # (X, Y, Z) uint16, the stride in other parts; 0: skipped
 
 
 @body
@@ -84,41 +79,9 @@ def exit_distance(p, d, lo, cell, i, s):
 
 
 @body
-def bit_of(i, j, m):
-    """The bit of part (i, j, m) of the 4 x 4 x 4 of a cell: those of an eighth of the cell lie in a row."""
-    eighth = 32 * (i >> 1) + 16 * (j >> 1) + 8 * (m >> 1)
-    return np.uint64(eighth + 4 * (i & 1) + 2 * (j & 1) + (m & 1))
-
-
-@body
-def inner_exit(bits, p, d, lo, cell, i, j, m):
-    """How far away a ray at p in cell (i, j, m) leaves the empty part or eighth of that cell around p, or -1
-    where p lies in matter: in a part whose bit (`bit_of`) is set."""
-    x = min(max(int((p[0] - lo[0]) / cell[0] * 4) - 4 * i, 0), 3)
-    y = min(max(int((p[1] - lo[1]) / cell[1] * 4) - 4 * j, 0), 3)
-    z = min(max(int((p[2] - lo[2]) / cell[2] * 4) - 4 * m, 0), 3)
-    eighth = bits >> np.uint64(32 * (x >> 1) + 16 * (y >> 1) + 8 * (z >> 1)) & np.uint64(255)
-    if eighth == np.uint64(0):
-        x, y, z, n = 2 * i + (x >> 1), 2 * j + (y >> 1), 2 * m + (z >> 1), 2
-    elif eighth >> np.uint64(4 * (x & 1) + 2 * (y & 1) + (z & 1)) & np.uint64(1) == np.uint64(0):
-        x, y, z, n = 4 * i + x, 4 * j + y, 4 * m + z, 4
-    else:
-        return -1.0
-    away = min(
-        exit_distance(p[0], d[0], lo[0], cell[0] / n, x, 1),
-        min(
-            exit_distance(p[1], d[1], lo[1], cell[1] / n, y, 1),
-            exit_distance(p[2], d[2], lo[2], cell[2] / n, z, 1),
-        ),
-    )
-    return max(away, 0.0)
-
-
-@body
 def next_sample(grid, origin, way, u0, u1, step, k):
-    """(first k' >= k at which u0 + k' step of a straight line lies in an occupied cell, and in matter where
-    the grid knows the insides of cells, for how many steps from there on one sample may stand), or (-1, 1)
-    when there is no such k' before u1.
+    """(first k' >= k at which u0 + k' step of a straight line lies in an occupied cell, for how many steps
+    from there on one sample may stand), or (-1, 1) when there is no such k' before u1.
 
     Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
     the same: what stands for several steps ends at a whole multiple of them, or before.
@@ -135,32 +98,21 @@ def next_sample(grid, origin, way, u0, u1, step, k):
         j = cell_of(y, lo[1], cell[1], ny)
         m = cell_of(z, lo[2], cell[2], nz)
         s = int(skip[np.uint64(i), np.uint64(j), np.uint64(m)])
-        many, mixed, end, away = 1, grid.inner.shape[0] != 0, u1, 0.0
         if s != 0:
-            many = 0
             away = min(
                 exit_distance(x, dx, lo[0], cell[0], i, s),
                 min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
             )
-        elif grid.stride.shape[0] != 0:
-            many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
-            mixed = many >= MIXED
-            many = many & (MIXED - 1)
-        if s == 0 and mixed:
-            bits = grid.inner[np.uint64(i), np.uint64(j), np.uint64(m)]
-            away = inner_exit(bits, (x, y, z), way, lo, cell, i, j, m)
-            if away >= 0.0:
-                many = int(grid.coarse[np.uint64(i), np.uint64(j), np.uint64(m)])
-                end = min(u1, u + away)
-        if many > 0:
-            if grid.stride.shape[0] == 0:
-                return k, 1
-            if grid.unit != step:
-                many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
-            most = max(1, int(math.ceil((end - u) / step + 0.5)) - 1)
-            # the same samples wherever a ray comes to cells of a stride; k % many takes twice as long
-            return k, min(many - (k - many * int(k / many)), most)
-        k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
+            k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
+            continue
+        if grid.stride.shape[0] == 0:
+            return k, 1
+        many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
+        if grid.unit != step:
+            many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
+        most = max(1, int(math.ceil((u1 - u) / step + 0.5)) - 1)
+        # the same samples wherever a ray comes to cells of a stride; k % many takes twice as long
+        return k, min(many - (k - many * int(k / many)), most)
 
 
 @body

@@ -11,8 +11,6 @@ from numba import njit, prange
 from fusedrf_cli.engine.kernels.parts import (
     LINE,
     adam_line,
-    bit_of,
-    body,
     lens_ray,
     sum_of_rows,
     touched,
@@ -156,50 +154,3 @@ def sums_of_rows(values, base, width, start, source, weight, target, keep):
     gains, the weighted sum of the rows source[start[i]:start[i + 1]], none of which is a target."""
     for i in prange(target.shape[0]):
         sum_of_rows(values, base, width, start, source, weight, target, i, keep)
-
-
-# The bits (`parts.bit_of`) of the parts of a cell that are the first, second, third or fourth along an axis.
-ALONG = np.zeros((3, 4), np.uint64)
-for _i, _j, _m in np.ndindex(4, 4, 4):
-    for _axis, _at in enumerate((_i, _j, _m)):
-        ALONG[_axis, _at] |= np.uint64(1) << bit_of.py_func(_i, _j, _m)
-
-
-@body
-def bits_between(axis, low, high, cell):
-    """The bits of the parts of a cell, counted along an axis of all cells, from low to high."""
-    bits = np.uint64(0)
-    for part in range(max(low - 4 * cell, 0), min(high - 4 * cell, 3) + 1):
-        bits |= ALONG[axis, part]
-    return bits
-
-
-@task
-def mark_parts(occupied, middles, reach, marked):
-    """Sets in marked (X, Y, Z) uint64 the bits (`parts.bit_of`) of the parts of cells that the boxes around
-    the occupied cells of another grid (A, B, C) reach. middles (3, 4) takes places counted in cells of that
-    one to places counted in parts of the marked one; reach (3,) is half the sides of such a box, in parts."""
-    nx, ny, nz = marked.shape
-    for x in range(occupied.shape[0]):
-        for y in range(occupied.shape[1]):
-            for z in range(occupied.shape[2]):
-                if occupied[x, y, z]:
-                    i0, i1 = parts_reached(middles, reach, 0, x, y, z, nx)
-                    j0, j1 = parts_reached(middles, reach, 1, x, y, z, ny)
-                    m0, m1 = parts_reached(middles, reach, 2, x, y, z, nz)
-                    for i in range(i0 // 4, i1 // 4 + 1):
-                        first = bits_between(0, i0, i1, i)
-                        for j in range(j0 // 4, j1 // 4 + 1):
-                            second = first & bits_between(1, j0, j1, j)
-                            for m in range(m0 // 4, m1 // 4 + 1):
-                                marked[i, j, m] |= second & bits_between(2, m0, m1, m)
-
-
-@body
-def parts_reached(middles, reach, axis, x, y, z, cells):
-    """The first and the last of the parts of so many cells along an axis that the box around a cell reaches,
-    the nearest where it lies beside them."""
-    at = middles[axis, 0] * (x + 0.5) + middles[axis, 1] * (y + 0.5) + middles[axis, 2] * (z + 0.5)
-    at += middles[axis, 3]
-    low, high = int(math.floor(at - reach[axis])), int(math.floor(at + reach[axis]))
-    return min(max(low, 0), 4 * cells - 1), min(max(high, 0), 4 * cells - 1)

@@ -2,13 +2,29 @@
 the same, and fog that they show stays."""
 
 import numpy as np
+import torch
 
-from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, SAME, without_haze
+from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, SAME, occupancy_of, without_haze
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.volume import render_rays
-from tests.engine.conftest import BOX, rays_at
-from tests.engine.fields.test_insides import ball
+from tests.engine.conftest import BOX, THIRTY_TWO, rays_at
 
+
+def ball(cells: int = 24):
+    """A ball of matter in a box of 49 texels an axis, under a grid that is occupied around it."""
+    field = VMField.create(BOX, (49,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
+    sections = field.sections(0)
+    for name in sections:
+        if name.startswith("density"):
+            sections[name].zero_()
+    at = torch.linspace(-1, 1, 49)
+    square = (at[:, None] ** 2 + at**2).float()
+    sections["density_plane_0"][..., 0] = 30 - 80 * square
+    sections["density_line_0"][:, 0] = 1
+    sections["density_plane_0"][..., 1] = 1
+    sections["density_line_0"][:, 1] = -80 * at**2
+    return field.with_occupancy(occupancy_of(field, BOX, cells))
 
 def fog(depth: float):
     """Fog of an optical depth across each of 32 x 32 x 32 cells, all occupied."""

@@ -17,7 +17,6 @@ from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.engine.conftest import BOX, points_in, random_vm, rays_at, unit
@@ -157,22 +156,6 @@ def test_a_composite_of_two_kinds(rule):
     for wanted, found in twice(vm(torch.float64), picture):
         check(found, wanted, torch.float32)
         assert wanted.max() > 0.1
-
-
-@on_a_device
-def test_pictures_under_a_grid_that_knows_the_insides_of_cells():
-    blocks = two_blocks(TURNED)
-    rays_o, rays_d = rays_at(blocks.aabb, 4)
-    assert with_known_insides(blocks).grid.inner.any()
-
-    def picture(field):
-        out = np.zeros((4, 5))
-        known = with_known_insides(field)
-        known.render_rays(rays_o, rays_d, reach_of(len(out), 0.0, np.inf), 0.1, 1e-3, out)
-        return (out,)
-
-    for wanted, found in twice(blocks, picture):
-        check(found, wanted)
 
 
 def trained(rays_o, rays_d, step, **more):

@@ -27,7 +27,6 @@ from numba import literally
 from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, RUN, WIDTH
 from fusedrf_cli.engine.kernels.parts import (
     FACE_TOLERANCE,
-    MIXED,
     accumulate,
     add_scaled,
     along,
@@ -481,7 +480,7 @@ def advance(field, grid, place, many, steps, k, p, way, u, u0, step):
     i, j, m = ownership_cell(field, grid, p)
     stride = 1
     if grid.stride.shape[0] != 0:
-        stride = max(1, int((int(grid.stride[i, j, m]) & (MIXED - 1)) * grid.unit / step + FACE_TOLERANCE))
+        stride = max(1, int(int(grid.stride[i, j, m]) * grid.unit / step + FACE_TOLERANCE))
     away = min(
         exit_distance(p[0], way[0], grid.lo[0], grid.cell[0], i, 1),
         min(

@@ -9,7 +9,6 @@ edit appends or drops a block and leaves the rest as it is.
 
 import math
 from collections.abc import Iterable, Mapping
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
@@ -43,19 +42,16 @@ from fusedrf_cli.engine.fields.computed import (
     unpack_bits,
 )
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed, Held
-from fusedrf_cli.engine.fields.insides import WORTH_TELLING
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
     SCENE_CELLS,
     OccupancyGrid,
     Pace,
-    box_corners,
     placed_cells,
     squeezed,
     transformed_aabb,
     unbounded_cells,
 )
-from fusedrf_cli.engine.kernels.loops import Rays
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm import bodies, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
@@ -67,7 +63,6 @@ CELLS_PER_NUMBER = 4  # of a tensor, from which on its cells are stored in brick
 PER_OWNED_CELL = 8  # bytes of a cell of several blocks: owners, distances, strides
 PER_OWNED_CELL_MADE = 16  # more while they are found
 PER_PLACED_CELL = 110  # of a tensor's cell while it is placed in the field
-BY_ROUTES = 40  # blocks at most: which of them it meets, each ray is asked for each
 NO_OWNERS = (np.zeros((0, 0, 0), np.uint8),) * 2
 MOST_MARKED = 1 << 26
 """Occupied cells of all blocks together from which on several are marked as one: 32 times 128³ of them."""
@@ -199,8 +194,6 @@ class VMField(ComputedField):
     update in place."""
 
     kind, bodies = "vm", bodies
-    by_routes = False
-    """Whether rays of pictures go each through the blocks that it meets, by samples of these alone."""
 
     def __init__(
         self,
@@ -401,20 +394,6 @@ class VMField(ComputedField):
         return apart_arrays(self.tensors)
 
     @cached_property
-    def balls(self) -> np.ndarray:
-        """(B, 4) centre and radius of a ball around each block's matter, in the field's frame; the radius is
-        infinite where that fills all of space."""
-        boxes = [box_corners(tensor.occupancy.tight_aabb(0)) for tensor in self.tensors]
-        found = []
-        for block in self.blocks:
-            matrix, corners = block.object_to_field, boxes[block.tensor]
-            middle = corners.mean(0) @ matrix[:3, :3].T + matrix[:3, 3]
-            reach = np.linalg.norm((corners - corners.mean(0)) @ matrix[:3, :3].T, axis=1).max()
-            endless = self.tensors[block.tensor].space is not bounded
-            found.append([*middle, np.inf if endless else reach * (1 + ROUNDING)])
-        return np.array(found)
-
-    @cached_property
     def alone(self) -> tuple["VMField", ...]:
         """Each block as a field of its own, in its object's frame, over the same numbers."""
         found = []
@@ -428,26 +407,6 @@ class VMField(ComputedField):
     def _afresh(self, *names: str) -> "VMField":
         """See ComputedField."""
         return super()._afresh("alone", *names)
-
-    def show(self, rays: Rays, out: np.ndarray) -> None:
-        """See ComputedField; in pictures of several blocks most rays meet one, which answers faster alone
-        (`vm/routes.py`)."""
-        if not self.by_routes:
-            return super().show(rays, out)
-        from fusedrf_cli.engine.kinds.vm.routes import show_by_routes
-
-        show_by_routes(self, super().show, rays, out)
-
-    def for_pictures(self, rays: int) -> "VMField":
-        """See ComputedField: of several blocks the insides of cells are told where pictures are worth it, and
-        rays go each through the blocks that it meets, where they are not too many."""
-        if self.owners is None or rays < WORTH_TELLING:
-            return self
-        from fusedrf_cli.engine.kinds.vm.insides import with_known_insides
-
-        shown = copy(with_known_insides(self))
-        shown.by_routes = len(self.blocks) <= BY_ROUTES
-        return shown
 
     @cached_property
     def crossings(self) -> list[int]:
