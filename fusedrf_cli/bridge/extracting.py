@@ -41,7 +41,7 @@ from fusedrf_cli.bridge.scene import (
     write_field,
 )
 from fusedrf_cli.bridge.shelf import Shelf
-from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, graph_bytes
+from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, graph_bytes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing, placed_box, placement
@@ -50,9 +50,10 @@ from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellConfig, Lattice, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
 from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks, shown_by, well_shown
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest, FuseRequest
@@ -437,11 +438,12 @@ def surface_at(field: StoredField, look: Look, what: str) -> np.ndarray:
 def selected(field: StoredField, told: Told) -> Selection:
     """The object in two looks: at all of the field in coarse cells, and at the box that it lies in. Where it
     touches other matter colours correct what masks say."""
-    found = choice(Lattice.over(field, field.occupancy.aabb, COARSE), told)
+    config = current(CellConfig)
+    found = choice(Lattice.over(field, field.occupancy.aabb, config.coarse), told)
     if not found.shows:
         return found
     held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
-    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), config.fine), told)
     return fine.without_foreign() if told.masks else fine
 
 
@@ -605,9 +607,11 @@ def within_size(
 ) -> tuple[Piece, dict]:
     """The piece, where its bundle is as small as was asked for, else as `fuse --max-size` makes it; and what
     the report says of that."""
+    config = current(HeaderConfig)
     overhead = graph_bytes(list(bundle.get("history", ())), bundle["cameras"], bundle.get("extras"))
-    overhead += sum(BESIDES + fused.bundle.headers[member].size for member in bundle.get("kept", ()))
-    overhead += sum(BESIDES + BundleSizes().exactly(one.field, piece.precision) for one in bundle["beside"])
+    overhead += sum(config.besides + fused.bundle.headers[member].size for member in bundle.get("kept", ()))
+    sizes = (BundleSizes().exactly(one.field, piece.precision) for one in bundle["beside"])
+    overhead += sum(config.besides + size for size in sizes)
     if overhead + BundleSizes().exactly(piece.field, piece.precision) <= request.max_size:
         return piece, {}
     wanted = FuseRequest(
