@@ -22,7 +22,6 @@ from fusedrf_cli.engine.rendering.differentiable import (
     seen_from,
     shifted,
 )
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP
 from fusedrf_cli.engine.spaces import bounded
 
 
@@ -93,7 +92,7 @@ class Scene:
         *,
         near: float = 0.0,
         step: float | None = None,
-        early_stop: float = EARLY_STOP,
+        early_stop: float | None = None,
     ) -> torch.Tensor:
         """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) with unit directions.
 
@@ -112,7 +111,7 @@ class Scene:
         pose: torch.Tensor | None = None,
         *,
         step: float | None = None,
-        early_stop: float = EARLY_STOP,
+        early_stop: float | None = None,
     ) -> Picture:
         """The view of a camera, from `pose` (4, 4), camera to world, where it is given in place of the
         camera's own; see `render_rays`."""
