@@ -55,6 +55,22 @@ def with_field(scene: SceneGraph, name: str, member: str | None) -> SceneGraph:
     return _changed(scene, lambda one: one == name, after)
 
 
+def with_leaves(scene: SceneGraph, becoming: Callable[[Node], Node | None]) -> SceneGraph:
+    """The scene whose nodes that hold a field, each without its children, became others, in document order;
+    None: without it."""
+
+    def after(node: Node) -> tuple[Node, ...]:
+        own = replace(node, children=())
+        own = own if node.field is None else becoming(own)
+        children = tuple(one for child in node.children for one in after(child))
+        if not children and (own is None or node.children and own.field is None and not own.children):
+            return ()
+        own = replace(node, field=None, children=()) if own is None else own
+        return (replace(own, children=(*own.children, *children)),)
+
+    return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node)))
+
+
 def _changed(scene: SceneGraph, goes: Callable[[str], bool], becoming: Becoming) -> SceneGraph:
     def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
         if goes(node.name):

@@ -23,8 +23,9 @@ from formats.records import BITS, BYTES_PER_NUMBER
 from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph
 from formats.views import View
+from fusedrf_cli.bridge.background import LEARNT as FUSED
 from fusedrf_cli.bridge.editing import Draft
-from fusedrf_cli.bridge.fusing import FUSED, best_of, best_suited
+from fusedrf_cli.bridge.fusing import best_of, best_suited
 from fusedrf_cli.bridge.making import Scene
 from fusedrf_cli.bridge.memory import FLOAT, Memory, ownership
 from fusedrf_cli.bridge.memory import sources as in_memory
@@ -45,6 +46,7 @@ from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, graph_bytes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing, placed_box, placement
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
@@ -619,10 +621,13 @@ def within_size(
     kind, _ = best_suited(scene.composed)
     if kind.field is not None:  # which would learn what the piece's own kind is made of
         kind = registry.kind(piece.field.kind)
-    kept, _, figures_of_it = best_of(wanted, scene, kind, overhead, memory, place, progress)
-    figures = figures_of_it()
+    made = best_of(wanted, scene, kind, overhead, memory, place, progress)
+    figures, precision = made.figures(), made.kept.tried.way.precision
     told = {name: figures[name] for name in ("psnr", "chosen")}
-    return Piece(kept.field, scene.composed.origin, kept.tried.way.precision), told
+    if kind.field is None:  # it stays in its own frame
+        (leaf,) = made.kept.field.leaves()
+        return Piece(opened(leaf.field), piece.origin, precision), told
+    return Piece(made.kept.field, scene.composed.origin, precision), told
 
 
 def alone(fused: Whole, piece: Piece, bundle: dict) -> LoadedScene:
