@@ -141,7 +141,7 @@ class FusedBundle:
         own = self.loaded.fields if not self.learnt else [self.background_source for _ in placed]
         found: dict[str, dict] = {}
         for leaf, f in zip(placed, own, strict=True):
-            if leaf.field == f.member or not f.whole:
+            if leaf.field == f.member or f.cropped:
                 continue
             told = {"field": f.member}
             if f.member not in self.kept:
@@ -192,6 +192,12 @@ def uncropped(graph: SceneGraph) -> SceneGraph:
 
 
 def stored_bytes(loaded: LoadedScene) -> Mapping[int, int]:
-    """Bytes of the members of fields that are shown as their bundles have them, by the field's id."""
-    known = (f for f in loaded.fields if f.whole and f.member in f.bundle.headers)
+    """Bytes of the members of fields that their bundles have, by the field's id."""
+    known = (f for f in loaded.fields if f.member in f.bundle.headers and not f.cropped)
     return {id(f.placed.field): f.bundle.headers[f.member].size for f in known}
+
+
+def unchanged_bytes(loaded: LoadedScene) -> int | None:
+    """Bytes of the members of all fields; None: they are not known."""
+    sizes = {f.member: f.bundle.headers[f.member].size for f in loaded.fields if f.member in f.bundle.headers}
+    return sum(sizes.values()) if all(f.member in sizes for f in loaded.fields) else None

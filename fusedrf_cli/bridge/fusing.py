@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 from formats.bundle import OpenBundle
 from fusedrf_cli.bridge.background import Background, kept_background
-from fusedrf_cli.bridge.bundling import FusedBundle, stored_bytes
+from fusedrf_cli.bridge.bundling import FusedBundle, stored_bytes, unchanged_bytes
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
 from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Result, Scene
 from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
@@ -178,6 +178,7 @@ def student_request(request: FuseRequest, scene: Scene, overhead: int) -> Studen
         sh_degree=request.sh_degree,
         source_bytes=tuple(scene.loaded.sizes),
         stored_bytes=stored_bytes(scene.loaded),
+        unchanged_bytes=unchanged_bytes(scene.loaded),
         seconds=request.time_budget,
         from_scratch=request.from_scratch,
         views=scene.views,

@@ -126,8 +126,8 @@ class InstancesStudent(MadeStudent):
     @cached_property
     def bytes_as_they_are(self) -> int | None:
         """Of the file with the fields' own bytes; None: not all are known."""
-        sizes = [self.request.stored_bytes.get(id(field)) for field in self.fields]
-        return None if None in sizes else self.request.overhead + sum(sizes)
+        size = self.request.unchanged_bytes
+        return None if size is None else self.request.overhead + size
 
     # -- bytes -----------------------------------------------------------------------------------------------
 

@@ -148,7 +148,9 @@ class StudentRequest:
     source_bytes: tuple[int, ...] = ()
     """In memory, of the distinct sources."""
     stored_bytes: Mapping[int, int] = field(default_factory=dict)
-    """Of distinct sources as their files have them, by the field's id, where all of one is shown."""
+    """Of distinct sources that their files have as they are, by the field's id."""
+    unchanged_bytes: int | None = None
+    """Of all sources as their files have them, where that is known."""
     seconds: float | None = None
     """Of learning; None: as many as its lesson takes."""
     from_scratch: bool = False
