@@ -18,19 +18,19 @@ from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds import instances
 from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student
-from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.engine.kinds.vm import students
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.main import cli
 from fusedrf_cli.signals import interrupt
 from tests.analytic.export import SHAPE, vm_field
@@ -99,8 +99,6 @@ def write_views(folder: Path, field=None, at=(0.0, 0.0, 0.0), side: int = 24, ar
 
 def make_tiny(patch: pytest.MonkeyPatch) -> None:
     """Coarse grids, few steps, small pictures: what is tested here is the way, not the quality."""
-    patch.setattr(vm, "OWNERSHIP_CELLS", 48)
-    patch.setattr(composed, "OCCUPANCY_CELLS", 48)
     patch.setattr(part("looks"), "WHOLE", 2)
     patch.setattr(part("looks"), "MOST_OBJECTS", 0)
     patch.setattr(Student, "lesson", TinySettings())
@@ -119,7 +117,7 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def tiny():
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, using(OccupancyConfig(scene_cells=48)):
         make_tiny(patch)
         yield
 

@@ -31,7 +31,7 @@ LADDER_FINISHED = ("int8", "int4")  # what was finished at 16 bits is surpassed 
 class InstancesKind(Kind):
     """A way of fusing whose fields are of any kinds."""
 
-    name = "blocks"
+    name = registry.INSTANCES
     good_for = "Scenes of any fields and rule: they stay nodes with their own numbers, fewer where asked."
     trains = False
     beside_background = False  # which is one of the instances

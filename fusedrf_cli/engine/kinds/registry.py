@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 GROUP = "fusedrf.kinds"
 AUTO = "auto"  # the name under which a kind is chosen by what the kinds say of a scene
-WAYS = {"blocks": f"{__package__}.instances"}
+INSTANCES = "blocks"  # the name under which nothing is learnt: every source stays a field of its own
+WAYS = {INSTANCES: f"{__package__}.instances"}
 """Ways of fusing whose fields are of other kinds, and the modules that hold them."""
 DEFAULT = "vm"  # what photos become where no kind is named
 
