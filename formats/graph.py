@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from formats.errors import FormatError
-from formats.scene import Node, SceneGraph, check_name
+from formats.scene import WHITE, Node, SceneGraph, check_name, multiplied
 
 Becoming = Callable[[Node, np.ndarray], tuple[Node, ...]]
 """What becomes of a node, whose parent's frame lies in the world by a (4, 4)."""
@@ -92,6 +92,31 @@ def without(scene: SceneGraph, names: Container[str]) -> SceneGraph:
 def with_nodes(scene: SceneGraph, nodes: Iterable[Node]) -> SceneGraph:
     """The scene with more nodes, behind those it has."""
     return replace(scene, nodes=(*scene.nodes, *nodes))
+
+
+def lifted(node: Node, kept: Container[str] = ()) -> Node:
+    """Of groups that hold but one node each that node, where it stood and as it was shown; a group stays that
+    is cropped, or whose name is one of those that are kept."""
+    while (
+        len(node.children) == 1
+        and node.field is None
+        and node.source is None
+        and not node.extras
+        and "crop" not in node.showing
+        and node.name not in kept
+    ):
+        (only,) = node.children
+        outer, showing = node.showing, dict(only.showing)
+        if "opacity" in outer:
+            showing["opacity"] = outer["opacity"] * showing.get("opacity", 1.0)
+        if "tint" in outer:
+            showing["tint"] = list(multiplied(outer["tint"], showing.get("tint", WHITE)))
+        placement = only.placement
+        if not np.array_equal(node.node_to_parent, np.eye(4)):
+            placement = placement_of(node.node_to_parent @ only.node_to_parent)
+        rule = only.composition or (node.composition if only.children else None)
+        node = replace(only, placement=placement, showing=showing, composition=rule)
+    return node
 
 
 def moved(node: Node, parent: np.ndarray, matrix: np.ndarray) -> Node:
