@@ -8,8 +8,8 @@ from formats.bundle import OpenBundle
 from fusedrf_cli.bridge.background import Background, kept_background
 from fusedrf_cli.bridge.bundling import FusedBundle, stored_bytes, unchanged_bytes
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
-from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Result, Scene
-from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
+from fusedrf_cli.bridge.making import Kept, Maker, MakingConfig, Result, Scene
+from fusedrf_cli.bridge.memory import Memory, MemoryConfig, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.rendering import tell_of_work
 from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
@@ -27,13 +27,14 @@ from fusedrf_cli.bridge.scene import LoadedScene, refuse_options, unusable_kind
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, Detail
+from fusedrf_cli.engine.composition.detail import Detail, DetailConfig
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.instances import distinct_fields
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student, StudentRequest, TooSmall
 from fusedrf_cli.engine.rendering.metrics import PSNR_CAP
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
@@ -65,7 +66,7 @@ def fuse(
         bundle = FusedBundle(request, everything, loaded, kind.field is not None)
         cameras = kept_cameras(loaded, progress)
         bundle.shown_as(kept_framing(loaded, scene.composed, cameras), cameras)
-        pixels = VIEWS_TO_CHOOSE_BY * DistilConfig.view_size**2
+        pixels = current(MakingConfig).views * DistilConfig.view_size**2
         tell_of_work(request.scene, scene.composed, pixels, progress)
         made = best_of(request, scene, kind, bundle.overhead, memory, place, progress, saved)
         entry = {
@@ -410,7 +411,7 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
     if not together and student.lesson is None and learning_is_asked(student, request):
         needed.append((0.0, asking_in_waves(student, scene.composed)))
     if not together:  # then one is read now and then in every stage
-        needed = [(max(copies, READING), parts) for copies, parts in needed]
+        needed = [(max(copies, current(MemoryConfig).reading), parts) for copies, parts in needed]
         room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
     shelf.resize(room)
     memory.expect(
@@ -423,13 +424,14 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
 def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
     """Say which objects a fused field will not hold as they are: stretched translucent ones, and those it has
     too few voxels for."""
+    config = current(DetailConfig)
     for d in details:
         if d.opacity_off and d.stretch > CONDITION_NOTED:
             progress.warn(
                 f"'{d.name}' is stretched by {d.stretch:.2f}: where it is translucent its "
                 f"opacity may be off by up to {d.opacity_off:.3f}"
             )
-        if d.voxels_across < ENOUGH_VOXELS:
+        if d.voxels_across < config.enough_voxels:
             progress.warn(f"'{d.name}' is only {d.voxels_across:.2g} voxels across; use {remedy}")
     coarse = [d for d in details if d.held_voxel > d.own_voxel * (1 + 1e-6)]
     if coarse:

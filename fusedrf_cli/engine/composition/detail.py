@@ -5,7 +5,13 @@ from dataclasses import dataclass
 
 from fusedrf_cli.engine.composition.affine import Placed
 
-ENOUGH_VOXELS = 8  # across an object, under which there is no shape left
+
+@dataclass(frozen=True)
+class DetailConfig:
+    """What is said about an object's detail."""
+
+    enough_voxels: int = 8
+    """Across an object, under which there is no shape left."""
 
 
 @dataclass(frozen=True)
