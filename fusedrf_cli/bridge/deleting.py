@@ -10,7 +10,7 @@ import numpy as np
 from formats.blocks import UNNAMED
 from formats.bundle import PART
 from formats.graph import belongs, with_field, without
-from formats.scene import Leaf
+from formats.nodes import Leaf
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit
 from fusedrf_cli.bridge.mending import LEARNT, Frame, Teacher, hole_of, learnt_from, learnt_surfaces, up_of
 from fusedrf_cli.bridge.rendering import renderable

@@ -11,7 +11,8 @@ from formats.blocks import UNNAMED
 from formats.bundle import OpenBundle, is_bundle, sha256_of
 from formats.graph import belongs
 from formats.history import check_history, distilled, sources
-from formats.scene import Leaf, SceneGraph
+from formats.nodes import Leaf
+from formats.scene import SceneGraph
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.scene import FoundField, LoadedScene, load_found, load_scene
 from fusedrf_cli.errors import InvalidInput, UsageProblem
