@@ -120,19 +120,18 @@ class OccupancyGrid:
     @property
     def subject(self) -> np.ndarray:
         """(6,) box of the field's frame that views of it look at: that around the occupied cells, or, in
-        unbounded space, the middle of the core; of a grid that does not reach there, since all cameras stand
-        in the core and look one way, the middle half of the cells no farther than n = 5 of unbounded.py."""
+        spaces without end, the middle of the core; of a grid that does not reach there, since all cameras
+        stand in the core and look one way, the middle half of the cells no farther than 5 from it."""
         if self.looked_at is not None:
             return self.looked_at
-        if self.space is not unbounded:
+        if self.space is bounded:
             return self.tight_aabb(0)
-        if (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
-            return unbounded.SUBJECT
-        centres = self.centres()
-        near = np.abs(centres).max(1) < 2 - 1 / 5
-        chosen = centres[near] if near.any() else centres
-        points = unbounded.placed(torch.from_numpy(chosen)).numpy()
-        return np.concatenate(np.quantile(points, [0.25, 0.75], axis=0))
+        if hasattr(self.space, "SUBJECT") and (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
+            return self.space.SUBJECT
+        points = self.space.placed(torch.from_numpy(self.centres())).numpy()
+        near = np.abs(points).max(1) < 5
+        chosen = points[near] if near.any() else points
+        return np.concatenate(np.quantile(chosen, [0.25, 0.75], axis=0))
 
     def within(self, aabb: np.ndarray) -> "OccupancyGrid":
         """The cells of a box (6,) whose faces are, but for rounding, those of cells."""
@@ -248,17 +247,17 @@ def reached_cells(
     grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, longest: int, space: ModuleType
 ) -> np.ndarray:
     """(X, Y, Z) bool: cells of a field's box, in the coordinates of its space, that a placed grid of either
-    space may reach; where that fills all of space, the field's does."""
-    if grid.space is unbounded:
+    space may reach; where that has no end, the field's has none."""
+    if grid.space is not bounded:
         return shared_cells(grid, object_to_field, longest)
     return marked_cells(grid, object_to_field, aabb, longest, space)
 
 
 def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int) -> np.ndarray:
-    """(X, Y, Z) bool: cells of a grid over unbounded space that occupied cells of another such grid, placed
-    by a (4, 4), reach: those that share a volume with one where it lies as it is, else those whose middle
-    lies in or beside one."""
-    if np.array_equal(object_to_field, np.eye(4)):
+    """(X, Y, Z) bool: cells of a grid over unbounded space that occupied cells of a grid in a space without
+    end, placed by a (4, 4), reach: those that share a volume with one where it lies as it is, else those
+    whose middle lies in or beside one."""
+    if grid.space is unbounded and np.array_equal(object_to_field, np.eye(4)):
         return overlapped(grid, longest)
     own, back = grid.dilated(), np.linalg.inv(object_to_field)
     wanted = OccupancyGrid.full(unbounded.WHOLE, longest, unbounded)
@@ -267,7 +266,7 @@ def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int)
         wanted.centres(), -(-wanted.occupied.size // current(OccupancyConfig).points_at_once)
     ):
         at = unbounded.placed(torch.from_numpy(part)).numpy() @ back[:3, :3].T + back[:3, 3]
-        found.append(own.contains(mapped(at, unbounded)))
+        found.append(own.contains(mapped(at, grid.space)))
     return np.concatenate(found).reshape(wanted.occupied.shape)
 
 
@@ -365,6 +364,8 @@ def frame_around(box: np.ndarray) -> np.ndarray:
 def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(4, 4) of an object seen from a frame that lies at `origin`: a position (3,), or a placement (4, 4)."""
     frame, matrix = placement(origin), object_to_world.copy()
+    if np.array_equal(frame, matrix):
+        return np.eye(4)
     matrix[:3, 3] -= frame[:3, 3]  # first, so that it is exact however far away both are
     if origin.shape == (4, 4):
         matrix[:3] = np.linalg.inv(frame[:3, :3]) @ matrix[:3]
