@@ -30,9 +30,9 @@ def check_past(bundle: Path | str, output: Path | str) -> None:
     if not os.path.lexists(folder):
         check_writable(folder, overwrite=False)
     elif not folder.is_dir():
-        raise ResourceError(f"{folder}: no folder, and in the way; move it, or leave --keep-history out")
+        raise ResourceError(f"{folder}: no folder, and in the way; move it, or leave --undoable out")
     elif not os.access(folder, os.W_OK | os.X_OK):
-        raise ResourceError(f"{folder}: cannot write in it; make it writable, or leave --keep-history out")
+        raise ResourceError(f"{folder}: cannot write in it; make it writable, or leave --undoable out")
     place = folder if folder.is_dir() else folder.parent
     if os.path.isfile(bundle) and os.stat(bundle).st_dev != os.stat(place).st_dev:  # no link will do
         check_space(folder, os.path.getsize(bundle))
@@ -141,7 +141,7 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
         raise BadSchema(f"{bundle}: it was not edited since it was made; there is nothing to undo")
     if checksum is None:
         raise BadSchema(
-            f"{bundle}: what it was before its last edit was not kept; edit with --keep-history to undo it"
+            f"{bundle}: what it was before its last edit was not kept; edit with --undoable to undo it"
         )
     path = past_of(bundle) / f"{checksum}.rfpack"
     if not path.is_file() or sha256_of(path) != checksum:

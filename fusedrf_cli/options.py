@@ -27,6 +27,20 @@ from fusedrf_cli.requests import Precision
 DEBUG = "fusedrf.debug"  # key in click's context.meta
 
 
+class RenamedOption(click.Option):
+    """An option that is still taken by the names that it had in the version before, which no help shows."""
+
+    def __init__(self, *flags: str, earlier: dict[str, str], **words):
+        """earlier: the flag that each earlier one stands for."""
+        super().__init__(*flags, **words)
+        self.earlier = earlier
+
+    def add_to_parser(self, parser, ctx: click.Context) -> None:
+        super().add_to_parser(parser, ctx)
+        for earlier, flag in self.earlier.items():
+            parser._long_opt[earlier] = parser._long_opt[flag]
+
+
 # --- options ------------------------------------------------------------------------------------------------
 
 
@@ -102,7 +116,14 @@ smallest = click.option(
 resume = click.option(
     "--resume", is_flag=True, help="Go on from the checkpoint that an interrupted or killed run left."
 )
-rgb = click.option("--rgb/--no-rgb", default=True, show_default=True, help="Finish on rendered views.")
+finetune = click.option(
+    "--finetune/--no-finetune",
+    cls=RenamedOption,
+    earlier={"--rgb": "--finetune", "--no-rgb": "--no-finetune"},
+    default=True,
+    show_default=True,
+    help="Finetune on rendered views.",
+)
 size = click.option("--size", type=SizeType(), help="Picture size in pixels; default: the cameras' own.")
 allow_outside = click.option(
     "--allow-outside", is_flag=True, help="Let a scene name sources outside its own folder."
@@ -170,8 +191,12 @@ mending = _stack(
     )
 )
 placement = _stack(tuple(click.option(*flags, **words) for flags, words in PLACEMENT.items()))
-keep_history = click.option(
-    "--keep-history", is_flag=True, help="Keep FUSED as it was in OUT.history, for `fusedrf undo`."
+undoable = click.option(
+    "--undoable",
+    cls=RenamedOption,
+    earlier={"--keep-history": "--undoable"},
+    is_flag=True,
+    help="Keep FUSED as it was in OUT.history, for `fusedrf undo`.",
 )
 running = _stack(_RUNNING)
 seeded = _stack((*_RUNNING, _seed))

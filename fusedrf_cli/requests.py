@@ -15,6 +15,8 @@ from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.placement import node_words
 
 STDIO = "-"
+EARLIER = {"rgb": "finetune", "naive": "reference", "direction": "view_from", "keep_history": "undoable"}
+"""Keywords that verbs still take by the names that they had in the version before."""
 Positive = Annotated[float, Meta(gt=0)]
 Count = Annotated[int, Meta(ge=1)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -204,7 +206,7 @@ class FuseRequest(Writing, Learning, Sizing):
     output: str
     _: KW_ONLY
     kind: str = "auto"
-    rgb: bool = True
+    finetune: bool = True
     """Whether to finish on rendered rays."""
     from_scratch: bool = False
     keep_sources: bool = False
@@ -228,7 +230,7 @@ class ConvertRequest(Writing, Learning, Sizing):
 class EditRequest(Writing):
     """A bundle that is changed; `fused` is read, and may be the output itself."""
 
-    keep_history: bool = False
+    undoable: bool = False
     """Whether to keep the bundle as it was, for `undo`."""
     memory: Count | None = None
 
@@ -268,7 +270,7 @@ class DeleteRequest(EditRequest, MendingRequest):
     names: tuple[str, ...]
     output: str
     _: KW_ONLY
-    rgb: bool = True
+    finetune: bool = True
     """Whether what fills a hole finishes on pictures."""
     allow_outside: bool = False
 
@@ -424,7 +426,7 @@ class RenderRequest(Writing, Running):
     """The cameras of the capture that the scene keeps, or those of them that were held out."""
     orbit: Count | None = None
     look_at: Vector | None = None
-    direction: tuple[float, float] | None = None
+    view_from: tuple[float, float] | None = None
     """From where to look: azimuth and elevation in degrees."""
     zoom: Positive = 1.0
     """How many times nearer than the default."""
@@ -439,7 +441,7 @@ class RenderRequest(Writing, Running):
     """None: transparent."""
     depth: bool = False
     fps: Positive = 24.0
-    naive: bool = False
+    reference: bool = False
     """Ask every source of a scene at every sample."""
     allow_outside: bool = False
 
@@ -449,10 +451,10 @@ class RenderRequest(Writing, Running):
             raise UsageProblem(
                 "--cameras, --path, --views and --orbit each choose the views; give one of them"
             )
-        aimed = any(part is not None for part in (self.look_at, self.direction, self.up)) or self.zoom != 1
+        aimed = any(part is not None for part in (self.look_at, self.view_from, self.up)) or self.zoom != 1
         if aimed and chosen and chosen != ["orbit"]:
             raise UsageProblem(
-                f"--look-at, --from, --zoom and --up do not apply to --{chosen[0]}; leave them out"
+                f"--look-at, --view-from, --zoom and --up do not apply to --{chosen[0]}; leave them out"
             )
         if self.near >= self.far:
             raise UsageProblem(

@@ -17,7 +17,7 @@ import msgspec
 from fusedrf_cli import requests
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.progress import NullProgress
-from fusedrf_cli.requests import STDIO, EditRequest, Writing
+from fusedrf_cli.requests import EARLIER, STDIO, EditRequest, Writing
 
 __all__ = [
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
@@ -32,6 +32,7 @@ def verb(name: str, request: type, does: str = "", module: str = "bridge") -> Ca
     signature = inspect.signature(request)
 
     def run(*words: Any, progress: NullProgress | None = None, **options: Any) -> dict:
+        options = {EARLIER.get(name, name): value for name, value in options.items()}
         asked = checked(request, signature.bind(*words, **options).arguments)
         progress = progress or NullProgress()
         with held_outputs(asked, progress) if isinstance(asked, Writing) else contextlib.nullcontext():
@@ -86,7 +87,7 @@ def held_outputs(asked: Writing, progress: NullProgress) -> Iterator[None]:
             waiting = progress.tell if in_place and path == asked.output else None
             locks.enter_context(output_lock(path, waiting))
         check_all()  # one may have come while we waited
-        if isinstance(asked, EditRequest) and asked.keep_history:
+        if isinstance(asked, EditRequest) and asked.undoable:
             from formats.undo import check_past
 
             check_past(edited, asked.output)

@@ -186,7 +186,7 @@ class Deletion:
         surfaces, unseen = hole_of(rest, box, up_of(self.draft.graph, at))
         if request.fill and surfaces:
             self.progress.phase("filling", None)
-            teach = Teacher(request, request.rgb, self.draft.place, self.progress, len(surfaces))
+            teach = Teacher(request, request.finetune, self.draft.place, self.progress, len(surfaces))
             for one in learnt_surfaces(surfaces, teach):
                 self.draft.add_node(one.name, one.field, at @ one.object_to_world, self.precision)
         return {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}

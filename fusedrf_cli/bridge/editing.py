@@ -121,7 +121,7 @@ class Draft:
 
     def write(self, request: EditRequest, entry: dict, learnt: bool = False) -> int:
         """Write the bundle with one more entry of history; the bytes written. learnt: it took long."""
-        if request.keep_history:
+        if request.undoable:
             entry = entry | {"before": keep(self.path, request.output)}
         used = {leaf.field for leaf in self.graph.leaves()}
         was = {leaf.field for leaf in self.bundle.scene.leaves()}

@@ -76,7 +76,7 @@ def fuse(
             "settings": {
                 "seed": request.seed,
                 "max_size": made.student.request.limit,
-                "rgb": request.rgb,
+                "rgb": request.finetune,
                 "from_scratch": request.from_scratch,
             },
             "psnr": reached_by(made.kept, made.student),
@@ -267,7 +267,7 @@ def choose(choosing: Choosing, student: Student, request: FuseRequest) -> Tried 
     groups, limit, target = student.ways(), student.request.limit, request.target_psnr
     found = None
     if target is not None:
-        found = choosing.smallest_reaching(groups, target, limit, student.gain if request.rgb else 0.0)
+        found = choosing.smallest_reaching(groups, target, limit, student.gain if request.finetune else 0.0)
     elif not student.compares:
         return choosing.make(student.plain(), limit, True)
     else:

@@ -9,7 +9,7 @@ def flags_of(kind: str, rung: Rung, seed: int = 0) -> str:
     words += ["--precision", rung.precision] if rung.precision is not None else []
     words += ["--ranks", f"{rung.ranks[0]},{rung.ranks[1]}"] if rung.ranks is not None else []
     words += ["--sh-degree", str(rung.sh_degree)] if rung.sh_degree is not None else []
-    words += [] if rung.rgb else ["--no-rgb"]
+    words += [] if rung.finetune else ["--no-finetune"]
     words += ["--max-size", in_words(rung.max_size)] if rung.max_size is not None else []
     words += ["--time-budget", f"{rung.time_budget:g}"] if rung.time_budget is not None else []
     return " ".join([*words, *(["--seed", str(seed)] if seed else [])])

@@ -188,7 +188,7 @@ class Maker:
             return None
         field, size, did = self.on_device(made.field, self.place), made.bytes, None
         before = psnr = self.measured(self.whole(field), way)
-        if finished and not made.exact and self.request.rgb and not self.budget.over:
+        if finished and not made.exact and self.request.finetune and not self.budget.over:
             learnt, did = self.finished(field)
             found, learnt_size = self.measured(self.whole(learnt), way), student.bytes_of(learnt, way)
             if found > before and learnt_size <= limit:
@@ -233,7 +233,7 @@ class Maker:
         else."""
         made_with |= {
             "numbers": run.student.params.numel() if run.refined is None else run.refined.params.numel(),
-            "rgb": self.request.rgb,
+            "rgb": self.request.finetune,
             "seed": self.request.seed,
             "boxes": [box.tolist() for box in boxes],
         }
@@ -341,7 +341,7 @@ class Maker:
         request, seconds = self.request, self.budget.part(tries)
         config = self.student.lesson_of(field.params.numel(), seconds)
         config = replace(config, seed=request.seed, **changes)
-        run = DistillRun(self.teacher, field, self.sampler, config, request.rgb, judge=self.judged_whole)
+        run = DistillRun(self.teacher, field, self.sampler, config, request.finetune, judge=self.judged_whole)
         # one that grows to a target goes on from whatever it started from
         made_with = {"kind": self.student.kind.name, "start": start if request.target_psnr is None else None}
         with self.resumed(run, made_with, self.sampler.boxes) as uninterrupted:

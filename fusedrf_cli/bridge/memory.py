@@ -234,7 +234,7 @@ def stages(
             points = points_kept(teacher, sampler, settings.rays, step, request.seed)
         taught = teaching(settings, points)
     # kept beside what learns: the field as it was made, and the numbers that its pictures have to surpass
-    kept = (not student.learnt) + (student.lesson is not None and request.rgb)
+    kept = (not student.learnt) + (student.lesson is not None and request.finetune)
     learns = (
         learning(learnt, torch.get_num_threads()) | {"its starts": kept * learnt * FLOAT} | taught | grids
         if learning_is_asked(student, request)
@@ -258,7 +258,7 @@ def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
 
 def learning_is_asked(student: Student, request: FuseRequest) -> bool:
     """Whether anything is going to be learnt."""
-    return student.learnt or request.rgb
+    return student.learnt or request.finetune
 
 
 def judged() -> dict[str, float]:

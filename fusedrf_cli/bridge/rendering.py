@@ -61,12 +61,12 @@ def render(request: RenderRequest, progress) -> dict:
             raise UsageProblem(
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
             )
-        if not request.naive:
+        if not request.reference:
             field = in_memory(loaded, field, picture_memory(None, views, suffix in FILMS), budget)
         needed = picture_memory(field, views, suffix in FILMS)
         held = isinstance(field, Composite)
         loaded.shelf.resize(sum(loaded.sizes) if held else budget.room(needed))
-        advice = "use --naive" if held else "give a smaller --size"
+        advice = "use --reference" if held else "give a smaller --size"
         budget.expect(sources(loaded.resident, loaded.shelf.room) | needed, advice=advice)
         tell_of_work(request.scene, field, rays_of(views), progress)
         progress.phase("rendering", len(views))

@@ -49,13 +49,13 @@ def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.n
     outlook = turned(outlook, request)
     if request.orbit is None:
         return [outlook.camera(lens)]
-    photographed = rig is not None and rig.surroundings and request.direction is None
+    photographed = rig is not None and rig.surroundings and request.view_from is None
     return outlook.orbit(lens, request.orbit, arc_of(rig, up) if photographed else None)
 
 
 def aimed(request: RenderRequest) -> bool:
     """Whether the view is to be other than the default one."""
-    asked = (request.look_at, request.direction, request.up)
+    asked = (request.look_at, request.view_from, request.up)
     return any(word is not None for word in asked) or request.zoom != 1
 
 
@@ -73,13 +73,13 @@ def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
 
 
 def turned(outlook: Outlook, request: RenderRequest) -> Outlook:
-    """The outlook as --look-at, --from and --zoom change it; UsageProblem where no camera could stand apart
+    """The outlook as --look-at, --view-from and --zoom change it; UsageProblem where no camera could stand apart
     from its target in float64."""
     config = current(ViewConfig)
     if request.look_at is not None:
         outlook = replace(outlook, target=np.array(request.look_at))
-    if request.direction is not None:
-        azimuth, elevation = np.radians(request.direction)
+    if request.view_from is not None:
+        azimuth, elevation = np.radians(request.view_from)
         outlook = replace(outlook, azimuth=azimuth, elevation=elevation)
     outlook = replace(outlook, distance=outlook.distance / request.zoom)
     far = float(np.abs(outlook.target).max())

@@ -12,7 +12,7 @@ from fusedrf_cli.option_types import InputType
 @options.writing("The bundle to write, OUT.rfpack.")
 @click.option("--name", required=True, help="The object's name in the scene.")
 @options.placement
-@options.keep_history
+@options.undoable
 @options.memory
 @options.added_precision
 @options.reporting

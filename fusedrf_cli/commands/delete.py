@@ -11,9 +11,9 @@ from fusedrf_cli.option_types import InputType
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @options.writing("The bundle to write, OUT.rfpack.")
 @options.mending
-@options.keep_history
+@options.undoable
 @options.time_budget
-@options.rgb
+@options.finetune
 @options.memory
 @options.allow_outside
 @options.seeded

@@ -25,7 +25,7 @@ def brief(report: dict) -> dict:
 @options.fused_max_size
 @options.smallest
 @options.time_budget
-@options.rgb
+@options.finetune
 @click.option("--from-scratch", is_flag=True, help="Do not start from the background's weights.")
 @click.option(
     "--keep-sources", is_flag=True, help="Keep the sources inside; delete then restores what was hidden."

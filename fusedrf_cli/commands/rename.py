@@ -11,7 +11,7 @@ from fusedrf_cli.option_types import InputType
 @click.argument("name")
 @click.argument("new_name", metavar="NEW")
 @options.writing("The bundle to write, OUT.rfpack.")
-@options.keep_history
+@options.undoable
 @options.memory
 @options.reporting
 def command(**words):

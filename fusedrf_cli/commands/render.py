@@ -20,8 +20,9 @@ from fusedrf_cli.requests import RenderRequest
 @click.option("--orbit", type=click.IntRange(1), metavar="N", help="N views around the scene.")
 @click.option("--look-at", type=VectorType(), help="Look at this point of the world.")
 @click.option(
-    "--from",
-    "direction",
+    "--view-from",
+    cls=options.RenamedOption,
+    earlier={"--from": "--view-from"},
     type=DirectionType(),
     help="Look from this side: degrees from +x about the upward axis, and above the horizon.",
 )
@@ -58,9 +59,11 @@ from fusedrf_cli.requests import RenderRequest
     "--fps", type=PositiveType(), default=RenderRequest.fps, show_default=True, help="Frames per second."
 )
 @click.option(
-    "--naive",
+    "--reference",
+    cls=options.RenamedOption,
+    earlier={"--naive": "--reference"},
     is_flag=True,
-    help="Ask every field of a scene at every sample, as fused fields are measured against.",
+    help="Query every field of a scene at every sample: the composition that others are measured against.",
 )
 @options.memory
 @options.allow_outside
@@ -72,7 +75,7 @@ def command(**words):
     SCENE is a bundle, a scene.json, or - for a scene on stdin. What was learnt from photos of a place is
     shown as one of them shows it, and --orbit circles what they look at, at their distance and height;
     where they were taken from one side, it swings to and fro between them. Anything else is framed from
-    outside. --look-at, --from, --zoom and --up change that view or orbit.
+    outside. --look-at, --view-from, --zoom and --up change that view or orbit.
 
     A scene.json of vm fields is put together in memory first, which takes a second or two, and is then as
     fast to look at as a fused one.

@@ -12,7 +12,7 @@ from fusedrf_cli.option_types import InputType, ShareType, TintType
 @click.argument("colour", metavar="[R,G,B]", type=TintType(), required=False)
 @options.writing("The bundle to write, OUT.rfpack.")
 @click.option("--opacity", type=ShareType(), help="Its density times this, above 0 and at most 1.")
-@options.keep_history
+@options.undoable
 @options.memory
 @options.reporting
 def command(**words):

@@ -13,7 +13,7 @@ from fusedrf_cli.option_types import InputType
 def command(**words):
     """Undo the last edit of a fused field.
 
-    What is written has the bytes that were there before. The edit must have been made with --keep-history,
+    What is written has the bytes that were there before. The edit must have been made with --undoable,
     which keeps them in FUSED.history.
 
     \b

@@ -65,7 +65,7 @@ class Restless(MadeStudent):
 
 def asked(**words) -> SimpleNamespace:
     """The words of a FuseRequest that making a student heeds."""
-    usual = {"target_psnr": None, "time_budget": None, "rgb": False, "seed": 0, "from_scratch": True}
+    usual = {"target_psnr": None, "time_budget": None, "finetune": False, "seed": 0, "from_scratch": True}
     return SimpleNamespace(**usual | words)
 
 
@@ -196,7 +196,7 @@ def test_rays_are_learnt_from_no_longer_than_allowed(monkeypatch):
 
 def test_where_the_time_is_over_a_student_stays_as_it_was_made(monkeypatch):
     student = Restless(None)
-    maker = maker_of(monkeypatch, student, lambda field: 20.0, asked(rgb=True, time_budget=1.0))
+    maker = maker_of(monkeypatch, student, lambda field: 20.0, asked(finetune=True, time_budget=1.0))
     monkeypatch.setattr(maker, "finished", lambda field: pytest.fail("learnt"))
     maker.budget.spent = 1.0
     assert maker.make(WAYS[0], 4000, True).psnr == 20.0

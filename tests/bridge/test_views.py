@@ -74,10 +74,10 @@ def room(folder):
 
 def views_of(folder, scene: str, **asked) -> list[Camera]:
     """The cameras that `render` takes."""
-    unset = ("cameras", "path", "views", "orbit", "look_at", "direction", "up", "size", "memory")
+    unset = ("cameras", "path", "views", "orbit", "look_at", "view_from", "up", "size", "memory")
     words = dict.fromkeys(unset)
     words |= {"zoom": 1.0, "background": None, "depth": False, "fps": 24.0, "allow_outside": False}
-    words |= {"naive": True}
+    words |= {"reference": True}
     words |= {"near": 0.0, "far": np.inf}
     words |= {"scene": str(folder / scene), "output": "out", "overwrite": False}
     request = RenderRequest(device="cpu", threads=None, **words | asked)
@@ -156,7 +156,7 @@ def test_an_orbit_of_photos_from_one_side_swings_between_them(folder, turn):
     seen, allowed = ((a - about + np.pi) % (2 * np.pi) - np.pi for a in (seen, allowed))
     assert allowed.min() - 1e-6 < seen.min() and seen.max() < allowed.max() + 1e-6
     assert np.ptp(seen) > 0.98 * np.ptp(allowed) and abs(np.diff(np.append(seen, seen[0]))).max() < 0.2
-    asked = views_of(folder, "side.rfpack", orbit=40, direction=(10.0, 20.0))
+    asked = views_of(folder, "side.rfpack", orbit=40, view_from=(10.0, 20.0))
     assert np.ptp(azimuths(asked, rig)) > 5.8
 
 
@@ -289,7 +289,7 @@ def test_an_edit_does_not_move_the_view(report, folder):
     report("add", "f.rfpack", "blue.rfpack", "--name", "far", "-t", "20,0,5", "-o", "g.rfpack")
     report("delete", "g.rfpack", "red", "-o", "h.rfpack", *SMALL)
     report("convert", "f.rfpack", "--kind", "vm", "-o", "i.rfpack", "--max-size", "400kB")
-    for asked in ({}, {"orbit": 3}, {"zoom": 2.0, "direction": (10.0, 20.0)}):
+    for asked in ({}, {"orbit": 3}, {"zoom": 2.0, "view_from": (10.0, 20.0)}):
         wanted = views_of(folder, "pair.json", **asked)
         for name in "fghi":
             found = views_of(folder, f"{name}.rfpack", **asked)
@@ -379,15 +379,15 @@ def test_where_to_look_from_and_how_far(folder, scene):
     np.testing.assert_allclose(eye_of(near) - target, (eye_of(plain) - target) / 2, atol=1e-9)
     east = np.array([1.0, 0, 0]) - up[0] * up
     for azimuth, elevation in ((0.0, 0.0), (90.0, 0.0), (-30.0, 45.0), (200.0, 90.0), (0.0, -90.0)):
-        (camera,) = views_of(folder, scene, direction=(azimuth, elevation), look_at=tuple(target))
+        (camera,) = views_of(folder, scene, view_from=(azimuth, elevation), look_at=tuple(target))
         away = (eye_of(camera) - target) / np.linalg.norm(eye_of(camera) - target)
         assert np.degrees(np.arcsin(np.clip(away @ up, -1, 1))) == pytest.approx(elevation, abs=1e-4)
         if abs(elevation) < 90:
             flat = away - (away @ up) * up
             turn = np.degrees(np.arctan2(np.cross(east, flat) @ up, east @ flat))
             assert np.cos(np.radians(turn - azimuth)) == pytest.approx(1)
-    first, *_ = views_of(folder, scene, orbit=4, direction=(30.0, 10.0), zoom=0.5)
-    (alone,) = views_of(folder, scene, direction=(30.0, 10.0), zoom=0.5)
+    first, *_ = views_of(folder, scene, orbit=4, view_from=(30.0, 10.0), zoom=0.5)
+    (alone,) = views_of(folder, scene, view_from=(30.0, 10.0), zoom=0.5)
     assert same(first, alone)
 
 

@@ -126,7 +126,7 @@ def test_a_matrix_goes_with_no_other_word():
 
 # --- commands and their bridge ------------------------------------------------------------------------------
 
-EDIT = ("fused", "output", "overwrite", "memory", "keep_history")
+EDIT = ("fused", "output", "overwrite", "memory", "undoable")
 COMMON = {"device": "auto", "threads": None, "seed": 0, "overwrite": False, "memory": None}
 
 
@@ -173,7 +173,7 @@ def test_fuse_hands_on_a_scene_by_pipe(run, bridge):
         "max_size": None,
         "target_psnr": None,
         "time_budget": None,
-        "rgb": False,
+        "finetune": False,
         "from_scratch": False,
         "keep_sources": False,
         "precision": None,
@@ -203,7 +203,7 @@ def test_delete_hands_on_its_names(run, bridge):
     run("delete", "chair.rfpack", "a", "b", "-o", "out")
     name, asked = bridge.call
     assert (name, asked["fused"], asked["names"]) == ("delete", "chair.rfpack", ("a", "b"))
-    more = {"names", "allow_outside", "refit", "fill", "rgb", "time_budget"}
+    more = {"names", "allow_outside", "refit", "fill", "finetune", "time_budget"}
     assert set(asked) == {*COMMON, *EDIT, *more}
 
 
@@ -215,17 +215,30 @@ def test_render_hands_on_a_background(run, bridge, colour, background):
     name, asked = bridge.call
     assert (name, asked["scene"], asked["output"]) == ("render", "chair.rfpack", "out.png")
     assert asked["background"] == background
-    others = {"cameras", "path", "views", "orbit", "look_at", "direction", "zoom", "up", "size", "depth"}
-    others |= {"near", "far", "naive"}
+    others = {"cameras", "path", "views", "orbit", "look_at", "view_from", "zoom", "up", "size", "depth"}
+    others |= {"near", "far", "reference"}
     wanted = {*COMMON, "scene", "output", "background", "allow_outside", "fps", *others}
     assert set(asked) == wanted - {"seed"}
 
 
+def test_options_are_taken_by_their_earlier_names_and_shown_by_their_own(run, bridge):
+    run("fuse", "s.json", "-o", "out", "--no-rgb")
+    assert bridge.call[1]["finetune"] is False
+    run("fuse", "s.json", "-o", "out", "--no-finetune", "--rgb")
+    assert bridge.call[1]["finetune"] is True
+    run("render", "chair.rfpack", "-o", "out.png", "--naive", "--from", "10,20")
+    assert bridge.call[1]["reference"] and bridge.call[1]["view_from"] == (10, 20)
+    run("move", "chair.rfpack", "a", "-o", "out", "--keep-history")
+    assert bridge.call[1]["undoable"]
+    shown = run("render", "--help").stdout + run("fuse", "--help").stdout + run("move", "--help").stdout
+    assert not any(f"{name} " in shown for name in ("--naive", "--from", "--rgb", "--no-rgb", "--keep-history"))
+
+
 def test_render_hands_on_where_to_look(run, bridge):
-    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--from", "-90,30", "--zoom", "2", "--up", "0,-2,0")
+    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--view-from", "-90,30", "--zoom", "2", "--up", "0,-2,0")
     assert run("render", "chair.rfpack", "-o", "out", *words).exit_code == 0
     asked = bridge.call[1]
-    found = [asked[word] for word in ("orbit", "look_at", "direction", "zoom", "up", "views")]
+    found = [asked[word] for word in ("orbit", "look_at", "view_from", "zoom", "up", "views")]
     assert found == [4, (1, -2, 0.5), (-90, 30), 2, (0, -2, 0), None]
     run("render", "chair.rfpack", "-o", "out", "--up", "auto")
     assert bridge.call[1]["up"] is None

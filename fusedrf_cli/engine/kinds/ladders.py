@@ -19,7 +19,7 @@ class Rung:
     ranks: tuple[int, int] | None = None
     sh_degree: int | None = None
     max_size: int | None = None
-    rgb: bool = True
+    finetune: bool = True
     """Whether to finish on rendered rays."""
     time_budget: float | None = None
 
@@ -38,8 +38,8 @@ def shrinking(rung: Rung, least_psnr: float) -> Ladder:
 
 def by_sizes() -> Ladder:
     """Few sizes; the seconds decide last, since that takes longest."""
-    for seconds, size, rgb in itertools.product(SECONDS, SIZES, (False, True)):
-        yield Rung(max_size=size, rgb=rgb, time_budget=seconds)
+    for seconds, size, finetune in itertools.product(SECONDS, SIZES, (False, True)):
+        yield Rung(max_size=size, finetune=finetune, time_budget=seconds)
 
 
 def readable_floor(size: float) -> int:
