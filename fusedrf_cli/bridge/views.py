@@ -73,8 +73,8 @@ def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
 
 
 def turned(outlook: Outlook, request: RenderRequest) -> Outlook:
-    """The outlook as --look-at, --view-from and --zoom change it; UsageProblem where no camera could stand apart
-    from its target in float64."""
+    """The outlook as --look-at, --view-from and --zoom change it; UsageProblem where no camera could
+    stand apart from its target in float64."""
     config = current(ViewConfig)
     if request.look_at is not None:
         outlook = replace(outlook, target=np.array(request.look_at))

@@ -222,20 +222,22 @@ def test_render_hands_on_a_background(run, bridge, colour, background):
 
 
 def test_options_are_taken_by_their_earlier_names_and_shown_by_their_own(run, bridge):
-    run("fuse", "s.json", "-o", "out", "--no-rgb")
+    run("fuse", "-", "-o", "out", "--no-rgb")
     assert bridge.call[1]["finetune"] is False
-    run("fuse", "s.json", "-o", "out", "--no-finetune", "--rgb")
+    run("fuse", "-", "-o", "out", "--no-finetune", "--rgb")
     assert bridge.call[1]["finetune"] is True
     run("render", "chair.rfpack", "-o", "out.png", "--naive", "--from", "10,20")
     assert bridge.call[1]["reference"] and bridge.call[1]["view_from"] == (10, 20)
-    run("move", "chair.rfpack", "a", "-o", "out", "--keep-history")
+    run("delete", "chair.rfpack", "a", "-o", "out", "--keep-history")
     assert bridge.call[1]["undoable"]
-    shown = run("render", "--help").stdout + run("fuse", "--help").stdout + run("move", "--help").stdout
-    assert not any(f"{name} " in shown for name in ("--naive", "--from", "--rgb", "--no-rgb", "--keep-history"))
+    shown = run("render", "--help").stdout + run("fuse", "--help").stdout + run("delete", "--help").stdout
+    earlier = ("--naive", "--from", "--rgb", "--no-rgb", "--keep-history")
+    assert not any(f"{name} " in shown for name in earlier)
 
 
 def test_render_hands_on_where_to_look(run, bridge):
-    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--view-from", "-90,30", "--zoom", "2", "--up", "0,-2,0")
+    words = ("--orbit", "4", "--look-at", "1,-2,0.5", "--view-from", "-90,30", "--zoom", "2")
+    words += ("--up", "0,-2,0")
     assert run("render", "chair.rfpack", "-o", "out", *words).exit_code == 0
     asked = bridge.call[1]
     found = [asked[word] for word in ("orbit", "look_at", "view_from", "zoom", "up", "views")]
