@@ -47,13 +47,13 @@ TEMPORARY = "fusedrf-poses-"
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """Photos that found their place."""
+    """Photos that found their pose."""
 
     views: tuple[View, ...]
     """For the photos as stored, whatever their EXIF orientation."""
     points: Points
     unposed: tuple[str, ...]
-    """Names of the photos that did not find a place."""
+    """Names of the photos that did not find a pose."""
     plain: tuple[str, ...]
     """Those of them that have few features."""
     models: tuple[int, ...]
@@ -144,7 +144,7 @@ def _not_found(folder: Path | str, counts: dict[Path, int], placed: int) -> str:
     plain = sum(count < FEW_FEATURES for count in counts.values())
     shown = f" ({plain} of them, such as {least.name}, are blurred or plain)" if plain else ""
     return (
-        f"{folder}: {placed or 'none'} of its {len(counts)} photos{shown} found their place; likely they "
+        f"{folder}: {placed or 'none'} of its {len(counts)} photos{shown} found their pose; likely they "
         "overlap too little, were taken from one spot, are blurred, or show plain walls or things that move: "
         "take more, moving a step between them, each with two thirds of what the one before shows"
     )

@@ -60,7 +60,7 @@ overwrite = click.option("-w", "--overwrite", is_flag=True, help="Replace the ou
 precision = click.option(
     "--precision",
     type=click.Choice(get_args(Precision)),
-    help="How numbers are stored; default: int8 of a place that fills all of space, else float16.",
+    help="How numbers are stored; default: int8 of an unbounded scene, else float16.",
 )
 added_precision = click.option(
     "--precision",
@@ -91,7 +91,7 @@ max_size = click.option("--max-size", type=BytesType(), help="Largest output fil
 fused_max_size = click.option(
     "--max-size",
     type=BytesType(),
-    help="Largest output file; default: 25MB, and what places of the scene take.",
+    help="Largest output file; default: 25MB, and what unbounded sources take.",
 )
 extracted_max_size = click.option(
     "--max-size",
@@ -185,7 +185,7 @@ mending = _stack(
             "--refit",
             type=InputType(),
             metavar="PHOTOS",
-            help="Learn what was behind from photos of the place.",
+            help="Learn what was behind from photos without the object.",
         ),
         click.option("--fill", is_flag=True, help="Fill the hole smoothly where nobody saw what was behind."),
     )

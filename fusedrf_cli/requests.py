@@ -82,7 +82,7 @@ class Sizing:
 
 
 class Node:
-    """An object that gets a name, `node_name`; and a place by `Placing`, which comes after this."""
+    """An object that gets a name, `node_name`; and a placement by `Placing`, which comes after this."""
 
     def __post_init__(self):
         self.object_to_world  # noqa: B018  (what is none is refused before any work)

@@ -125,12 +125,12 @@ def _keep(posed: Posed, folder: Path) -> Path:
 
 
 def _warn_of_unposed(source: str, unposed: Sequence[str], plain: Sequence[str], count: int, progress) -> None:
-    """Say which photos did not find a place, where some did not."""
+    """Say which photos did not find a pose, where some did not."""
     if not unposed:
         return
     more = f" and {len(unposed) - NAMED} more" if len(unposed) > NAMED else ""
     names = ", ".join(unposed[:NAMED]) + more
     why = f"; {', '.join(plain[:NAMED])} are blurred or plain" if plain else ""
     progress.warn(
-        f"{source}: {len(unposed)} of {count} photos found no place and were left out: {names}{why}"
+        f"{source}: {len(unposed)} of {count} photos found no pose and were left out: {names}{why}"
     )

@@ -47,7 +47,7 @@ def _placed_options(command):
         },
         ("--opacity",): {"type": ShareType(), "help": "Its density times this, above 0 and at most 1."},
         ("--tint",): {"type": TintType(), "help": "Its colours times red, green and blue from 0 to 1."},
-        ("--hidden",): {"is_flag": True, "help": "Leave it out, but keep its place in the scene."},
+        ("--hidden",): {"is_flag": True, "help": "Leave it out, but keep its node in the scene."},
     }
     for names, words in reversed(flags.items()):
         command = click.option(*names, cls=PlacedOption, **words)(command)

@@ -85,7 +85,7 @@ def command(**words):
 
     SCENE is a bundle, a scene.json, - for a scene on stdin, or a capture or mesh as `fusedrf train` takes it:
     of those photos, lenses, box, masks and notes are told. Of one that was learnt from photos their
-    cameras are counted. Of a fused bundle the objects are listed with kind, place, size in the world and
+    cameras are counted. Of a fused bundle the objects are listed with kind, position, size in the world and
     bytes; an object that was distilled into one field with others has no bytes of its own, but the node
     of that field inside which it is. Damage is found, but arrays are not decoded, so the answer is quick.
 

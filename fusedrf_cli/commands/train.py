@@ -47,7 +47,7 @@ from fusedrf_cli.requests import TrainRequest
 @click.option(
     "--unbounded/--bounded",
     default=None,
-    help="Learn all of space, as photos of a place show it, or a box; default: as the photos need.",
+    help="Learn an unbounded scene, or a box; default: as the photos need.",
 )
 @click.option("--centre", type=VectorType(), help="Middle of what is learnt finest.")
 @click.option("--radius", type=PositiveType(), help="Half the side of what is learnt finest.")

@@ -56,7 +56,7 @@ def test_a_capture_is_written_beside_the_photos(report, holiday, folder):
     assert (said["photos"], said["posed"], said["left_out"], said["models"]) == (6, 5, ["p5.png"], [5])
     assert said["sparse_points"] == 99 and "z is up" in said["world"] and "arbitrary" in said["world"]
     (warning,) = said["warnings"]
-    assert "1 of 6 photos found no place and were left out: p5.png; p5.png are blurred or plain" in warning
+    assert "1 of 6 photos found no pose and were left out: p5.png; p5.png are blurred or plain" in warning
     document = json.loads((folder / "garden/transforms.json").read_text())
     assert [frame["file_path"] for frame in document["frames"]] == [f"../holiday/p{i}.png" for i in range(5)]
     seen = [view.seen.tolist() for view in read_capture(folder / "garden").train]
