@@ -1,10 +1,10 @@
 """Colour whose features are the coefficients of spherical harmonics (Plenoxels, Fridovich-Keil et al., CVPR
-2022): rgb_c = sigmoid(Σ_k Y_k(d) features[c, k])."""
+2022): logit_c = Σ_k Y_k(d) features[c, k]."""
 
 import torch
 
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import sh_basis, sigmoid
+from fusedrf_cli.engine.kernels.parts import sh_basis
 
 
 def sizes(width: int, coefficients: int) -> dict[str, int]:
@@ -18,7 +18,7 @@ def reference(
 ) -> torch.Tensor:
     """See decoders."""
     harmonics = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
-    return (features[:, : 3 * coefficients].view(-1, 3, coefficients) * harmonics[:, None]).sum(2).sigmoid()
+    return (features[:, : 3 * coefficients].view(-1, 3, coefficients) * harmonics[:, None]).sum(2)
 
 
 def bound(field, sections: dict, features: torch.Tensor, width: int, coefficients: int) -> float:
@@ -45,16 +45,16 @@ def logit(scratch, c):
 def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
     features_forward(field, cell, scratch, scratch, AT)
-    r, g, b = logit(scratch, 0), logit(scratch, 1), logit(scratch, 2)
-    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
+    return logit(scratch, 0), logit(scratch, 1), logit(scratch, 2)
 
 
-def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
     for r in range(3 * COEFFICIENTS, WIDTH):
         scratch[AT + r] = 0
     for c in range(3):
-        d_logit = d_rgb[c] * rgb[c] * (1 - rgb[c])
         for k in range(COEFFICIENTS):
-            scratch[AT + c * COEFFICIENTS + k] = field.params.dtype.type(d_logit * scratch[AT + WIDTH + k])
+            scratch[AT + c * COEFFICIENTS + k] = field.params.dtype.type(
+                d_logits[c] * scratch[AT + WIDTH + k]
+            )
     features_backward(field, cell, scratch, AT, scratch, grad)

@@ -11,6 +11,13 @@ unit cube of the box, three float64:
     summed(field, cell, scratch), summed_backward(field, cell, d, base, scratch, grad)
                                the sum of the features, and its adjoint for d[base]: for decoders that need no
                                more, without a way by memory; others need none
+    located(field, cell, scratch)
+                               of the density's, the cell with what the last `summed` or `forward` found out
+                               of it; keep(cell), an int, and again(field, kept, unit), the cell that it was
+                               made of: may be left out where `locate` says all
+    logits(field, cell, scratch), logits_backward(field, cell, d_logits, scratch)
+                               of the density's, what it adds to the colour's three logits, and what they send
+                               back, which waits in scratch for the way back of the density; may be left out
     prefetch_at(field, array, cell)
                                asks for what these read of an array laid out as the field's numbers; may be
                                left out
@@ -24,9 +31,11 @@ For Python, with `options` what a field's shape says of the encoding:
     Arrays, arrays(field, starts, **options)
                                what the functions read beside `field.params`, if anything: a NamedTuple, and
                                that of a field where its sections begin at starts in `params`
-    reference(sections, unit, read, **options)
+    reference(field, sections, unit, read, **options)
                                (N, WIDTH) features of its sections at unit (N, 3), in plain torch; `read` is
                                what the slot that it reads hands on (kernels/assembled.py), or None
     bound(sections, read, **options)
                                (WIDTH,) float64 the largest magnitude that each feature can reach
+    logits_reference(field, sections, unit, **options), logits_bound(sections, **options)
+                               the same of `logits`: (N, 3), and one magnitude
 """

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,11 +42,13 @@ class Part:
     axes: tuple[int, ...] = ()
     """Axes of the box (0 x, 1 y, 2 z) that its leading dimensions run along, texel by texel."""
     rate: float = 1.0
-    """What it learns at, relative to the optimiser's rate."""
+    """What it learns at, relative to the optimiser's rate; at 0 it does not."""
     spread: float = 0.0
     """Standard deviation of an untrained field's numbers."""
     columns: int | None = None
     """Of a row of numbers, how many are stored; the others fill it up to whole runs and are 0. None: all."""
+    fades: bool = False
+    """See Group."""
 
     @property
     def on_vertices(self) -> bool:
@@ -191,11 +193,12 @@ class BoxField(ComputedField):
         for part, low, high, lines in zip(
             self.parts, self.starts, self.starts[1:], self.reached, strict=False
         ):
-            last = groups[-1] if groups else None
-            if last and last.lines is None and lines is None and last.rate == part.rate:
-                groups[-1] = Group(last.low, int(high), part.rate)
-            else:
-                groups.append(Group(int(low), int(high), part.rate, lines))
+            last, alike = groups[-1] if groups else None, (part.rate, part.fades)
+            whole = last is not None and last.lines is None and lines is None and last.high == low
+            if whole and (last.rate, last.fades) == alike:
+                groups[-1] = replace(last, high=int(high))
+            elif part.rate:
+                groups.append(Group(int(low), int(high), part.rate, lines, part.fades))
         return groups
 
     # -- storing -----------------------------------------------------------------------------------------
@@ -203,7 +206,7 @@ class BoxField(ComputedField):
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and metadata for a bundle: the parts, and occupancy as packed bits."""
         arrays = {
-            part.name: self.pack(part, view.detach().cpu()).numpy()
+            self.stored_name(part.name): self.pack(part, view.detach().cpu()).numpy()
             for part, view in zip(self.parts, self.sections().values(), strict=True)
         }
         arrays |= packed_bits("occupancy", self.occupancy.occupied)
@@ -220,6 +223,11 @@ class BoxField(ComputedField):
             "shape": asdict(self.shape),
         }
         return arrays, metadata
+
+    @classmethod
+    def stored_name(cls, name: str) -> str:
+        """The name in files of the array of a part."""
+        return name
 
     def stored_shape(self, part: Part) -> tuple[int, ...]:
         """Shape under which a part is stored; of vertices, the used ones in order."""
@@ -274,13 +282,14 @@ class BoxField(ComputedField):
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
         check_samples(grid.space.most_samples(grid.aabb, sampling_step(bare)), "the field")
         for part in bare.parts:  # before `params` takes memory
-            found, expected = arrays.get(part.name), bare.stored_shape(part)
+            name, expected = cls.stored_name(part.name), bare.stored_shape(part)
+            found = arrays.get(name)
             if found is None or found.shape != expected:
                 have = "nothing" if found is None else list(found.shape)
-                raise ValueError(f"array '{part.name}' should have shape {list(expected)}, found {have}")
+                raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
         field = cls(shape, bare.box, resolution, scale, shift, occupancy=grid)
         for part, view in zip(field.parts, field.sections().values(), strict=True):
-            stored = torch.from_numpy(np.ascontiguousarray(arrays[part.name], np.float32))
+            stored = torch.from_numpy(np.ascontiguousarray(arrays[cls.stored_name(part.name)], np.float32))
             field.unpack(part, stored, view)
         field.check_answers()
         return field

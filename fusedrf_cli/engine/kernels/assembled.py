@@ -16,12 +16,13 @@ from functools import cache
 from types import FunctionType, ModuleType
 from typing import NamedTuple
 
-from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kernels.parts import LINE, sigmoid
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
 HOOKS = (
-    "locate", "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward"
+    "locate", "located", "keep", "again", "forward", "backward", "summed", "summed_backward", "logits",
+    "logits_backward", "prefetch_at", "ray_setup", "ray_backward",
 )  # fmt: skip
 """What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"  # fields of every assembly's Arrays: numbers (P,), corner (3,) and sides (3,)
@@ -47,13 +48,18 @@ def density(field, grid, k, p, d, scratch):
     if not inside:
         return 0.0, 0.0, 0, (unit, cell)
     sigma, pre = sigma_forward(field, cell, scratch)
-    return sigma, pre, 1, (unit, cell)
+    return sigma, pre, 1, (unit, density_located(field, cell, scratch))
+
+
+def keep(place):
+    """See loops.py."""
+    return density_keep(place[1])
 
 
 def again(field, held, p):
     """See loops.py."""
     unit = unit_of(field, p)[0]
-    return unit, density_locate(field, unit)
+    return unit, density_again(field, held, unit)
 
 
 def shared_cell(field, place):
@@ -76,21 +82,37 @@ def end(field, frame, d, scratch, grad):
     rgb_ray_backward(field, d, scratch, grad)
 
 
+def plain_logits(field, place, r, g, b, scratch):
+    """The logits of a colour, to which the density's encoding adds none."""
+    return r, g, b
+
+
+def shifted_logits(field, place, r, g, b, scratch):
+    """The same, where it does."""
+    red, green, blue = density_logits(field, place[1], scratch)
+    return r + red, g + green, b + blue
+
+
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py."""
-    return rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+    r, g, b = rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+    r, g, b = shown_logits(field, place, r, g, b, scratch)
+    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
 def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py; colour first, since it may send back to what sigma hands on."""
     if shaded:
-        rgb_backward(field, colour_cell(field, place), d, rgb, d_rgb, scratch, memory, at, grad)
+        d_red, d_green = d_rgb[0] * rgb[0] * (1 - rgb[0]), d_rgb[1] * rgb[1] * (1 - rgb[1])
+        d_logits = d_red, d_green, d_rgb[2] * rgb[2] * (1 - rgb[2])
+        rgb_backward(field, colour_cell(field, place), d, d_logits, scratch, memory, at, grad)
+        density_logits_backward(field, place[1], d_logits, scratch)
     sigma_backward(field, place[1], pre, d_sigma, scratch, grad)
 
 
 def ahead_density(field, array, held, p):
     """See loops.py."""
-    density_prefetch_at(field, array, density_locate(field, unit_of(field, p)[0]))
+    density_prefetch_at(field, array, density_again(field, held, unit_of(field, p)[0]))
 
 
 def ahead_colour(field, array, held, p):
@@ -98,7 +120,7 @@ def ahead_colour(field, array, held, p):
     colour_prefetch_at(field, array, colour_cell(field, again(field, held, p)))
 
 
-TEMPLATES = unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
+TEMPLATES = unit_of, density, keep, again, begin, end, colour, backward, ahead_density, ahead_colour
 
 
 # -- what a module may leave out -----------------------------------------------------------------------------
@@ -113,6 +135,25 @@ def locate(field, unit):
     return unit
 
 
+def located(field, cell, scratch):
+    """The cell, of which no more is known now."""
+    return cell
+
+
+def none_kept(cell):
+    """Nothing: a cell is located as quickly again."""
+    return 0
+
+
+def located_again(field, kept, unit):
+    """The cell as it is located."""
+    return density_locate(field, unit)
+
+
+def none_added(field, cell, d_logits, scratch):
+    """Nothing was added."""
+
+
 def prefetch_at(field, array, cell):
     """Nothing: what is read is near at hand."""
 
@@ -125,7 +166,8 @@ def ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-DEFAULTS = {f.__name__: f for f in (locate, prefetch_at, ray_setup, ray_backward)}
+DEFAULTS = {f.__name__: f for f in (locate, located, prefetch_at, ray_setup, ray_backward)}
+DEFAULTS |= {"keep": none_kept, "again": located_again, "logits_backward": none_added}
 
 
 # -- one namespace of four slots -----------------------------------------------------------------------------
@@ -138,10 +180,12 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
     assembly = ModuleType(f"{__name__}.{label}.bodies")
-    names = vars(assembly) | {"EDGE": EDGE}
+    names = vars(assembly) | {"EDGE": EDGE, "sigmoid": sigmoid}
     names |= {template.__name__: renamed(template, template.__name__, assembly, {}) for template in TEMPLATES}
     shared = colour is density or getattr(colour, "locate", locate) is None
-    names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", assembly, {})
+    chosen = {"colour_cell": shared_cell if shared else own_cell}
+    chosen["shown_logits"] = shifted_logits if hasattr(density, "logits") else plain_logits
+    names |= {name: renamed(function, name, assembly, {}) for name, function in chosen.items()}
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
             if names.setdefault(name, value) is not value:
@@ -158,6 +202,7 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
         raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
     hooks = {name: getattr(module, name, DEFAULTS.get(name)) for name in HOOKS}
     pending = {name: hook for name, hook in hooks.items() if hook is not None}
+    known_as = dict(pending)
     while pending:
         name, function = pending.popitem()
         new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
@@ -170,8 +215,11 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
                 new[used] = f"{READS[slot]}_{needed}"
             elif isinstance(value, FunctionType) or used.isupper() or used in fields:
                 new[used] = f"{slot}_{used}"
-                if isinstance(value, FunctionType) and new[used] not in names:
-                    pending[used] = value
+                if isinstance(value, FunctionType):
+                    if known_as.setdefault(used, value) is not value:
+                        raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
+                    if new[used] not in names:
+                        pending[used] = value
                 elif used.isupper() and used in known:
                     names[new[used]] = value
             elif used in known and names.setdefault(used, value) is not value:  # numpy, kernels/parts.py

@@ -33,7 +33,7 @@ def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
     box = field.box
     inside = (point - box[:3]) / (box[3:] - box[:3])
     factors = field.slot_sections()["colour"]
-    products = plane_line.reference(factors, torch.from_numpy(inside[None]), None, 16)[0].numpy()
+    products = plane_line.reference(None, factors, torch.from_numpy(inside[None]), None, 16)[0].numpy()
     x = [*(float(row @ products) for row in field.basis.numpy()), *direction]
     values = x + [np.sin(f * v) for f in (1, 2) for v in x] + [np.cos(f * v) for f in (1, 2) for v in x]
     for i in range(3):

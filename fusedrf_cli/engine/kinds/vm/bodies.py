@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import literally
 
-from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, RUN, WIDTH
+from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, ROW, RUN
 from fusedrf_cli.engine.kernels.parts import (
     FACE_TOLERANCE,
     accumulate,
@@ -267,17 +267,17 @@ def run_at(field, t, level, i, j, run):
     """Offset in params of the rows of the `run`-th RUN vertices along z at (i, j): they share a hash and lie
     side by side."""
     h = (i * 2654435761) ^ (j * 805459861) ^ (run * 3674653429)  # wraps around at 64 bits
-    return (field.layout[t, 13] + level * field.rows[t, 0] * WIDTH) + (
+    return (field.layout[t, 13] + level * field.rows[t, 0] * ROW) + (
         (h ^ (h >> 15)) & (field.rows[t, 0] // RUN - 1)
-    ) * (RUN * WIDTH)
+    ) * (RUN * ROW)
 
 
 def edge(field, t, level, i, j, k):
     """Offsets in params of the rows of vertices (i, j, k) and (i, j, k + 1)."""
     last = k % RUN == RUN - 1
     low = run_at(field, t, level, i, j, k // RUN)
-    high = run_at(field, t, level, i, j, k // RUN + 1) if last else low + (k % RUN + 1) * WIDTH
-    return np.uint64(low + k % RUN * WIDTH), np.uint64(high)
+    high = run_at(field, t, level, i, j, k // RUN + 1) if last else low + (k % RUN + 1) * ROW
+    return np.uint64(low + k % RUN * ROW), np.uint64(high)
 
 
 def vertex_below(field, t, level, u, v, w):
@@ -347,7 +347,7 @@ def scatter_detail(field, grad, t, u, v, w, d_feature, rgb, d_rgb):
 
 
 def add_row(grad, row, density, red, green, blue):
-    """Adds to the WIDTH numbers of a row, to which others may be adding too."""
+    """Adds to the ROW numbers of a row, to which others may be adding too."""
     accumulate(grad, row, density)
     accumulate(grad, row + np.uint64(1), red)
     accumulate(grad, row + np.uint64(2), green)

@@ -131,7 +131,7 @@ def block_colour(field, b: int, points: torch.Tensor, dirs: torch.Tensor) -> tor
 def vm_products(sections: dict[str, torch.Tensor], what: str, unit: torch.Tensor) -> torch.Tensor:
     """(N, 3 R) products P_r(a, b) L_r(c), mode after mode (TensoRF, eq. 5); what is "density" or "colour"."""
     own = {name.removeprefix(f"{what}_"): view for name, view in sections.items()}
-    return plane_line.reference(own, unit, None, 0)
+    return plane_line.reference(None, own, unit, None, 0)
 
 
 def vm_density_feature(sections: dict[str, torch.Tensor], unit: torch.Tensor) -> torch.Tensor:

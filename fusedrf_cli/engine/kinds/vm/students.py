@@ -10,7 +10,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.computed import BRICK
-from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
+from fusedrf_cli.engine.fields.hashed import PER_BLOCK, ROW, TOGETHER
 from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
@@ -108,7 +108,7 @@ class VMKind(Kind):
     def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
         """With all rows of details, and all cells, of which few are stored."""
         bits = {end: sum(8 * s[0] for n, s in shapes.items() if n.endswith(end)) for end in (BLOCKS, BRICKS)}
-        return decoded + 4 * bits[BLOCKS] * TOGETHER * WIDTH + bits[BRICKS] // 2 * BRICK**3
+        return decoded + 4 * bits[BLOCKS] * TOGETHER * ROW + bits[BRICKS] // 2 * BRICK**3
 
     def without(self, field: VMField, names: set[str]) -> VMField | None:
         """Without the blocks of those names."""
@@ -206,7 +206,7 @@ def contents_of(shape: VMShape, tensors: Sequence[VMTensor], blocks: int) -> Con
             used = read_texels(tensor, int(name[-1])) if "_plane_" in name else None
             if name == "detail" and tensor.held:
                 rows, of_blocks = tensor.held
-                section = rows, WIDTH
+                section = rows, ROW
                 bits += tensor.hashed.shape[0] // TOGETHER + 8 * PER_BLOCK * of_blocks
             sections.append(Section(name, section, used))
     return Contents(sections, bits, len(tensors), blocks)

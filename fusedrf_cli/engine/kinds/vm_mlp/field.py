@@ -22,7 +22,6 @@ from fusedrf_cli.engine.spaces import bounded, name_of
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
 MAX_WIDTH = 256  # of a stored field
-FACTOR_SPREAD = 0.1  # TensoRF's, of planes and lines
 TENSOR = "tensor_0."  # in front of the names that a `vm` field's only tensor has
 
 
@@ -60,8 +59,8 @@ class VMMLPField(AssembledField):
         rank, density = {"rank": shape.colour_rank}, {"rank": shape.density_rank}
         network = {"width": 3 * shape.colour_rank, "rows": shape.features, "hidden": shape.width}
         return {
-            "density": Slot(plane_line, density, f"{TENSOR}density_", spread=FACTOR_SPREAD),
-            "colour": Slot(plane_line, rank, f"{TENSOR}colour_", spread=FACTOR_SPREAD),
+            "density": Slot(plane_line, density, f"{TENSOR}density_"),
+            "colour": Slot(plane_line, rank, f"{TENSOR}colour_"),
             "sigma": Slot(density_sum),
             "rgb": Slot(tensorf_mlp, network, "network.", BASIS_RATE),
         }

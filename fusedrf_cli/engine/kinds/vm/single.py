@@ -1,0 +1,239 @@
+"""The `vm` field: vector-matrix decomposed grids (TensoRF, Chen et al. ECCV 2022) with spherical-harmonic
+colour, in unbounded scenes with a hash grid for what is finer than the texels.
+
+In files it is one *tensor*, placed by one *block* (SPEC, section 2): other numbers of them are what earlier
+versions wrote for several objects, and are read as nodes of the scene graph (formats/blocks.py).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import prod
+
+import numpy as np
+import torch
+
+from fusedrf_cli.engine.decoders import density_sum, sh_basis
+from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
+from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
+from fusedrf_cli.engine.fields.base import FieldNeeds
+from fusedrf_cli.engine.fields.box import LINE, Part, checked_box
+from fusedrf_cli.engine.fields.computed import (
+    FEW_CELLS,
+    PER_CELL,
+    PER_CELL_MADE,
+    WHITE,
+    Reads,
+    packed_bits,
+    runs_of,
+)
+from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, ROW, Hashed, Held
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.spaces import bounded, name_of
+
+CELLS_PER_NUMBER = 4  # of a field, from which on its cells are stored in bricks where these are smaller
+BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less
+MAX_NUMBERS = 2 << 30  # of a field that is read: of a hash grid a file may hold few rows
+TENSOR = "tensor_0."  # in front of the names that its arrays have in files
+DETAIL = "density_detail"  # the rows of the hash grid
+
+
+@dataclass(frozen=True)
+class VMShape(RankedShape):
+    """Components per mode, and what is finer than the texels."""
+
+    hashed: Hashed | None = None
+
+
+class VMField(AssembledField):
+    """Planes and lines over one box; its occupancy has the same box."""
+
+    kind = "vm"
+    shape_type = VMShape
+    name = ""
+    """Of the object that it is, as files say."""
+
+    @classmethod
+    def slots_of(cls, shape: VMShape) -> dict[str, Slot]:
+        """See AssembledField."""
+        density, basis = {"rank": shape.density_rank}, {"coefficients": shape.coefficients}
+        encoding = plane_line
+        if shape.hashed is not None:
+            encoding, density = plane_line_hash, density | {"hashed": shape.hashed}
+        return {
+            "density": Slot(encoding, density, "density_"),
+            "colour": Slot(plane_line, {"rank": shape.colour_rank}, "colour_"),
+            "sigma": Slot(density_sum),
+            "rgb": Slot(sh_basis, {"width": 3 * shape.colour_rank} | basis, "colour_", BASIS_RATE),
+        }
+
+    @classmethod
+    def create(
+        cls, shape: VMShape, box: np.ndarray, resolution: tuple[int, int, int], generator: torch.Generator
+    ) -> "VMField":
+        """See BoxField; the colour basis is uniform as a linear layer's."""
+        field = super().create(shape, box, resolution, generator)
+        bound = (3 * shape.colour_rank) ** -0.5
+        field.basis.uniform_(-bound, bound, generator=generator)
+        return field
+
+    def resampled(self, box: np.ndarray, resolution: tuple[int, int, int]) -> "VMField":
+        """See BoxField; the hash grid, which lies in the coordinates, stays."""
+        new = super().resampled(box, resolution)
+        new.name = self.name
+        return new
+
+    def with_occupancy(self, occupancy: OccupancyGrid) -> "VMField":
+        """See ComputedField."""
+        return super().with_occupancy(replace(occupancy, aabb=self.box))
+
+    @property
+    def basis(self) -> torch.Tensor:
+        """(3, coefficients, 3 rank) view of the matrix that makes coefficients of colour products."""
+        return self.sections()["colour_basis"]
+
+    @property
+    def sampling_step(self) -> float:
+        """See fields/base.py; where rows are finer than texels, theirs."""
+        step = self.space.picture_step(self.voxel_size)
+        return step if self.shape.hashed is None else min(step, self.shape.hashed.picture_step)
+
+    @property
+    def held(self) -> Held | None:
+        """Which rows of its hash grid a file holds; None: it has none, or all."""
+        return Held.of(self.sections()[DETAIL].detach().cpu().numpy()) if self.shape.hashed else None
+
+    # -- storing ---------------------------------------------------------------------------------------------
+
+    @classmethod
+    def stored_name(cls, name: str) -> str:
+        """See BoxField."""
+        return TENSOR + ("detail" if name == DETAIL else name)
+
+    def numbers(self) -> dict[str, np.ndarray]:
+        """The arrays of numbers that files have, by name; of a hash grid that few cells can ask the rows
+        other than 0."""
+        own = self.sections().items()
+        arrays = {self.stored_name(name): view.detach().cpu().numpy() for name, view in own}
+        rows = self.stored_name(DETAIL)
+        if rows in arrays:  # as files have always had them, last
+            detail, held = arrays.pop(rows), self.held
+            arrays[rows] = detail if held is None else detail[held.rows]
+            if held is not None:
+                arrays[runs_of(rows)] = held.lengths
+                arrays |= {f"{rows}_{name}": bits for name, bits in held.state().items()}
+        return arrays
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict]:
+        """See BoxField."""
+        arrays = self.numbers()
+        hashed, held = self.shape.hashed, runs_of(self.stored_name(DETAIL)) in arrays
+        few = 0 if held else min(FEW_CELLS, CELLS_PER_NUMBER * self.size)
+        cells = packed_bits(f"{TENSOR}occupancy", self.occupancy.occupied, few)
+        needs = {"hashed"} if hashed else set()
+        needs |= ({"held", "runs"} if held else set()) | ({"held"} if len(cells) > 1 else set())
+        shape = {name: getattr(self.shape, name) for name in ("density_rank", "colour_rank", "sh_degree")}
+        tensor = {
+            "resolution": list(self.resolution),
+            "aabb": self.box.tolist(),
+            "scale": self.scale,
+            "shift": self.shift,
+            "occupancy": list(self.occupancy.occupied.shape),
+            **({} if self.space is bounded else {"space": name_of(self.space)}),
+        }
+        if hashed is not None:
+            tensor["hashed"] = {"spacings": list(hashed.spacings), "rows": hashed.rows}
+        block = {"tensor": 0, "object_to_field": np.eye(4).tolist(), "name": self.name}
+        metadata = {"aabb": self.box.tolist(), "shape": shape, "tensors": [tensor], "blocks": [block]}
+        return arrays | cells, ({"needs": sorted(needs)} if needs else {}) | metadata
+
+    @classmethod
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+        """See Kind.field_needs."""
+        (tensor,) = metadata["tensors"]
+        rows, hashed = cls.stored_name(DETAIL), tensor.get("hashed")
+        whole = {rows: (len(hashed["spacings"]) * hashed["rows"], ROW)} if hashed and rows in shapes else {}
+        stored = {name: shape for name, shape in (shapes | whole).items() if ".occupancy" not in name}
+        numbers = sum(-(-prod(shape) // LINE) * LINE for shape in stored.values())
+        cells = prod(tensor["occupancy"])
+        return FieldNeeds(4 * numbers + PER_CELL * cells, PER_CELL_MADE * cells)
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
+        """See BoxField."""
+        own = box_metadata(cls.kind, metadata)
+        cells = {
+            name.removeprefix(TENSOR): array
+            for name, array in arrays.items()
+            if name.startswith(f"{TENSOR}occupancy")
+        }
+        field = super().from_state(with_all_rows(arrays, own["shape"].get("hashed")) | cells, own)
+        field.name = str(metadata["blocks"][0]["name"])
+        return field
+
+    def unpack(self, part: Part, stored: torch.Tensor, values: torch.Tensor) -> None:
+        """See BoxField; rows of 0 take no memory."""
+        if part.name == DETAIL:
+            rows = stored.any(1)
+            values[rows] = stored[rows]
+        else:
+            super().unpack(part, stored, values)
+
+
+def box_metadata(kind: str, metadata: dict) -> dict:
+    """The metadata of a stored field of one tensor as BoxField's. Raises ValueError where there are several
+    tensors, or the one is placed anywhere but in the field's own frame."""
+    tensors, blocks = metadata["tensors"], metadata["blocks"]
+    if len(tensors) != 1 or len(blocks) != 1 or blocks[0]["tensor"] != 0:
+        raise ValueError(
+            f"a {kind} field has one tensor and one block of it, found {len(tensors)} and {len(blocks)}: "
+            "several are read as nodes of a scene"
+        )
+    (tensor,), (block,) = tensors, blocks
+    if not np.array_equal(block["object_to_field"], np.eye(4)) or tuple(block.get("tint", WHITE)) != WHITE:
+        raise ValueError(
+            f"block 0 of a {kind} field should place it as it is, without a tint: that is a node's to say"
+        )
+    aabb = checked_box(tensor["aabb"], "tensor 0: aabb").tolist()
+    shape = dict(metadata["shape"])
+    if "hashed" in tensor:
+        shape["hashed"] = hashed_of(tensor["hashed"], np.asarray(aabb))
+    cells = {"aabb": aabb, "counts": tensor["occupancy"], "space": tensor.get("space", "bounded")}
+    own = {name: tensor[name] for name in ("resolution", "scale", "shift")}
+    return own | {"aabb": aabb, "cells": cells, "shape": shape}
+
+
+def hashed_of(stored: dict, box: np.ndarray) -> Hashed:
+    """A hash grid as metadata tell it, of a field over a box (6,). Raises ValueError naming what does not
+    fit."""
+    spacings, rows = stored["spacings"], stored["rows"]
+    if type(rows) is not int or not 0 < rows <= MAX_ROWS or not 1 <= len(spacings) <= MAX_LEVELS:
+        raise ValueError(
+            f"a hash grid has 1 to {MAX_LEVELS} levels of at most {MAX_ROWS} rows, found {len(spacings)} of "
+            f"{rows}"
+        )
+    hashed = Hashed(tuple(float(h) for h in spacings), rows)
+    if not np.abs(box).max() <= MAX_VERTEX * min(hashed.spacings):
+        raise ValueError(
+            f"the vertices of a hash grid should be numbered up to {MAX_VERTEX}, but its box reaches to "
+            f"{np.abs(box).max():g} and its 'spacings' are {list(hashed.spacings)}"
+        )
+    return hashed
+
+
+def with_all_rows(arrays: dict[str, np.ndarray], hashed: Hashed | None) -> dict[str, np.ndarray]:
+    """The arrays with all rows of a hash grid, of which a file may hold few. Raises ValueError naming what
+    does not fit."""
+    name = VMField.stored_name(DETAIL)
+    blocks, runs = (arrays.get(f"{name}_{which}") for which in ("blocks", "held"))
+    if hashed is None or blocks is None or runs is None:
+        return arrays
+    held = Held.from_state(blocks, runs, hashed.shape[0])
+    lengths, found = arrays.get(runs_of(name)), arrays.get(name)
+    if lengths is None or not np.array_equal(lengths, held.lengths):
+        raise ValueError(f"the runs of array '{name}' are not those of its blocks")
+    if found is None or found.shape != (held.count, ROW):
+        have = "nothing" if found is None else list(found.shape)
+        raise ValueError(f"array '{name}' should have shape {[held.count, ROW]}, found {have}")
+    whole = np.zeros(hashed.shape, found.dtype)
+    whole[held.rows] = found
+    return arrays | {name: whole}
