@@ -20,9 +20,10 @@ from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds.student import DistilConfig, Plan, Student
-from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
+from fusedrf_cli.engine.rendering.volume import RenderConfig
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import ResourceProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
@@ -118,8 +119,9 @@ def sources(sizes: list[int], room: float = float("inf"), copies: float = 0.0) -
 
 def picture(width: int, height: int, composed: bool) -> dict[str, float]:
     """Rendering one picture by bands; `composed`: by the general renderer."""
-    band = min(width * max(1, ROWS_AT_ONCE_PIXELS // width), width * height)
-    waves = min(band, RAYS_AT_ONCE) * SAMPLES_PER_WAVE * PER_SAMPLE if composed else 0
+    config = current(RenderConfig)
+    band = min(width * max(1, config.pixels_at_once // width), width * height)
+    waves = min(band, config.rays_at_once) * config.samples_per_wave * PER_SAMPLE if composed else 0
     return {"a band of the picture": band * PER_PIXEL + waves}
 
 
@@ -136,7 +138,8 @@ def measured(width: int, height: int) -> dict[str, float]:
 
 def ownership(aabb: np.ndarray) -> dict[str, float]:
     """Grids over a scene's box (6,)."""
-    return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, SCENE_CELLS)))}
+    config = current(OccupancyConfig)
+    return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, config.scene_cells)))}
 
 
 def result(numbers: int, measured: bool = True) -> dict[str, float]:
@@ -167,7 +170,7 @@ def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> d
 def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str, float]:
     """The field of a fit at its full resolution, with so many texels along the longest axis, while its
     occupancy is made anew."""
-    grid = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, longest)))
+    grid = np.prod(cell_counts(plan.box, min(current(OccupancyConfig).cells, longest)))
     learns = learning(plan.numbers, threads, 1 if unbounded else 2)
     return {**learns, "its occupancy": float(grid) * PER_TRIED_CELL}
 

@@ -37,10 +37,11 @@ from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.hashed import Hashed
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Section, Way
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import REACH
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
@@ -404,7 +405,7 @@ def fitting_longest(
 
 def bytes_of(plan: Plan, precision: str) -> int:
     """At most so many bytes of a bundle with a field as planned."""
-    cells = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, max(plan.resolution))))
+    cells = np.prod(cell_counts(plan.box, min(current(OccupancyConfig).cells, max(plan.resolution))))
     return BESIDES + BundleSizes().of(plan.contents(int(cells)), precision)
 
 

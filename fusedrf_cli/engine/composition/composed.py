@@ -11,17 +11,17 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.occupancy import (
-    SCENE_CELLS,
+    OccupancyConfig,
     OccupancyGrid,
-    Pace,
     frame_around,
     placed_box,
     placed_cells,
     unbounded_cells,
 )
+from fusedrf_cli.engine.fields.pace import Pace
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import unbounded
 
-OCCUPANCY_CELLS = SCENE_CELLS
 RULES = ("max", "add")
 
 
@@ -73,14 +73,15 @@ class ComposedField:
     def occupancy(self) -> OccupancyGrid:
         """Cells that any placed field's occupied cells reach. In unbounded space each is sampled as finely as
         those that reach it need: most of it is far from anything that is fine."""
+        config = current(OccupancyConfig)
         grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
         if any(p.unbounded for p in self.placed):
             again = ((p.field.occupancy, p.object_to_world) for p in self.placed)
             steps = (sampling_step(p.field) for p in self.placed)
-            pace = Pace(OccupancyGrid.full(unbounded.WHOLE, OCCUPANCY_CELLS, unbounded))
-            marks = pace.kept(unbounded_cells(grids, OCCUPANCY_CELLS), again, steps)
+            pace = Pace(OccupancyGrid.full(unbounded.WHOLE, config.scene_cells, unbounded))
+            marks = pace.kept(unbounded_cells(grids, config.scene_cells), again, steps)
             return replace(pace.grid(reduce(np.logical_or, marks)), looked_at=self.subject)
-        aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
+        aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, config.scene_cells)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
     @property

@@ -28,11 +28,12 @@ from fusedrf_cli.engine.distillation.poses import (
 from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.computed import AS_IT_IS, NONE_KNOWN, Batch
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts, texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 
 
 def fit(
@@ -311,7 +312,7 @@ class FitRun:
         lies behind surfaces, is no matter."""
         field = self.field
         grid = field.occupancy
-        counts = cell_counts(grid.aabb, min(DEFAULT_CELLS, max(field.resolution)))
+        counts = cell_counts(grid.aabb, min(current(OccupancyConfig).cells, max(field.resolution)))
         if grid.occupied.shape != counts:  # as fine as those to be found, with the same cells occupied
             middles = OccupancyGrid.full(grid.aabb, max(counts)).centres()
             field = field.with_occupancy(grid.marked(grid.contains(middles).reshape(counts)))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.rendering.volume import render_rays
 
 EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
@@ -18,7 +18,7 @@ SAME = 1e-6  # mean square by which pictures differ that show the same: 60 dB
 
 
 def occupancy_of(
-    field: StoredField, box: np.ndarray | None = None, cells: int = DEFAULT_CELLS
+    field: StoredField, box: np.ndarray | None = None, cells: int = OccupancyConfig.cells
 ) -> OccupancyGrid:
     """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
     optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.

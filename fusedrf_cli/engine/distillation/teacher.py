@@ -12,13 +12,13 @@ from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import (
-    RAYS_AT_ONCE,
-    SEEN_WEIGHT,
+    RenderConfig,
     reach_of,
     render_rays,
     waves,
     weights_from_depths,
 )
+from fusedrf_cli.engine.settings import current
 
 SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
 MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
@@ -88,7 +88,7 @@ def ask(
     step: float,
     generator: torch.Generator,
     chance: Chance = matter_first,
-    at_once: int = RAYS_AT_ONCE,
+    at_once: int = RenderConfig.rays_at_once,
 ) -> TeacherPool:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
@@ -142,6 +142,7 @@ def _ask_part(
     generator: torch.Generator,
     chance: Chance,
 ) -> tuple[torch.Tensor, ...]:
+    config = current(RenderConfig)
     n = len(rays_o)
     trans, pixels = np.ones(n, np.float32), np.zeros((n, 4), np.float32)
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
@@ -160,7 +161,7 @@ def _ask_part(
         depth = found * torch.from_numpy(spans[mask]).float()
         chosen = (before > SEEN) & (torch.rand(len(points), generator=generator) < chance(depth, before))
         # most samples are empty, and a colour costs more than a density
-        shown = torch.from_numpy(weights[mask] > SEEN_WEIGHT) | (chosen & (depth > SEEN_WEIGHT))
+        shown = torch.from_numpy(weights[mask] > config.seen_weight) | (chosen & (depth > config.seen_weight))
         colour = torch.zeros(len(points), 3)
         if shown.any():
             colour[shown] = teacher.query(points[shown], dirs[shown])[1].float()

@@ -8,8 +8,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import POINTS_AT_ONCE, PROBES, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.selection.cells import Selection
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 FINEST = 320
@@ -50,7 +51,7 @@ def without_object(
     finer = refined(grid, voxel)
     index = np.argwhere(finer.occupied)
     kept, matter = finer.occupied.copy(), Matter(selection)
-    for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
+    for part in np.array_split(index, -(-len(index) // current(OccupancyConfig).points_at_once) or 1):
         kept[tuple(part[emptied(finer, part, matter, to_field)].T)] = False
     return grid if (kept == finer.occupied).all() else grid.marked(kept)
 
@@ -129,7 +130,7 @@ def restricted(field, holds: Holds):
     parts of its own cells, so that nothing shows that was empty before. None where nothing is left."""
     grid = refined(field.occupancy, field.voxel_size)
     index, kept = np.argwhere(grid.occupied), grid.occupied.copy()
-    for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
+    for part in np.array_split(index, -(-len(index) // current(OccupancyConfig).points_at_once) or 1):
         kept[tuple(part.T)] = wholly(field, holds, grid.aabb[:3] + (part + 0.5) * grid.cell, grid.cell)
     return field.with_occupancy(grid.marked(kept)) if kept.any() else None
 
