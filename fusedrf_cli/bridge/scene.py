@@ -329,8 +329,17 @@ def as_shown_needs(needs: FieldNeeds, leaf: Leaf) -> FieldNeeds:
 
 
 def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
+    """As `part_shown`. InvalidInput where that is nothing."""
+    shown = part_shown(field, leaf, where)
+    if shown is None:
+        raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
+    return shown
+
+
+def part_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField | None:
     """What a leaf shows of its field: all of it, or what its crops hold, with its density times its opacity
-    and its colours times its tint. InvalidInput where that is nothing, or the kind of field has no such."""
+    and its colours times its tint; None where that is nothing. InvalidInput where the kind of field has no
+    such."""
     kind = registry.kind(field.kind)
     try:
         shown = field if leaf.opacity == 1 else kind.thinned(field, leaf.opacity)
@@ -338,9 +347,7 @@ def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
             shown = kind.cropped(shown, lambda points: np.all([c.holds(points) for c in leaf.crops], 0))
     except ValueError as error:
         raise InvalidInput(f"{where}: {error}") from error
-    if shown is None:
-        raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
-    return shown if leaf.tint == WHITE else kind.tinted(shown, leaf.tint)
+    return shown if shown is None or leaf.tint == WHITE else kind.tinted(shown, leaf.tint)
 
 
 def background_of(scene: LoadedScene) -> SourceField:

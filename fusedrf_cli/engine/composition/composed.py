@@ -9,16 +9,18 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.occupancy import (
     OccupancyConfig,
     OccupancyGrid,
     frame_around,
+    mapped,
     placed_box,
     placed_cells,
     unbounded_cells,
 )
 from fusedrf_cli.engine.fields.pace import Pace
+from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import unbounded
 
@@ -137,6 +139,19 @@ class ComposedField:
         seen = inside[found > 0]
         if with_colour and len(seen):
             rgb[seen] += found[found > 0, None] * _colour(placed, points[seen], dirs[seen]).double()
+
+
+def occupied_at(field: RadianceField, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: which points (N, 3) of its frame lie in occupied cells of a field, or of one of those that a
+    composed scene places: the cells that each has of its own."""
+    field = opened(field)
+    if not isinstance(field, ComposedField):
+        return field.occupancy.contains(mapped(points, field.occupancy.space))
+    found = np.zeros(len(points), bool)
+    for p in field.placed:
+        matrix = p.world_to_object
+        found |= occupied_at(p.field, points @ matrix[:3, :3].T + matrix[:3, 3])
+    return found
 
 
 def largest(placed: list[Placed]) -> Placed:

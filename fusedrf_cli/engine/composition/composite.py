@@ -306,6 +306,12 @@ class Waves:
         ends, groups = (found.begin, found.end), self.scene.rules(slots[2])
         self.each("trace_ray", *slots, ends, traces)
         segments.merge_samples(shared, start, self.early_stop, groups, traces, found.end, self.out)
+        self.add_samples(shared, start, slots, ends, traces)
+
+    def add_samples(
+        self, shared: np.ndarray, start: np.ndarray, slots: tuple, ends: tuple, traces: Traces
+    ) -> None:
+        """Add what the samples of rays shared (M,) show, by the weights that they were given."""
         self.each("shade_ray", *slots, ends, traces)
         segments.add_colours(shared, start, traces, self.out)
 

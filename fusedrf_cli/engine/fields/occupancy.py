@@ -364,6 +364,8 @@ def frame_around(box: np.ndarray) -> np.ndarray:
 def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(4, 4) of an object seen from a frame that lies at `origin`: a position (3,), or a placement (4, 4)."""
     frame, matrix = placement(origin), object_to_world.copy()
+    if np.array_equal(frame, matrix):
+        return np.eye(4)
     matrix[:3, 3] -= frame[:3, 3]  # first, so that it is exact however far away both are
     if origin.shape == (4, 4):
         matrix[:3] = np.linalg.inv(frame[:3, :3]) @ matrix[:3]

@@ -1,13 +1,15 @@
 """Which cells of a field are an object's."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from types import ModuleType
 
 import numpy as np
 import torch
 from scipy.ndimage import label, uniform_filter
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts, mapped, transformed_aabb
+from fusedrf_cli.engine.spaces import bounded
 
 COARSE, FINE = 128, 192
 """Cells along the longest side: of a first look at all of a field, of a second one at the object's box."""
@@ -141,6 +143,40 @@ class Selection:
     """(M,) bool: its cells."""
     sure: float = 1.0
     """How far those who chose agree, from 0 to 1."""
+    object_to_lattice: np.ndarray = field(default_factory=partial(np.eye, 4))
+    """(4, 4) from the frame of the field that is cut to that of the field that was selected in."""
+
+    def seen_from(self, object_to_frame: np.ndarray) -> "Selection":
+        """The same object for a field that lies in this one's frame by a (4, 4)."""
+        return replace(self, object_to_lattice=self.object_to_lattice @ object_to_frame)
+
+    def lattice_points(self, points: np.ndarray, space: ModuleType) -> np.ndarray:
+        """(N, 3) points of the coordinates of a space, of the field that is cut, in those of the lattice."""
+        if self.is_aligned(space):
+            return points
+        at = space.placed(torch.from_numpy(points)).numpy() @ self.object_to_lattice[:3, :3].T
+        return mapped(at + self.object_to_lattice[:3, 3], self.lattice.grid.space)
+
+    def is_aligned(self, space: ModuleType) -> bool:
+        """Whether the coordinates of a space, of the field that is cut, are those of the lattice."""
+        return space is self.lattice.grid.space and np.array_equal(self.object_to_lattice, np.eye(4))
+
+    def box_in(self, grid: OccupancyGrid) -> np.ndarray:
+        """(6,) the box of a grid of the field that is cut, or so much of it as is known to hold the object;
+        its upper corner lies below the lower one where it holds nothing of it."""
+        box, core = self.object.tight_aabb(1), self.lattice.grid.space is bounded
+        if not self.is_aligned(grid.space):
+            if grid.space is not bounded or not (
+                core or np.abs(box).max() <= 1
+            ):  # as the frame's in the core
+                return grid.aabb
+            box = transformed_aabb(box, np.linalg.inv(self.object_to_lattice))
+        return np.concatenate([np.maximum(box[:3], grid.aabb[:3]), np.minimum(box[3:], grid.aabb[3:])])
+
+    def cell_in(self) -> float:
+        """The narrowest side of its cells in the frame of the field that is cut."""
+        stretch = np.linalg.svd(self.object_to_lattice[:3, :3], compute_uv=False)[0]
+        return float(self.lattice.grid.cell.min() / stretch)
 
     @cached_property
     def object(self) -> OccupancyGrid:
@@ -183,11 +219,11 @@ class Selection:
     def without(self, cells: np.ndarray) -> "Selection":
         """The object without some cells, (M,) bool, and without small pieces that then lie apart."""
         left = self.chosen & ~cells
-        return Selection(self.lattice, self.lattice.pieces(left, np.ones(len(left))), self.sure)
+        return replace(self, chosen=self.lattice.pieces(left, np.ones(len(left))))
 
     def joined(self, cells: np.ndarray) -> "Selection":
         """The object with some cells, (M,) bool."""
-        return Selection(self.lattice, self.chosen | cells, self.sure)
+        return replace(self, chosen=self.chosen | cells)
 
     @property
     def shows(self) -> bool:

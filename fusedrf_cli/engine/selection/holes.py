@@ -138,7 +138,6 @@ class Columns:
         return np.outer((u >= 0) & (u < self.size[0]), (v >= 0) & (v < self.size[1]))
 
 
-
 def patches(
     rest: RadianceField, box: np.ndarray, up: np.ndarray, gone: RadianceField | None = None
 ) -> tuple[list[Patch], float]:

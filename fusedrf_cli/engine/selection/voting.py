@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 
-from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.rendering.cameras import Camera, projected
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.engine.selection.cells import Lattice, Selection
+from fusedrf_cli.engine.selection.weights import cell_weights
 
 ENOUGH = 0.02
 """Votes from which a cell is decided by them."""
@@ -60,13 +60,13 @@ def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
 def shown_by(field, lattice: Lattice, cameras: Sequence[Camera]) -> np.ndarray:
     """(M,) how much cameras in the frame see of each cell in a field, which may be the lattice's own without
     something: the largest sum of weights (NeRF, eq. 3) in the cell or one beside it."""
-    found, step = np.zeros(len(lattice.index)), sampling_step(lattice.field)
+    found = np.zeros(len(lattice.index))
     for camera in cameras:
         rays_o, rays_d = camera.rays()
         met = reaching(lattice, rays_o, rays_d)
         rays_o, rays_d = rays_o[met], rays_d[met]
-        half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), np.uint8)
-        sums = field.votes(rays_o, rays_d, half, every, step, lattice.grid)
+        half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), bool)
+        sums = cell_weights(field, rays_o, rays_d, half, every, lattice.grid)
         found += sums[1][lattice.grid.occupied]
     return maximum_filter(lattice.spread(found), 3)[lattice.grid.occupied]
 
@@ -103,7 +103,7 @@ def tallied(lattice: Lattice, looks: Sequence[Look]) -> np.ndarray:
             asked &= look.counted.ravel()
             weight = POINTED
         rays = rays_o[asked], rays_d[asked], jitter[asked], look.inside.ravel()[asked]
-        sums = lattice.field.votes(*rays, sampling_step(lattice.field), lattice.grid)
+        sums = cell_weights(lattice.field, *rays, lattice.grid)
         found = found + weight * sums[:, lattice.grid.occupied]
     return found
 

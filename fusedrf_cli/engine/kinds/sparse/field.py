@@ -100,8 +100,14 @@ class SparseField(ComputedField):
     def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":
         """The same numbers without the voxels that lie in empty cells alone; itself where that would leave
         none."""
-        lattice = training.within(self.fine, occupancy)
+        lattice = training.within(self.fine, occupancy.contains)
         return self if lattice is None else self.on(lattice, occupancy.space)
+
+    def reaching(self, contains: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
+        """The same numbers of the voxels that reach where `contains` says so of points (N, 3) of the
+        coordinates of the space; None where there is none."""
+        lattice = training.within(self.fine, contains)
+        return None if lattice is None else self.on(lattice, self.lies_in)
 
     def with_voxels(self, holds: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
         """The same numbers of the voxels of whose corners (N, 3), in the coordinates of the space, `holds`
@@ -124,7 +130,7 @@ class SparseField(ComputedField):
         axis, where this one's cells are occupied. Raises ValueError for a field of several levels."""
         training.check_one_level(self)
         lattice = training.whole_lattice(np.asarray(aabb, np.float64), resolution)
-        return training.carried(self, training.within(lattice, self.occupancy) or lattice)
+        return training.carried(self, training.within(lattice, self.occupancy.contains) or lattice)
 
     def stored(self, as_stored: StoredAs) -> "SparseField":
         """See ComputedField; where the bricks are stays as it is, and need not be found again."""
