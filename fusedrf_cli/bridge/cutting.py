@@ -20,8 +20,9 @@ from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.selection.cells import ASIDE, Selection
+from fusedrf_cli.engine.selection.cells import CellConfig, Selection
 from fusedrf_cli.engine.selection.voting import shown_by
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput
 
 COPIES = 3.0
@@ -151,13 +152,13 @@ def cut(whole: Whole, selection: Selection, both: bool, guessed: bool) -> tuple[
 
 
 def holders(whole: Whole, selection: Selection) -> set[str]:
-    """The nodes in whose occupied cells more than ASIDE of an object's cells lie."""
+    """The nodes in whose occupied cells more than a share (CellConfig.aside) of an object's cells lie."""
     points = selection.lattice.points[selection.chosen & selection.lattice.dense]
     found = set()
     for leaf, placed in whole.nodes:
         inverse = np.linalg.inv(whole.object_to_frame(leaf))
         own = occupied_at(placed.field, points @ inverse[:3, :3].T + inverse[:3, 3])
-        if own.mean() > ASIDE:
+        if own.mean() > current(CellConfig).aside:
             found.add(leaf.name)
     return found
 

@@ -12,7 +12,7 @@ from formats.rig import read_rig
 from formats.scene import SceneGraph
 from formats.views import Capture, View
 from fusedrf_cli.bridge.budget import Budget
-from fusedrf_cli.bridge.extent import NEAR_OF_POINTS, Extent, near_of
+from fusedrf_cli.bridge.extent import Extent, ExtentConfig, near_of
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
@@ -31,24 +31,32 @@ from fusedrf_cli.engine.kinds import registry, splitting
 from fusedrf_cli.engine.kinds.student import DistilConfig, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_image
-from fusedrf_cli.engine.selection.cells import FINE, Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellConfig, Lattice, Selection
 from fusedrf_cli.engine.selection.holes import patches
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.requests import Learning, MendingRequest, TrainRequest
 
-SECONDS = 120.0
-"""Of learning from --refit's photos, where no time budget is given."""
-SHARE = 0.8
-"""Of a time budget that goes to it."""
-FAINT = 0.03
-"""Opacity of the object from which a pixel of a photo is left out."""
-GROWN = 4
-"""Pixels around those that are left out too: what the object's rim colours."""
+
+@dataclass(frozen=True)
+class MendingConfig:
+    """How a hole is learnt and filled."""
+
+    seconds: float = 120.0
+    """Of learning from --refit's photos, where no time budget is given."""
+    share: float = 0.8
+    """Of a time budget that goes to it."""
+    faint: float = 0.03
+    """Opacity of the object from which a pixel of a photo is left out."""
+    grown: int = 4
+    """Pixels around those that are left out too: what the object's rim colours."""
+    settings: DistilConfig = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+    numbers: int = 2_000_000
+    """Of the tensor that a smooth surface is learnt into, at most."""
+
+
 LEARNT, FILLED = "restored/refit", "restored/filled"
 """Names of nodes of what is put into the hole."""
-SETTINGS = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
-NUMBERS = 2_000_000
-"""Of the tensor that a smooth surface is learnt into, at most."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +83,7 @@ class Teacher:
         """The student, taught, with its numbers on the CPU."""
         seconds = self.budget.part(max(1, self.tries))
         self.tries -= 1
-        settings = replace(SETTINGS, seed=self.seed, time_budget=seconds)
+        settings = replace(current(MendingConfig).settings, seed=self.seed, time_budget=seconds)
         rays = RaySampler([teacher.occupancy.subject])
         run = DistillRun(teacher, student.to(self.place), rays, settings, self.rgb)
         learnt, _ = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
@@ -105,7 +113,7 @@ def learnt_surfaces(surfaces: list[Placed], teach: Teacher) -> list[Placed]:
     for one in surfaces:
         teacher = ComposedField([one])
         generator = torch.Generator().manual_seed(teach.seed)
-        student = kind.empty(teacher, Way(), NUMBERS, generator, one.name)
+        student = kind.empty(teacher, Way(), current(MendingConfig).numbers, generator, one.name)
         found.append(Placed(one.name, teach(teacher, student), placement(teacher.origin)))
     return found
 
@@ -142,7 +150,7 @@ def mended(
 
 def in_hole(learnt: StoredField, rest: RadianceField, found: RadianceField) -> StoredField | None:
     """What a field learnt anew has around an object where what is left has nothing."""
-    lattice = Lattice.over(learnt, box_in(learnt, found.occupancy), FINE)
+    lattice = Lattice.over(learnt, box_in(learnt, found.occupancy), current(CellConfig).fine)
     kind, free = registry.kind(learnt.kind), ~occupied_at(rest, lattice.points)
     behind = kind.cut_out(learnt, Selection(lattice, free)) if free.any() else None
     return behind and kind.trimmed(behind)
@@ -204,6 +212,7 @@ def posed_as(capture: Capture, frame: Frame, progress) -> Capture:
 
 def extent_like(frame: Frame, capture: Capture) -> Extent:
     """The extent of the bundle's own field, for cameras of its world."""
+    config = current(ExtentConfig)
     origin, field = placement(frame.origin), frame.field
     box = field.occupancy.aabb
     if field.occupancy.space is bounded:
@@ -211,14 +220,15 @@ def extent_like(frame: Frame, capture: Capture) -> Extent:
     poses = np.array([view.camera_to_world for view in capture.train])
     extent = Extent(box, origin, True)
     near = near_of(capture.train, scene_frame(poses).distance) / extent.unit
-    clear = [max(near, NEAR_OF_POINTS * (view.near or 0) / extent.unit) for view in capture.train]
+    clear = [max(near, config.near_of_points * (view.near or 0) / extent.unit) for view in capture.train]
     shown = shown_cells([extent.camera(camera_of(view)) for view in capture.train], near, clear)
     return replace(extent, near=near, cells=shown.within(box))
 
 
 def wanted_of(request: MendingRequest) -> TrainRequest:
     """A training as `train` without options would do it."""
-    seconds = SHARE * request.time_budget if request.time_budget else SECONDS
+    config = current(MendingConfig)
+    seconds = config.share * request.time_budget if request.time_budget else config.seconds
     return TrainRequest(
         request.refit, request.output, overwrite=request.overwrite, precision="float16",
         memory=request.memory, time_budget=seconds, seed=request.seed, device=request.device,
@@ -242,5 +252,6 @@ def without(found: RadianceField | None, capture: Capture, cameras: list[Camera]
 
 def shows(found: RadianceField, camera: Camera, view: View) -> np.ndarray:
     """(H, W) bool: the pixels of a view that an object shows in, and a few around them."""
-    shown = render_image(found, camera).opacity > FAINT
-    return binary_dilation(shown, iterations=GROWN) if shown.any() else shown
+    config = current(MendingConfig)
+    shown = render_image(found, camera).opacity > config.faint
+    return binary_dilation(shown, iterations=config.grown) if shown.any() else shown

@@ -18,9 +18,10 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.selection.cells import COARSE, FINE, Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellConfig, Lattice, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
 from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest
 
@@ -213,11 +214,12 @@ def watching(fused: Whole) -> list[Camera]:
 def selected(field: RadianceField, told: Told) -> Selection:
     """The object in two looks: at all of the field in coarse cells, and at the box that it lies in. Where it
     touches other matter colours correct what masks say."""
-    found = choice(Lattice.over(field, field.occupancy.aabb, COARSE), told)
+    config = current(CellConfig)
+    found = choice(Lattice.over(field, field.occupancy.aabb, config.coarse), told)
     if not found.shows:
         return found
     held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
-    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), FINE), told)
+    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), config.fine), told)
     return fine.without_foreign() if told.masks else fine
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from fusedrf_cli.bridge.looks import LookConfig
 from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.blocks import students as blocks
@@ -82,8 +83,7 @@ def quick(monkeypatch, in_force) -> None:
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.students.SHAPE", SHAPE)
     monkeypatch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     monkeypatch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
-    monkeypatch.setattr("fusedrf_cli.bridge.looks.WHOLE", 2)
-    monkeypatch.setattr("fusedrf_cli.bridge.looks.MOST_OBJECTS", 0)
+    in_force(LookConfig(whole=2, most_objects=0))
 
 
 def pytest_generate_tests(metafunc):

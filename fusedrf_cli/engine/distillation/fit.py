@@ -17,15 +17,15 @@ from fusedrf_cli.engine.distillation.exposure import (
 )
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
-from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
-from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam, alike
+from fusedrf_cli.engine.distillation.matter import MatterConfig, occupancy_of, without_haze
+from fusedrf_cli.engine.distillation.optimiser import Adam, AdamConfig, alike
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
     changed,
     refined,
 )
-from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
+from fusedrf_cli.engine.distillation.smoothness import SmoothnessConfig, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.computed import AS_IT_IS, NONE_KNOWN, Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, cell_counts, texels
@@ -143,7 +143,8 @@ class FitRun:
 
     def fresh_optimiser(self) -> Adam:
         """An optimiser of the field as it is now."""
-        return Adam.of(self.field, self.config.unbounded_momentum if self.config.unbounded else BETA1)
+        usual = current(AdamConfig).beta1
+        return Adam.of(self.field, self.config.unbounded_momentum if self.config.unbounded else usual)
 
     def forget(self) -> None:
         """Let go of what only another step would need, several times the field's numbers."""
@@ -304,7 +305,7 @@ class FitRun:
                 return
             self.occupy(occupancy)
         if self.share() >= self.config.low_density_left_from or not self.refreshes:
-            rays_o, rays_d, *_ = self.pool.draw(RAYS_THAT_JUDGE)
+            rays_o, rays_d, *_ = self.pool.draw(current(MatterConfig).rays_that_judge)
             self.occupy(without_haze(self.field, rays_o, rays_d, self.config.near))
 
     def shown_cells(self) -> OccupancyGrid:
@@ -397,9 +398,10 @@ class FitRun:
     def learn(self, sums: np.ndarray, rays: int, decay: float, known: int = 0) -> None:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
         of the next. Of `known` of them depths are known, and their colour errors are not in the sums."""
+        config = current(SmoothnessConfig)
         if self.config.smooth:
-            strip = int(torch.randint(STRIPS, (), generator=self.generator))
-            add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)
+            strip = int(torch.randint(config.strips, (), generator=self.generator))
+            add_roughness(self.field, self.optimiser.gradient[0], config.weight * rays, strip)
         if self.steps % self.config.faded_each == 0:
             self.optimiser.fade(self.config.faded_each * decay * self.faded)
         self.optimiser.step(self.config.rate * decay)

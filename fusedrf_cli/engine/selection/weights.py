@@ -10,7 +10,8 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, mapped
 from fusedrf_cli.engine.kernels import segments
 from fusedrf_cli.engine.kernels.instances import FARTHEST, Traces
 from fusedrf_cli.engine.kernels.segments import DONE, RayBatch
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, reach_of, waves, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import RenderConfig, reach_of, waves, weights_from_depths
+from fusedrf_cli.engine.settings import current
 
 
 def cell_weights(
@@ -60,7 +61,7 @@ def march(
 ) -> None:
     """Add the weights of rays through any field, by asking it at each sample."""
     trans, reach = np.ones(len(rays_o), np.float32), reach_of(len(rays_o), 0.0, np.inf)
-    rays = rays_o, rays_d, reach, jitter, sampling_step(field), lambda: trans > EARLY_STOP
+    rays = rays_o, rays_d, reach, jitter, sampling_step(field), lambda: trans > current(RenderConfig).early_stop
     for ray, distances, spans, counts in waves(field, *rays):
         mask = np.arange(distances.shape[1]) < counts[:, None]
         points = rays_o[ray][:, None] + distances[..., None] * rays_d[ray][:, None]
@@ -77,7 +78,7 @@ def count_instances(
     """Add the weights of rays through a scene, with the samples and the step of each instance."""
     reach = np.minimum(reach_of(len(rays_o), 0.0, np.inf), FARTHEST)
     rays = RayBatch(exact(rays_o), exact(rays_d), reach)
-    counting = WeightWaves(scene, rays, 1.0, EARLY_STOP, np.zeros((len(rays_o), 5), np.float32))
+    counting = WeightWaves(scene, rays, 1.0, current(RenderConfig).early_stop, np.zeros((len(rays_o), 5), np.float32))
     counting.inside, counting.tally = inside, tally
     while counting.go_on():
         pass

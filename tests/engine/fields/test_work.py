@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.base import MOST_SAMPLES
+from fusedrf_cli.engine.fields.base import SamplingConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.kinds import registry
@@ -52,7 +52,7 @@ def test_a_detail_that_is_too_fine_is_refused():
 def test_cubic_voxels_are_always_bearable():
     """8,192 texels along each side, the most that a stored field has."""
     box = np.array([0.0, 0, 0, 1, 1, 1])
-    assert bounded.most_samples(box, bounded.picture_step(1 / 8191)) < MOST_SAMPLES
+    assert bounded.most_samples(box, bounded.picture_step(1 / 8191)) < SamplingConfig.most_samples
 
 
 @pytest.mark.parametrize("space", [bounded, unbounded])

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples
+from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
     PER_CELL_MADE,
@@ -38,6 +38,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     check_counts,
     table_entries,
 )
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
@@ -334,6 +335,7 @@ class SparseField(ComputedField):
 
 def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     """The tree of a stored field. Raises ValueError naming what does not fit."""
+    config = current(SamplingConfig)
     counts = metadata["counts"]
     if not isinstance(counts, list) or len(counts) != 3:
         raise ValueError(f"counts should be three whole numbers, found {counts}")
@@ -360,7 +362,7 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     tree = replace(tree, phase=tuple(whole(n, "phase", 0, 1) for n in phase))
     if not tree.mask.any():
         raise ValueError("array 'masks' should have an active voxel")
-    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", MOST_OF_SEVERAL)
+    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", config.most_of_several)
     tree.tables  # noqa: B018  (made now, so that what is too large is refused here)
     return tree
 

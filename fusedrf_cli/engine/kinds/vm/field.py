@@ -18,7 +18,7 @@ import torch
 
 from fusedrf_cli.engine.encodings.plane_line import MODES
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples, sampling_step
+from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples, sampling_step
 from fusedrf_cli.engine.fields.box import (
     DENSITY_SCALE_PER_EXTENT,
     DENSITY_SHIFT,
@@ -512,6 +512,7 @@ class VMField(ComputedField):
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
         """Inverse of `state`. Every number is checked before it can size an array or index one."""
+        config = current(SamplingConfig)
         shape = VMShape(**metadata["shape"])
         tensors = tuple(stored_tensor(i, t, arrays, shape) for i, t in enumerate(metadata["tensors"]))
         blocks = tuple(stored_block(i, b, len(tensors)) for i, b in enumerate(metadata["blocks"]))
@@ -532,7 +533,9 @@ class VMField(ComputedField):
                     view[torch.from_numpy(held.rows)] = numbers
             check_answers(t, tensors[t], unplaced.sections(t))
         field = cls.assembled(shape, tensors, blocks, params)
-        check_samples(field.occupancy.most_samples(sampling_step(field)), "its blocks", MOST_OF_SEVERAL)
+        check_samples(
+            field.occupancy.most_samples(sampling_step(field)), "its blocks", config.most_of_several
+        )
         return field
 
 
