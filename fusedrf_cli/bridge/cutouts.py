@@ -16,7 +16,6 @@ from formats.records import BITS, FieldRecord
 from formats.scene import Leaf, Node, SceneGraph, dump_scene
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.cutting import Fields, Whole
-from fusedrf_cli.bridge.fusing import NODES
 from fusedrf_cli.bridge.scene import part_shown, stored
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import StoredField
@@ -98,11 +97,6 @@ class Cutout:
     def fields(self) -> FieldSet:
         """Those that it has, and those of the bundle."""
         return self.whole.draft.bundle.with_fields(self.writer.members)
-
-    @property
-    def kind_to_fuse(self) -> str:
-        """The way in which its fields become smaller."""
-        return self.kinds if self.kinds != "vm" and "," not in self.kinds else NODES
 
     @property
     def kinds(self) -> str:

@@ -36,6 +36,7 @@ from fusedrf_cli.bridge.sources import as_it_is
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placed_box
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.selection.voting import shown_by, well_shown
 from fusedrf_cli.engine.selection.weights import cell_weights
@@ -215,7 +216,7 @@ def within_size(request: ExtractRequest, cutout: Cutout, progress) -> dict:
         alone.write(pieces, False)
         fused = fuse(
             FuseRequest(
-                pieces, smaller, kind=cutout.kind_to_fuse, max_size=max(1, request.max_size - beside),
+                pieces, smaller, kind=registry.INSTANCES, max_size=max(1, request.max_size - beside),
                 precision=request.precision, memory=request.memory, time_budget=request.time_budget,
                 seed=request.seed, device=request.device, threads=request.threads,
             ),
