@@ -56,6 +56,11 @@ class Part:
         return self.axes == (0, 1, 2)
 
 
+def aligned(part: Part) -> int:
+    """Floats of a part, up to whole cache lines."""
+    return -(-math.prod(part.shape) // LINE) * LINE
+
+
 class BoxField(ComputedField):
     """A field over one box; σ = scale softplus(feature + shift), scale in 1/length.
 
@@ -67,6 +72,8 @@ class BoxField(ComputedField):
     """
 
     shape_type: type
+    name = ""
+    """Of the object that it is, where its kind's files say so."""
 
     def __init__(
         self,
@@ -117,7 +124,7 @@ class BoxField(ComputedField):
         if self.params.device.type != "cpu":
             return self.to("cpu").resampled(box, resolution).to(self.params.device)
         new = type(self)(self.shape, box, resolution, self.scale, self.shift, occupancy=self.occupancy)
-        new.params = new.params.to(self.params.dtype)
+        new.params, new.name = new.params.to(self.params.dtype), self.name
         at = [unit_texels(new.box, self.box, axis, new.resolution[axis]) for axis in range(3)]
         for part, old, target in zip(
             self.parts, self.sections().values(), new.sections().values(), strict=True
@@ -137,13 +144,17 @@ class BoxField(ComputedField):
     @cached_property
     def starts(self) -> np.ndarray:
         """(parts + 1,) int64: where each part begins in `params`, on a cache line, and the end."""
-        counts = [-(-int(np.prod(part.shape)) // LINE) * LINE for part in self.parts]
-        return np.cumsum([0, *counts], dtype=np.int64)
+        return np.cumsum([0, *map(aligned, self.parts)], dtype=np.int64)
 
     @property
     def size(self) -> int:
         """Floats of `params`."""
         return int(self.starts[-1])
+
+    @classmethod
+    def size_of(cls, shape: object, resolution: tuple[int, int, int]) -> int:
+        """Floats of the `params` of a field."""
+        return sum(map(aligned, cls.parts_of(shape, resolution)))
 
     def sections(self) -> dict[str, torch.Tensor]:
         """Views of the parts of `params` by name."""
@@ -253,7 +264,7 @@ class BoxField(ComputedField):
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs."""
         parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
-        numbers = sum(-(-math.prod(part.shape) // LINE) * LINE for part in parts)
+        numbers = sum(map(aligned, parts))
         counts, texels = metadata["cells"]["counts"], metadata["resolution"]
         made, unwritten = PER_CELL_MADE * math.prod(counts), 0
         for part in parts:

@@ -5,7 +5,7 @@ A place of photos has surfaces everywhere, and products of planes and lines over
 and stones apart; vertices that are found by a hash cost memory only where some surface uses them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -30,9 +30,9 @@ class Hashed:
     """Of the vertices of each level."""
     rows: int
     """Of each level, a power of two; vertices share them."""
-    learns_from: int = 100
+    learns_from: int = field(default=100, compare=False)
     """Texels along a field's longest axis from which it learns; before, it would learn what is coarse."""
-    rate: float = 0.5
+    rate: float = field(default=0.5, compare=False)
     """It learns at, relative to the factors; at 1 smooth things come out grainy: a cup after 100 s SSIM 0.77,
     with 0.5 0.79."""
 

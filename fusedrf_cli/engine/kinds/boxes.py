@@ -46,8 +46,8 @@ class BoxKind(Kind):
         return [Section(part.name, (*part.shape[:-1], part.columns or part.shape[-1])) for part in parts]
 
     def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
-        """See Kind; with what fills rows up."""
-        return sum(int(np.prod(part.shape)) for part in self.field.parts_of(self.shape(way), resolution))
+        """See Kind; with what fills rows and cache lines up."""
+        return self.field.size_of(self.shape(way), resolution)
 
     def student(self, scene: ComposedField, request: StudentRequest) -> Student:
         """See Kind."""
@@ -70,7 +70,9 @@ class BoxKind(Kind):
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> BoxField:
         """See Kind."""
-        return self.field.create(self.shape(plan.way), plan.box, plan.resolution, generator)
+        field = self.field.create(self.shape(plan.way), plan.box, plan.resolution, generator)
+        field.name = name
+        return field
 
 
 class GridStudent(Student):
