@@ -287,7 +287,7 @@ class BoxField(ComputedField):
         cells = metadata["cells"]
         grid = OccupancyGrid(
             checked_box(cells["aabb"], "cells"),
-            unpack_bits(arrays, "occupancy", counts),
+            unpack_bits(arrays, cls.stored_name("occupancy"), counts),
             space_named(cells.get("space", "bounded")),
         )
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)

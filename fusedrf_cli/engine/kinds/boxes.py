@@ -31,14 +31,19 @@ class BoxKind(Kind):
 
     field: type[BoxField]
 
+    @property
+    def usual(self) -> object:
+        """The field's shape where nothing is asked."""
+        return self.field.shape_type()
+
     def shape(self, way: Way) -> object:
-        """The field's shape for a way; what the way leaves open is the shape's own default."""
+        """The field's shape for a way; what the way leaves open is as usual."""
         asked = {"sh_degree": way.sh_degree}
         if way.ranks is not None:
             asked |= dict(zip(("density_rank", "colour_rank"), way.ranks, strict=True))
         known = {field.name for field in fields(self.field.shape_type)}
         heeded = {name: value for name, value in asked.items() if name in known and value is not None}
-        return replace(self.field.shape_type(), **heeded)
+        return replace(self.usual, **heeded)
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """See Kind."""

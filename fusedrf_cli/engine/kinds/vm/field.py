@@ -120,7 +120,7 @@ class VMField(AssembledField):
         arrays = self.numbers()
         hashed, held = self.shape.hashed, runs_of(self.stored_name(DETAIL)) in arrays
         few = 0 if held else min(FEW_CELLS, CELLS_PER_NUMBER * self.size)
-        cells = packed_bits(f"{TENSOR}occupancy", self.occupancy.occupied, few)
+        cells = packed_bits(self.stored_name("occupancy"), self.occupancy.occupied, few)
         needs = {"hashed"} if hashed else set()
         needs |= ({"held", "runs"} if held else set()) | ({"held"} if len(cells) > 1 else set())
         shape = {name: getattr(self.shape, name) for name in ("density_rank", "colour_rank", "sh_degree")}
@@ -158,12 +158,7 @@ class VMField(AssembledField):
         )
         if numbers > MAX_NUMBERS:
             raise ValueError(f"it has {numbers:,} numbers, but at most {MAX_NUMBERS:,} are read")
-        cells = {
-            name.removeprefix(TENSOR): array
-            for name, array in arrays.items()
-            if name.startswith(f"{TENSOR}occupancy")
-        }
-        field = super().from_state(with_all_rows(arrays, own["shape"].get("hashed")) | cells, own)
+        field = super().from_state(with_all_rows(arrays, own["shape"].get("hashed")), own)
         field.name = str(metadata["blocks"][0]["name"])
         return field
 

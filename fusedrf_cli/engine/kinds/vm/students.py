@@ -1,7 +1,7 @@
 """A vm field as a student: over a scene's box, from a background's numbers where these can be taken over."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,14 @@ from fusedrf_cli.engine.kinds.vm.trimming import (
 )
 from fusedrf_cli.engine.settings import current
 
+
+@dataclass(frozen=True)
+class VMConfig:
+    """What a vm field has where nothing else is asked."""
+
+    shape: VMShape = VMShape()
+
+
 MAX_DEGREE = 3
 COARSER = 1.5  # times its own voxel: how coarse a field can get before it is left without its detail
 BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
@@ -51,6 +59,11 @@ class VMKind(BoxKind):
     takes_over = True
     hashes = True
     distilled = "int8"  # measured: four objects in 25 MB, 0.6 dB more than half the numbers in float16
+
+    @property
+    def usual(self) -> VMShape:
+        """See BoxKind."""
+        return current(VMConfig).shape
 
     def shape(self, way: Way) -> VMShape:
         """See BoxKind."""
