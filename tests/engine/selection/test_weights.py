@@ -7,7 +7,7 @@ import pytest
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import as_composite
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.selection.weights import Tally, cell_weights, march
 from tests.analytic.export import exported
 from tests.analytic.fields import Gaussian, Tint
@@ -18,8 +18,8 @@ BOX = np.array([-1.0, -1, -1, 1, 1, 1])
 
 
 @pytest.fixture(autouse=True)
-def coarse_occupancy(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+def coarse_occupancy(in_force):
+    in_force(OccupancyConfig(scene_cells=24))
 
 
 def blob(kind, density=20.0):
