@@ -23,7 +23,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun, Recipe
 from fusedrf_cli.engine.distillation.judging import Judge
-from fusedrf_cli.engine.distillation.losses import OPAQUE
+from fusedrf_cli.engine.distillation.losses import LossConfig
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import Schedule
 from fusedrf_cli.engine.fields.streamed import opened
@@ -95,8 +95,8 @@ def opacity(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, to
 
 def capped_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The squared error of optical depth up to what looks opaque."""
-    off = depth - wanted.clamp_max(OPAQUE)
-    off[(depth >= OPAQUE) & (wanted >= OPAQUE)] = 0
+    off = depth - wanted.clamp_max(LossConfig.opaque)
+    off[(depth >= LossConfig.opaque) & (wanted >= LossConfig.opaque)] = 0
     return off**2, 2 * off
 
 

@@ -18,12 +18,13 @@ import numpy as np
 
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell
-from fusedrf_cli.bridge.training import QUALITY
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.distillation import fit
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.settings import using
 
 LOOKED_AT = 50  # steps from one count of changed lines to the next: counting takes as long as a step
 
@@ -63,9 +64,10 @@ def measured(capture: Path, seconds: float, light: float) -> dict:
         learn(self, sums, rays, *more)
 
     tell(f"{capture.name}: {light:g}")
+    known = {name: getattr(Presets, name) for name in ("draft", "normal", "high", "best")}
     with (
         tempfile.TemporaryDirectory() as folder,
-        mock.patch.dict(QUALITY, {name: replace(how, light=light) for name, how in QUALITY.items()}),
+        using(Presets(**{name: replace(how, light=light) for name, how in known.items()})),
         mock.patch.object(fit.FitRun, "learn", counted),
         mock.patch.object(fit.FitRun, "step", timed(taken, "step", fit.FitRun.step)),
         mock.patch.object(ComputedField, "train_rays", timed(taken, "pass", ComputedField.train_rays)),

@@ -12,16 +12,23 @@ from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
 from fusedrf_cli.bridge.rendering import in_memory, picture_memory, renderable, tell_of_work
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
+from fusedrf_cli.engine.distillation.judging import JudgingConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import EvaluateRequest
 
-SCENE_VIEWS = 8
-SCENE_SIZE = (400, 400)
-SCENE_SEED = (JUDGED_SEED, 1)  # a stream of their own
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The views of a scene that are compared."""
+
+    views: int = 8
+    size: tuple[int, int] = (400, 400)
+    seed: tuple[int, int] = (JudgingConfig.judged_seed, 1)
+    """A stream of their own."""
 
 
 def evaluate(request: EvaluateRequest, progress) -> dict:
@@ -134,10 +141,12 @@ def scene_pairs(
 ) -> Iterator[tuple[Pair, int]]:
     """The same of another scene, as `render` draws it, from where it and its objects were photographed; every
     pixel counts."""
+    evaluation = current(EvaluationConfig)
+    config = current(JudgingConfig)
     loaded = load_scene(against, allow_outside, budget, place)
     field, origin = renderable(loaded)
-    width, height = size or SCENE_SIZE
-    views = looks_of(loaded, loaded.composed(), SCENE_VIEWS, (width, height), SCENE_SEED)
+    width, height = size or evaluation.size
+    views = looks_of(loaded, loaded.composed(), evaluation.views, (width, height), evaluation.seed)
     cameras = [look.camera for look in views]
     needed = sources(loaded.resident) | picture_memory(field, cameras, film=False) | measured(width, height)
     budget.expect(needed, advice="give a smaller --size")
@@ -145,4 +154,4 @@ def scene_pairs(
     for look in views:
         shot = render_image(field, look.camera, origin=origin)
         every = np.ones(shot.opacity.shape, bool)
-        yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > COVERED, look.of), len(views)
+        yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > config.covered, look.of), len(views)

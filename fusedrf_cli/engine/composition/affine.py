@@ -9,6 +9,7 @@ on points.
 
 from dataclasses import dataclass
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
 from fusedrf_cli.engine.kernels.reference import exact
-from fusedrf_cli.engine.spaces import unbounded
+from fusedrf_cli.engine.spaces import bounded
 
 CONDITION_LIMIT = 1e6  # a flatter placement cannot be inverted to float32's accuracy
 
@@ -55,8 +56,13 @@ class Placed:
 
     @cached_property
     def unbounded(self) -> bool:
-        """Whether the field fills all of space."""
-        return self.field.occupancy.space is unbounded
+        """Whether the field lies in a space without end."""
+        return self.space is not bounded
+
+    @property
+    def space(self) -> ModuleType:
+        """That the field lies in."""
+        return self.field.occupancy.space
 
     def reaches(self, box: np.ndarray) -> bool:
         """Whether there may be anything of it in a box (6,) of the world."""

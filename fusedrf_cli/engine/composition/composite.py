@@ -7,6 +7,7 @@ several meet, each leaves its samples, and these are merged by the scene's rule.
 
 from collections.abc import Iterable, Mapping
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -99,7 +100,7 @@ class Composite(ComposedField):
     def posed(self, poses: Mapping[str, np.ndarray]) -> "Composite":
         """See ComposedField."""
         other = super().posed(poses)
-        for name in ("groups", "leaves", "instances", "sampling_step"):
+        for name in ("groups", "leaves", "instances", "spaces", "sampling_step"):
             other.__dict__.pop(name, None)
         return other
 
@@ -149,7 +150,14 @@ class Composite(ComposedField):
             np.concatenate(list(skip.values())),
             np.array([sampling_step(field) for field in self.fields]),
             np.stack([sphere_around(p, f) for p, f in zip(self.leaves, self.fields, strict=True)]),
+            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.leaves], np.int64),
         )
+
+    @cached_property
+    def spaces(self) -> tuple[ModuleType, ...]:
+        """Those without end that instances lie in, by name."""
+        found = {p.space for p in self.leaves if p.unbounded}
+        return tuple(sorted(found, key=lambda space: space.__name__))
 
     @cached_property
     def sampling_step(self) -> float:
@@ -269,7 +277,8 @@ class Waves:
         """The next segments of rays left (M,). Where more instances meet than there is room for, they are
         looked for again with more room."""
         arguments = self.rays, self.scene.instances
-        segments.next_segments(*arguments, left, get_num_threads(), self.segments)
+        next_segments = segments.next_segments_in(self.scene.spaces)
+        next_segments(*arguments, left, get_num_threads(), self.segments)
         shared = left[self.segments.instance[left] == segments.SHARED]
         found, room = self.segments.n_meeting[shared], self.segments.meeting.shape[1]
         if len(shared) and found.max() > room:
@@ -278,7 +287,7 @@ class Waves:
             wider[:, :room] = self.segments.meeting
             self.segments = self.segments._replace(meeting=wider)
             self.segments.end[again] = self.segments.alone_from[again]
-            segments.next_segments(*arguments, again, get_num_threads(), self.segments)
+            next_segments(*arguments, again, get_num_threads(), self.segments)
         return self.segments
 
     def parts(self, shared: np.ndarray) -> list[np.ndarray]:
@@ -297,6 +306,12 @@ class Waves:
         ends, groups = (found.begin, found.end), self.scene.rules(slots[2])
         self.each("trace_ray", *slots, ends, traces)
         segments.merge_samples(shared, start, self.early_stop, groups, traces, found.end, self.out)
+        self.add_samples(shared, start, slots, ends, traces)
+
+    def add_samples(
+        self, shared: np.ndarray, start: np.ndarray, slots: tuple, ends: tuple, traces: Traces
+    ) -> None:
+        """Add what the samples of rays shared (M,) show, by the weights that they were given."""
         self.each("shade_ray", *slots, ends, traces)
         segments.add_colours(shared, start, traces, self.out)
 
@@ -327,7 +342,7 @@ def room_for_traces(slots: int) -> Traces:
 
 def sphere_around(placed: Placed, field: RadianceField) -> np.ndarray:
     """(4,) centre and radius of a sphere around the occupied cells of a placed field, without end where they
-    lie in unbounded space."""
+    lie in a space without end."""
     if placed.unbounded:
         return np.array([0, 0, 0, FARTHEST])
     corners, matrix = box_corners(field.occupancy.tight_aabb(0)), placed.object_to_world

@@ -5,8 +5,13 @@ from dataclasses import dataclass
 
 from fusedrf_cli.engine.composition.affine import Placed
 
-ENOUGH_VOXELS = 8  # across an object, under which there is no shape left
-LOST_NOTED = 0.01  # share of an object's cells
+
+@dataclass(frozen=True)
+class DetailConfig:
+    """What is said about an object's detail."""
+
+    enough_voxels: int = 8
+    """Across an object, under which there is no shape left."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +29,6 @@ class Detail:
     """The finest that the fused field tells apart there."""
     voxels_across: float
     """Of the fused field, along the object's longest side."""
-    lost: float = 0.0
-    """Share of its cells of matter that the fused field does not show."""
 
 
 def details_at_voxel(placed: list[Placed], voxel: float) -> list[Detail]:

@@ -158,7 +158,7 @@ class ComputedField:
         sigma, rgb = self.reference(params, at, dirs)
         if self.tint is not None:
             rgb = rgb * torch.tensor(self.tint, dtype=rgb.dtype, device=rgb.device)
-        return sigma * self.space.rates(at).to(sigma.dtype), rgb
+        return sigma * self.space.density_rates(at, dirs.to(at)).to(sigma.dtype), rgb
 
     # -- the same field otherwise ------------------------------------------------------------------------
 

@@ -39,6 +39,7 @@ class Instances(NamedTuple):
     skip: object  # flat uint8, see GridArrays
     step: object  # (B,) at which it is sampled, in its own coordinates
     spheres: object  # (B, 4) centre and radius around its occupied cells, in the scene's frame; or infinite
+    space: object  # (B,) int64 of an instance without end its number among the spaces of these; else 0
 
 
 class Box(NamedTuple):
@@ -213,11 +214,11 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
         index, many = next_sample(grid, origin, way, u0, u1, step, index)
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
             u = u0 + 0.5 * between(index, many) * step
-            p = along(origin, way, u)
+            p = position_at(origin, way, u)
             standing(field, many, scratch)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0 and sigma > 0.0:
-                depth = sigma * optical_length(warp, p, u, many, steps, step)
+                depth = sigma * optical_length(warp, p, d, u, many, steps, step)
                 low, high = interval(warp, u + 0.5 * (steps - 1) * many * step, steps * many * step)
                 out.low[s, count], out.high[s, count] = low / length, high / length
                 out.middle[s, count] = distance(warp, u) / length
@@ -281,7 +282,7 @@ def densest_at(field, grid, query, i, scratch, memory, out):
     p, d, length = point_in_instance(field, grid, query, i)
     if known(field, grid, p):
         sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
-        sigma *= rate(p) * length
+        sigma *= rate(p, d) * length
         if steps > 0 and query.adds:
             out.sigma[j] += sigma
         elif steps > 0 and sigma > DENSER * out.sigma[j]:
@@ -299,7 +300,7 @@ def colour_at(field, grid, query, i, scratch, memory, out):
         sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
         if steps == 0 or sigma <= 0.0:
             return
-        share = sigma * rate(p) * length / out.sigma[j]
+        share = sigma * rate(p, d) * length / out.sigma[j]
     else:
         place = again(field, out.cell[j], p)
     begin(field, frame_of(place), d, scratch)

@@ -3,6 +3,8 @@ there, and how the samples of several are merged. Loops for the CPU.
 """
 
 import math
+from functools import cache
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +13,8 @@ from numba import prange
 from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER, FARTHEST
 from fusedrf_cli.engine.kernels.parts import along, body
 from fusedrf_cli.engine.kernels.plain import loop, task
-from fusedrf_cli.engine.kernels.specialise import loops_for
+from fusedrf_cli.engine.kernels.specialise import body as inlined
+from fusedrf_cli.engine.kernels.specialise import loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 TILE = 256  # rays, which lie close together in pictures
@@ -209,6 +212,43 @@ def next_segments(rays, instances, chosen, threads, segments):
         if low < high:
             near = np.empty(instances.step.shape[0], np.int64)
             segment_task(rays, instances, chosen, low, high, near, segments)
+
+
+# -- other spaces than bounded and unbounded ones ------------------------------------------------------------
+
+
+def next_in_either(instances, b, o, d, t, end, gap):
+    """`next_change` of an instance in one space, or in one of others."""
+    if instances.space[b] == NUMBER:
+        return next_in_this(instances, b, o, d, t, end, gap)
+    return next_in_others(instances, b, o, d, t, end, gap)
+
+
+@cache
+def next_segments_in(spaces: tuple[ModuleType, ...]):
+    """`next_segments` for scenes whose instances that have no sphere around them lie in some spaces, which
+    Instances.space counts. What most scenes have is compiled without the others."""
+    if spaces in ((), (unbounded,)):
+        return next_segments
+    loops = [loops_for(None, (), space) for space in spaces]
+    found, tag = loops[-1].names["next_change"], loops[-1].tag
+    for number in range(len(spaces) - 2, -1, -1):
+        tag = f"{loops[number].tag}_{tag}"
+        names = {
+            "next_in_this": loops[number].names["next_change"],
+            "next_in_others": found,
+            "NUMBER": number,
+        }
+        found = task(rebound(next_in_either, names, tag))
+    names = globals() | {"next_in_space": found}
+    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting):
+        name = function.py_func.__name__
+        names[name] = inlined(rebound(function.py_func, names, tag))
+    names["segment_task"] = task(rebound(segment_task.py_func, names, tag))
+    return loop(rebound(next_segments.py_func, names, tag))
+
+
+# -- slots and rays ------------------------------------------------------------------------------------------
 
 
 @task
