@@ -11,17 +11,24 @@ unit cube of the box, three float64:
     summed(field, cell, scratch), summed_backward(field, cell, d, base, scratch, grad)
                                the sum of the features, and its adjoint for d[base]: for decoders that need no
                                more, without a way by memory; others need none
-    located(field, cell, scratch)
-                               of the density's, the cell with what the last `summed` or `forward` found out
-                               of it; keep(cell), an int, and again(field, kept, unit), the cell that it was
-                               made of: may be left out where `locate` says all
-    logits(field, cell, scratch), logits_backward(field, cell, d_logits, scratch)
-                               of the density's, what it adds to the colour's three logits, and what they send
-                               back, which waits in scratch for the way back of the density; may be left out
     prefetch_at(field, array, cell)
                                asks for what these read of an array laid out as the field's numbers; may be
                                left out
 Points may lie a rounding outside the cube; no index may. A multiple of 8 features lets them use vectors.
+
+The density's encoding may also have
+    steps_at(field, cell, unit, k)
+                               for how many steps of a ray its sample k stands, 0 where there is nothing; left
+                               out: 1 in the box
+    advance(field, cell, many, steps, k, p, way, u, u0, step), known(field, grid, p)
+                               as kernels/loops.py has them
+    located(field, cell, scratch)
+                               the cell with what the last `summed` or `forward` has found out of it
+    keep(cell), again(field, held, unit)
+                               an int from which `again` makes the cell once more, where `locate` does not
+    logits(field, cell, scratch), logits_backward(field, cell, d_logits, scratch)
+                               what it adds to the three logits of the colour, and what they send back, which
+                               waits in scratch for the way back of the density
 
 For Python, with `options` what a field's shape says of the encoding:
     sizes(**options)           constants: WIDTH, ROOM (numbers of scratch, if any, which lie from AT on), and
@@ -35,7 +42,8 @@ For Python, with `options` what a field's shape says of the encoding:
                                (N, WIDTH) features of its sections at unit (N, 3), in plain torch; `read` is
                                what the slot that it reads hands on (kernels/assembled.py), or None
     bound(sections, read, **options)
-                               (WIDTH,) float64 the largest magnitude that each feature can reach
+                               (WIDTH,) float64 the largest magnitude that each feature can reach; of fields
+                               over a box
     logits_reference(field, sections, unit, **options), logits_bound(sections, **options)
                                the same of `logits`: (N, 3), and one magnitude
 """

@@ -236,10 +236,10 @@ HOSTILE_HELD = {
     "too few bits": ("detail_blocks", lambda a: a[:-1], "told by a bit"),
     "other bits": ("detail_blocks", lambda a: np.zeros_like(a), "should be told"),
     "an empty block": ("detail_held", np.zeros_like, "none is"),
-    "other rows": ("detail_held", lambda a: a ^ np.uint8(255), "none is|its detail|should have shape"),
+    "other rows": ("detail_held", lambda a: a ^ np.uint8(255), "none is|the runs of|should have shape"),
     "masks of another type": ("detail_held", lambda a: a.astype(np.int32), "should be told"),
     "no masks": ("detail_held", lambda a: None, "should have shape"),
-    "other runs": ("detail.runs", lambda a: a[::-1] + np.uint8(1), "runs of its detail"),
+    "other runs": ("detail.runs", lambda a: a[::-1] + np.uint8(1), "the runs of"),
     "fewer numbers": ("detail", lambda a: a[:-1], "should have shape"),
 }
 

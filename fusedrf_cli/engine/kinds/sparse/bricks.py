@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.asking import OCTANTS
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 
 MAX_LEVEL = 7
 MAX_TOP_CELLS = 1 << 22
@@ -137,9 +137,15 @@ class BrickTree:
         return cls(np.asarray(lo, np.float64), sides(top), tuple(counts), level, at, mask)
 
     @cached_property
+    def bits(self) -> np.ndarray:
+        """(N,) uint64, the masks: voxel (i, j, k) is bit (i * 4 + j) * 4 + k."""
+        weights = np.uint64(1) << np.arange(SIDE**3, dtype=np.uint64)
+        return (self.mask.reshape(-1, SIDE**3) * weights).sum(1, dtype=np.uint64)
+
+    @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as SparseArrays has them. Raises
-        ValueError where they would be too large."""
+        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as encodings/bricks.py has
+        them. Raises ValueError where they would be too large."""
         depth = np.zeros(self.counts, np.uint8)
         held = np.zeros(self.counts, bool)
         for level in range(self.depth + 1):
@@ -408,7 +414,7 @@ def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def corner_offsets(n: int) -> np.ndarray:
     """(8,) offsets of a voxel's corners from its first in a brick of n voxels a side, as `corner` of
-    sparse/bodies.py."""
+    encodings/bricks.py."""
     return (OCTANTS * [(n + 1) ** 2, n + 1, 1]).sum(1)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kinds.asking import (
     AT_ONCE,
@@ -20,7 +21,6 @@ from fusedrf_cli.engine.kinds.asking import (
     placed_in,
     touching,
 )
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,

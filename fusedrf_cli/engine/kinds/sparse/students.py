@@ -12,10 +12,10 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
+from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
-from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
