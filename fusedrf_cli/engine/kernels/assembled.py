@@ -71,12 +71,12 @@ def own_cell(field, place):
     return colour_locate(field, place[0])
 
 
-def begin(field, frame, d, scratch):
+def begin(field, d, scratch):
     """See loops.py."""
     rgb_ray_setup(field, d, scratch)
 
 
-def end(field, frame, d, scratch, grad):
+def end(field, d, scratch, grad):
     """See loops.py."""
     rgb_ray_backward(field, d, scratch, grad)
 

@@ -156,8 +156,7 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
     trans, pending, enough = 1.0 - out[r, 3], 0.0, COLOUR_FROM
-    current, begun = -1, entered(o, d, slots.reach[r, 0] * length)
-    started(field, step, scratch)
+    ready, begun = False, entered(o, d, slots.reach[r, 0] * length)
     for _ in range(PIECES):
         if trans <= slots.early_stop:
             break
@@ -179,9 +178,9 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
                 depth += weight * distance(warp, u)
                 pending += weight
                 if pending > enough:
-                    if frame_of(place) != current:
-                        current = frame_of(place)
-                        begin(field, current, d, scratch)
+                    if not ready:
+                        begin(field, d, scratch)
+                        ready = True
                     c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
                     red += pending * c_r
                     green += pending * c_g
@@ -203,7 +202,6 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
     step, far = slots.step, slots.reach[r, 1] * length
     trans, count, complete = 1.0 - slots.rendered[r, 3], 0, FARTHEST
     begun = entered(o, d, slots.reach[r, 0] * length)
-    started(field, step, scratch)
     for _ in range(PIECES):
         if trans <= slots.early_stop or count == MAX_TRACED:
             break
@@ -215,7 +213,6 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
             u = u0 + 0.5 * between(index, many) * step
             p = position_at(origin, way, u)
-            standing(field, many, scratch)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0 and sigma > 0.0:
                 depth = sigma * optical_length(warp, p, d, u, many, steps, step)
@@ -240,15 +237,15 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
     _, o, d, length = slot_ray(slots, s)
     red, green, blue = 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
-    pending, enough, current = 0.0, COLOUR_FROM, -1
+    pending, enough, ready = 0.0, COLOUR_FROM, False
     for q in range(out.count[s]):
         pending += out.weight[s, q]
         if pending > enough:
             p = point(along(o, d, out.middle[s, q] * length))
             place = again(field, out.cell[s, q], p)
-            if frame_of(place) != current:
-                current = frame_of(place)
-                begin(field, current, d, scratch)
+            if not ready:
+                begin(field, d, scratch)
+                ready = True
             c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
             red += pending * c_r
             green += pending * c_g
@@ -303,7 +300,7 @@ def colour_at(field, grid, query, i, scratch, memory, out):
         share = sigma * rate(p, d) * length / out.sigma[j]
     else:
         place = again(field, out.cell[j], p)
-    begin(field, frame_of(place), d, scratch)
+    begin(field, d, scratch)
     c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
     out.rgb[j, 0] += share * c_r
     out.rgb[j, 1] += share * c_g

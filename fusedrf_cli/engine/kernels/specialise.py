@@ -73,7 +73,7 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
 
 def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, light, *bases_of(space), space, *(family(bodies) if bodies else ())]
+    modules = [loops, instances, light, *bases_of(space), space, *([bodies] if bodies else ())]
     names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
     own = {module.__name__ for module in modules}
     found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}
@@ -84,17 +84,6 @@ def bases_of(space: ModuleType) -> list[ModuleType]:
     """The modules of other spaces that a space takes functions from."""
     taken = {f.__module__ for f in vars(space).values() if isinstance(f, FunctionType)}
     return [sys.modules[name] for name in sorted(taken - {space.__name__})]
-
-
-def family(bodies: ModuleType) -> list[ModuleType]:
-    """The modules of other kinds that a kind's module takes functions from, and itself last; of an assembly
-    itself alone (kernels/assembled.py)."""
-    if hasattr(bodies, "functions"):
-        return [bodies]
-    taken = {f.__module__ for f in vars(bodies).values() if isinstance(f, FunctionType)}
-    others = [sys.modules[name] for name in sorted(taken - {bodies.__name__})]
-    others = [module for module in others if hasattr(module, "Arrays")]
-    return [module for other in others for module in family(other)] + [bodies]
 
 
 def rebound(function: FunctionType, names: dict, tag: str) -> FunctionType:

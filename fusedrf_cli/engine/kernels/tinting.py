@@ -1,8 +1,8 @@
-"""Colours times a tint of each frame: what stands in for a kind's `colour` and `backward` where a field has
+"""Colours times a tint: what stands in for a kind's `colour` and `backward` where a field has
 tints.
 
-Here `own_colour` and `own_backward` mean the kind's, and `field.tint` is (frames, 3), with frames as
-`frame_of` counts them. Fields without tints are compiled without any of it.
+Here `own_colour` and `own_backward` mean the kind's, and `field.tint` is (1, 3). Fields without tints are
+compiled without any of it.
 """
 
 from functools import cache
@@ -13,16 +13,14 @@ import numpy as np
 
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py: the kind's, times the tint."""
-    frame = frame_of(place)
     red, green, blue = own_colour(field, place, p, d, scratch, memory, at)
-    return red * field.tint[frame, 0], green * field.tint[frame, 1], blue * field.tint[frame, 2]
+    return red * field.tint[0, 0], green * field.tint[0, 1], blue * field.tint[0, 2]
 
 
 def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py: the kind's, which knows of no tint. Under one of 0 nothing is sent back, whatever the
     colour was."""
-    frame = frame_of(place)
-    red, green, blue = field.tint[frame, 0], field.tint[frame, 1], field.tint[frame, 2]
+    red, green, blue = field.tint[0, 0], field.tint[0, 1], field.tint[0, 2]
     bare = rgb[0] / max(red, 1e-6), rgb[1] / max(green, 1e-6), rgb[2] / max(blue, 1e-6)
     sent = d_rgb[0] * red, d_rgb[1] * green, d_rgb[2] * blue
     own_backward(field, place, p, d, pre, d_sigma, shaded, bare, sent, scratch, memory, at, grad)
@@ -39,7 +37,7 @@ def tinted(functions: dict) -> dict:
 
 
 def with_tints(arrays: NamedTuple, tints: np.ndarray) -> NamedTuple:
-    """A kind's Arrays and tints (frames, 3) behind them."""
+    """A kind's Arrays and a tint (1, 3) behind them."""
     return tinted_arrays(type(arrays))(*arrays, np.ascontiguousarray(tints, np.float64))
 
 
