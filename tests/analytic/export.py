@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.student import Way

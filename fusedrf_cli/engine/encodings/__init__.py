@@ -16,6 +16,15 @@ unit cube of the box, three float64:
                                left out
 Points may lie a rounding outside the cube; no index may. A multiple of 8 features lets them use vectors.
 
+The density's encoding may also say where and how densely there is anything to sample:
+    steps_at(field, cell, unit, k)
+                               for how many steps of a ray its sample k stands, 0 where there is nothing; left
+                               out: 1 in the box
+    advance(field, cell, many, steps, k, p, way, u, u0, step), known(field, grid, p)
+                               as kernels/loops.py has them
+    keep(cell), again(field, held, unit)
+                               an int from which `again` makes the cell once more
+
 For Python, with `options` what a field's shape says of the encoding:
     sizes(**options)           constants: WIDTH, ROOM (numbers of scratch, if any, which lie from AT on), and
                                its own
@@ -28,5 +37,6 @@ For Python, with `options` what a field's shape says of the encoding:
                                (N, WIDTH) features of its sections at unit (N, 3), in plain torch; `read` is
                                what the slot that it reads hands on (kernels/assembled.py), or None
     bound(sections, read, **options)
-                               (WIDTH,) float64 the largest magnitude that each feature can reach
+                               (WIDTH,) float64 the largest magnitude that each feature can reach; of fields
+                               over a box
 """

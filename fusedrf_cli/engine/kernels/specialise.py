@@ -13,7 +13,7 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, loops, parts, tinting
+from fusedrf_cli.engine.kernels import instances, light, loops, parts, tinting
 from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": task, "sweep_task": task}
@@ -73,7 +73,7 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
 
 def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, *bases_of(space), space, *(family(bodies) if bodies else ())]
+    modules = [loops, instances, light, *bases_of(space), space, *(family(bodies) if bodies else ())]
     names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
     own = {module.__name__ for module in modules}
     found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}

@@ -11,8 +11,8 @@ import torch
 from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
 from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, trunk_features
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
-from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
+from fusedrf_cli.engine.kernels import instances, light, loops, parts, specialise
+from fusedrf_cli.engine.kernels.assembled import OPTIONAL, READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 from ..conftest import BOX, points_in
@@ -162,8 +162,10 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     space or of kernels/parts.py would be called in its place. Hooks of loops.py are there to be hidden."""
     bodies = vars(field.bodies)
     own = {name for name in {*bodies, *field.bodies.sizes(field)} if not name.startswith("__")}
-    hooks, settings = {template.__name__ for template in TEMPLATES}, {"LEARN_FROM", "SHADING_COST"}
-    for module, allowed in ((loops, hooks | settings), (space, settings), (parts, set()), (instances, set())):
+    hooks = {template.__name__ for template in TEMPLATES} | set(OPTIONAL)
+    settings = {"LEARN_FROM", "SHADING_COST"}
+    for module in (loops, space, parts, instances, light):
+        allowed = {loops: hooks | settings, space: settings}.get(module, set())
         others = {name for name in own & set(vars(module)) if bodies.get(name) is not vars(module)[name]}
         assert others <= allowed
 

@@ -12,13 +12,14 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
+from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
+from fusedrf_cli.engine.kinds.sparse import coarsening
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.resample import USUAL_SLOPE, TooFewNumbers, resampled
+from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
 from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
 from fusedrf_cli.engine.kinds.student import (
@@ -30,7 +31,6 @@ from fusedrf_cli.engine.kinds.student import (
     Plan,
     Section,
     StudentRequest,
-    TooSmall,
     Way,
 )
 from fusedrf_cli.engine.selection.cells import Selection
@@ -40,9 +40,6 @@ PADDED = 1.6  # floats in memory for each number that is stored: rows are padded
 WHOLE_BELOW = 0.8  # of the numbers allowed: fewer are taken where no object needs more
 PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squares of a vertex
 BYTES_PER_BRICK = 10  # masks and nodes
-NUMBERS_PER_BRICK = 2 * BYTES_PER_BRICK  # as which a brick counts, of half a byte each at least
-FEWEST_NUMBERS = 5000  # of a field that is made smaller
-RUNS = 1.06  # times the bytes of codes: rows are coded run by run
 DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0
 # Places are photographed from few sides, and what they say to others is anything: fitted by a lower degree,
 # it changes what photos do show. A park in 50 MB, before rays: 24.2 dB by degree 1, 30.0 by 2.
@@ -97,25 +94,9 @@ class SparseKind(Kind):
         return SparseStudent(self, scene, request)
 
     def reduction(self, outline: SparseField, voxel: float, way: Way) -> Reduction:
-        """See Kind: bricks anew, in about as many numbers as voxels so wide leave."""
+        """See Kind and sparse/coarsening.py."""
         degree = outline.shape.sh_degree if way.sh_degree is None else way.sh_degree
-        shape = SparseShape(min(degree, outline.shape.sh_degree))
-        bricks, bands = len(outline.tree.level), outline.coarse.free if shape.sh_degree else 0
-        numbers = ROW * outline.fine.free + shape.band_numbers * bands
-        wider = max(1.0, voxel / outline.voxel_size)
-        if wider == 1 and shape == outline.shape:
-            rows = Section("rows", (outline.fine.free, ROW))
-            sections = [rows, Section("bands", (bands, shape.band_numbers))] if bands else [rows]
-            return Reduction(Contents(sections, 8 * BYTES_PER_BRICK * bricks), lambda field: field, True)
-        few = max(FEWEST_NUMBERS, int((numbers + NUMBERS_PER_BRICK * bricks) * wider**USUAL_SLOPE))
-
-        def make(field: SparseField) -> SparseField:
-            try:
-                return resampled(field, shape, few, NUMBERS_PER_BRICK)
-            except TooFewNumbers as error:
-                raise TooSmall(LEAST_BYTES) from error
-
-        return Reduction(Contents([Section("rows", (int(RUNS * few / ROW), ROW))]), make, False)
+        return coarsening.reduced(outline, voxel, degree)
 
     def describe(self, field: SparseField) -> dict:
         """The voxel and the bricks of every level, and how many vertices they have."""
