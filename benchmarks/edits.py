@@ -13,6 +13,7 @@ import random
 import shutil
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,16 +32,36 @@ from fusedrf_cli.engine.distillation.judging import meets
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 
-OBJECTS = {"blocks": 32, "sparse": 8, "vm": 32}
-"""How many are added one by one; bricks take longer."""
 FUSING = {"vm": ("--time-budget", "20"), "sparse": ("--max-size", "4MB")}
 """Further words of a fuse."""
-MOST = "1MB"
-"""For a source: bricks as fine as larger ones take minutes to fill."""
-SHUFFLED = 6
-SIDE, VIEWS = 300, 4
-POINTS = 200_000
+
+
+@dataclass(frozen=True)
+class Edits:
+    """What is edited, how often, and how it is looked at."""
+
+    objects: tuple[tuple[str, int], ...] = (("blocks", 32), ("sparse", 8), ("vm", 32))
+    """How many are added one by one; bricks take longer."""
+    most: str = "1MB"
+    """For a source: bricks as fine as larger ones take minutes to fill."""
+    shuffled: int = 6
+    side: int = 300
+    views: int = 4
+    points: int = 200_000
+    inner: int = 3
+    """Of the objects that were fused, one that is deleted."""
+    repeats: int = 3
+    photos: int = 40
+    photo_side: int = 300
+    refit: str = "30"
+    edits: int = 2000
+    """Of the long run."""
+    cycle: int = 20
+    """Of them that add an object, move it about, name it anew, and delete it."""
+
+
 FRAME = np.array([-0.6, -0.6, -0.6, 9.7, 4.5, 0.6])
 FRAME_SIDES = FRAME[3:] - FRAME[:3]
 """Of the lattice, which pictures show."""
@@ -48,29 +69,26 @@ EXTRA = "extra", "fuze.rfpack", ["-t", "4.55,0.1,0", "-r", "0,0,20", "-s", "4"]
 """One more object, between two others and reaching into their boxes."""
 SMALL = "small", "chair.rfpack", ["-t", "4.55,2.0,0.2", "-s", "0.53"]
 """One whose box is about a hundredth of the scene's of 32; of that of 8 it is the one before."""
-INNER = 3
-"""Of the objects that were fused, one that is deleted."""
-REPEATS = 3
-PHOTOS, PHOTO_SIDE, REFIT = 40, 300, "30"
-EDITS, CYCLE = 2000, 20
-"""Of the long run, and how many of them add an object, move it about, name it anew, and delete it."""
 ABOUT = (
-    f"Written by `python -m benchmarks.edits DATA`: chairs and bottles of {MOST} on a lattice, turned "
-    f"and scaled. All PSNR is of {VIEWS} pictures of the whole. *One by one* is the PSNR to the composed "
+    f"Written by `python -m benchmarks.edits DATA`: chairs and bottles of {Edits.most} on a lattice, turned "
+    f"and scaled. All PSNR is of {Edits.views} pictures of the whole. *One by one* is the PSNR to the "
+    "composed "
     "scene of a field that all were added to, *at once* that of one fuse. To what was fused at once "
     "another object is added, between two and into their boxes: *outside* is the largest change of "
     "density, in parts of the largest, at points outside of the region that this touched, and the PSNR "
     "to before of the pixels whose rays miss it. *Deleted again*: the PSNR to before once it is "
-    f"deleted, with all sources known; and with none, but {PHOTOS} photos of {PHOTO_SIDE} x {PHOTO_SIDE} "
+    f"deleted, with all sources known; and with none, but {Edits.photos} photos of "
+    f"{Edits.photo_side} x {Edits.photo_side} "
     "pixels of the scene before (`--refit`, half a minute). *Fused in, deleted*: of an object that was "
     "fused with the others, the PSNR to one fuse of the others as blocks, sources known and photos "
-    f"alone. *Shuffled*: {SHUFFLED} additions to the same in another order. *Edit*: seconds to add an "
+    f"alone. *Shuffled*: {Edits.shuffled} additions to the same in another order. *Edit*: seconds to add an "
     "object whose box has that share of the scene's, and over those of the fuse of all."
 )
 LONG = (
-    f"\n## {EDITS:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an object is "
-    f"added, moved {CYCLE - 3} times, named anew and deleted, over and over. Median seconds per edit of the "
-    "first and the last hundred; bytes that history takes in the bundle, and bundles that are kept.\n\n"
+    f"\n## {Edits.edits:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an "
+    f"object is added, moved {Edits.cycle - 3} times, named anew and deleted, over and over. Median seconds "
+    "per edit of the first and the last hundred; bytes that history takes in the bundle, and bundles that "
+    "are kept.\n\n"
 )
 
 
@@ -148,12 +166,14 @@ def added(folder: Path, kind: str, objects, output: str, kept: Kept) -> list[lis
 
 def cameras() -> list[Camera]:
     """From around the lattice."""
-    lens = framing_lens(SIDE, SIDE)
-    return [framing(FRAME, lens, 2 * np.pi * i / VIEWS + 0.3, 0.5).camera(lens) for i in range(VIEWS)]
+    config = current(Edits)
+    lens = framing_lens(config.side, config.side)
+    angles = (2 * np.pi * i / config.views + 0.3 for i in range(config.views))
+    return [framing(FRAME, lens, angle, 0.5).camera(lens) for angle in angles]
 
 
 def pictures(folder: Path, bundle: str) -> np.ndarray:
-    """(VIEWS, H, W, 3) of a bundle or a scene over white."""
+    """(`views`, H, W, 3) of a bundle or a scene over white."""
     field, origin = renderable(load_scene(str(folder / bundle)))
     return np.array([render_image(field, camera, origin=origin).over((1, 1, 1)) for camera in cameras()])
 
@@ -174,20 +194,22 @@ def densities(folder: Path, bundle: str, points: np.ndarray) -> np.ndarray:
 def outside(folder: Path, before: str, after: str, box: np.ndarray) -> tuple[float, float]:
     """The largest change of density at points outside of a box (6,) of the world, in parts of the largest
     density, and the PSNR in dB of the pixels whose rays miss it."""
-    points = np.random.default_rng(1).uniform(FRAME[:3], FRAME[3:], (POINTS, 3))
+    config = current(Edits)
+    points = np.random.default_rng(1).uniform(FRAME[:3], FRAME[3:], (config.points, 3))
     points = points[((points < box[:3]) | (points > box[3:])).any(1)]
     old, new = (densities(folder, bundle, points) for bundle in (before, after))
-    missed = np.array([~meets(*camera.rays(), box).reshape(SIDE, SIDE) for camera in cameras()])
+    missed = np.array([~meets(*camera.rays(), box).reshape(config.side, config.side) for camera in cameras()])
     shots = [pictures(folder, bundle)[missed] for bundle in (before, after)]
     return float(np.abs(new - old).max() / old.max()), min(float(psnr(*shots)), 99.0)
 
 
 def photographed(folder: Path, scene: str, output: Path) -> None:
     """A capture of a scene from around it and above, with what is empty transparent."""
+    config = current(Edits)
     field, origin = renderable(load_scene(str(folder / scene)))
-    lens, views, shots = framing_lens(PHOTO_SIDE, PHOTO_SIDE), [], []
-    for i in range(PHOTOS):
-        outlook = framing(FRAME, lens, 2.4 * i, 0.15 + 1.0 * i / PHOTOS)
+    lens, views, shots = framing_lens(config.photo_side, config.photo_side), [], []
+    for i in range(config.photos):
+        outlook = framing(FRAME, lens, 2.4 * i, 0.15 + 1.0 * i / config.photos)
         c = outlook.camera(lens, name=f"p{i:02d}")
         shots.append(to_pixels(render_image(field, c, origin=origin), None))
         views.append(View(c.name, c.camera_to_world, c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height))
@@ -197,7 +219,7 @@ def photographed(folder: Path, scene: str, output: Path) -> None:
 def deleted(folder: Path, bundle: str, name: str, before: str) -> tuple[float, float]:
     """PSNR in dB to a bundle or scene of what is left when an object is deleted: where the other sources are
     found, and where none is, but there are photos of that scene."""
-    learning = ("--time-budget", REFIT)
+    learning = ("--time-budget", current(Edits).refit)
     fusedrf(folder, "delete", bundle, name, *learning, "-o", "less.rfpack")
     known = likeness(folder, "less.rfpack", before)
     apart = folder / "apart"
@@ -221,16 +243,17 @@ def shuffled(folder: Path, kind: str, objects) -> float:
 
 def timed(folder: Path, bundle: str, one) -> tuple[float, float]:
     """Median seconds of adding an object, and the share that it touches of the scene's box."""
-    tried = [put(folder, bundle, one, "more.rfpack") for _ in range(REPEATS)]
+    tried = [put(folder, bundle, one, "more.rfpack") for _ in range(current(Edits).repeats)]
     low, high = np.array(tried[0][1]["touched"]["aabb"]).reshape(2, 3)
     return float(np.median([seconds for seconds, _ in tried])), float(np.prod((high - low) / FRAME_SIDES))
 
 
 def row(folder: Path, kind: str) -> tuple[dict, list[list]]:
     """All of it for one kind: the table's row, and number of objects and dB along the additions."""
+    config = current(Edits)
     tell(kind)
     kept = Kept(folder / f"{kind}.json")
-    objects = nodes(OBJECTS[kind])
+    objects = nodes(dict(config.objects)[kind])
     once, many, more = (f"{kind}_{name}.rfpack" for name in ("once", "many", "more"))
     compose(folder, objects, "all.json")
     whole = kept.once("seconds", lambda: fused(folder, kind, objects, once))
@@ -241,9 +264,9 @@ def row(folder: Path, kind: str) -> tuple[dict, list[list]]:
     again = kept.once("deleted again", lambda: deleted(folder, more, EXTRA[0], once))
     without = f"without_{len(objects)}.rfpack"
     if not (folder / without).exists():  # as blocks it is the composed scene, and is rendered sooner
-        fused(folder, "blocks", objects[:INNER] + objects[INNER + 1 :], without)
-    inner = kept.once("fused in", lambda: deleted(folder, once, objects[INNER][0], without))
-    order = kept.once("shuffled", lambda: shuffled(folder, kind, objects[:SHUFFLED]))
+        fused(folder, "blocks", objects[: config.inner] + objects[config.inner + 1 :], without)
+    inner = kept.once("fused in", lambda: deleted(folder, once, objects[config.inner][0], without))
+    order = kept.once("shuffled", lambda: shuffled(folder, kind, objects[: config.shuffled]))
     along = added(folder, kind, objects, many, kept)
     return {
         "kind": kind,
@@ -279,7 +302,7 @@ def long_run(folder: Path) -> dict:
         shutil.copy(folder / "pair.rfpack", folder / "cycle.rfpack")
         shutil.rmtree(folder / "pair.rfpack.history", ignore_errors=True)
     shutil.copy(folder / "cycle.rfpack", folder / "pair.rfpack")
-    while len(seconds) < EDITS:
+    while len(seconds) < current(Edits).edits:
         seconds += cycle(folder)
         shutil.copy(folder / "pair.rfpack", folder / "cycle.rfpack")
         said = read_headers(folder / "pair.rfpack")[0].history
@@ -295,11 +318,11 @@ def long_run(folder: Path) -> dict:
 
 
 def cycle(folder: Path) -> list[float]:
-    """Seconds of each of CYCLE edits, after which the scene holds what it did."""
+    """Seconds of each of `cycle` edits, after which the scene holds what it did."""
     steps = [
         ("add", "lone.rfpack", "--name", "one", "-t", "1.3,1,0", "-s", "4"),
         ("move", "one", "-r", "0,0,17"),
-        *[("move", "one", "-t", f"{0.3 * (-1) ** i},0,0") for i in range(CYCLE - 4)],
+        *[("move", "one", "-t", f"{0.3 * (-1) ** i},0,0") for i in range(current(Edits).cycle - 4)],
         ("rename", "one", "two"),
         ("delete", "two"),
     ]
@@ -316,7 +339,7 @@ def write_page(out: Path, found: dict) -> None:
     path = out / "edits.json"
     found = (json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}) | found
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    kinds = [found[kind] for kind in OBJECTS if kind in found]
+    kinds = [found[kind] for kind in dict(current(Edits).objects) if kind in found]
     lines = {row["kind"]: along for row, along in kinds}
     over_time(lines, {}, ("objects, added one by one", "PSNR to the scene of them, dB"), out / "edits.svg")
     table = markdown([row for row, _ in kinds])
@@ -328,10 +351,12 @@ def write_page(out: Path, found: dict) -> None:
 
 def main() -> None:
     """Train, fuse, edit, measure, and write the page."""
+    config = current(Edits)
     parser = argparse.ArgumentParser(prog="python -m benchmarks.edits", description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "real")
-    parser.add_argument("--kind", action="append", choices=[*OBJECTS, "long"], help="one; may be repeated")
+    measured = [*dict(config.objects), "long"]
+    parser.add_argument("--kind", action="append", choices=measured, help="one; may be repeated")
     parser.add_argument("--keep", type=Path, help="a folder in which sources and figures are kept")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -339,9 +364,9 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for source, where in {"chair": "chair", "fuze": "fuze/fuze.obj"}.items():
             if not (folder / f"{source}.rfpack").exists():
-                words = ("-o", f"{source}.rfpack", "--time-budget", "15", "--max-size", MOST)
+                words = ("-o", f"{source}.rfpack", "--time-budget", "15", "--max-size", config.most)
                 fusedrf(folder, "train", str(asked.data.resolve() / where), *words)
-        for what in asked.kind or [*OBJECTS, "long"]:
+        for what in asked.kind or measured:
             write_page(asked.out, {what: long_run(folder) if what == "long" else row(folder, what)})
 
 

@@ -12,20 +12,10 @@ import numpy as np
 from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_nodes
+from formats.nodes import WHITE, Leaf, check_affine
 from formats.records import FieldRecord, as_stored, reading_size
-from formats.scene import (
-    WHITE,
-    Leaf,
-    Node,
-    SceneGraph,
-    check_affine,
-    dump_scene,
-    expand_scene,
-    inline_scenes,
-    make_node,
-    parse_scene,
-    resolve_source,
-)
+from formats.scene import Node, SceneGraph, dump_scene, make_node, parse_scene
+from formats.sources import expand_scene, inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
@@ -58,6 +48,8 @@ class SourceField:
     needs: FieldNeeds
     whole: bool = True
     """Whether it is shown as the bundle has it."""
+    cropped: bool = False
+    """Whether the field is what crops leave of the bundle's."""
     groups: tuple[tuple[str, str], ...] = ()
     """The groups of nodes that it is in which have a rule of their own, from the root down, and their
     rules."""
@@ -315,7 +307,8 @@ class _Loader:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
-        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole, leaf.groups)
+        shown = leaf.whole, bool(leaf.crops), leaf.groups
+        return SourceField(placed, leaf.background, bundle, member, needs, *shown)
 
 
 def key_of(leaf: Leaf, member: str) -> str:

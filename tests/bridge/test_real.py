@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import edits, placed, real, spoiled
+from benchmarks.real import RealConfig
 from formats.captures import hold_out, read_capture
 from formats.images import read_image, read_image_header, write_png
 from fusedrf_cli.bridge.pictures import over_white
@@ -32,11 +33,10 @@ def data(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_page(data, shop, tmp_path, monkeypatch):
+def test_the_page(data, shop, tmp_path, monkeypatch, in_force):
     shutil.copytree(shop / "photos", data / "made")
     out = tmp_path / "real"
-    monkeypatch.setattr(real, "OTHERS", (1.0, 2.0))
-    monkeypatch.setattr(real, "FRAME_WIDTH", 24)
+    in_force(RealConfig(others=(1.0, 2.0), frame_width=24))
     monkeypatch.setattr(sys, "argv", ["real", str(data), "--out", str(out), "--share", "0.5"])
     real.main()
     with (out / "real.csv").open(newline="") as file:
@@ -74,16 +74,15 @@ def test_the_table_of_spoiled_captures(data, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_the_page_of_edits(folder, tmp_path, monkeypatch):
+def test_the_page_of_edits(folder, tmp_path, monkeypatch, in_force):
     """Of two solids in place of the captures; what was measured once is not measured again."""
     for name, solid in (("chair", "red"), ("fuze", "blue")):
         shutil.copy(folder / f"{solid}.rfpack", folder / f"{name}.rfpack")
     out = tmp_path / "real"
     out.mkdir()
-    kinds = {"blocks": 4, "sparse": 4}
-    small = {"SIDE": 40, "VIEWS": 2, "SHUFFLED": 3, "PHOTOS": 6, "PHOTO_SIDE": 32, "EDITS": 20, "REFIT": "2"}
-    for name, value in (small | {"POINTS": 2000, "REPEATS": 1, "OBJECTS": kinds}).items():
-        monkeypatch.setattr(edits, name, value)
+    small = {"side": 40, "views": 2, "shuffled": 3, "photos": 6, "photo_side": 32, "edits": 20, "refit": "2"}
+    kinds = ("blocks", 4), ("sparse", 4)
+    in_force(edits.Edits(**small, points=2000, repeats=1, objects=kinds))
     monkeypatch.setattr(sys, "argv", ["edits", str(folder), "--out", str(out), "--keep", str(folder)])
     edits.main()
     found = json.loads((out / "edits.json").read_text())
