@@ -3,7 +3,7 @@ and learn. But for slow tests the loops are run by Python, so that nothing is co
 
 from dataclasses import dataclass
 from functools import cache
-from types import FunctionType
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels import specialise
 from fusedrf_cli.engine.kernels.instances import FARTHEST, Instances
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import (
     bounded,
@@ -37,6 +38,7 @@ from tests.analytic.fields import Gaussian, Tint
 from tests.analytic.rays import affine, turn, unit
 
 from ..kernels.interpreted import interpreted
+from ..kinds.sparse_cases import random_sparse
 
 DVGO = {"shell": 0.2, "contracted_density": 1.0}
 CURVED = {
@@ -512,6 +514,19 @@ def test_a_stored_field_keeps_its_space(space):
 def test_what_is_no_space_is_refused(entry):
     with pytest.raises(ValueError, match="space"):
         space_named(entry)
+
+
+def test_kinds_that_follow_straight_lines_are_refused_in_curved_spaces():
+    bodies = ModuleType("straight")
+    exec(
+        "def advance(field, grid, place, many, steps, k, p, way, u, u0, step):\n    return k + 1",
+        vars(bodies),
+    )
+    with pytest.raises(ValueError, match="straight follows straight rays"):
+        specialise.specialised(bodies, {}, contracted_l2)
+    tree = random_sparse().fine
+    with pytest.raises(ValueError, match="bricks cannot lie in space 'contracted_linf'"):
+        SparseField(SparseShape(0), tree, 1.0, space=contracted_linf)
 
 
 # -- compiled ------------------------------------------------------------------------------------------------
