@@ -102,7 +102,10 @@ class SparseField(Assembled):
         params: torch.Tensor | None = None,
         space: ModuleType = bounded,
     ):
-        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space."""
+        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space; ValueError where
+        rays are curved in it, since loops leave bricks along straight lines."""
+        if getattr(space, "CURVED", False):
+            raise ValueError(f"bricks cannot lie in space {name_of(space)!r}, in which rays are curved")
         self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
         self.coarse = fine.wider if shape.sh_degree else None
         self.params = pages.zeros(self.size) if params is None else params
