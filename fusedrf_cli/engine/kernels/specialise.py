@@ -62,6 +62,8 @@ def loops_for(bodies: ModuleType | None, sizes: tuple[tuple[str, int], ...], spa
 def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleType) -> tuple[str, dict]:
     """A name for the combination, and its namespace of compiled functions."""
     names, functions = namespace(bodies, space)
+    if getattr(space, "CURVED", False) and names["advance"] is not loops.advance:
+        raise ValueError(f"{bodies.__name__} follows straight rays, which {space.__name__} has none of")
     if TINTED in sizes:
         functions = tinting.tinted(functions)
     names |= sizes

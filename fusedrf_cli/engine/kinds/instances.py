@@ -15,7 +15,15 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung, shrinking
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.student import Made, MadeStudent, Needs, StudentRequest, Suits, Way
+from fusedrf_cli.engine.kinds.student import (
+    Made,
+    MadeStudent,
+    Needs,
+    StudentRequest,
+    Suits,
+    TooSmall,
+    Way,
+)
 
 # Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md).
 RANKS = ((8, 16), (8, 24), None)
@@ -116,7 +124,10 @@ class InstancesStudent(MadeStudent):
                 return field
             return reductions[i].make(opened(field).to("cpu"))
 
-        return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+        try:
+            return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+        except TooSmall:
+            return None
 
     def fits_as_it_is(self, limit: int) -> bool:
         """Whether the fields with their own bytes are no larger than a limit."""

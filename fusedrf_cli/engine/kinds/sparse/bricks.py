@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from fusedrf_cli.engine.encodings.bricks import SIDE
+from fusedrf_cli.engine.encodings.bricks import COARSE, SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.reference import OCTANTS
 
@@ -66,6 +66,27 @@ class BrickTree:
     def of_same_box(self, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
         """Other bricks in this tree's top cells."""
         return BrickTree.of(self.lo, self.top, self.counts, level, at, mask, self.phase)
+
+    def coarser(self, halvings: int) -> "BrickTree":
+        """The tree whose voxels are at least 2^halvings times as wide as the finest, each active where any
+        in it was; in wider top cells where those are needed."""
+        finest = self.depth - halvings
+        level = np.minimum(self.level.astype(np.int64), finest)
+        brick, *inner = np.nonzero(self.mask)
+        up = (self.level - level)[brick]
+        voxel = (self.at[brick] * SIDE + np.stack(inner, 1)) >> up[:, None]
+        wider = max(-finest, 0)
+        level, cell = level[brick] + wider, voxel // SIDE
+        key, first, back = np.unique(
+            np.stack([level, node_keys(cell)], 1), axis=0, return_index=True, return_inverse=True
+        )
+        mask = np.zeros((len(key), SIDE, SIDE, SIDE), bool)
+        mask[(back.ravel(), *(voxel % SIDE).T)] = True
+        level, at = key[:, 0].astype(np.uint8), cell[first]
+        if not wider:
+            return self.of_same_box(level, at, mask)
+        counts = -(-np.asarray(self.counts) // 2**wider)
+        return BrickTree.of(self.lo, self.top * 2**wider, counts, level, at, mask)
 
     @property
     def depth(self) -> int:
@@ -245,6 +266,20 @@ class Lattice:
         """(V, 3) int64 in units of the tree, free ones first."""
         self.vertices[rank] = vertices
         self.spread = self._spread(keys, rank, hanging, parents)
+        self._coarser: dict[int, Lattice] = {}
+
+    def coarser(self, halvings: int) -> "Lattice":
+        """The vertices of `BrickTree.coarser`, made once."""
+        if not halvings:
+            return self
+        if halvings not in self._coarser:
+            self._coarser[halvings] = Lattice(self.tree.coarser(halvings), self.n)
+        return self._coarser[halvings]
+
+    @cached_property
+    def wider(self) -> "Lattice":
+        """The vertices of the same tree with COARSE voxels a side of a brick."""
+        return Lattice(self.tree, COARSE)
 
     @property
     def width(self) -> np.ndarray:

@@ -17,7 +17,7 @@ import torch
 
 from fusedrf_cli.engine.decoders import density_sum, sh
 from fusedrf_cli.engine.encodings import bricks
-from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE, active_at
+from fusedrf_cli.engine.encodings.bricks import ROW, SIDE, active_at
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.assembled import Assembled, Slot
 from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples
@@ -102,9 +102,12 @@ class SparseField(Assembled):
         params: torch.Tensor | None = None,
         space: ModuleType = bounded,
     ):
-        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space."""
+        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space; ValueError where
+        rays are curved in it, since loops leave bricks along straight lines."""
+        if getattr(space, "CURVED", False):
+            raise ValueError(f"bricks cannot lie in space {name_of(space)!r}, in which rays are curved")
         self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
-        self.coarse = Lattice(fine.tree, COARSE) if shape.sh_degree else None
+        self.coarse = fine.wider if shape.sh_degree else None
         self.params = pages.zeros(self.size) if params is None else params
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":

@@ -16,6 +16,8 @@ from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
+from fusedrf_cli.engine.kinds.reduction import Reduction
+from fusedrf_cli.engine.kinds.sparse import coarsening
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
@@ -90,6 +92,11 @@ class SparseKind(Kind):
     def student(self, scene: ComposedField, request: StudentRequest) -> "SparseStudent":
         """Bricks of a scene."""
         return SparseStudent(self, scene, request)
+
+    def reduction(self, outline: SparseField, voxel: float, way: Way) -> Reduction:
+        """See Kind and sparse/coarsening.py."""
+        degree = outline.shape.sh_degree if way.sh_degree is None else way.sh_degree
+        return coarsening.reduced(outline, voxel, degree)
 
     def describe(self, field: SparseField) -> dict:
         """The voxel and the bricks of every level, and how many vertices they have."""
