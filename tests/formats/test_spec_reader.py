@@ -16,7 +16,7 @@ from fusedrf_cli.engine.spaces import contracted_l2, contracted_linf, ndc, space
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import open_scene
 from tests.engine.conftest import points_in, unit
-from tests.engine.kinds.cases import KINDS, coarse_ownership  # noqa: F401  (a fixture)
+from tests.engine.kinds.cases import KINDS  # noqa: F401  (a fixture)
 from tests.formats import spec_reader
 
 COUNT = 200

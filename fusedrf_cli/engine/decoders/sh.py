@@ -1,11 +1,11 @@
 """Colour whose features are the coefficients of spherical harmonics (Plenoxels, Fridovich-Keil et al., CVPR
-2022): rgb_c = sigmoid(Σ_k Y_k(d) features[c, k]). Where they stand `apart`, the first features are those of
-degree 1 and more, channel by channel, and the last three those of degree 0."""
+2022): logit_c = Σ_k Y_k(d) features[c, k]. Where they stand `apart`, the first features are those of degree
+1 and more, channel by channel, and the last three those of degree 0."""
 
 import torch
 
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import sh_basis, sigmoid
+from fusedrf_cli.engine.kernels.parts import sh_basis
 
 
 def sizes(width: int, coefficients: int, apart: bool = False) -> dict[str, int]:
@@ -30,7 +30,7 @@ def reference(
         features = torch.cat([features[:, -3:, None], rest], 2)
     else:
         features = features[:, : 3 * coefficients].view(-1, 3, coefficients)
-    return (features * harmonics[:, None]).sum(2).sigmoid()
+    return (features * harmonics[:, None]).sum(2)
 
 
 def bound(field, sections: dict, features: torch.Tensor, **options) -> float:
@@ -58,18 +58,16 @@ def logit(scratch, c):
 def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
     features_forward(field, cell, scratch, scratch, AT)
-    r, g, b = logit(scratch, 0), logit(scratch, 1), logit(scratch, 2)
-    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
+    return logit(scratch, 0), logit(scratch, 1), logit(scratch, 2)
 
 
-def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
     y, real = AT + WIDTH, field.params.dtype.type
     for r in range(WIDTH):
         scratch[AT + r] = 0
     for c in range(3):
-        d_logit = d_rgb[c] * rgb[c] * (1 - rgb[c])
-        scratch[AT + FIRST + c * FIRST_STEP] = real(d_logit * scratch[y])
+        scratch[AT + FIRST + c * FIRST_STEP] = real(d_logits[c] * scratch[y])
         for k in range(COEFFICIENTS - 1):
-            scratch[AT + REST + c * REST_STEP + k] = real(d_logit * scratch[y + 1 + k])
+            scratch[AT + REST + c * REST_STEP + k] = real(d_logits[c] * scratch[y + 1 + k])
     features_backward(field, cell, scratch, AT, scratch, grad)

@@ -66,7 +66,7 @@ def arrays(field, starts: np.ndarray, numbers: int) -> Arrays:
     return Arrays(*starts, *tree.tables, tree.level, tree.bits, *field.vertex_rows, tree.depth)
 
 
-def reference(sections: dict, unit: torch.Tensor, read: None, numbers: int) -> torch.Tensor:
+def reference(field, sections: dict, unit: torch.Tensor, read: None, numbers: int) -> torch.Tensor:
     """See encodings; a section is a lattice of vertices (kinds/sparse/bricks.py) and its rows (V, R). Which
     voxel a point lies in is a constant; where none is active, what is answered means nothing."""
     return torch.cat([blend(lattice, settled(lattice, rows), unit) for lattice, rows in sections.values()], 1)

@@ -13,6 +13,8 @@ from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.kernels.reference import cell_at, exact
 
+MAX_RANK = 1024  # of a stored field
+
 
 @dataclass(frozen=True)
 class Slot:
@@ -26,8 +28,6 @@ class Slot:
     """In front of the names of its sections, in files."""
     rate: float = 1.0
     """What its numbers learn at, relative to the optimiser's rate and to what the module says."""
-    spread: float | None = None
-    """Standard deviation of an untrained field's numbers; None: what the module says."""
 
     @property
     def sizes(self) -> dict[str, int | float]:
@@ -43,14 +43,34 @@ class Slot:
         if not hasattr(self.module, "sections"):
             return []
         return [
-            replace(
-                part,
-                name=self.prefix + part.name,
-                rate=self.rate * part.rate,
-                spread=part.spread if self.spread is None else self.spread,
-            )
+            replace(part, name=self.prefix + part.name, rate=self.rate * part.rate)
             for part in self.module.sections(resolution, **self.options)
         ]
+
+
+@dataclass(frozen=True)
+class RankedShape:
+    """Components of a decomposed field whose colours are spherical harmonics."""
+
+    density_rank: int = 16
+    """Components, per mode, of the density."""
+    colour_rank: int = 24
+    """Components, per mode, of the colour features."""
+    sh_degree: int = 2
+
+    def __post_init__(self):
+        """Refuse what the kernels were not written for: runs of eight components, four SH bands."""
+        for name in ("density_rank", "colour_rank"):
+            rank = getattr(self, name)
+            if type(rank) is not int or not 8 <= rank <= MAX_RANK or rank % 8:
+                raise ValueError(f"'{name}' should be a multiple of 8 up to {MAX_RANK}, found {rank}")
+        if self.sh_degree not in range(4):
+            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
+
+    @property
+    def coefficients(self) -> int:
+        """SH coefficients per channel."""
+        return (self.sh_degree + 1) ** 2
 
 
 class Assembled(ComputedField):
@@ -101,13 +121,15 @@ class Assembled(ComputedField):
         own = bare.slot_sections()
         unit, held = bare.located(exact(points, params.device))
         density, colour, sigma, rgb = self.slots.values()
-        features = density.module.reference(own["density"], unit, None, **density.options)
+        features = density.module.reference(self, own["density"], unit, None, **density.options)
         values, outputs = sigma.module.reference(self, own["sigma"], features, **sigma.options)
         values = torch.where(held, values, 0)
-        features = colour.module.reference(own["colour"], unit, outputs, **colour.options)
+        features = colour.module.reference(self, own["colour"], unit, outputs, **colour.options)
         dirs = exact(dirs, params.device)
-        colours = rgb.module.reference(self, own["rgb"], features, dirs, **rgb.options)
-        return values, torch.where((values > 0)[:, None], colours, 0)
+        logits = rgb.module.reference(self, own["rgb"], features, dirs, **rgb.options)
+        if hasattr(density.module, "logits_reference"):
+            logits = logits + density.module.logits_reference(self, own["density"], unit, **density.options)
+        return values, torch.where((values > 0)[:, None], logits.sigmoid(), 0)
 
 
 class AssembledField(Assembled, BoxField):
@@ -171,4 +193,7 @@ class AssembledField(Assembled, BoxField):
         largest, outputs = sigma.module.bound(self, own["sigma"], features, **sigma.options)
         self.check_density(largest)
         features = colour.module.bound(own["colour"], outputs, **colour.options)
-        self.check_logit(rgb.module.bound(self, own["rgb"], features, **rgb.options))
+        logit = rgb.module.bound(self, own["rgb"], features, **rgb.options)
+        if hasattr(density.module, "logits_bound"):
+            logit += density.module.logits_bound(own["density"], **density.options)
+        self.check_logit(logit)

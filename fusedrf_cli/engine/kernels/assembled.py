@@ -16,13 +16,13 @@ from functools import cache
 from types import FunctionType, ModuleType
 from typing import NamedTuple
 
-from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kernels.parts import LINE, sigmoid
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
 HOOKS = (
-    "locate", "steps_at", "known", "keep", "again", "advance",
-    "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward",
+    "locate", "steps_at", "located", "known", "keep", "again", "advance", "forward", "backward", "summed",
+    "summed_backward", "logits", "logits_backward", "prefetch_at", "ray_setup", "ray_backward",
 )  # fmt: skip
 """What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"
@@ -52,7 +52,7 @@ def density(field, grid, k, p, d, scratch):
     if steps == 0:
         return 0.0, 0.0, 0, (unit, cell)
     sigma, pre = sigma_forward(field, cell, scratch)
-    return sigma, pre, steps, (unit, cell)
+    return sigma, pre, steps, (unit, density_located(field, cell, scratch))
 
 
 def again(field, held, p):
@@ -81,15 +81,31 @@ def end(field, frame, d, scratch, grad):
     rgb_ray_backward(field, d, scratch, grad)
 
 
+def plain_logits(field, place, r, g, b, scratch):
+    """The logits of a colour, to which the density's encoding adds none."""
+    return r, g, b
+
+
+def shifted_logits(field, place, r, g, b, scratch):
+    """The same, where it does."""
+    red, green, blue = density_logits(field, place[1], scratch)
+    return r + red, g + green, b + blue
+
+
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py."""
-    return rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+    r, g, b = rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+    r, g, b = shown_logits(field, place, r, g, b, scratch)
+    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
 def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py; colour first, since it may send back to what sigma hands on."""
     if shaded:
-        rgb_backward(field, colour_cell(field, place), d, rgb, d_rgb, scratch, memory, at, grad)
+        d_red, d_green = d_rgb[0] * rgb[0] * (1 - rgb[0]), d_rgb[1] * rgb[1] * (1 - rgb[1])
+        d_logits = d_red, d_green, d_rgb[2] * rgb[2] * (1 - rgb[2])
+        rgb_backward(field, colour_cell(field, place), d, d_logits, scratch, memory, at, grad)
+        density_logits_backward(field, place[1], d_logits, scratch)
     sigma_backward(field, place[1], pre, d_sigma, scratch, grad)
 
 
@@ -122,7 +138,7 @@ def own_known(field, grid, p):
 
 def ahead_density(field, array, held, p):
     """See loops.py."""
-    density_prefetch_at(field, array, density_locate(field, unit_of(field, p)))
+    density_prefetch_at(field, array, again(field, held, p)[1])
 
 
 def ahead_colour(field, array, held, p):
@@ -157,6 +173,15 @@ def steps_at(field, cell, unit, k):
     return 1 if min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE else 0
 
 
+def located(field, cell, scratch):
+    """The cell, of which no more is known now."""
+    return cell
+
+
+def logits_backward(field, cell, d_logits, scratch):
+    """Nothing was added to a colour's logits."""
+
+
 def ray_setup(field, d, scratch):
     """Nothing is known of a ray."""
 
@@ -165,7 +190,7 @@ def ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-DEFAULTS = {f.__name__: f for f in (locate, steps_at, ray_setup, ray_backward)}
+DEFAULTS = {f.__name__: f for f in (locate, steps_at, located, logits_backward, ray_setup, ray_backward)}
 
 
 # -- one namespace of four slots -----------------------------------------------------------------------------
@@ -178,7 +203,7 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
     assembly = ModuleType(f"{__name__}.{label}.bodies")
-    names = dict(vars(assembly))
+    names = vars(assembly) | {"sigmoid": sigmoid}
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
             if names.setdefault(name, value) is not value:
@@ -187,6 +212,7 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     templates |= {name: template for name, (template, hook) in OPTIONAL.items() if hook in names}
     shared = colour is density or getattr(colour, "locate", locate) is None
     templates["colour_cell"] = shared_cell if shared else own_cell
+    templates["shown_logits"] = shifted_logits if hasattr(density, "logits") else plain_logits
     names |= {name: renamed(template, name, assembly, {}) for name, template in templates.items()}
     functions = {name: value for name, value in names.items() if isinstance(value, FunctionType)}
     vars(assembly).update(names, Arrays=arrays_type(slots), functions=functions, sizes=constants)
@@ -200,6 +226,7 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
         raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
     hooks = {name: getattr(module, name, DEFAULTS.get(name)) for name in HOOKS}
     pending = {name: hook for name, hook in hooks.items() if hook is not None}
+    known_as = dict(pending)
     while pending:
         name, function = pending.popitem()
         new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
@@ -212,8 +239,11 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
                 new[used] = f"{READS[slot]}_{needed}"
             elif isinstance(value, FunctionType) or used.isupper() or used in fields:
                 new[used] = f"{slot}_{used}"
-                if isinstance(value, FunctionType) and new[used] not in names:
-                    pending[used] = value
+                if isinstance(value, FunctionType):
+                    if known_as.setdefault(used, value) is not value:
+                        raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
+                    if new[used] not in names:
+                        pending[used] = value
                 elif used.isupper() and used in known:
                     names[new[used]] = value
             elif used in known and names.setdefault(used, value) is not value:  # numpy, kernels/parts.py
