@@ -20,6 +20,7 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor, shrinking
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
+from fusedrf_cli.option_types import BytesType
 from fusedrf_cli.progress import NullProgress
 from fusedrf_cli.requests import ChartRequest
 from fusedrf_cli.signals import interrupt
