@@ -14,7 +14,7 @@ from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_nodes
 from formats.nodes import WHITE, Leaf, check_affine
 from formats.records import FieldRecord, as_stored, reading_size
-from formats.scene import Node, SceneGraph, dump_scene, make_node, parse_scene
+from formats.scene import MAX_SCENE_BYTES, Node, SceneGraph, dump_scene, make_node, parse_scene
 from formats.sources import expand_scene, inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory, sources
@@ -29,8 +29,6 @@ from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.errors import FusedRFError, InvalidInput, UsageProblem
 from fusedrf_cli.requests import FuseRequest, TrainRequest
 
-STDIN_LIMIT = 4 << 20
-NO_MEMBER = "fields/0000000000000000.safetensors"
 MALFORMED = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
 """What reading arrays and metadata that make no field may raise."""
 OPTIONS = {"ranks": "--ranks", "sh_degree": "--sh-degree"}
@@ -195,7 +193,7 @@ def load_scene(
     if path == "-":
         where = Path.cwd() / "scene.json"
         graph = inline_scenes(
-            parse_scene(sys.stdin.buffer.read(STDIN_LIMIT + 1), "standard input"), where, allow_outside
+            parse_scene(sys.stdin.buffer.read(MAX_SCENE_BYTES + 1), "standard input"), where, allow_outside
         )
         return _Loader(where, budget, place).load(graph, allow_outside)
     if is_bundle(path):
@@ -438,7 +436,7 @@ def check_graph(
     """Before a field is learnt: raise what `write_field` would because of where it lies and what is kept
     with it."""
     try:
-        dump_scene(graph_of(NO_MEMBER, name, origin, framing, cameras))
+        dump_scene(graph_of("fields/0000000000000000.safetensors", name, origin, framing, cameras))
     except FormatError as error:
         raise error.within(output) from error
 
