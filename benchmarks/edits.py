@@ -85,9 +85,10 @@ ABOUT = (
     "object whose box has that share of the scene's, and over those of the fuse of all."
 )
 LONG = (
-    f"\n## {Edits.edits:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an object "
-    f"is added, moved {Edits.cycle - 3} times, named anew and deleted, over and over. Median seconds per edit "
-    "of the first and the last hundred; bytes that history takes in the bundle, and bundles that are kept.\n\n"
+    f"\n## {Edits.edits:,} edits\n\nOf a small scene of blocks, in place and with `--keep-history`: an "
+    f"object is added, moved {Edits.cycle - 3} times, named anew and deleted, over and over. Median seconds "
+    "per edit of the first and the last hundred; bytes that history takes in the bundle, and bundles that "
+    "are kept.\n\n"
 )
 
 
