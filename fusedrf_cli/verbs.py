@@ -19,7 +19,8 @@ from fusedrf_cli import requests
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.progress import NullProgress
-from fusedrf_cli.requests import STDIO, EditRequest, Writing
+from fusedrf_cli.request_parts import STDIO
+from fusedrf_cli.requests import EditRequest, Writing
 
 __all__ = [
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
