@@ -41,7 +41,7 @@ from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Section, Way
+from fusedrf_cli.engine.kinds.student import Plan, Section, StudentConfig, Way
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import REACH
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
@@ -394,7 +394,7 @@ def fitting_longest(
     longest = settings.longest
     while (
         max_size
-        and longest > LEAST_TEXELS
+        and longest > current(StudentConfig).least_texels
         and bytes_of(kind.untrained(box, longest, settings.way), precision) > max_size
     ):
         longest -= current(Presets).fewer_texels
