@@ -9,8 +9,8 @@ import pytest
 CAUGHT = """
 import signal, sys, time, types
 from formats.atomic import atomic_writer
+from fusedrf_cli import signals
 from fusedrf_cli.engine.settings import using
-from fusedrf_cli.signals import SignalConfig
 def train(request, progress):
     with atomic_writer(request.output) as file:
         file.write(b"half")
@@ -24,7 +24,7 @@ def caught(seconds):
 import fusedrf_cli
 fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
 from fusedrf_cli.main import main
-with using(SignalConfig({patience}, {echo})):
+with using(signals.SignalConfig({patience}, {echo})):
     main()
 """
 WORDS = ("train", "chair.rfpack", "-o", "out.rfpack")
@@ -93,7 +93,7 @@ def train(request, progress):
 import fusedrf_cli
 fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
 from fusedrf_cli.main import main
-with using(SignalConfig({patience}, {echo})):
+with using(signals.SignalConfig({patience}, {echo})):
     main()
 """
 
