@@ -93,8 +93,7 @@ def train(request, progress):
 import fusedrf_cli
 fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
 from fusedrf_cli.main import main
-with using(signals.SignalConfig({patience}, {echo})):
-    main()
+main()
 """
 
 
