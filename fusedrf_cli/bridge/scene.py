@@ -256,6 +256,8 @@ class _Loader:
                 for leaf, b, member in found
             }
             reading = {"a source while it is read": max(each.reading for each in needs.values())}
+            if copied := sum(one.copied for one in {id(one): one for _, one, _ in found}.values()):
+                reading["fields of a bundle of an earlier version"] = copied
             self.shelf.resize(self.budget.room(reading))
             self.budget.expect(
                 sources([*sizes.values()], self.shelf.room) | reading, advice="use smaller sources"

@@ -56,17 +56,37 @@ class BoxKind(Kind):
         return (GridStudent if on_vertices else Student)(self, scene, request)
 
     def reduction(self, outline: BoxField, voxel: float, way: Way) -> Reduction:
-        """See Kind: fewer texels."""
+        """See Kind: fewer texels, and SH bands where the kind has them. Ranks are of too different a use from
+        kind to kind to have one bound."""
         box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
-        same, none = resolution == outline.resolution, outline.params
-        unit = outline.scale, outline.shift
-        bare = type(outline)(outline.shape, box, resolution, *unit, none, outline.occupancy)
+        same, shape, unit = resolution == outline.resolution, outline.shape, (outline.scale, outline.shift)
+        if way.sh_degree is not None and "sh_degree" in self.takes:
+            shape = replace(shape, sh_degree=min(shape.sh_degree, way.sh_degree))
+        bare = type(outline)(shape, box, resolution, *unit, outline.params, outline.occupancy)
         sections = [Section(part.name, bare.stored_shape(part)) for part in bare.parts]
 
         def make(field: BoxField) -> BoxField:
-            return field if same else field.resampled(box, resolution)
+            small = field if same else field.resampled(box, resolution)
+            return small if shape == field.shape else self.with_bands(small, shape)
 
-        return Reduction(Contents(sections, outline.occupancy.occupied.size), make, same)
+        lossless = same and shape == outline.shape
+        return Reduction(Contents(sections, outline.occupancy.occupied.size), make, lossless)
+
+    def with_bands(self, field: BoxField, shape: object) -> BoxField:
+        """A field with the first of its SH bands, as many as another shape has: a colour basis (3, bands,
+        rank) has them apart, rows of vertices side by side for each channel."""
+        unit = field.scale, field.shift
+        small = type(field)(shape, field.box, field.resolution, *unit, occupancy=field.occupancy)
+        own, fewer = field.shape.coefficients, shape.coefficients
+        for old, new in zip(field.sections().values(), small.sections().values(), strict=True):
+            if old.shape == new.shape:
+                new.copy_(old)
+            elif old.dim() == 3:
+                new.copy_(old[:, :fewer])
+            else:
+                rows = old[..., : 3 * own].unflatten(-1, (3, own))[..., :fewer]
+                new[..., : 3 * fewer] = rows.flatten(-2)
+        return small
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> BoxField:
         """See Kind."""

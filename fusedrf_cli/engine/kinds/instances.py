@@ -16,7 +16,15 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung, shrinking
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.student import Made, MadeStudent, Needs, StudentRequest, Suits, Way
+from fusedrf_cli.engine.kinds.student import (
+    Made,
+    MadeStudent,
+    Needs,
+    StudentRequest,
+    Suits,
+    TooSmall,
+    Way,
+)
 from fusedrf_cli.engine.settings import current
 
 
@@ -130,7 +138,10 @@ class InstancesStudent(MadeStudent):
                 return field
             return reductions[i].make(opened(field).to("cpu"))
 
-        return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+        try:
+            return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+        except TooSmall:
+            return None
 
     def fits_as_it_is(self, limit: int) -> bool:
         """Whether the fields with their own bytes are no larger than a limit."""

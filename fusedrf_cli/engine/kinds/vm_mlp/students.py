@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
+from fusedrf_cli.engine.kinds.boxes import BoxKind
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import Plan, Section, Way
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, VMMLPShape, weight_shapes
@@ -16,6 +17,7 @@ class VMMLPKind(Kind):
     good_for = "Glossy objects, whose colour changes with the view faster than spherical harmonics can."
     field = VMMLPField
     takes = frozenset({"ranks"})
+    reduction = BoxKind.reduction
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """Those of the tensor, and the network's weights and biases."""
