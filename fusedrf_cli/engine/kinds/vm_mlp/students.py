@@ -17,7 +17,7 @@ class VMMLPKind(Kind):
     good_for = "Glossy objects, whose colour changes with the view faster than spherical harmonics can."
     field = VMMLPField
     takes = frozenset({"ranks"})
-    reduction = BoxKind.reduction
+    reduces, reduction = frozenset(), BoxKind.reduction
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """Those of the tensor, and the network's weights and biases."""
