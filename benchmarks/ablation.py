@@ -27,7 +27,7 @@ from fusedrf_cli.engine.distillation.losses import LossConfig
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import Schedule
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kinds.student import TOLD_NUMBERS, DistilConfig, Way
+from fusedrf_cli.engine.kinds.student import DistilConfig, StudentConfig, Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 
 VIEWS, VIEW_SIZE, VIEWS_SEED = 8, (200, 200), 11
@@ -171,7 +171,7 @@ class Task:
         """What distilling by a variant's recipe gives."""
         told = round(variant.rays * self.settings.rays), round(variant.steps * self.settings.steps)
         settings = replace(self.settings, seed=variant.seed, rays=told[0], steps=told[1], **variant.config)
-        most = round(variant.numbers * TOLD_NUMBERS)
+        most = round(variant.numbers * StudentConfig.told_numbers)
         plan = VM.plan(self.composed.aabb, self.composed.voxel_size, Way(), most)
         generator, student = torch.Generator().manual_seed(settings.seed), None
         if not variant.from_scratch:
