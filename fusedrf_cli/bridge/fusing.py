@@ -23,7 +23,7 @@ from fusedrf_cli.bridge.running import (
     load_checkpoint,
     written_somewhere,
 )
-from fusedrf_cli.bridge.scene import LoadedScene, refuse_options, unusable_kind
+from fusedrf_cli.bridge.scene import LoadedScene, note_options, refuse_options, unusable_kind
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -62,6 +62,8 @@ def fuse(
         scene = Scene.of(loaded)
         kind, suits = choose_kind(request.kind, loaded, scene.composed)
         refuse_options(kind, request)
+        if kind.field is None:
+            note_options(request, loaded, progress)
         started = time.monotonic()
         bundle = FusedBundle(request, everything, loaded, kind.field is not None)
         cameras = kept_cameras(loaded, progress)

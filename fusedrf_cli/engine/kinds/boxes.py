@@ -32,6 +32,11 @@ class BoxKind(Kind):
     field: type[BoxField]
 
     @property
+    def reduces(self) -> frozenset[str]:
+        """See Kind; ranks are of too different a use from kind to kind to have one bound."""
+        return self.takes & {"sh_degree"}
+
+    @property
     def usual(self) -> object:
         """The field's shape where nothing is asked."""
         return self.field.shape_type()
@@ -61,11 +66,10 @@ class BoxKind(Kind):
         return (GridStudent if on_vertices else Student)(self, scene, request)
 
     def reduction(self, outline: BoxField, voxel: float, way: Way) -> Reduction:
-        """See Kind: fewer texels, and SH bands where the kind has them. Ranks are of too different a use from
-        kind to kind to have one bound."""
+        """See Kind: fewer texels, and SH bands where the kind has them."""
         box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
         same, shape, unit = resolution == outline.resolution, outline.shape, (outline.scale, outline.shift)
-        if way.sh_degree is not None and "sh_degree" in self.takes:
+        if way.sh_degree is not None and "sh_degree" in self.reduces:
             shape = replace(shape, sh_degree=min(shape.sh_degree, way.sh_degree))
         bare = type(outline)(shape, box, resolution, *unit, outline.params, outline.occupancy)
         sections = [Section(part.name, bare.stored_shape(part)) for part in bare.parts]

@@ -55,7 +55,7 @@ class VMKind(BoxKind):
     name = "vm"
     good_for = "Objects and scenes in their own axes: small, smooth, quick to train."
     field = VMField
-    takes = frozenset({"ranks", "sh_degree"})
+    takes = reduces = frozenset({"ranks", "sh_degree"})
     takes_over = True
     hashes = True
     distilled = "int8"  # measured: four objects in 25 MB, 0.6 dB more than half the numbers in float16
