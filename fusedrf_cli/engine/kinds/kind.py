@@ -149,10 +149,6 @@ class Kind:
 
     # -- cutting ---------------------------------------------------------------------------------------------
 
-    def without(self, field: StoredField, names: set[str]) -> StoredField | None:
-        """A field without the parts that go by those names; None where nothing is left."""
-        return field
-
     def cut_out(self, field: StoredField, selection: Selection) -> StoredField | None:
         """A selected object as a field in the frame of the field, with the numbers that it has there; None
         where there is nothing of it. The selection may be one in a scene that places the field
