@@ -22,9 +22,8 @@ from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import StudentRequest
-from fusedrf_cli.engine.kinds.vm.blocks import reshaped
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.students import place_of
+from fusedrf_cli.engine.kinds.vm.trimming import reshaped
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.spaces import unbounded
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
@@ -44,13 +43,12 @@ def walls(seed: int = 0) -> VMField:
     kind, generator = registry.kind("vm"), torch.Generator().manual_seed(seed)
     way = replace(way_of(SHAPE), hashed=Hashed((1.0, 0.5), 256))
     field = kind.create(kind.plan_at(WHOLE, (17,) * 3, way), generator)
-    field.sections(0)["detail"].normal_(0, 0.1, generator=generator)
+    field.sections()["density_detail"].normal_(0, 0.1, generator=generator)
     middles = OccupancyGrid.full(WHOLE, 32, unbounded)
     there = (abs(middles.centres()).max(1) > 1.9).reshape(middles.occupied.shape)
     field = field.with_occupancy(middles.marked(there))
-    tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
-    numbers = field.params * torch.tensor(2.0)
-    return VMField(field.shape, (tensor,), field.blocks, numbers, field.occupancy)
+    field.shift = float(np.log(np.expm1(20 / field.scale)))
+    return field.with_params(field.params * torch.tensor(2.0))
 
 
 def fine_walls() -> VMField:
@@ -103,7 +101,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
 
     def taken(room: Placed, scene: ComposedField, numbers: int = 10**7):
         plan = kind.plan(scene.aabb, scene.voxel_size, way, numbers)
-        return place_of(room, plan, scene)
+        return kind.place_of(room, plan, scene)
 
     student = taken(scene.placed[0], scene)
     assert student.shape == SHAPE and torch.equal(student.params, room.params)
@@ -372,13 +370,13 @@ def furnished() -> VMField:
     kind, generator = registry.kind("vm"), torch.Generator().manual_seed(3)
     way = replace(way_of(SHAPE), hashed=Hashed((1 / 16, 1 / 32), 1 << 15))
     field = kind.create(kind.plan_at(WHOLE, (49,) * 3, way), generator)
-    field.sections(0)["detail"].normal_(0, 0.5, generator=generator)
+    field.sections()["density_detail"].normal_(0, 0.5, generator=generator)
     grid = OccupancyGrid.full(WHOLE, 64, unbounded)
     at = grid.centres()
     there = (abs(at).max(1) > 1.9) | (np.linalg.norm(at - [0.3, 0, 0], axis=1) < 0.25)
     field = field.with_occupancy(grid.marked(there.reshape(grid.occupied.shape)))
-    tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
-    return VMField(field.shape, (tensor,), field.blocks, 4 * field.params, field.occupancy)
+    field.shift = float(np.log(np.expm1(20 / field.scale)))
+    return field.with_params(4 * field.params)
 
 
 @pytest.fixture
@@ -394,7 +392,7 @@ def test_an_object_out_of_a_place_has_the_numbers_that_it_asks_alone(folder, rep
     """Those of the place to the bit, in a fraction of its bytes."""
     (room, _), (ball, _) = (load_scene(str(folder / n)).lone() for n in ("room.rfpack", "ball.rfpack"))
     assert cut["precision"] == "int8" and cut["bytes"] < 0.2 * (folder / "room.rfpack").stat().st_size
-    rows, own = (field.sections(0)["detail"] for field in (room, ball))
+    rows, own = (field.sections()["density_detail"] for field in (room, ball))
     asked = (own != 0).any(1)
     assert torch.equal(own[asked], rows[asked]) and 0.02 < asked.float().mean() < 0.5
     rng, grid = np.random.default_rng(0), ball.occupancy
@@ -427,7 +425,8 @@ def test_it_stays_small_where_it_is_put(folder, report, cut):
     assert (folder / "left_balls.rfpack").stat().st_size <= three
     said = report("extract", "three_balls.rfpack", "--name", "b", "-o", "b.rfpack")
     (ball, _), (b, _) = (load_scene(str(folder / n)).lone() for n in ("ball.rfpack", "b.rfpack"))
-    assert said["precision"] == "int8" and torch.equal(b.sections(0)["detail"], ball.sections(0)["detail"])
+    rows, own = (field.sections()["density_detail"] for field in (b, ball))
+    assert said["precision"] == "int8" and torch.equal(rows, own)
 
 
 def test_its_size_can_be_limited(folder, report, cut):

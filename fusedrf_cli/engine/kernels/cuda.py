@@ -73,14 +73,19 @@ def raise_to(out, i, value):
 
 
 @device
+def scatter_4(out, o, weight, values, v):
+    """`parts.scatter_4`, atomic."""
+    add_4(
+        out, o, weight * values[v], weight * values[v + np.uint64(1)], weight * values[v + np.uint64(2)],
+        weight * values[v + np.uint64(3)],
+    )  # fmt: skip
+
+
+@device
 def scatter_8(out, o, weight, values, v):
     """`parts.scatter_8`, atomic."""
-    for r in range(2):
-        at = v + np.uint64(4 * r)
-        add_4(
-            out, o + np.uint64(4 * r), weight * values[at], weight * values[at + np.uint64(1)],
-            weight * values[at + np.uint64(2)], weight * values[at + np.uint64(3)],
-        )  # fmt: skip
+    scatter_4(out, o, weight, values, v)
+    scatter_4(out, o + np.uint64(4), weight, values, v + np.uint64(4))
 
 
 @device
@@ -95,7 +100,7 @@ def literally(value):
 
 
 REPLACED = {
-    "accumulate": accumulate, "raise_to": raise_to, "scatter_8": scatter_8,
+    "accumulate": accumulate, "raise_to": raise_to, "scatter_4": scatter_4, "scatter_8": scatter_8,
     "ahead_density": ahead, "ahead_colour": ahead, "literally": literally,
 }  # fmt: skip
 

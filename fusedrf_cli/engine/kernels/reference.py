@@ -11,6 +11,8 @@ import torch
 from torch.nn.functional import softplus
 
 EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
+OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+"""(8, 3) the corners of a voxel, z first."""
 
 
 def exact(values: torch.Tensor | np.ndarray, device: torch.device) -> torch.Tensor:

@@ -13,7 +13,7 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, loops, parts, tinting
+from fusedrf_cli.engine.kernels import instances, light, loops, parts, tinting
 from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": task, "sweep_task": task}
@@ -62,6 +62,8 @@ def loops_for(bodies: ModuleType | None, sizes: tuple[tuple[str, int], ...], spa
 def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleType) -> tuple[str, dict]:
     """A name for the combination, and its namespace of compiled functions."""
     names, functions = namespace(bodies, space)
+    if getattr(space, "CURVED", False) and names["advance"] is not loops.advance:
+        raise ValueError(f"{bodies.__name__} follows straight rays, which {space.__name__} has none of")
     if TINTED in sizes:
         functions = tinting.tinted(functions)
     names |= sizes
@@ -73,7 +75,7 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
 
 def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, *bases_of(space), space, *(family(bodies) if bodies else ())]
+    modules = [loops, instances, light, *bases_of(space), space, *(family(bodies) if bodies else ())]
     names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
     own = {module.__name__ for module in modules}
     found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}

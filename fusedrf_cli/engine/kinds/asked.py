@@ -13,8 +13,8 @@ from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.asking import (
-    OCTANTS,
     AskingConfig,
     colours,
     density,

@@ -13,11 +13,8 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kernels.reference import sh_basis
+from fusedrf_cli.engine.kernels.reference import OCTANTS, sh_basis
 from fusedrf_cli.engine.settings import current
-
-OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
-"""(8, 3) the corners of a voxel, z first."""
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,19 @@ class BoxKind(Kind):
 
     field: type[BoxField]
 
+    @property
+    def usual(self) -> object:
+        """The field's shape where nothing is asked."""
+        return self.field.shape_type()
+
     def shape(self, way: Way) -> object:
-        """The field's shape for a way; what the way leaves open is the shape's own default."""
+        """The field's shape for a way; what the way leaves open is as usual."""
         asked = {"sh_degree": way.sh_degree}
         if way.ranks is not None:
             asked |= dict(zip(("density_rank", "colour_rank"), way.ranks, strict=True))
         known = {field.name for field in fields(self.field.shape_type)}
         heeded = {name: value for name, value in asked.items() if name in known and value is not None}
-        return replace(self.field.shape_type(), **heeded)
+        return replace(self.usual, **heeded)
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """See Kind."""
@@ -46,8 +51,8 @@ class BoxKind(Kind):
         return [Section(part.name, (*part.shape[:-1], part.columns or part.shape[-1])) for part in parts]
 
     def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
-        """See Kind; with what fills rows up."""
-        return sum(int(np.prod(part.shape)) for part in self.field.parts_of(self.shape(way), resolution))
+        """See Kind; with what fills rows and cache lines up."""
+        return self.field.size_of(self.shape(way), resolution)
 
     def student(self, scene: ComposedField, request: StudentRequest) -> Student:
         """See Kind."""
@@ -90,7 +95,9 @@ class BoxKind(Kind):
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> BoxField:
         """See Kind."""
-        return self.field.create(self.shape(plan.way), plan.box, plan.resolution, generator)
+        field = self.field.create(self.shape(plan.way), plan.box, plan.resolution, generator)
+        field.name = name
+        return field
 
 
 class GridStudent(Student):

@@ -7,16 +7,16 @@ from types import ModuleType
 
 import pytest
 
-from fusedrf_cli.engine.decoders import density_sum, sh_basis
-from fusedrf_cli.engine.encodings import line
-from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
+from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis
+from fusedrf_cli.engine.encodings import bricks, line
+from fusedrf_cli.engine.kernels import instances, light, loops, parts, specialise
 from fusedrf_cli.engine.kernels.assembled import assemble
-from fusedrf_cli.engine.kinds.sparse import bodies as sparse
 from fusedrf_cli.engine.kinds.vm import bodies as vm
 from fusedrf_cli.engine.spaces import SPACES, bounded
 from tests.engine.kinds.cases import KINDS
 
 CP = assemble(line, line, density_sum, sh_basis)
+SPARSE = assemble(bricks, bricks, density_sum, sh)
 SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
 
 SCRIPT = """
@@ -148,7 +148,7 @@ def tag(bodies: ModuleType = vm, sizes: dict = SIZES, space: ModuleType = bounde
 def test_kinds_sizes_and_spaces_have_names_of_their_own():
     other_space = ModuleType("elsewhere")
     other_space.__dict__.update({k: v for k, v in vars(bounded).items() if k != "__name__"})
-    tags = [tag(), tag(sparse), tag(CP), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
+    tags = [tag(), tag(SPARSE), tag(CP), tag(sizes=SIZES | {"RANK": 16}), tag(space=other_space)]
     assert len(set(tags)) == len(tags) and tag() == tags[0]
 
 
@@ -174,7 +174,7 @@ HOOKS = {
 def test_no_name_means_two_things_in_a_namespace(name, space):
     """It is flat, and the later name wins: a template's constant would be a kind's offset in scratch."""
     field = KINDS[name]()
-    ours = [vars(module) for module in (parts, loops, instances, space)]
+    ours = [vars(module) for module in (parts, loops, instances, light, space)]
     theirs = {k: v for module in specialise.family(field.bodies) for k, v in vars(module).items()}
     theirs |= getattr(field.bodies, "functions", {})
     meanings: dict[str, object] = {}
@@ -185,9 +185,9 @@ def test_no_name_means_two_things_in_a_namespace(name, space):
 
 
 def test_what_a_kind_leaves_out_has_a_default():
-    _, names = specialise.specialised(sparse, SIZES, bounded)
-    assert names["end"].py_func.__code__ is loops.end.__code__
-    assert names["advance"].py_func.__code__ is sparse.advance.__code__
+    _, names = specialise.specialised(SPARSE, SIZES, bounded)
+    assert names["end"].py_func.__code__ is SPARSE.end.__code__
+    assert names["advance"].py_func.__code__ is SPARSE.advance.__code__
     _, names = specialise.specialised(CP, SIZES, bounded)
     assert names["advance"].py_func.__code__ is loops.advance.__code__
     assert names["end"].py_func.__code__ is CP.end.__code__

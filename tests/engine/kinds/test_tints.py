@@ -1,7 +1,5 @@
 """Colours of fields times a tint."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,11 +7,10 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.volume import render_rays
 
 from ..conftest import rays_at
-from .cases import KINDS, coarse_ownership, random_blocks  # noqa: F401  (a fixture)
+from .cases import KINDS  # noqa: F401  (a fixture)
 from .test_references import asked, sent_back
 
 TINT = (0.9, 0.4, 0.0)
@@ -58,39 +55,6 @@ def test_tints_multiply(pair):
     torch.testing.assert_close(found[seen].double(), rgb[seen] * exactly((0.45, 0.2, 0.0)), rtol=1e-5, atol=0)
 
 
-def tinted_blocks():
-    """Three blocks, of which two have tints."""
-    field = random_blocks()
-    tints = TINT, (1.0, 1.0, 1.0), (0.2, 0.7, 1.0)
-    blocks = tuple(replace(b, tint=tint) for b, tint in zip(field.blocks, tints, strict=True))
-    return VMField(field.shape, field.tensors, blocks, field.params, field.occupancy, field.owners)
-
-
-def test_every_block_has_its_own_tint():
-    """As the plain torch reference says, which looks the tint of each sample's block up."""
-    plain, field = random_blocks(), tinted_blocks()
-    points, dirs = asked(field, 1000)
-    found, wanted = field.query(points, dirs), field.reference(field.params, points, dirs)
-    torch.testing.assert_close(found[1], wanted[1], rtol=0, atol=1e-9)
-    rgb = plain.query(points, dirs)[1]
-    seen = rgb.amin(1) > 0
-    shares = (found[1] / rgb)[seen].numpy().round(9)
-    assert {tuple(share) for share in shares} == {block.tint for block in field.blocks}
-
-
-@pytest.mark.parametrize("kind", ["blocks", "sparse"])
-def test_what_is_sent_back_went_through_the_tint(kind):
-    field = tinted_blocks() if kind == "blocks" else registry.kind(kind).tinted(KINDS[kind](), TINT)
+def test_what_is_sent_back_went_through_the_tint():
+    field = registry.kind("sparse").tinted(KINDS["sparse"](), TINT)
     np.testing.assert_allclose(*sent_back(field, field.answers), rtol=1e-5, atol=1e-9)
-
-
-def test_blocks_keep_their_tints_in_a_bundle():
-    field = tinted_blocks()
-    arrays, metadata = field.state()
-    assert "tint" not in metadata["blocks"][1]
-    back = type(field).from_state(arrays, metadata)
-    assert [block.tint for block in back.blocks] == [block.tint for block in field.blocks]
-    for wrong in ([1, 1], [1, 1, 1.5], [float("nan"), 1, 1], "red"):
-        metadata["blocks"][0]["tint"] = wrong
-        with pytest.raises(ValueError):
-            type(field).from_state(arrays, metadata)

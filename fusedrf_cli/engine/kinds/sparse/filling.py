@@ -4,18 +4,18 @@ import numpy as np
 import torch
 from scipy import sparse
 
+from fusedrf_cli.engine.encodings.bricks import COARSE, SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.asking import (
-    OCTANTS,
     AskingConfig,
     density_features,
     dilated,
     inverse_softplus,
     seen_colours,
 )
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, corner_offsets
-from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField
+from fusedrf_cli.engine.kinds.sparse.field import SparseField
 from fusedrf_cli.engine.settings import current
 
 CORRECTIONS = 3

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kinds.asking import (
     AskingConfig,
@@ -20,7 +21,6 @@ from fusedrf_cli.engine.kinds.asking import (
     placed_in,
     touching,
 )
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,
@@ -31,7 +31,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     node_keys,
     sides,
 )
-from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
 from fusedrf_cli.engine.kinds.sparse.seen import can_be_cut
 from fusedrf_cli.engine.kinds.sparse.training import of_voxels
@@ -138,7 +138,7 @@ def fitted(
 def number_count(lattice: Lattice, shape: SparseShape) -> int:
     """Numbers of a sparse field over a lattice."""
     count = 4 * lattice.free
-    return count + (shape.band_numbers * Lattice(lattice.tree, COARSE).free if shape.sh_degree else 0)
+    return count + (shape.band_numbers * lattice.wider.free if shape.sh_degree else 0)
 
 
 def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:

@@ -12,13 +12,14 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
+from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
+from fusedrf_cli.engine.kinds.sparse import coarsening
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.resample import ResampleConfig, TooFewNumbers, resampled
+from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
 from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
 from fusedrf_cli.engine.kinds.student import (
@@ -30,7 +31,6 @@ from fusedrf_cli.engine.kinds.student import (
     Plan,
     Section,
     StudentRequest,
-    TooSmall,
     Way,
 )
 from fusedrf_cli.engine.selection.cells import Selection
@@ -50,12 +50,6 @@ class SparseConfig:
     """Bytes, as seen: keys, places, indices and least squares of a vertex."""
     bytes_per_brick: int = 10
     """Masks and nodes."""
-    numbers_per_brick: int = 2 * bytes_per_brick
-    """As which a brick counts, of half a byte each at least."""
-    fewest_numbers: int = 5000
-    """Of a field that is made smaller."""
-    runs: float = 1.06
-    """Times the bytes of codes: rows are coded run by run."""
     degree: int = 1
     """Measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0."""
     degree_in_place: int = 2
@@ -122,29 +116,9 @@ class SparseKind(Kind):
         return SparseStudent(self, scene, request)
 
     def reduction(self, outline: SparseField, voxel: float, way: Way) -> Reduction:
-        """See Kind: bricks anew, in about as many numbers as voxels so wide leave."""
-        config = current(SparseConfig)
+        """See Kind and sparse/coarsening.py."""
         degree = outline.shape.sh_degree if way.sh_degree is None else way.sh_degree
-        shape = SparseShape(min(degree, outline.shape.sh_degree))
-        bricks, bands = len(outline.tree.level), outline.coarse.free if shape.sh_degree else 0
-        numbers = ROW * outline.fine.free + shape.band_numbers * bands
-        wider = max(1.0, voxel / outline.voxel_size)
-        if wider == 1 and shape == outline.shape:
-            rows = Section("rows", (outline.fine.free, ROW))
-            sections = [rows, Section("bands", (bands, shape.band_numbers))] if bands else [rows]
-            return Reduction(
-                Contents(sections, 8 * config.bytes_per_brick * bricks), lambda field: field, True
-            )
-        fewer = wider ** current(ResampleConfig).usual_slope
-        few = max(config.fewest_numbers, int((numbers + config.numbers_per_brick * bricks) * fewer))
-
-        def make(field: SparseField) -> SparseField:
-            try:
-                return resampled(field, shape, few, config.numbers_per_brick)
-            except TooFewNumbers as error:
-                raise TooSmall(config.least_bytes) from error
-
-        return Reduction(Contents([Section("rows", (int(config.runs * few / ROW), ROW))]), make, False)
+        return coarsening.reduced(outline, voxel, degree)
 
     def describe(self, field: SparseField) -> dict:
         """The voxel and the bricks of every level, and how many vertices they have."""
