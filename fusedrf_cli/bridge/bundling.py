@@ -13,7 +13,7 @@ from formats.embedding import Embedding
 from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_leaves
 from formats.records import FieldRecord
-from formats.scene import Leaf, Node, SceneGraph
+from formats.scene import WHITE, Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.making import Kept
@@ -38,7 +38,7 @@ class FusedBundle:
         self.kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
         self.nodes = history_nodes(loaded, request.output, self.kept)
         self.composed = loaded.composed()
-        self.graph = SceneGraph(()) if learnt else named_graph(request, everything, loaded)
+        self.graph = named_graph(request, everything, loaded)
         self.framing: tuple[float, ...] | None = None
         self.cameras: dict | None = None
 
@@ -98,7 +98,10 @@ class FusedBundle:
         else:
             own = add(writer, stays.field, background.precision)
         name = free_name(source.placed.name, {LEARNT})
-        node = Node(name, own, None, placement_of(source.placed.object_to_world), True)
+        leaf = next(leaf for leaf, f in self.leaves if f is source)
+        words = {} if leaf.opacity == 1 else {"opacity": leaf.opacity}
+        words |= {} if leaf.tint == WHITE else {"tint": list(leaf.tint)}
+        node = Node(name, own, None, placement_of(leaf.object_to_world), True, showing=words)
         place = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
         return SceneGraph((node, Node(LEARNT, member, None, place)))
 
