@@ -168,6 +168,19 @@ def refuse_options(kind: Kind, request: FuseRequest | TrainRequest) -> None:
             raise UsageProblem(f"{option} does not apply to kind '{kind.name}'; leave it out")
 
 
+def note_options(request: FuseRequest, loaded: LoadedScene, progress) -> None:
+    """Say which of the sources, which stay fields of their own, do not heed an option; UsageProblem where
+    none does."""
+    kinds = {f.placed.field.kind for f in loaded.fields}
+    for word, option in OPTIONS.items():
+        others = sorted(name for name in kinds if word not in registry.kind(name).reduces)
+        if getattr(request, word) is None or not others:
+            continue
+        if len(others) == len(kinds):
+            raise UsageProblem(f"{option} does not apply to kind {', '.join(others)}; leave it out")
+        progress.warn(f"{option} does not apply to fields of kind {', '.join(others)}: they keep theirs")
+
+
 def needs_of(bundle: OpenBundle, member: str) -> FieldNeeds:
     """What a field of a bundle needs of memory, told by its header before it is read. InvalidInput where that
     makes no field."""

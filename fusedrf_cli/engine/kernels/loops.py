@@ -306,7 +306,7 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     for number in range(PIECES):
         if trans <= batch.early_stop:
             break
-        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, math.inf)
+        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, FARTHEST)
         u0 = u0 + batch.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         ask_for(field, held, origin, way, u0, step, k, many)
@@ -378,11 +378,11 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         for q in range(count):
             before = before[0] + kept.weight[q], before[1] + kept.weight[q] * kept.along[q]
     number = kept.piece[count - 1]
-    origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
+    origin, way, u0, _, course = piece(number, grid, o, d, batch.near, FARTHEST)
     for q in range(count - 1, -1, -1):
         if PIECES > 1 and kept.piece[q] != number:
             number = kept.piece[q]
-            origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
+            origin, way, u0, _, course = piece(number, grid, o, d, batch.near, FARTHEST)
         u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
         p = position_at(origin, way, u)
         place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
@@ -423,7 +423,7 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
     nx, ny, nz = grid.skip.shape
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, math.inf)
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, FARTHEST)
         u0 = u0 + rays.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
@@ -450,7 +450,7 @@ def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
     nx, ny, nz = rays.counts[0], rays.counts[1], rays.counts[2]
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, math.inf)
+        origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, FARTHEST)
         u0 = u0 + rays.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:

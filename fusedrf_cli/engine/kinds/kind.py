@@ -38,6 +38,8 @@ class Kind:
     """Whether a field of it can begin from photos."""
     takes: frozenset[str] = frozenset()
     """Which of Way's words it heeds, besides the precision: "ranks", "sh_degree"."""
+    reduces: frozenset[str] = frozenset()
+    """Which of them `reduction` heeds."""
     hashes = False
     """Whether its fields may have a hashed detail (`Way.hashed`)."""
     takes_over = False

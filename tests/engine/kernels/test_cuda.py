@@ -186,10 +186,10 @@ def trained(rays_o, rays_d, step, **more):
 
 @on_a_device
 @every_field
-def test_train_rays(name, dtype, monkeypatch):
+def test_train_rays(name, dtype, in_force):
     """More rays than have memory at a time, and more shaded samples than have a slot for what they keep."""
     field = FIELDS[name](dtype)
-    monkeypatch.setattr(cuda, "RAYS_IN_FLIGHT", 2)
+    in_force(cuda.CudaConfig(rays_in_flight=2))
     for wanted, found in twice(field, trained(*rays_at(field.aabb, 3), 0.1)):
         check(found, wanted, dtype)
     assert wanted[0, 2] > 3  # samples

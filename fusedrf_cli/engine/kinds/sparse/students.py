@@ -84,7 +84,7 @@ class SparseKind(Kind):
     name = "sparse"
     good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local."
     field = SparseField
-    takes = frozenset({"sh_degree"})
+    takes = reduces = frozenset({"sh_degree"})
     precisions = ("int8", "float16")
     beside_background = False  # its bricks are as coarse as the background where that is all there is
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
