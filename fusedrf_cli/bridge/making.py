@@ -102,9 +102,9 @@ class Maker:
         compares = request.target_psnr is not None and student.lesson is None
         self.views = VIEWS_TO_CHOOSE_BY if compares else lesson.views
         size = lesson.view_size, lesson.view_size
-        self.looks = looks_of(scene.loaded, scene.composed, self.views, size, (JUDGED_SEED, 3, request.seed))
         answered = as_composite if together else lambda scene: scene
         truth = self.teacher = answered(scene.composed)
+        self.looks = looks_of(scene.loaded, truth, self.views, size, (JUDGED_SEED, 3, request.seed))
         if student.scene is not scene.composed:
             self.teacher = answered(student.scene)
         self.judge = Judge(truth, [look.camera for look in self.looks], truth.origin)
@@ -269,8 +269,8 @@ class Maker:
         field, start = self.student.begun(plan, before, background, generator)
         if wanted and start == NOTHING:
             self.progress.warn(
-                f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
-                "nothing"
+                f"'{background.name}' is of another kind, turned, stretched or tinted, so the student starts "
+                "from nothing"
             )
         taken_over = wanted and start != NOTHING and same_texels(field, background.field)
         return field, start, {"coarse_from": None, "rate": RATE_IN_PLACE} if taken_over else {}

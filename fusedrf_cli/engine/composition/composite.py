@@ -57,10 +57,7 @@ def groups_of(placed: Iterable[Placed], rule: str) -> list[tuple[list[Placed], s
         if not isinstance(scene, ComposedField):
             groups.append(([p], rule))
             continue
-        inner = [
-            Placed(f"{p.name}/{q.name}", q.field, p.object_to_world @ q.object_to_world) for q in scene.placed
-        ]
-        below = groups_of(inner, scene.rule)
+        below = groups_of([q.within(p) for q in scene.placed], scene.rule)
         if scene.rule == rule:
             groups += below
         elif all(len(members) == 1 for members, _ in below):
@@ -149,6 +146,7 @@ class Composite(ComposedField):
             np.concatenate(list(skip.values())),
             np.array([sampling_step(field) for field in self.fields]),
             np.stack([sphere_around(p, f) for p, f in zip(self.leaves, self.fields, strict=True)]),
+            np.array([(p.opacity, *p.tint) for p in self.leaves]),
         )
 
     @cached_property
@@ -182,7 +180,7 @@ class Composite(ComposedField):
     ) -> PointAnswers:
         """What instances (M,) composed by a rule answer at points (N, 3) along dirs (N, 3)."""
         matrix, adds, n = self.instances.world_to_instance, rule == "add", len(points)
-        asked = PointQuery(points, dirs, None, 0, matrix, adds, False)
+        asked = PointQuery(points, dirs, None, 0, matrix, self.instances.shown, adds, False)
         answers = PointAnswers(np.zeros(n), np.full(n, -1), np.empty(n, np.int64), np.zeros((n, 3)))
         near = {b: self.points_near(points, b) for b in members}
         for b, chosen in near.items():
@@ -312,6 +310,7 @@ class Waves:
             part = order[stops[b] : stops[b + 1]]
             slots = Slots(
                 *self.rays, part, ray, instance, *ends, scene.instances.world_to_instance,
+                scene.instances.shown,
                 float(self.steps[b]), float(self.early_stop), self.out,
             )  # fmt: skip
             scene.fields[b].each(item, slots, len(part), out, RAYS_PER_TASK)

@@ -13,11 +13,10 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, loops, parts, tinting
+from fusedrf_cli.engine.kernels import instances, loops, parts
 from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": task, "sweep_task": task}
-TINTED = "TINTED"  # among the sizes of a field that has tints
 body = njit(**FLAGS, forceinline=True, _nrt=False)
 
 
@@ -62,8 +61,6 @@ def loops_for(bodies: ModuleType | None, sizes: tuple[tuple[str, int], ...], spa
 def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleType) -> tuple[str, dict]:
     """A name for the combination, and its namespace of compiled functions."""
     names, functions = namespace(bodies, space)
-    if TINTED in sizes:
-        functions = tinting.tinted(functions)
     names |= sizes
     tag = combination(bodies, sizes, space, names)
     for name, function in functions.items():

@@ -41,8 +41,8 @@ class BlocksKind(Kind):
 
     def suits(self, scene: ComposedField) -> Suits:
         """Nothing is nearer to a scene of vm fields, in far less time (DESIGN)."""
-        if scene.rule != "max" or any(p.field.kind != VM.name for p in scene.placed):
-            return Suits(None, f"{self.name} need {VM.name} sources and 'max' composition")
+        if scene.rule != "max" or any(p.field.kind != VM.name or not p.as_it_is for p in scene.placed):
+            return Suits(None, f"{self.name} need {VM.name} sources as they are and 'max' composition")
         return Suits(
             2.0, f"all sources are {VM.name} fields and the densest shows, so that each keeps its own axes"
         )

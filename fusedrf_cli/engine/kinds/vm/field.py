@@ -16,6 +16,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.encodings.plane_line import MODES
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples, sampling_step
@@ -32,7 +33,6 @@ from fusedrf_cli.engine.fields.computed import (
     FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
-    WHITE,
     ComputedField,
     Group,
     Reads,
@@ -304,12 +304,6 @@ class VMField(ComputedField):
         return back
 
     # -- reading ---------------------------------------------------------------------------------------------
-
-    @property
-    def tints(self) -> np.ndarray | None:
-        """See ComputedField: of the blocks."""
-        tints = np.array([block.tint for block in self.blocks])
-        return None if (tints == 1).all() else tints
 
     @property
     def resolution(self) -> tuple[int, int, int] | None:

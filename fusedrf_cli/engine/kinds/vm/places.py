@@ -131,7 +131,7 @@ def place_student(
     if request.from_scratch or scene.rule != "max" or len(around) != 1 or not objects:
         return None
     (place,) = around
-    if place.field.kind != VMField.kind:
+    if place.field.kind != VMField.kind or not place.as_it_is:
         return None
     shape = common_shape([opened(place.field).shape, asked])
     ranks = shape.density_rank, shape.colour_rank

@@ -124,8 +124,7 @@ def block_colour(field, b: int, points: torch.Tensor, dirs: torch.Tensor) -> tor
     if tensor.hashed:
         asked = asks_detail(vm_density_feature(sections, unit.to(kind)), tensor)
         added = torch.where(asked[:, None], detail(sections, tensor, unit)[:, 1:], 0)
-    rgb = vm_colour(sections, unit.to(kind), turned.to(kind), added)
-    return rgb * torch.tensor(field.blocks[b].tint, dtype=kind, device=points.device)
+    return vm_colour(sections, unit.to(kind), turned.to(kind), added)
 
 
 def vm_products(sections: dict[str, torch.Tensor], what: str, unit: torch.Tensor) -> torch.Tensor:

@@ -2,7 +2,6 @@
 taken over."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -134,22 +133,12 @@ class VMKind(Kind):
         """See vm/trimming.py."""
         return without_unasked(field)
 
-    def thinned(self, field: VMField, factor: float) -> VMField:
-        """Each tensor has a scale of its own."""
-        tensors = tuple(replace(tensor, scale=tensor.scale * factor) for tensor in field.tensors)
-        return VMField(field.shape, tensors, field.blocks, field.params, field.occupancy, field.owners)
-
-    def tinted(self, field: VMField, tint: tuple[float, float, float]) -> VMField:
-        """Each block has a tint of its own."""
-        return editing.tinted(field, tint)
-
 
 def place_of(background: Placed, plan: Plan, scene: ComposedField) -> VMField | None:
     """The numbers of a place that gives a scene its frame, over the cells of the scene; None where they are
     more than planned, or matter of the scene lies outside of what they cover."""
     field, cells = background.field, scene.occupancy
-    tinted = getattr(field, "tints", None) is not None  # which what stands in the place must not be
-    if type(field) is not VMField or len(field.blocks) != 1 or not background.unbounded or tinted:
+    if type(field) is not VMField or len(field.blocks) != 1 or not background.unbounded:
         return None
     box, shape = field.tensors[0].aabb, common_shape([field.shape, shape_of(plan.way)])
     beyond = np.maximum(box[:3] - cells.centres(), cells.centres() - box[3:]).max()
