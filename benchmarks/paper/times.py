@@ -95,9 +95,7 @@ def photograph(scene: Path, box: np.ndarray, folder: Path) -> None:
     composed = load_scene(str(scene)).composed()
     cameras = scattered(box, VIEWS, SIZE, SIZE, seed=SEED)
     shots = [render_image(composed, c, origin=composed.origin) for c in cameras]
-    views = [
-        View(c.name, c.camera_to_world, c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height) for c in cameras
-    ]
+    views = [View(c.name, c.camera_to_world, c.fl_x, c.fl_y, c.cx, c.cy, c.width, c.height) for c in cameras]
     write_capture(folder, views, np.stack([to_pixels(shot, None) for shot in shots]), "train")
 
 

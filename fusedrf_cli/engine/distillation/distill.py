@@ -43,7 +43,7 @@ from fusedrf_cli.engine.kinds.student import DistilConfig
 
 @dataclass(frozen=True)
 class Recipe:
-    """The parts of the method, of which benchmarks/ablation.py replaces one at a time."""
+    """The parts of the method."""
 
     chance: Chance = matter_first
     density_loss: DensityLoss = log_depth
