@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from formats.errors import FormatError
-from formats.scene import Node, SceneGraph, check_name
+from formats.scene import WHITE, Node, SceneGraph, check_name, multiplied
 
 Becoming = Callable[[Node, np.ndarray], tuple[Node, ...]]
 """What becomes of a node, whose parent's frame lies in the world by a (4, 4)."""
@@ -55,6 +55,22 @@ def with_field(scene: SceneGraph, name: str, member: str | None) -> SceneGraph:
     return _changed(scene, lambda one: one == name, after)
 
 
+def with_leaves(scene: SceneGraph, becoming: Callable[[Node], Node | None]) -> SceneGraph:
+    """The scene whose nodes that hold a field became others, one after the other in document order; None:
+    without it."""
+
+    def after(node: Node) -> tuple[Node, ...]:
+        own = node if node.field is None else becoming(node)
+        children = tuple(one for child in node.children for one in after(child))
+        if own is None:
+            return (replace(node, field=None, children=children),) if children else ()
+        if node.children and not children and own.field is None:
+            return ()
+        return (replace(own, children=children) if node.children else own,)
+
+    return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node)))
+
+
 def _changed(scene: SceneGraph, goes: Callable[[str], bool], becoming: Becoming) -> SceneGraph:
     def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
         if goes(node.name):
@@ -76,6 +92,31 @@ def without(scene: SceneGraph, names: Container[str]) -> SceneGraph:
 def with_nodes(scene: SceneGraph, nodes: Iterable[Node]) -> SceneGraph:
     """The scene with more nodes, behind those it has."""
     return replace(scene, nodes=(*scene.nodes, *nodes))
+
+
+def lifted(node: Node, kept: Container[str] = ()) -> Node:
+    """Of groups that hold but one node each that node, where it stood and as it was shown; a group stays that
+    is cropped, or whose name is one of those that are kept."""
+    while (
+        len(node.children) == 1
+        and node.field is None
+        and node.source is None
+        and not node.extras
+        and "crop" not in node.showing
+        and node.name not in kept
+    ):
+        (only,) = node.children
+        outer, showing = node.showing, dict(only.showing)
+        if "opacity" in outer:
+            showing["opacity"] = outer["opacity"] * showing.get("opacity", 1.0)
+        if "tint" in outer:
+            showing["tint"] = list(multiplied(outer["tint"], showing.get("tint", WHITE)))
+        placement = only.placement
+        if not np.array_equal(node.node_to_parent, np.eye(4)):
+            placement = placement_of(node.node_to_parent @ only.node_to_parent)
+        rule = only.composition or (node.composition if only.children else None)
+        node = replace(only, placement=placement, showing=showing, composition=rule)
+    return node
 
 
 def moved(node: Node, parent: np.ndarray, matrix: np.ndarray) -> Node:

@@ -2,7 +2,7 @@
 
 import os
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 SHORT_WAIT = "1000"
 """Turns for which a thread of torch's spins while it waits for another, before it sleeps."""

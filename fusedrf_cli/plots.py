@@ -2,8 +2,10 @@
 
 import importlib.util
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.report import readable_size
 
@@ -17,11 +19,23 @@ LOOKS = (  # Okabe and Ito's colours, which colour-blind readers tell apart; a k
     ("#000000", "X"),
 )
 AXES = {"seconds": "seconds to fuse", "bytes": "bytes", "ms": "milliseconds per frame"}
-PALE = 0.25
-ROW_INCHES = 0.19
-FONT = 8  # points
-FEW_TICKS = 20  # times the smallest value, from which on an axis is marked at 1, 2 and 5 alone
-FAR = 3  # times the largest point, from which on a reference is off the scale
+
+
+@dataclass(frozen=True)
+class PlotConfig:
+    """How charts look."""
+
+    pale: float = 0.25
+    """Opacity of points that others surpass."""
+    row_inches: float = 0.19
+    font: int = 8
+    """Points."""
+    few_ticks: int = 20
+    """Times the smallest value, from which on an axis is marked at 1, 2 and 5 alone."""
+    far: int = 3
+    """Times the largest point, from which on a reference is off the scale."""
+
+
 AROUND = [(dx, dy) for r in (9, 15, 22) for dx, dy in ((-r, r), (0, r), (r, r), (r, 0), (r, -r), (0, -r))]
 
 
@@ -53,7 +67,8 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
     """PSNR against seconds, bytes and milliseconds of points (bridge.chart.Point), those on a frontier
     numbered as in the list of `best` below; `composed` has the scene's own bytes and ms.
     """
-    height = 4.4 + ROW_INCHES * (len(best) + 2)
+    config = current(PlotConfig)
+    height = 4.4 + config.row_inches * (len(best) + 2)
     figure = pyplot().figure(figsize=(13, height), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(4.4, height - 4.4))
     panels = above.subplots(1, 3, sharey=True)
@@ -64,7 +79,7 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
     panels[0].set_ylabel("PSNR against the scene as composed, dB")
     above.suptitle(title, parse_math=False)
     handles = kind_handles(points)
-    above.legend(handles=handles, loc="outside upper right", ncols=len(handles), fontsize=FONT)
+    above.legend(handles=handles, loc="outside upper right", ncols=len(handles), fontsize=config.font)
     write_list(below, best, looks(points))
     figure.draw_without_rendering()  # places are final from here on
     for panel, cost in zip(panels, AXES, strict=True):
@@ -74,12 +89,13 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
 
 def draw_panel(panel, cost: str, points: Sequence) -> None:
     """The points over one cost, the surpassed ones pale, and the frontier as a line."""
+    config = current(PlotConfig)
     from matplotlib import ticker
 
     seen = looks(points)
     for point in points:
         colour, marker = seen[point.kind]
-        alpha = 1 if cost in point.frontier else PALE
+        alpha = 1 if cost in point.frontier else config.pale
         look = {"color": colour, "alpha": alpha, "markersize": 6, "markeredgewidth": 0}
         panel.plot(getattr(point, cost), point.psnr, marker, **look)
     line = sorted((getattr(p, cost), p.psnr) for p in points if cost in p.frontier)
@@ -91,24 +107,25 @@ def draw_panel(panel, cost: str, points: Sequence) -> None:
     panel.margins(y=0.1)
     panel.grid(alpha=0.3)
     tell = (lambda x, _: readable_size(x)) if cost == "bytes" else (lambda x, _: f"{x:g}")
-    few = max(values) > FEW_TICKS * min(values)
+    few = max(values) > config.few_ticks * min(values)
     panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if few else (1, 1.5, 2, 3, 4, 5, 6, 8)))
     panel.xaxis.set_major_formatter(tell)
     panel.xaxis.set_minor_locator(ticker.NullLocator())
-    panel.tick_params(labelsize=FONT)
+    panel.tick_params(labelsize=config.font)
 
 
 def draw_composed(panel, cost: str, value: float, largest: float) -> None:
     """A line where the scene stands as composed: at the panel's end where it is far beyond all points."""
+    config = current(PlotConfig)
     left, right = panel.get_xlim()
     text = "all sources" if cost == "bytes" else "as composed"
-    if value > FAR * largest:
+    if value > config.far * largest:
         text += f": {readable_size(value) if cost == 'bytes' else f'{value:,.0f} ms'}, off the scale"
     else:
         panel.set_xlim(min(left, value / 1.2), max(right, value * 1.2))
     at = min(value, 0.985 * panel.get_xlim()[1])
     panel.axvline(at, color="black", linewidth=1, linestyle=":")
-    where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": FONT}
+    where = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": config.font}
     panel.annotate(text, (at, 0.02), (-4, 0), rotation=90, ha="right", va="bottom", **where)
 
 
@@ -130,6 +147,7 @@ def looks(points: Sequence) -> dict[str, tuple[str, str]]:
 
 def number(panel, cost: str, points: Sequence, best: Sequence) -> None:
     """Write its number beside every point of a panel's frontier, where nothing else is."""
+    config = current(PlotConfig)
     to_pixels, per_point = panel.transData.transform, panel.figure.dpi / 72
     taken = [tuple(to_pixels((getattr(p, cost), p.psnr)) / per_point) for p in points]
     for i, point in enumerate(best, 1):
@@ -138,7 +156,7 @@ def number(panel, cost: str, points: Sequence, best: Sequence) -> None:
         x, y = to_pixels((getattr(point, cost), point.psnr)) / per_point
         dx, dy = max(AROUND, key=lambda d: (clear((x + d[0], y + d[1]), taken), -abs(d[0]) - abs(d[1])))
         taken.append((x + dx, y + dy))
-        where = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": FONT}
+        where = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": config.font}
         panel.annotate(str(i), (getattr(point, cost), point.psnr), (dx, dy), **where)
 
 
@@ -149,6 +167,7 @@ def clear(place: tuple[float, float], taken: Sequence[tuple[float, float]], enou
 
 def write_list(figure, best: Sequence, seen: dict[str, tuple[str, str]]) -> None:
     """What the numbers stand for: the flags, and what they give."""
+    config = current(PlotConfig)
     longest = max(len(p.flags) for p in best)
     head = f"{'':4}{'fusedrf fuse …':{longest}}{'dB':>8}{'SSIM':>8}{'size':>9}{'fuse, s':>9}{'frame, ms':>11}"
     rows = [
@@ -158,4 +177,4 @@ def write_list(figure, best: Sequence, seen: dict[str, tuple[str, str]]) -> None
     colours = ["black", *(seen[p.kind][0] for p in best)]
     for row, (text, colour) in enumerate(zip([head, *rows], colours, strict=True)):
         y = 1 - (row + 0.5) / (len(rows) + 1.5)
-        figure.text(0.05, y, text, family="monospace", fontsize=FONT + 0.5, color=colour, va="center")
+        figure.text(0.05, y, text, family="monospace", fontsize=config.font + 0.5, color=colour, va="center")

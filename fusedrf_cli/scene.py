@@ -23,8 +23,7 @@ from fusedrf_cli.engine.rendering.differentiable import (
     seen_from,
     shifted,
 )
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP
-from fusedrf_cli.engine.spaces import unbounded
+from fusedrf_cli.engine.spaces import bounded
 
 
 def open_scene(path: str | Path, device: str = "cpu", allow_outside: bool = False) -> "Scene":
@@ -94,7 +93,7 @@ class Scene:
         *,
         near: float = 0.0,
         step: float | None = None,
-        early_stop: float = EARLY_STOP,
+        early_stop: float | None = None,
     ) -> torch.Tensor:
         """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) with unit directions.
 
@@ -114,7 +113,7 @@ class Scene:
         pose: torch.Tensor | None = None,
         *,
         step: float | None = None,
-        early_stop: float = EARLY_STOP,
+        early_stop: float | None = None,
     ) -> Picture:
         """The view of a camera, from `pose` (4, 4), camera to world, where it is given in place of the
         camera's own; see `render_rays`."""
@@ -154,7 +153,7 @@ class Scene:
         (name, place), *others = now.items()
         alone = not others and not learnt and shown[name].as_it_is
         moved = np.array_equal(place[:3, :3], np.eye(3))
-        if alone and (moved or self.fields[name].occupancy.space is unbounded):
+        if alone and (moved or self.fields[name].occupancy.space is not bounded):
             return self.fields[name], short_origin(place), None
         known = self._composed and {p.name: p.object_to_world for p in self._composed[0]}
         if not known or any(not np.array_equal(known[name], pose) for name, pose in now.items()):

@@ -1,11 +1,13 @@
-"""The files that take longest come first, so that no process is left alone with one of them at the end; and
-no test hears of an interrupt that another one made."""
+"""The files that take longest come first, so that no process is left alone with one of them at the end; no
+test hears of an interrupt that another one made; and settings of its own end with a test."""
 
+import contextlib
 from pathlib import Path
 
 import pytest
 
 from fusedrf_cli import signals
+from fusedrf_cli.engine.settings import using
 
 LONGEST = (
     *("bridge/test_extract.py", "bridge/test_fuse.py", "formats/test_posing.py", "promises/test_kills.py"),
@@ -26,3 +28,10 @@ def pytest_collection_modifyitems(items):
 def not_interrupted(monkeypatch):
     """As a process begins."""
     monkeypatch.setattr(signals, "_raised", None)
+
+
+@pytest.fixture
+def in_force():
+    """in_force(OccupancyConfig(scene_cells=24), …): settings until the end of the test."""
+    with contextlib.ExitStack() as stack:
+        yield lambda *settings: stack.enter_context(using(*settings))

@@ -105,7 +105,9 @@ def parse_mtl(data: bytes, notes: Notes, file: str) -> dict[str, Material]:
             if len(found) > MAX_MATERIALS:
                 notes.add(f"{file} has more than {MAX_MATERIALS:,} materials, the rest is left out")
                 return found
-        elif current is not None:
+        elif current is None:
+            notes.add(f"{file}: {word} before its first newmtl belongs to no material")
+        else:
             try:
                 _set(current, word, rest)
             except ValueError:

@@ -25,19 +25,20 @@ from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.bridge.sources import as_it_is
 from fusedrf_cli.engine.composition.composite import Composite
-from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
+from fusedrf_cli.engine.distillation.judging import JudgingConfig
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import FusedRFError, Interrupted, InvalidInput, UsageProblem
 from fusedrf_cli.progress import NullProgress
 from fusedrf_cli.requests import ChartRequest, FuseRequest
 
 VIEWS = 8
-HELD_OUT = (JUDGED_SEED, 2)  # a pair seeds a stream that no single number, such as a person's --seed, does
+HELD_OUT = (JudgingConfig.judged_seed, 2)  # a pair seeds a stream that no single number, as of --seed, does
 ROUNDS = 5  # of frames, all fields taking turns
 PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
 COSTS = ("seconds", "bytes", "ms")
@@ -99,6 +100,7 @@ class Benchmark:
     ):
         """Render the scene as composed, by default from where the scene and its objects were photographed;
         given a box (6,) of the world, from all around that."""
+        config = current(JudgingConfig)
         loaded = load_scene(scene, allow_outside, memory, place)
         needed = sources(loaded.sizes) | frame_memory(None, *size) | measured(*size)
         composed = composite_of(loaded, memory, needed)
@@ -111,7 +113,7 @@ class Benchmark:
         needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * PER_PIXEL_KEPT
         memory.expect(needed, advice="give a smaller --size")
         shots = [render_image(composed, c, origin=composed.origin) for c in cameras]
-        truth, seen = [shot.over(WHITE) for shot in shots], [shot.opacity > COVERED for shot in shots]
+        truth, seen = [shot.over(WHITE) for shot in shots], [shot.opacity > config.covered for shot in shots]
         total = source_bytes(loaded)
         return cls(scene, memory, size, allow_outside, place, box, cameras, truth, seen, total)
 

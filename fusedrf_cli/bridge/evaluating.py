@@ -12,16 +12,23 @@ from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
 from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable, tell_of_work
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.distillation.judging import COVERED, JUDGED_SEED
+from fusedrf_cli.engine.distillation.judging import JudgingConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import EvaluateRequest
 
-SCENE_VIEWS = 8
-SCENE_SIZE = (400, 400)
-SCENE_SEED = (JUDGED_SEED, 1)  # a stream of their own
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The views of a scene that are compared."""
+
+    views: int = 8
+    size: tuple[int, int] = (400, 400)
+    seed: tuple[int, int] = (JudgingConfig.judged_seed, 1)
+    """A stream of their own."""
 
 
 def evaluate(request: EvaluateRequest, progress) -> dict:
@@ -132,13 +139,15 @@ def scene_pairs(
 ) -> Iterator[tuple[Pair, int]]:
     """The same of another scene, as `render` draws it, from where it and its objects were photographed; every
     pixel counts."""
+    evaluation = current(EvaluationConfig)
+    config = current(JudgingConfig)
     loaded = load_scene(against, allow_outside, budget, place)
-    size = size or SCENE_SIZE
+    size = size or evaluation.size
     field = composite_of(loaded, budget, frame_memory(None, *size) | measured(*size))
-    views = looks_of(loaded, field, SCENE_VIEWS, size, SCENE_SEED)
+    views = looks_of(loaded, field, evaluation.views, size, evaluation.seed)
     needed = frame_memory(field, *size) | measured(*size)
     budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
     for look in views:
         shot = render_image(field, look.camera, origin=field.origin)
         every = np.ones(shot.opacity.shape, bool)
-        yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > COVERED, look.of), len(views)
+        yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > config.covered, look.of), len(views)

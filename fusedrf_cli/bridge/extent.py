@@ -18,6 +18,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     seen_box,
 )
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import TrainRequest
@@ -25,27 +26,31 @@ from fusedrf_cli.requests import TrainRequest
 CORE = {"inward": 0.6, "forward-facing": 0.6, "outward": 1.2}
 """Half the side of the core: in distances between cameras and focus, or, of cameras that look outwards, in
 distances of the farthest camera from their middle."""
-FAN_CORE, FAN_CORES = 0.65, (0.15, 0.4)
-"""Half the side of the core around cameras that all look one way, in distances of the nearest of their sparse
-points; the least and the most in distances of what they look at. Half as much, or half as much again, shows
-0.3 to 0.5 dB less."""
-FAN_CORE_UNKNOWN = 0.3
-"""The same in distances of what they look at, where there are no sparse points."""
-NEAR = 0.1
-"""Of the distance between cameras and focus: nothing is learnt closer to a camera."""
-NEAR_OF_POINTS = 0.6
-"""Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer is
-empty, for all other cameras too."""
-FAR_AWAY = 64.0
-"""Times its longest side from the world's origin a box has a frame of its own."""
-
-BOX_CELLS = 64
-"""Along the longest axis of the hull that only gives the box of what alpha shows."""
 
 
-FLATTEST = 1000.0
-"""How many times as long as its shortest side a box's longest may be: readers refuse a field whose rays would
-take too many samples (engine/fields/base.py)."""
+@dataclass(frozen=True)
+class ExtentConfig:
+    """How far what is learnt reaches."""
+
+    fan_core: float = 0.65
+    """Half the side of the core around cameras that all look one way, in distances of the nearest of their
+    sparse points. Half as much, or half as much again, shows 0.3 to 0.5 dB less."""
+    fan_cores: tuple[float, float] = (0.15, 0.4)
+    """The least and the most of that, in distances of what they look at."""
+    fan_core_unknown: float = 0.3
+    """The same in distances of what they look at, where there are no sparse points."""
+    near: float = 0.1
+    """Of the distance between cameras and focus: nothing is learnt closer to a camera."""
+    near_of_points: float = 0.6
+    """Of the distance of a camera's nearest sparse points, where there are any: what its picture shows nearer
+    is empty, for all other cameras too."""
+    far_away: float = 64.0
+    """Times its longest side from the world's origin a box has a frame of its own."""
+    box_cells: int = 64
+    """Along the longest axis of the hull that only gives the box of what alpha shows."""
+    flattest: float = 1000.0
+    """How many times as long as its shortest side a box's longest may be: readers refuse a field whose rays
+    would take too many samples (engine/fields/base.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +95,12 @@ class Extent:
 
 def check_flatness(extent: Extent) -> None:
     """UsageProblem, before work begins, for a box so flat that no reader would take the field."""
+    config = current(ExtentConfig)
     sides = extent.box[3:] - extent.box[:3]
-    if not sides.max() <= FLATTEST * sides.min():
+    if not sides.max() <= config.flattest * sides.min():
         raise UsageProblem(
-            f"the box {extent.box.tolist()} is more than {FLATTEST:,.0f} times as long as it is thin; give a "
-            "thicker --aabb"
+            f"the box {extent.box.tolist()} is more than {config.flattest:,.0f} times as long as it is thin; "
+            "give a thicker --aabb"
         )
 
 
@@ -120,14 +126,16 @@ def extent_of(request: TrainRequest, capture: Capture, cut_out: bool) -> Extent:
     if request.aabb is not None or capture.opaque or capture.kind == "mesh":
         return extent
     # Its cells are not kept to: transparent pixels tell what is empty in the box.
-    return replace(extent, box=visual_hull(views, extent.box, BOX_CELLS).aabb)
+    return replace(extent, box=visual_hull(views, extent.box, current(ExtentConfig).box_cells).aabb)
 
 
 def in_own_frame(box: np.ndarray) -> Extent:
     """The extent of a box (6,) of the world: in the world's frame, or, where it lies far away for its size or
     is of no ordinary size, in one of its own, so that numbers have the digits that they have anywhere."""
+    config = current(ExtentConfig)
     frame = placement(frame_around(box))
-    if np.array_equal(frame[:3, :3], np.eye(3)) and np.abs(box).max() <= FAR_AWAY * (box[3:] - box[:3]).max():
+    near = np.abs(box).max() <= config.far_away * (box[3:] - box[:3]).max()
+    if near and np.array_equal(frame[:3, :3], np.eye(3)):
         return Extent(box)
     return Extent(seen_box(box, frame), frame)
 
@@ -147,7 +155,7 @@ def _unbounded(request: TrainRequest, capture: Capture) -> Extent:
     unit = Extent(WHOLE, origin).unit
     near /= unit
     whole = Extent(WHOLE, origin, True, near)
-    clear = [max(near, NEAR_OF_POINTS * (view.near or 0) / unit) for view in views]
+    clear = [max(near, current(ExtentConfig).near_of_points * (view.near or 0) / unit) for view in views]
     shown = shown_cells([whole.camera(camera_of(view)) for view in views], near, clear)
     box = shown.tight_aabb(0)  # texels that no photo shows would be lost
     return replace(whole, box=box, cells=shown.within(box))
@@ -168,9 +176,10 @@ def fan(frame: SceneFrame, views: Sequence[View]) -> np.ndarray:
     directions as seen from the middle of the cameras, so that texels are as fine as pixels near and far.
     (The normalised device coordinates of NeRF, Mildenhall et al. 2020, appendix C, are such too.)
     """
+    config = current(ExtentConfig)
     poses, known = np.array([view.camera_to_world for view in views]), [v.near for v in views if v.near]
-    nearest = FAN_CORE * min(known) if known else FAN_CORE_UNKNOWN * frame.distance
-    unit = float(np.clip(nearest, *(share * frame.distance for share in FAN_CORES)))
+    nearest = config.fan_core * min(known) if known else config.fan_core_unknown * frame.distance
+    unit = float(np.clip(nearest, *(share * frame.distance for share in config.fan_cores)))
     ahead = -poses[:, :3, 2].mean(0)
     ahead /= np.linalg.norm(ahead)
     left = np.cross(poses[:, :3, 1].mean(0), ahead)
@@ -185,5 +194,6 @@ def fan(frame: SceneFrame, views: Sequence[View]) -> np.ndarray:
 
 def near_of(views: tuple[View, ...], distance: float) -> float:
     """World distance from every camera before which there is nothing, as far as sparse points tell."""
+    config = current(ExtentConfig)
     known = [view.near for view in views if view.near]
-    return min(NEAR * distance, *(NEAR_OF_POINTS * near for near in known)) if known else NEAR * distance
+    return min([config.near * distance, *(config.near_of_points * near for near in known)])

@@ -10,8 +10,8 @@ from formats.embedding import Embedding
 from formats.scene import dump_scene
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
-from fusedrf_cli.bridge.making import VIEWS_TO_CHOOSE_BY, Kept, Maker, Scene
-from fusedrf_cli.bridge.memory import READING, Memory, asking_in_waves, learning_is_asked, stages
+from fusedrf_cli.bridge.making import Kept, Maker, MakingConfig, Scene
+from fusedrf_cli.bridge.memory import Memory, MemoryConfig, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.rendering import tell_of_work
 from fusedrf_cli.bridge.rigs import kept_cameras, kept_framing
@@ -36,11 +36,12 @@ from fusedrf_cli.bridge.scene import (
 from fusedrf_cli.bridge.sizes import BundleSizes, graph_bytes
 from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.detail import ENOUGH_VOXELS, LOST_NOTED, Detail
+from fusedrf_cli.engine.composition.detail import Detail, DetailConfig
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student, StudentRequest, TooSmall
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
@@ -78,7 +79,7 @@ def fuse(
         cameras = kept_cameras(loaded, progress)
         framing = kept_framing(loaded, scene.composed, cameras)
         check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
-        pixels = VIEWS_TO_CHOOSE_BY * DistilConfig.view_size**2
+        pixels = current(MakingConfig).views * DistilConfig.view_size**2
         tell_of_work(request.scene, scene.composed, pixels, progress)
         overhead = graph_bytes(nodes, cameras)
         found, student, figures_of_it = best_of(
@@ -415,7 +416,7 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
     if not together and student.lesson is None and learning_is_asked(student, request):
         needed.append((0.0, asking_in_waves(student, scene.composed)))
     if not together:  # then one is read now and then in every stage
-        needed = [(max(copies, READING), parts) for copies, parts in needed]
+        needed = [(max(copies, current(MemoryConfig).reading), parts) for copies, parts in needed]
         room = min(memory.room(parts) - copies * max(sizes) for copies, parts in needed)
     shelf.resize(room)
     memory.expect(
@@ -428,15 +429,16 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
 def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
     """Say which objects a fused field will not hold as they are: stretched translucent ones, those it has too
     few voxels for, and those that share their cells with more than two."""
+    config = current(DetailConfig)
     for d in details:
         if d.opacity_off and d.stretch > CONDITION_NOTED:
             progress.warn(
                 f"'{d.name}' is stretched by {d.stretch:.2f}: where it is translucent its "
                 f"opacity may be off by up to {d.opacity_off:.3f}"
             )
-        if d.voxels_across < ENOUGH_VOXELS:
+        if d.voxels_across < config.enough_voxels:
             progress.warn(f"'{d.name}' is only {d.voxels_across:.2g} voxels across; use {remedy}")
-        if d.lost > LOST_NOTED:
+        if d.lost > config.lost_noted:
             progress.warn(
                 f"{d.lost:.0%} of '{d.name}' is not shown, since more than two objects meet there in one "
                 "cell of a grid over the whole scene; render the scene itself, or fuse its parts apart"

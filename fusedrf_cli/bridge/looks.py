@@ -18,28 +18,44 @@ from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite, as_composite
-from fusedrf_cli.engine.distillation.judging import COVERED
+from fusedrf_cli.engine.distillation.judging import JudgingConfig
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import unbounded
 
-WHOLE = 3
-"""Of the views, at least so many show the whole scene; the others show objects."""
-MOST_OBJECTS = 6
-"""That get a view of their own, in addition to those that were asked for."""
-NEIGHBOURS = 4
-"""A view of a capture is taken somewhere between a camera and one of so many that are nearest to it."""
-UNPHOTOGRAPHED = 400
-"""Pixels a side of the pictures of an object that no photo shows, in which it is framed."""
-OWN_VIEWS, MORE_VIEWS, SMALL = 100, 60, 96
-"""Of `views_of_place`: so many cameras of the photos at most, so many between them, and pixels a side."""
-TRIES, ROUGH, SHOWN, VEILED = 12, 12, 0.2, 0.05
-"""So many views of an object in a place are drawn until one, of so many pixels a side, shows it in that share
-of them: as far away as it is alone, to that part of its box's diagonal."""
-VIEWS_SEED = 5_000_011
-LOWEST, HIGHEST = 0.05, 1.3
-"""Radians above the horizon of such views."""
+
+@dataclass(frozen=True)
+class LookConfig:
+    """How many views judge a scene, and what they show."""
+
+    whole: int = 3
+    """Of the views, at least so many show the whole scene; the others show objects."""
+    most_objects: int = 6
+    """That get a view of their own, in addition to those that were asked for."""
+    neighbours: int = 4
+    """A view of a capture is taken somewhere between a camera and one of so many that are nearest to it."""
+    unphotographed: int = 400
+    """Pixels a side of the pictures of an object that no photo shows, in which it is framed."""
+    own_views: int = 100
+    """Of `views_of_place`: cameras of the photos, at most."""
+    more_views: int = 60
+    """Cameras between those."""
+    small: int = 96
+    """Pixels a side of both."""
+    views_seed: int = 5_000_011
+    tries: int = 12
+    """Views of an object in a place that are drawn until one shows it."""
+    rough: int = 12
+    """Pixels a side of such a view."""
+    shown: float = 0.2
+    """Share of them that must show it as far away as it is alone."""
+    veiled: float = 0.05
+    """Up to that part of its box's diagonal."""
+    lowest: float = 0.05
+    """Radians above the horizon of such views."""
+    highest: float = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +125,17 @@ def share_shown(
 ) -> float:
     """The share of a view in which an object of a scene, `alone` by its name, can be seen: a place may stand
     before it, or around the camera, since the object was photographed elsewhere."""
-    wide, high = camera.width / ROUGH, camera.height / ROUGH
+    config = current(LookConfig)
+    wide, high = camera.width / config.rough, camera.height / config.rough
     rough = replace(
-        camera, width=ROUGH, height=ROUGH,
+        camera, width=config.rough, height=config.rough,
         fl_x=camera.fl_x / wide, cx=camera.cx / wide, fl_y=camera.fl_y / high, cy=camera.cy / high,
     )  # fmt: skip
     of_all, of_it = (render_image(f, rough, origin=f.origin) for f in (composed, alone[subject.name]))
-    there, veil = of_it.opacity > COVERED, VEILED * np.linalg.norm(subject.box[3:] - subject.box[:3])
+    there = of_it.opacity > current(JudgingConfig).covered
+    veil = config.veiled * np.linalg.norm(subject.box[3:] - subject.box[:3])
     apart = np.abs(of_all.depth[there] - of_it.depth[there])
-    return np.count_nonzero(apart <= veil) / ROUGH**2
+    return np.count_nonzero(apart <= veil) / config.rough**2
 
 
 def looks(
@@ -132,13 +150,14 @@ def looks(
     """`count` seeded views of a size (width, height), or more where there are objects: of the whole scene, as
     a rig that shows its surroundings saw it, else from around a box (6,) of the world; and of its objects in
     turn, in an order drawn anew for every seed, from where they are `seen` in enough of a view."""
+    config = current(LookConfig)
     rng = np.random.default_rng(seed)
-    close = max(min(len(objects), MOST_OBJECTS), count - WHOLE) if objects else 0
-    whole = max(count - close, WHOLE) if close else count
+    close = max(min(len(objects), config.most_objects), count - config.whole) if objects else 0
+    whole = max(count - close, config.whole) if close else count
     if rig is not None and rig.surroundings:
         found = [Look(photographed(rig, None, size, rng, i % 2 == 1)) for i in range(whole)]
     else:
-        drawn = scattered(box, whole, *size, seed=int(rng.integers(1 << 62)), lowest=LOWEST)
+        drawn = scattered(box, whole, *size, seed=int(rng.integers(1 << 62)), lowest=config.lowest)
         found = [Look(camera) for camera in drawn]
     order = rng.permutation(len(objects)) if close else []
     for number in range(close):
@@ -149,15 +168,17 @@ def looks(
 
 
 def views_of_place(scene: LoadedScene, composed: ComposedField) -> tuple[Camera, ...]:
-    """Cameras of SMALL pixels a side in the frame of a scene: those of the photos of its place, and more from
-    between them; none where the scene keeps no cameras of a place."""
+    """Small cameras in the frame of a scene: those of the photos of its place, and more from between them; none
+    where the scene keeps no cameras of a place."""
+    config = current(LookConfig)
     rig = rig_of(scene)
     if rig is None or not rig.surroundings or composed.occupancy.space is not unbounded:
         return ()
-    rng = np.random.default_rng(VIEWS_SEED)
-    chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(len(rig.views), OWN_VIEWS)).astype(int))
-    views = [rig.views[i] for i in chosen] + [between(rig.views, rng) for _ in range(MORE_VIEWS)]
-    pictures = (replace(view, distortion=(), fisheye=False).reframed(SMALL, SMALL) for view in views)
+    rng = np.random.default_rng(config.views_seed)
+    chosen = np.unique(np.linspace(0, len(rig.views) - 1, min(len(rig.views), config.own_views)).astype(int))
+    views = [rig.views[i] for i in chosen] + [between(rig.views, rng) for _ in range(config.more_views)]
+    size = config.small, config.small
+    pictures = (replace(view, distortion=(), fisheye=False).reframed(*size) for view in views)
     return tuple(
         replace(camera_of(view), distortion=(0.0,) * 5).seen_from(composed.origin) for view in pictures
     )
@@ -165,22 +186,24 @@ def views_of_place(scene: LoadedScene, composed: ComposedField) -> tuple[Camera,
 
 def close_up(subject: Subject, size: tuple[int, int], rng: np.random.Generator) -> Camera:
     """A view of an object as its photos show it; of one without any, as large as it is framed in
-    UNPHOTOGRAPHED pixels."""
+    `unphotographed` pixels."""
+    config = current(LookConfig)
     at = spot(subject.box, rng)
     if subject.rig is not None:
         return photographed(subject.rig, at, size, rng, True)
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(LOWEST, HIGHEST)
-    camera = framing_camera(subject.box, azimuth, elevation, UNPHOTOGRAPHED, UNPHOTOGRAPHED)
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), rng.uniform(config.lowest, config.highest)
+    camera = framing_camera(subject.box, azimuth, elevation, config.unphotographed, config.unphotographed)
     return window(camera, at, size, rng)
 
 
 def close_up_seen(subject: Subject, size: tuple[int, int], rng: np.random.Generator, seen: Seen) -> Camera:
     """The first close-up that shows enough of the object, or the one of all tries that shows most of it."""
+    config = current(LookConfig)
     most, best = -1.0, None
-    for _ in range(TRIES):
+    for _ in range(config.tries):
         camera = close_up(subject, size, rng)
         share = seen(camera, subject)
-        if share >= SHOWN:
+        if share >= config.shown:
             return camera
         if share > most:
             most, best = share, camera
@@ -221,11 +244,12 @@ def window(camera: Camera, at: np.ndarray | None, size: tuple[int, int], rng: np
 
 def between(views: Sequence[View], rng: np.random.Generator) -> View:
     """A view with the lens of one of the views, from somewhere on the way to one near to it."""
+    config = current(LookConfig)
     poses = np.array([view.camera_to_world for view in views])
     first = int(rng.integers(len(views)))
     apart = np.linalg.norm(poses[:, :3, 3] - poses[first, :3, 3], axis=1)
     alike = poses[:, :3, 2] @ poses[first, :3, 2] > 0.7
-    near = [i for i in np.argsort(apart, kind="stable") if alike[i] and i != first][:NEIGHBOURS]
+    near = [i for i in np.argsort(apart, kind="stable") if alike[i] and i != first][: config.neighbours]
     second = near[int(rng.integers(len(near)))] if near else first
     share = float(rng.uniform(0, 1))
     pose = np.eye(4)

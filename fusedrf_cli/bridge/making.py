@@ -19,18 +19,28 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.distillation.distill import DistillReport, DistillRun
 from fusedrf_cli.engine.distillation.finish import RayLesson
-from fusedrf_cli.engine.distillation.judging import JUDGED_SEED, Judge
+from fusedrf_cli.engine.distillation.judging import Judge, JudgingConfig
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.student import NOTHING, DistilConfig, MadeStudent, Plan, Student, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.requests import FuseRequest
 
-VIEWS_TO_CHOOSE_BY = 8
-RATE_IN_PLACE = 0.02  # of a student that begins as a place and has only to learn what stands in it: 3 dB
-WORTH_SAVING = 10.0  # seconds of learning, from which on a student is saved before it is measured
-TRIES = 6  # that a search for a target makes, about
+
+@dataclass(frozen=True)
+class MakingConfig:
+    """How students are made, and when they are saved."""
+
+    views: int = 8
+    """That a student is judged by where what is learnt does not say so."""
+    rate_in_place: float = 0.02
+    """Of a student that begins as a place and has only to learn what stands in it: 3 dB."""
+    worth_saving: float = 10.0
+    """Seconds of learning, from which on a student is saved before it is measured."""
+    tries: int = 6
+    """That a search for a target makes, about."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +110,12 @@ class Maker:
         self.budget = Budget(request.time_budget)
         lesson = student.lesson or DistilConfig()
         compares = request.target_psnr is not None and student.lesson is None
-        self.views = VIEWS_TO_CHOOSE_BY if compares else lesson.views
+        self.views = current(MakingConfig).views if compares else lesson.views
         size = lesson.view_size, lesson.view_size
+        seed = current(JudgingConfig).judged_seed, 3, request.seed
         answered = as_composite if together else lambda scene: scene
         truth = self.teacher = answered(scene.composed)
-        self.looks = looks_of(scene.loaded, truth, self.views, size, (JUDGED_SEED, 3, request.seed))
+        self.looks = looks_of(scene.loaded, truth, self.views, size, seed)
         if student.scene is not scene.composed:
             self.teacher = answered(student.scene)
         self.judge = Judge(truth, [look.camera for look in self.looks], truth.origin)
@@ -214,14 +225,15 @@ class Maker:
             return run.held and (run.held[0], run.held[1] | made_with)
 
         def learnt() -> bool:
-            return run.learnt_seconds > WORTH_SAVING
+            return run.learnt_seconds > current(MakingConfig).worth_saving
 
         return resumable(self.request.output, checkpoint, held, self.progress, learnt)
 
     def tries_to_come(self) -> int:
         """How many tries the seconds that are left have to do for, about."""
+        config = current(MakingConfig)
         if self.request.target_psnr is not None:
-            return max(2, TRIES - self.finished_tries)  # how many a search takes is not known
+            return max(2, config.tries - self.finished_tries)  # how many a search takes is not known
         return max(1, (FINALISTS if self.student.compares else 1) - self.finished_tries)
 
     @cached_property
@@ -263,6 +275,7 @@ class Maker:
 
     def begun(self, plan: Plan, before: StoredField | None) -> tuple[StoredField, str, dict]:
         """A student before it learns, what it starts from, and what that changes of how it learns."""
+        config = current(MakingConfig)
         generator = torch.Generator().manual_seed(self.request.seed)
         wanted = before is None and self.student.kind.takes_over and not self.request.from_scratch
         background = self.scene.background() if wanted else None
@@ -273,7 +286,7 @@ class Maker:
                 "from nothing"
             )
         taken_over = wanted and start != NOTHING and same_texels(field, background.field)
-        return field, start, {"coarse_from": None, "rate": RATE_IN_PLACE} if taken_over else {}
+        return field, start, {"coarse_from": None, "rate": config.rate_in_place} if taken_over else {}
 
     def taught(
         self, field: StoredField, start: str, changes: dict, tries: int

@@ -8,6 +8,7 @@ import contextlib
 import resource
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,41 +21,66 @@ from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import points_kept
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, SCENE_CELLS, cell_counts
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds.student import DistilConfig, Plan, Student
-from fusedrf_cli.engine.rendering.volume import RAYS_AT_ONCE, ROWS_AT_ONCE_PIXELS, SAMPLES_PER_WAVE
+from fusedrf_cli.engine.rendering.volume import RenderConfig
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import ResourceProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
 
-SHARE_OF_FREE = 0.8
+
+@dataclass(frozen=True)
+class MemoryConfig:
+    """Bytes, but for copies and shares, that work takes."""
+
+    share_of_free: float = 0.8
+    compiled: int = 100 << 20
+    """Kernels, once they are loaded, and the libraries that come with them."""
+    reading: float = 1.5
+    """Copies of a field's numbers while it is read: decoded arrays, and the file's pages."""
+    resampling: float = 2.5
+    """Copies while it becomes part of another: widened, by itself, and at its new resolution."""
+    per_pixel: int = 350
+    """Of a band: rays in float64, before and after turning, those of one block apart, pixels."""
+    per_sample: int = 300
+    """Of a wave through the general renderer: distances, points in each field, σ, colour."""
+    per_cell: int = 24
+    """Of an ownership grid: owners, counts, marks, and the distances that are made of them."""
+    per_segment: int = 400
+    """Of a ray of a composite: its segments, their ends, and the numbers that sort them."""
+    per_slot: int = 1400
+    """Of an instance in a segment that several share: its samples."""
+    per_measured: int = 150
+    """Of a pixel that is compared: both pictures, and what SSIM makes of them."""
+    per_tried_cell: int = 120
+    """Of the cells that a fit asks for their density: indices, centres and their copies."""
+    per_ray: int = 112
+    """Of a teacher's rays: where they are, what they show, and copies while they are joined."""
+    per_point: int = 60
+    """Of a teacher's points in pieces, one of their columns joined, and its place there."""
+    per_pixel_of_photos: int = 4
+    """Its colour."""
+    per_masked_pixel: int = 10
+    """More where masks leave some out: which, and the numbers of those that are left."""
+    per_own_ray: int = 24
+    """Of each camera's pixel: directions in float32, twice while they are joined."""
+    per_made_ray: int = 100
+    """Of one camera's pixel: directions in float64, while they are made."""
+
+
 FLOAT = 4
-COMPILED = 100 << 20  # kernels, once they are loaded, and the libraries that come with them
-READING = 1.5  # copies of a field's numbers while it is read: decoded arrays, and the file's pages
-RESAMPLING = 2.5  # copies while it becomes part of another: widened, by itself, and at its new resolution
-PER_PIXEL = 350  # of a band: rays in float64, before and after turning, those of one block apart, pixels
-PER_SAMPLE = 300  # of a wave through the general renderer: distances, points in each field, σ, colour
-PER_CELL = 24  # of an ownership grid: owners, counts, marks, and the distances that are made of them
-PER_SEGMENT = 400  # of a ray of a composite: its segments, their ends, and the numbers that sort them
-PER_SLOT = 1400  # of an instance in a segment that several share: its samples
-PER_MEASURED = 150  # of a pixel that is compared: both pictures, and what SSIM makes of them
-PER_TRIED_CELL = 120  # of the cells that a fit asks for their density: indices, centres and their copies
-PER_RAY = 112  # of a teacher's rays: where they are, what they show, and copies while they are joined
-PER_POINT = 60  # of a teacher's points in pieces, one of their columns joined, and its place there
-PER_PIXEL_OF_PHOTOS = 4  # its colour
-PER_MASKED_PIXEL = 10  # more where masks leave some out: which, and the numbers of those that are left
-PER_OWN_RAY = 24  # of each camera's pixel: directions in float32, twice while they are joined
-PER_MADE_RAY = 100  # of one camera's pixel: directions in float64, while they are made
 
 
 class Memory:
     """How much a command may take, and what it said it would."""
 
     def __init__(self, limit: int | None = None):
-        """limit for the whole process; None: what it holds now and SHARE_OF_FREE of what is free."""
+        """limit for the whole process; None: what it holds now and `share_of_free` of what is free."""
+        config = current(MemoryConfig)
         self.base = resident()
         self.asked = limit is not None
-        self.limit = limit if self.asked else int(self.base + SHARE_OF_FREE * available())
+        self.limit = limit if self.asked else int(self.base + config.share_of_free * available())
         self.predicted = 0
 
     def expect(self, *stages: Mapping[str, float], advice: str) -> None:
@@ -62,7 +88,7 @@ class Memory:
         ResourceProblem, with advice.
         """
         parts = max(stages, key=lambda stage: sum(stage.values()))
-        needed = int(self.base + COMPILED + sum(parts.values()))
+        needed = int(self.base + current(MemoryConfig).compiled + sum(parts.values()))
         self.predicted = max(self.predicted, needed)
         if needed > self.limit:
             most = max(parts, key=parts.get)
@@ -74,7 +100,7 @@ class Memory:
 
     def room(self, parts: Mapping[str, float]) -> float:
         """What the limit leaves beside parts."""
-        return self.limit - self.base - COMPILED - sum(parts.values())
+        return self.limit - self.base - current(MemoryConfig).compiled - sum(parts.values())
 
     def report(self) -> dict[str, int]:
         """For a command's report: what was expected, and the most that this process ever held."""
@@ -111,32 +137,37 @@ def available() -> int:
 
 def sources(sizes: list[int], room: float = float("inf"), copies: float = 0.0) -> dict[str, float]:
     """Distinct fields of those sizes, as many as there is room for, and copies of the largest while it is
-    worked on: READING, RESAMPLING or none.
+    worked on: `reading`, `resampling` or none.
     """
     return {"the sources": max(min(sum(sizes), room), max(sizes)) + copies * max(sizes)}
 
 
 def picture(width: int, height: int, composed: bool) -> dict[str, float]:
     """Rendering one picture by bands; `composed`: by the general renderer."""
-    band = min(width * max(1, ROWS_AT_ONCE_PIXELS // width), width * height)
-    waves = min(band, RAYS_AT_ONCE) * SAMPLES_PER_WAVE * PER_SAMPLE if composed else 0
-    return {"a band of the picture": band * PER_PIXEL + waves}
+    memory = current(MemoryConfig)
+    config = current(RenderConfig)
+    band = min(width * max(1, config.pixels_at_once // width), width * height)
+    waves = min(band, config.rays_at_once) * config.samples_per_wave * memory.per_sample if composed else 0
+    return {"a band of the picture": band * memory.per_pixel + waves}
 
 
 def segments(rays: int) -> dict[str, float]:
     """Rays of a picture of a Composite, so many in all, and the samples of several instances."""
+    config = current(MemoryConfig)
     rays = min(rays, Composite.rays_at_once)
-    return {"segments of rays": rays * PER_SEGMENT + SLOTS_AT_ONCE * PER_SLOT}
+    return {"segments of rays": rays * config.per_segment + SLOTS_AT_ONCE * config.per_slot}
 
 
 def measured(width: int, height: int) -> dict[str, float]:
     """Holding a whole picture against another."""
-    return {"two pictures and their comparison": width * height * PER_MEASURED}
+    return {"two pictures and their comparison": width * height * current(MemoryConfig).per_measured}
 
 
 def ownership(aabb: np.ndarray) -> dict[str, float]:
     """Grids over a scene's box (6,)."""
-    return {"grids over the scene": PER_CELL * float(np.prod(cell_counts(aabb, SCENE_CELLS)))}
+    memory = current(MemoryConfig)
+    config = current(OccupancyConfig)
+    return {"grids over the scene": memory.per_cell * float(np.prod(cell_counts(aabb, config.scene_cells)))}
 
 
 def result(numbers: int, measured: bool = True) -> dict[str, float]:
@@ -152,34 +183,37 @@ def learning(numbers: int, threads: int, moments: int = 2) -> dict[str, float]:
 
 def decoding(pixels: int, masked: bool, beside: int) -> dict[str, float]:
     """Photos of so many pixels together while they are read, and what their decoders take beside them."""
-    return {"the photos": pixels * (PER_PIXEL_OF_PHOTOS + masked), "decoding them": beside}
+    config = current(MemoryConfig)
+    return {"the photos": pixels * (config.per_pixel_of_photos + masked), "decoding them": beside}
 
 
 def photos(count: int, width: int, height: int, cameras: int, masked: bool) -> dict[str, float]:
     """Photos as they are drawn from, some pixels left out where they are `masked`, and the rays of so many
     different cameras."""
+    config = current(MemoryConfig)
     pixels = width * height
-    per_pixel = PER_PIXEL_OF_PHOTOS + PER_MASKED_PIXEL * masked
-    per_ray = cameras * PER_OWN_RAY + PER_MADE_RAY
+    per_pixel = config.per_pixel_of_photos + config.per_masked_pixel * masked
+    per_ray = cameras * config.per_own_ray + config.per_made_ray
     return {"the photos": pixels * (count * per_pixel + per_ray)}
 
 
 def fitting(plan: Plan, longest: int, threads: int, unbounded: bool) -> dict[str, float]:
     """The field of a fit at its full resolution, with so many texels along the longest axis, while its
     occupancy is made anew."""
-    grid = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, longest)))
+    grid = np.prod(cell_counts(plan.box, min(current(OccupancyConfig).cells, longest)))
     learns = learning(plan.numbers, threads, 1 if unbounded else 2)
-    return {**learns, "its occupancy": float(grid) * PER_TRIED_CELL}
+    return {**learns, "its occupancy": float(grid) * current(MemoryConfig).per_tried_cell}
 
 
 def teaching(settings: DistilConfig, points: int) -> dict[str, float]:
     """What is asked of the teachers."""
-    return {"the teachers' answers": settings.rays * PER_RAY + points * PER_POINT}
+    config = current(MemoryConfig)
+    return {"the teachers' answers": settings.rays * config.per_ray + points * config.per_point}
 
 
 def lesson(rays: int) -> dict[str, float]:
     """Rays to learn from, and what they show."""
-    return {"rays to learn from": rays * PER_RAY}
+    return {"rays to learn from": rays * current(MemoryConfig).per_ray}
 
 
 def stages(

@@ -12,43 +12,51 @@ from formats.rig import read_rig
 from formats.scene import SceneGraph
 from formats.views import Capture, View
 from fusedrf_cli.bridge.budget import Budget
-from fusedrf_cli.bridge.extent import NEAR_OF_POINTS, Extent, near_of
+from fusedrf_cli.bridge.extent import Extent, ExtentConfig, near_of
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.posing import posed_capture
 from fusedrf_cli.bridge.training import fit_memory, fit_settings, warn_of_numbers
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composed import ComposedField, occupied_at
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.distillation.distill import DistillRun
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.visibility import shown_cells
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
-from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, mapped, placement
 from fusedrf_cli.engine.kinds import registry, splitting
 from fusedrf_cli.engine.kinds.student import DistilConfig, Way
-from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.kinds.vm.trimming import without_unasked
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.selection.cells import CellConfig, Lattice, Selection
 from fusedrf_cli.engine.selection.holes import patches
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 from fusedrf_cli.requests import Learning, MendingRequest, TrainRequest
 
-SECONDS = 120.0
-"""Of learning from --refit's photos, where no time budget is given."""
-SHARE = 0.8
-"""Of a time budget that goes to it."""
-FAINT = 0.03
-"""Opacity of the object from which a pixel of a photo is left out."""
-GROWN = 4
-"""Pixels around those that are left out too: what the object's rim colours."""
+
+@dataclass(frozen=True)
+class MendingConfig:
+    """How a hole is learnt and filled."""
+
+    seconds: float = 120.0
+    """Of learning from --refit's photos, where no time budget is given."""
+    share: float = 0.8
+    """Of a time budget that goes to it."""
+    faint: float = 0.03
+    """Opacity of the object from which a pixel of a photo is left out."""
+    grown: int = 4
+    """Pixels around those that are left out too: what the object's rim colours."""
+    settings: DistilConfig = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
+    numbers: int = 2_000_000
+    """Of the tensor that a smooth surface is learnt into, at most."""
+
+
 LEARNT, FILLED = "restored/refit", "restored/filled"
 """Names of nodes of what is put into the hole."""
-SETTINGS = DistilConfig(rays=120_000, steps=500, rgb_steps=500, view_size=160)
-NUMBERS = 2_000_000
-"""Of the tensor that a smooth surface is learnt into, at most."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,7 @@ class Frame:
     path: str
     scene: SceneGraph
     """Of the bundle that it is in."""
-    field: StoredField
+    field: RadianceField
     origin: np.ndarray
     """Of its frame in the world: a position (3,), or a placement (4, 4)."""
 
@@ -75,7 +83,7 @@ class Teacher:
         """The student, taught, with its numbers on the CPU."""
         seconds = self.budget.part(max(1, self.tries))
         self.tries -= 1
-        settings = replace(SETTINGS, seed=self.seed, time_budget=seconds)
+        settings = replace(current(MendingConfig).settings, seed=self.seed, time_budget=seconds)
         rays = RaySampler([teacher.occupancy.subject])
         run = DistillRun(teacher, student.to(self.place), rays, settings, self.rgb)
         learnt, _ = run.finish(advance=lambda share, figures: self.progress.advance(share, **figures))
@@ -105,7 +113,7 @@ def learnt_surfaces(surfaces: list[Placed], teach: Teacher) -> list[Placed]:
     for one in surfaces:
         teacher = ComposedField([one])
         generator = torch.Generator().manual_seed(teach.seed)
-        student = kind.empty(teacher, Way(), NUMBERS, generator, one.name)
+        student = kind.empty(teacher, Way(), current(MendingConfig).numbers, generator, one.name)
         found.append(Placed(one.name, teach(teacher, student), placement(teacher.origin)))
     return found
 
@@ -113,8 +121,8 @@ def learnt_surfaces(surfaces: list[Placed], teach: Teacher) -> list[Placed]:
 def mended(
     request: MendingRequest,
     frame: Frame,
-    rest: StoredField,
-    found: StoredField,
+    rest: RadianceField,
+    found: RadianceField,
     memory: Memory,
     place: str,
     progress,
@@ -129,32 +137,33 @@ def mended(
             progress.warn(f"{request.refit}: its photos show nothing in the place of the object")
         else:
             fillings.append(Placed(LEARNT, behind, np.eye(4)))
-    whole = ComposedField([Placed("", rest, np.eye(4)), *fillings], origin=np.eye(4)) if fillings else rest
-    surfaces, unseen = hole_of(whole, found.occupancy.subject, up_of(frame.scene, frame.origin), found)
+    whole = rest
+    if fillings:
+        whole = as_composite(ComposedField([Placed("", rest, np.eye(4)), *fillings], origin=np.eye(4)))
+    box = found.subject if isinstance(found, ComposedField) else found.occupancy.subject
+    surfaces, unseen = hole_of(whole, box, up_of(frame.scene, frame.origin), found)
     if request.fill and surfaces:
         progress.phase("filling", None)
         fillings += learnt_surfaces(surfaces, Teacher(request, False, place, progress, len(surfaces)))
     return fillings, told | {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}
 
 
-def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredField | None:
-    """What a field learnt anew has in the box of an object where what is left has nothing."""
-    box, same = found.occupancy.aabb, found.space is learnt.space
+def in_hole(learnt: StoredField, rest: RadianceField, found: RadianceField) -> StoredField | None:
+    """What a field learnt anew has around an object where what is left has nothing."""
+    lattice = Lattice.over(learnt, box_in(learnt, found.occupancy), current(CellConfig).fine)
+    kind, free = registry.kind(learnt.kind), ~occupied_at(rest, lattice.points)
+    behind = kind.cut_out(learnt, Selection(lattice, free)) if free.any() else None
+    return behind and kind.trimmed(behind)
 
-    def inside(points: np.ndarray, size: np.ndarray) -> np.ndarray:
-        held = ((points >= box[:3]) & (points <= box[3:])).all(1) if same else in_frame(points)
-        held[held] = ~rest.occupancy.contains(points[held])
-        return held
 
-    def in_frame(points: np.ndarray) -> np.ndarray:
-        at = splitting.placed(points, learnt.space)
-        return ((at >= box[:3]) & (at <= box[3:])).all(1)
-
-    looked_in = learnt.occupancy.aabb
-    if same:
-        looked_in = splitting.common_box(looked_in, box)
-    behind = splitting.within(learnt, learnt.tensors[0].aabb, learnt.voxel_size, inside, looked_in)
-    return behind and without_unasked(behind)
+def box_in(field: RadianceField, cells: OccupancyGrid) -> np.ndarray:
+    """(6,) in the coordinates of a field's space the part of its box around occupied cells of its frame."""
+    box, space = cells.tight_aabb(1), field.occupancy.space
+    if cells.space is not space:
+        points = mapped(splitting.placed(cells.centres(), cells.space), space)
+        box = np.concatenate([points.min(0) - cells.cell, points.max(0) + cells.cell])
+    aabb = field.occupancy.aabb
+    return np.concatenate([np.maximum(box[:3], aabb[:3]), np.minimum(box[3:], aabb[3:])])
 
 
 # -- learning from photos ------------------------------------------------------------------------------------
@@ -163,11 +172,11 @@ def in_hole(learnt: VMField, rest: StoredField, found: StoredField) -> StoredFie
 def learnt_from(
     request: MendingRequest,
     frame: Frame,
-    found: StoredField | None,
+    found: RadianceField | None,
     memory: Memory,
     place: str,
     progress,
-) -> tuple[VMField, dict]:
+) -> tuple[StoredField, dict]:
     """A field in the frame of the bundle's, learnt from photos with the pixels of an object left out (None:
     the photos show none), and what the report says of it."""
     progress.phase("reading photos", None)
@@ -203,6 +212,7 @@ def posed_as(capture: Capture, frame: Frame, progress) -> Capture:
 
 def extent_like(frame: Frame, capture: Capture) -> Extent:
     """The extent of the bundle's own field, for cameras of its world."""
+    config = current(ExtentConfig)
     origin, field = placement(frame.origin), frame.field
     box = field.occupancy.aabb
     if field.occupancy.space is bounded:
@@ -210,14 +220,15 @@ def extent_like(frame: Frame, capture: Capture) -> Extent:
     poses = np.array([view.camera_to_world for view in capture.train])
     extent = Extent(box, origin, True)
     near = near_of(capture.train, scene_frame(poses).distance) / extent.unit
-    clear = [max(near, NEAR_OF_POINTS * (view.near or 0) / extent.unit) for view in capture.train]
+    clear = [max(near, config.near_of_points * (view.near or 0) / extent.unit) for view in capture.train]
     shown = shown_cells([extent.camera(camera_of(view)) for view in capture.train], near, clear)
     return replace(extent, near=near, cells=shown.within(box))
 
 
 def wanted_of(request: MendingRequest) -> TrainRequest:
     """A training as `train` without options would do it."""
-    seconds = SHARE * request.time_budget if request.time_budget else SECONDS
+    config = current(MendingConfig)
+    seconds = config.share * request.time_budget if request.time_budget else config.seconds
     return TrainRequest(
         request.refit, request.output, overwrite=request.overwrite, precision="float16",
         memory=request.memory, time_budget=seconds, seed=request.seed, device=request.device,
@@ -225,7 +236,7 @@ def wanted_of(request: MendingRequest) -> TrainRequest:
     )  # fmt: skip
 
 
-def without(found: StoredField | None, capture: Capture, cameras: list[Camera], progress) -> Pictures:
+def without(found: RadianceField | None, capture: Capture, cameras: list[Camera], progress) -> Pictures:
     """The photos of a capture without the pixels that show an object, given in the frame of the cameras."""
     loaded = load_photos(capture.train)
     if found is None:
@@ -239,7 +250,8 @@ def without(found: StoredField | None, capture: Capture, cameras: list[Camera], 
     return Pictures(loaded.pixels, ignored)
 
 
-def shows(found: StoredField, camera: Camera, view: View) -> np.ndarray:
+def shows(found: RadianceField, camera: Camera, view: View) -> np.ndarray:
     """(H, W) bool: the pixels of a view that an object shows in, and a few around them."""
-    shown = render_image(found, camera).opacity > FAINT
-    return binary_dilation(shown, iterations=GROWN) if shown.any() else shown
+    config = current(MendingConfig)
+    shown = render_image(found, camera).opacity > config.faint
+    return binary_dilation(shown, iterations=config.grown) if shown.any() else shown

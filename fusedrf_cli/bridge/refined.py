@@ -1,7 +1,7 @@
 """Photos whose poses were refined while a field was learnt from them: where they were taken from now, and
 what that is worth on photos that the field has not seen, whose poses are as inexact."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,10 +21,18 @@ from fusedrf_cli.engine.distillation.poses import (
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 
-ROUNDS = 12
-ALIGNED_BY = (4.0, 0.5)  # pixels by which poses are tried: at first, at last
-RAYS = 600  # of each photo
+
+@dataclass(frozen=True)
+class RefinedConfig:
+    """How the poses of held-out photos are found."""
+
+    rounds: int = 12
+    aligned_by: tuple[float, float] = (4.0, 0.5)
+    """Pixels by which poses are tried: at first, at last."""
+    rays: int = 600
+    """Of each photo."""
 
 
 def with_poses(capture: Capture, extent: Extent, poses: Poses) -> Capture:
@@ -73,13 +81,14 @@ def aligned(field, capture: Capture, extent: Extent, near: float, seed: int) -> 
 def align(field, camera: Camera, truth: np.ndarray, learnt: np.ndarray, near: float, seed: int) -> Camera:
     """The camera near one of the field's frame from which the field shows the pixels `learnt` (H, W) of a
     photo (H, W, 3) best."""
+    config = current(RefinedConfig)
     generator = torch.Generator().manual_seed(seed)
     pixels = np.concatenate([np.rint(255 * truth), np.full((*learnt.shape, 1), 255)], -1).astype(np.uint8)
     pool = RayPool([camera], Pictures(pixels.reshape(-1, 4), ~learnt.reshape(-1)), generator)
-    first, last = ALIGNED_BY
-    for number in range(ROUNDS):
-        *rays, colours = pool.sample(RAYS, generator)
-        probe = first * (last / first) ** (number / (ROUNDS - 1)) * pool.pixel
+    first, last = config.aligned_by
+    for number in range(config.rounds):
+        *rays, colours = pool.sample(config.rays, generator)
+        probe = first * (last / first) ** (number / (config.rounds - 1)) * pool.pixel
         pool.place(changed_each(pool.poses, refined(field, rays, colours, near, probe)))
     matrix = camera.camera_to_world.copy()
     matrix[:3, :3], matrix[:3, 3] = pool.rotation[0].numpy(), pool.position[0].numpy()

@@ -22,13 +22,24 @@ from fusedrf_cli.engine.composition.composite import Composite, as_composite
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, render_image
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
-MANY_RAYS, MANY_SAMPLES, MUCH_WORK = 1 << 28, 1 << 14, 1 << 32
-"""From so many rays on, or so many samples of a ray and of all, a command says that it takes long."""
 NOTHING_ELSE: Mapping[str, float] = MappingProxyType({})
-FRAME_BYTES = 60  # of a film's pixel: its floats, and their way to bytes
+
+
+@dataclass(frozen=True)
+class WorkConfig:
+    """When a rendering is said to take long, and what a film takes."""
+
+    many_rays: int = 1 << 28
+    """From which on a command says that it takes long."""
+    many_samples: int = 1 << 14
+    """Of a ray, from which on it says so where there are `much_work` of all rays."""
+    much_work: int = 1 << 32
+    frame_bytes: int = 60
+    """Of a film's pixel: its floats, and their way to bytes."""
 
 
 def render(request: RenderRequest, progress) -> dict:
@@ -85,7 +96,7 @@ def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     largest = max(views, key=lambda view: view.width * view.height)
     needed = frame_memory(field, largest.width, largest.height)
     pixels = largest.width * largest.height
-    return needed | ({"the film": pixels * (FRAME_BYTES + len(views))} if film else {})
+    return needed | ({"the film": pixels * (current(WorkConfig).frame_bytes + len(views))} if film else {})
 
 
 def frame_memory(field, width: int, height: int) -> dict[str, float]:
@@ -98,11 +109,12 @@ def frame_memory(field, width: int, height: int) -> dict[str, float]:
 
 def tell_of_work(scene: str, field, rays: int, progress) -> None:
     """A warning where so many rays through a field may take much longer than people expect."""
+    config = current(WorkConfig)
     sampled = field.fields if isinstance(field, Composite) else [field]
     samples = max(f.occupancy.most_samples(sampling_step(f)) for f in sampled)
-    if rays >= MANY_RAYS:
+    if rays >= config.many_rays:
         progress.warn(f"{scene}: {rays:,} pixels may take long; give a smaller --size")
-    elif samples >= MANY_SAMPLES and rays * samples >= MUCH_WORK:
+    elif samples >= config.many_samples and rays * samples >= config.much_work:
         progress.warn(
             f"{scene}: a ray takes up to {samples:,} samples, since something is that much finer than the "
             "whole is wide, and this may take long; leave out what is smallest, or farthest away"

@@ -8,6 +8,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,20 @@ from formats.errors import OutputExists, ResourceError
 from fusedrf_cli import signals
 from fusedrf_cli.bridge.memory import available, peak
 from fusedrf_cli.engine.rendering.volume import is_out_of_memory
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, NumericFailure, ResourceProblem
 from fusedrf_cli.report import readable_size
 
-SAVED_EVERY = 90.0
-"""Seconds from the end of one saving of a run to the next: with what saving takes, a kill loses less than two
-minutes."""
+
+@dataclass(frozen=True)
+class RunningConfig:
+    """How often a run is saved."""
+
+    saved_every: float = 90.0
+    """Seconds from the end of one saving of a run to the next: with what saving takes, a kill loses less than
+    two minutes."""
+
+
 FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
 
 
@@ -78,13 +87,14 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
 class Uninterrupted:
     """A context to go through once per step, in which an interrupt waits for the step's end: what is saved
     then is no half of one. A second interrupt does not wait, and `torn` tells that there is nothing to save.
-    Every SAVED_EVERY seconds it is saved after a step in any case, for runs that are killed; where that
+    Every `saved_every` seconds it is saved after a step in any case, for runs that are killed; where that
     fails, it is tried again as much later, and `failed` is called once with a sentence.
     """
 
     def __init__(self, save: Callable[[], object], failed: Callable[[str], None]):
+        config = current(RunningConfig)
         self.torn, self.waiting, self.previous = False, None, {}
-        self.save, self.due, self.failed = save, time.monotonic() + SAVED_EVERY, failed
+        self.save, self.due, self.failed = save, time.monotonic() + config.saved_every, failed
 
     def __call__(self) -> "Uninterrupted":
         return self
@@ -120,7 +130,7 @@ class Uninterrupted:
         except (OSError, ResourceError) as error:
             self.failed(f"{error}; learning goes on, and saving its state is tried again")
             self.failed = lambda sentence: None
-        self.due = time.monotonic() + SAVED_EVERY
+        self.due = time.monotonic() + current(RunningConfig).saved_every
 
 
 @contextlib.contextmanager

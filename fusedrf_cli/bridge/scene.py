@@ -328,19 +328,24 @@ def as_shown_needs(needs: FieldNeeds, leaf: Leaf) -> FieldNeeds:
 
 
 def cropped(field: StoredField, leaf: Leaf, where: str) -> StoredField:
-    """What a leaf's crops hold of its field; all of it where it has none. InvalidInput where that is nothing,
-    or the kind of field cannot be cropped."""
+    """As `part_shown`. InvalidInput where that is nothing."""
+    shown = part_shown(field, leaf, where)
+    if shown is None:
+        raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
+    return shown
+
+
+def part_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField | None:
+    """What a leaf shows of its field: all of it, or what its crops hold; None where that is nothing.
+    InvalidInput where the kind of field cannot be cropped."""
     if not leaf.crops:
         return field
     try:
-        shown = registry.kind(field.kind).cropped(
+        return registry.kind(field.kind).cropped(
             field, lambda points: np.all([crop.holds(points) for crop in leaf.crops], 0)
         )
     except ValueError as error:
         raise InvalidInput(f"{where}: {error}") from error
-    if shown is None:
-        raise InvalidInput(f"{where}: its crop holds nothing of it; crops are in the frame of the node")
-    return shown
 
 
 def background_of(scene: LoadedScene) -> SourceField:

@@ -1,6 +1,7 @@
 """How many bytes a field takes in a bundle, told from its contents before its numbers are made."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,13 +10,23 @@ from formats.records import BITS, BYTES_PER_NUMBER, FieldRecord, coded_bytes, en
 from formats.scene import SceneGraph, dump_scene, make_node
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.kinds.student import Contents, Section
+from fusedrf_cli.engine.settings import current
 
-HEADER = 512  # of a field: its metadata but for arrays, parts and placements
-HEADER_PER_PART = 2000  # its shape, and some 14 arrays' names and offsets
-HEADER_PER_ARRAY = 150
-HEADER_PER_CODED = 250  # and where an array is codes and scales
-HEADER_PER_PLACEMENT = 700
-BESIDES = 1024  # of a bundle: settings, figures and file headers
+
+@dataclass(frozen=True)
+class HeaderConfig:
+    """Bytes of a bundle beside the numbers of its fields."""
+
+    field: int = 512
+    """Of a field: its metadata but for arrays, parts and placements."""
+    per_part: int = 2000
+    """Of a part: its shape, and some 14 arrays' names and offsets."""
+    per_array: int = 150
+    per_coded: int = 250
+    """More where an array is codes and scales."""
+    per_placement: int = 700
+    besides: int = 1024
+    """Of a bundle: settings, figures and file headers."""
 
 
 class BundleSizes:
@@ -23,8 +34,9 @@ class BundleSizes:
 
     def of(self, contents: Contents, precision: str) -> int:
         """At most so many bytes for a field of those contents."""
-        headers = max(HEADER_PER_PART * contents.parts, HEADER_PER_ARRAY * len(contents.sections))
-        total = HEADER + headers + HEADER_PER_PLACEMENT * contents.placements + contents.bits // 8
+        config = current(HeaderConfig)
+        headers = max(config.per_part * contents.parts, config.per_array * len(contents.sections))
+        total = config.field + headers + config.per_placement * contents.placements + contents.bits // 8
         return total + sum(section_bytes(section, precision) for section in contents.sections)
 
     def exactly(self, field: StoredField, precision: str) -> int:
@@ -41,7 +53,7 @@ def section_bytes(section: Section, precision: str) -> int:
     most = coded_bytes(section.shape, precision)
     if precision not in BITS or not is_coded(section.shape):
         return most
-    most += HEADER_PER_CODED
+    most += current(HeaderConfig).per_coded
     if section.used is None or len(section.shape) != 3:
         return most
     kept = section.shape[2] * kept_texels(section.used)
@@ -66,7 +78,7 @@ def graph_bytes(nodes: list[dict], cameras: dict | None = None, extras: dict | N
     framing = (-math.pi,) * 3 + (math.pi,) * 3
     history = ({"nodes": nodes},)
     scene = SceneGraph((node,), history=history, framing=framing, cameras=cameras, extras=extras or {})
-    return BESIDES + len(dump_scene(scene))
+    return current(HeaderConfig).besides + len(dump_scene(scene))
 
 
 def camera_bytes(cameras: dict | None) -> int:

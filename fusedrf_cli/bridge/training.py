@@ -32,32 +32,30 @@ from fusedrf_cli.bridge.running import (
     written_somewhere,
 )
 from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
-from fusedrf_cli.bridge.sizes import BESIDES, BundleSizes, camera_bytes, section_bytes
+from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, camera_bytes, section_bytes
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.pixels import Pictures
 from fusedrf_cli.engine.fields.hashed import Hashed
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, cell_counts
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Section, Way
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import REACH
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import TrainRequest
-
-QUALITY = {
-    "draft": TrainConfig(longest=128, steps=1500, samples=1 << 15),
-    "normal": TrainConfig(longest=224, steps=4000, samples=1 << 15),
-    "high": TrainConfig(longest=256, steps=9000, samples=1 << 15),
-    "best": TrainConfig(longest=256, steps=24000, samples=1 << 15),
-}
 
 
 @dataclass(frozen=True)
 class Presets:
     """How a TrainConfig follows from the quality, the time and the bytes that are asked for."""
 
+    draft: TrainConfig = TrainConfig(longest=128, steps=1500, samples=1 << 15)
+    normal: TrainConfig = TrainConfig(longest=224, steps=4000, samples=1 << 15)
+    high: TrainConfig = TrainConfig(longest=256, steps=9000, samples=1 << 15)
+    best: TrainConfig = TrainConfig(longest=256, steps=24000, samples=1 << 15)
     patient: tuple[tuple[str, float], ...] = (("best", 200.0), ("high", 90.0), ("normal", 0.0))
     """Seconds of a time budget from which an object is learnt so where no quality is asked for. Of unbounded
     scenes the texels follow the time budget."""
@@ -107,9 +105,6 @@ class Presets:
     a minute what they do in ten."""
 
 
-PRESETS = Presets()
-
-
 def train(request: TrainRequest, progress) -> dict:
     """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
     with engine(request.device, request.threads, progress) as place:
@@ -122,7 +117,7 @@ def train(request: TrainRequest, progress) -> dict:
         cut_out = cuts_out(request, capture)
         extent = extent_of(request, capture, cut_out)
         check_flatness(extent)
-        suits = PRESETS.unbounded_precision if extent.unbounded else "float16"
+        suits = current(Presets).unbounded_precision if extent.unbounded else "float16"
         request = replace(request, precision=request.precision or suits)
         kept = cameras_of_capture(capture, cut_out, progress)
         check_graph(request.output, Path(request.output).stem, extent.origin, None, kept)
@@ -257,33 +252,34 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
 
 def paced(seconds: float | None, place: str) -> float | None:
     """Seconds of two cores that a time budget at a place to compute counts as."""
-    return seconds and seconds * (PRESETS.gpu_pace if place == "cuda" else 1)
+    return seconds and seconds * (current(Presets).gpu_pace if place == "cuda" else 1)
 
 
 def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> TrainConfig:
     """The settings of the asked quality, or, of an object, of the one that the time budget is enough for; the
     best of an object has texels as fine as the photos' pixels ask for, and fewer but larger steps."""
+    presets = current(Presets)
     name = request.quality or "normal"
     budget = paced(request.time_budget, place)
     if request.quality is None and budget and not extent.unbounded:
-        name = next(name for name, seconds in PRESETS.patient if budget >= seconds)
-    settings = QUALITY[name]
+        name = next(name for name, seconds in presets.patient if budget >= seconds)
+    settings = getattr(presets, name)
     if place == "cuda":
-        settings = replace(settings, samples=settings.samples * PRESETS.gpu_samples)
+        settings = replace(settings, samples=settings.samples * presets.gpu_samples)
     if name != "best" or extent.unbounded:
         return settings
     centre, side = (extent.box[:3] + extent.box[3:]) / 2, (extent.box[3:] - extent.box[:3]).max()
     cameras = [extent.camera(camera_of(view)) for view in capture.train]
     away = [np.linalg.norm(camera.camera_to_world[:3, 3] - centre) for camera in cameras]
     pixels = np.median([c.fl_x * side / max(d, side / 2) for c, d in zip(cameras, away, strict=True)])
-    longest = int(np.clip(round(PRESETS.texels_per_pixel * pixels), settings.longest, PRESETS.finest_object))
+    longest = int(np.clip(round(presets.texels_per_pixel * pixels), settings.longest, presets.finest_object))
     return with_larger_steps(replace(settings, longest=longest))
 
 
 def with_larger_steps(settings: TrainConfig) -> TrainConfig:
     """More samples in a step, in as many fewer steps."""
-    steps, samples = settings.steps // PRESETS.more_samples, settings.samples * PRESETS.more_samples
-    return replace(settings, steps=steps, samples=samples)
+    more = current(Presets).more_samples
+    return replace(settings, steps=settings.steps // more, samples=settings.samples * more)
 
 
 def fit_settings(
@@ -312,7 +308,9 @@ def fit_settings(
     if request.max_size or not extent.unbounded:
         longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     else:  # however its numbers are stored
-        longest = fitting_longest(kind, extent.box, settings, PRESETS.largest_unbounded, kind.faithful)
+        longest = fitting_longest(
+            kind, extent.box, settings, current(Presets).largest_unbounded, kind.faithful
+        )
     plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)
@@ -322,17 +320,18 @@ def of_place(settings: TrainConfig, kind: Kind, box: np.ndarray, room: int | Non
     """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
     learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
     longer they learn."""
+    presets = current(Presets)
     budget = paced(settings.time_budget, settings.device)
-    takes = section_bytes(Section("detail", PRESETS.hashed.shape), settings.way.precision)
-    fits = room is None or takes <= PRESETS.hashed_share * room
-    patient = budget is None or budget >= PRESETS.hashed_from
-    if kind.hashes and fits and patient and settings.steps >= PRESETS.hashed_steps:
-        longest = texels_of_place(box, PRESETS.hashed_texels * settings.longest)
-        way = replace(settings.way, hashed=PRESETS.hashed)
+    takes = section_bytes(Section("detail", presets.hashed.shape), settings.way.precision)
+    fits = room is None or takes <= presets.hashed_share * room
+    patient = budget is None or budget >= presets.hashed_from
+    if kind.hashes and fits and patient and settings.steps >= presets.hashed_steps:
+        longest = texels_of_place(box, presets.hashed_texels * settings.longest)
+        way = replace(settings.way, hashed=presets.hashed)
         settings = replace(settings, longest=longest, way=way)
-        return with_larger_steps(settings) if budget or settings.steps > PRESETS.hashed_steps else settings
-    patience = max(1.0, (budget or 0) / PRESETS.more_texels_from)
-    more = PRESETS.unbounded_texels * min(PRESETS.most_texels, patience**PRESETS.more_texels_power)
+        return with_larger_steps(settings) if budget or settings.steps > presets.hashed_steps else settings
+    patience = max(1.0, (budget or 0) / presets.more_texels_from)
+    more = presets.unbounded_texels * min(presets.most_texels, patience**presets.more_texels_power)
     return replace(settings, longest=texels_of_place(box, more * settings.longest))
 
 
@@ -398,14 +397,14 @@ def fitting_longest(
         and longest > LEAST_TEXELS
         and bytes_of(kind.untrained(box, longest, settings.way), precision) > max_size
     ):
-        longest -= PRESETS.fewer_texels
+        longest -= current(Presets).fewer_texels
     return longest
 
 
 def bytes_of(plan: Plan, precision: str) -> int:
     """At most so many bytes of a bundle with a field as planned."""
-    cells = np.prod(cell_counts(plan.box, min(DEFAULT_CELLS, max(plan.resolution))))
-    return BESIDES + BundleSizes().of(plan.contents(int(cells)), precision)
+    cells = np.prod(cell_counts(plan.box, min(current(OccupancyConfig).cells, max(plan.resolution))))
+    return current(HeaderConfig).besides + BundleSizes().of(plan.contents(int(cells)), precision)
 
 
 def check_size(smallest: int, allowed: float | None) -> None:

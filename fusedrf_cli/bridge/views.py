@@ -1,7 +1,7 @@
 """The views that `render` takes: those of a file, those of the capture that a scene keeps, or ones that look
 at what the scene shows."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,13 +12,22 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import chosen_rig, framed_box, rig_of
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.rendering.cameras import UP, Camera, Outlook, azimuth_of, framing, framing_lens
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import RenderRequest
 
-DEFAULT_SIZE = (800, 800)
-LEANING = 0.7  # cosine: photos held within 45 degrees of +z leave +z upright
-ONE_SIDED = np.radians(120)  # without any camera: photos taken from one side
-LEAST_APART = 1e-13  # of a target's distance from the world's origin
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """What is shown where nothing was asked for."""
+
+    default_size: tuple[int, int] = (800, 800)
+    leaning: float = 0.7
+    """Cosine: photos held within 45 degrees of +z leave +z upright."""
+    one_sided: float = np.radians(120)
+    """Without any camera: photos taken from one side."""
+    least_apart: float = 1e-13
+    """Of a target's distance from the world's origin."""
 
 
 def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.ndarray) -> list[Camera]:
@@ -35,7 +44,7 @@ def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.n
             return [photo]
         lens, outlook = pinhole(photo), standing(rig, up)
     else:
-        lens = framing_lens(*(request.size or DEFAULT_SIZE))
+        lens = framing_lens(*(request.size or current(ViewConfig).default_size))
         outlook = replace(framing(framed_box(scene, field, origin), lens), up=up)
     outlook = turned(outlook, request)
     if request.orbit is None:
@@ -60,12 +69,13 @@ def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
     if rig is None or rig.surroundings:
         return UP if rig is None else rig.up
     own = scene.graph.cameras is not None and scene.graph.framing is None
-    return rig.up if own and rig.up @ UP < LEANING else UP
+    return rig.up if own and rig.up @ UP < current(ViewConfig).leaning else UP
 
 
 def turned(outlook: Outlook, request: RenderRequest) -> Outlook:
     """The outlook as --look-at, --from and --zoom change it; UsageProblem where no camera could stand apart
     from its target in float64."""
+    config = current(ViewConfig)
     if request.look_at is not None:
         outlook = replace(outlook, target=np.array(request.look_at))
     if request.direction is not None:
@@ -73,7 +83,7 @@ def turned(outlook: Outlook, request: RenderRequest) -> Outlook:
         outlook = replace(outlook, azimuth=azimuth, elevation=elevation)
     outlook = replace(outlook, distance=outlook.distance / request.zoom)
     far = float(np.abs(outlook.target).max())
-    if not max(1 / FARTHEST, far * LEAST_APART) < outlook.distance < FARTHEST or far >= FARTHEST:
+    if not max(1 / FARTHEST, far * config.least_apart) < outlook.distance < FARTHEST or far >= FARTHEST:
         raise UsageProblem(
             f"--look-at and --zoom put a camera {outlook.distance:.3g} from a point that is {far:.3g} from "
             "the world's origin, which its numbers cannot hold; give a nearer point, or another --zoom"
@@ -103,7 +113,7 @@ def arc_of(rig: Rig, up: np.ndarray) -> tuple[float, float] | None:
     around = np.sort([azimuth_of(eye - rig.focus, up) for eye in rig.poses[:, :3, 3]])
     gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
     widest = int(gaps.argmax())
-    if gaps[widest] < ONE_SIDED:
+    if gaps[widest] < current(ViewConfig).one_sided:
         return None
     end = float(around[widest])
     return end + float(gaps[widest]) - 2 * np.pi, end

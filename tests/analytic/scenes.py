@@ -13,7 +13,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.rendering.cameras import FRAMING_FOV, Camera, look_at
+from fusedrf_cli.engine.rendering.cameras import Camera, FramingConfig, look_at
 from tests.analytic.export import exported, vm_field
 from tests.analytic.fields import AnalyticField, Box, Gaussian, Tint, interval_of_box
 from tests.analytic.rays import DIRECTIONS_26, affine, moved_rays, turn
@@ -138,7 +138,7 @@ def scene_of(*parts: tuple) -> Scene:
 
 def camera_at(eye, target=(0.0, 0.0, 0.0), size: int = 64, up=(0.0, 0.0, 1.0)) -> Camera:
     """A square camera of the framing field of view at eye (3,) that looks at target (3,)."""
-    focal = 0.5 * size / np.tan(FRAMING_FOV / 2)
+    focal = 0.5 * size / np.tan(FramingConfig.fov / 2)
     pose = look_at(np.asarray(eye, float), np.asarray(target, float), np.asarray(up, float))
     return Camera(pose, focal, focal, size / 2, size / 2, size, size)
 

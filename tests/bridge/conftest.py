@@ -17,20 +17,24 @@ from formats.captures import write_capture
 from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
+from fusedrf_cli.bridge.looks import LookConfig
+from fusedrf_cli.bridge.making import MakingConfig
+from fusedrf_cli.bridge.mending import MendingConfig
 from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.engine.composition import composed
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student
-from fusedrf_cli.engine.kinds.vm import field as vm
 from fusedrf_cli.engine.kinds.vm import students
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.main import cli
 from fusedrf_cli.signals import interrupt
 from tests.analytic.export import SHAPE, vm_field
@@ -97,29 +101,31 @@ def write_views(folder: Path, field=None, at=(0.0, 0.0, 0.0), side: int = 24, ar
         write_capture(folder, [views[i] for i in chosen], np.stack([pixels[i] for i in chosen]), split)
 
 
+DRAFT = TrainConfig(longest=24, steps=60, samples=1 << 13, steps_to_show=1)
+TINY = (
+    OccupancyConfig(scene_cells=48),
+    LookConfig(whole=2, most_objects=0),
+    MakingConfig(views=2),
+    MendingConfig(settings=TinySettings(), numbers=SHAPE.size((20, 20, 20))),
+    Presets(DRAFT, DRAFT, DRAFT, DRAFT),
+)
+"""Coarse grids, few steps, and few pictures to judge by."""
+
+
 def make_tiny(patch: pytest.MonkeyPatch) -> None:
-    """Coarse grids, few steps, small pictures: what is tested here is the way, not the quality."""
-    patch.setattr(vm, "OWNERSHIP_CELLS", 48)
-    patch.setattr(composed, "OCCUPANCY_CELLS", 48)
-    patch.setattr(part("looks"), "WHOLE", 2)
-    patch.setattr(part("looks"), "MOST_OBJECTS", 0)
+    """Few steps, small pictures: what is tested here is the way, not the quality."""
     patch.setattr(Student, "lesson", TinySettings())
     patch.setattr(part("making"), "DistilConfig", TinySettings)  # for students that are not taught
     for made in (SparseStudent, AskedStudent):
         patch.setattr(made, "lesson", replace(made.lesson, points_per_step=1 << 13, views=2, view_size=32))
     patch.setattr(students, "SHAPE", SHAPE)
     patch.setattr(blocks, "RANKS", (None,))  # others would be compiled
-    patch.setattr(part("making"), "VIEWS_TO_CHOOSE_BY", 2)
     patch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
-    patch.setattr(part("mending"), "SETTINGS", TinySettings())
-    patch.setattr(part("mending"), "NUMBERS", SHAPE.size((20, 20, 20)))
-    draft = TrainConfig(longest=24, steps=60, samples=1 << 13, steps_to_show=1)
-    patch.setattr(part("training"), "QUALITY", dict.fromkeys(("draft", "normal", "high", "best"), draft))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def tiny():
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, using(*TINY):
         make_tiny(patch)
         yield
 

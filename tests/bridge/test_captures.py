@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from formats.images import read_image, write_png
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.distillation.config import TrainConfig
-from tests.bridge.conftest import part
 from tests.formats.test_captures import looking_at
 from tests.formats.test_readers import binary_model
 
@@ -15,10 +15,10 @@ DRAFT = ("--quality", "draft")
 
 
 @pytest.fixture(autouse=True)
-def short(monkeypatch):
+def short(in_force):
     """Steps, not seconds, decide, so that a busy machine changes nothing."""
     settings = TrainConfig(longest=16, steps=300, samples=1 << 12)
-    monkeypatch.setattr(part("training"), "QUALITY", {"draft": settings})
+    in_force(Presets(draft=settings))
 
 
 def eyes(count: int) -> list[np.ndarray]:

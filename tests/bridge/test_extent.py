@@ -8,19 +8,17 @@ import pytest
 import torch
 
 from formats.views import Capture, View
-from fusedrf_cli.bridge import training
 from fusedrf_cli.bridge.extent import extent_of
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.refined import with_poses
-from fusedrf_cli.bridge.training import PRESETS, fit_settings, quality_of, texels_of_place
+from fusedrf_cli.bridge.training import Presets, fit_settings, quality_of, texels_of_place
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.poses import poses_of
-from fusedrf_cli.engine.fields.occupancy import ORDINARY, placed_box
+from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import look_at
 from fusedrf_cli.engine.spaces.unbounded import SUBJECT, WHOLE, contracted
 from fusedrf_cli.requests import TrainRequest
-from tests.bridge.conftest import part
 
 BOX = np.array([-9.0] * 3 + [9.0] * 3)
 UP = np.array([0.0, 0.0, 1.0])
@@ -82,7 +80,7 @@ def test_a_box_far_away_or_of_another_size_has_a_frame_of_its_own(unit, at):
     box = np.concatenate([at - unit, at + 1.5 * unit])
     extent = extent_of(boxed(tuple(box)), capture, False)
     side = (extent.box[3:] - extent.box[:3]).max()
-    assert ORDINARY[0] <= side <= ORDINARY[1] and np.abs(extent.box).max() < side and not extent.unbounded
+    assert 2.0**-10 <= side <= 2.0**12 and np.abs(extent.box).max() < side and not extent.unbounded
     np.testing.assert_allclose(placed_box(extent.box, extent.origin), box, rtol=1e-12)
     np.testing.assert_allclose(extent.report()["aabb"], box, rtol=1e-12)
     for view in capture.train:
@@ -125,10 +123,10 @@ def test_views_of_what_lies_before_cameras_look_there():
     assert np.array_equal(around.cells.subject, SUBJECT)
 
 
-def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(monkeypatch):
+def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(in_force):
     """At 4 units of distance a pixel of these lenses is 4/87 wide."""
-    known = {"normal": TrainConfig(longest=224), "high": TrainConfig(longest=256)}
-    monkeypatch.setattr(part("training"), "QUALITY", known | {"best": TrainConfig(longest=256)})
+    finer = TrainConfig(longest=256)
+    in_force(Presets(normal=TrainConfig(longest=224), high=finer, best=finer))
     capture = photos([(4, 0, 0), (0, 4, 0), (-4, 0, 0), (0, -4, 0), (0, 0.1, 4)])
     words = replace(request(), unbounded=False, aabb=(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0))
     extent = extent_of(words, capture, False)
@@ -146,9 +144,9 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     assert longest(300, None, 100) == 512 and longest(300, "normal", 100) == 224
     best, plain = found(300), TrainConfig()
     assert best.samples > plain.samples and best.samples * best.steps == plain.samples * plain.steps
-    there = found(300 / PRESETS.gpu_pace, place="cuda")  # in larger steps, and sooner
+    there = found(300 / Presets.gpu_pace, place="cuda")  # in larger steps, and sooner
     assert (there.longest, there.steps) == (best.longest, best.steps)
-    assert there.samples == best.samples * PRESETS.gpu_samples
+    assert there.samples == best.samples * Presets.gpu_samples
 
 
 def test_cameras_come_back_from_the_frame_of_a_field():
@@ -177,10 +175,11 @@ def test_planes_over_a_part_of_space_have_as_many_texels_as_over_all_of_it():
     assert abs(texels(part) / texels(WHOLE) - 1) < 0.02
 
 
-def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch):
+def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(in_force):
     """And fewer texels then; no object does, nor a kind that has none."""
-    for name, steps in (("draft", 1500), ("normal", 4000), ("best", 24000)):
-        monkeypatch.setitem(training.QUALITY, name, TrainConfig(longest=224, steps=steps))
+    presets = {"draft": 1500, "normal": 4000, "best": 24000}
+    presets = {name: TrainConfig(longest=224, steps=steps) for name, steps in presets.items()}
+    in_force(Presets(**presets))
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
 
@@ -191,13 +190,13 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
 
     plain = settings(time_budget=60.0)
     assert plain.way.hashed is None
-    assert settings(time_budget=60.0, place="cuda").way.hashed is PRESETS.hashed
+    assert settings(time_budget=60.0, place="cuda").way.hashed is Presets.hashed
     for words in ({"time_budget": 600.0}, {}, {"quality": "best"}, {"max_size": 30_000_000}):
         found = settings(**words)
-        assert found.way.hashed is PRESETS.hashed
-        assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * training.QUALITY["normal"].longest)
+        assert found.way.hashed is Presets.hashed
+        assert found.longest < 0.8 * texels_of_place(WHOLE, 2 * presets["normal"].longest)
         larger = "time_budget" in words or "quality" in words
-        named = training.QUALITY[words.get("quality", "normal")]
+        named = presets[words.get("quality", "normal")]
         assert (found.samples / named.samples, named.steps / found.steps) == ((2, 2) if larger else (1, 1))
     assert settings(quality="draft").way.hashed is None
     assert settings(max_size=12_000_000).way.hashed is None
@@ -205,9 +204,9 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(monkeypatch
 
 
 @pytest.mark.parametrize("precision", ("float16", "float32"))
-def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, monkeypatch):
+def test_planes_are_as_fine_as_the_quality_says_and_voxels_as_a_file_allows(precision, in_force):
     """Where no size is asked for, however the numbers are stored; and within one that is."""
-    monkeypatch.setitem(training.QUALITY, "normal", TrainConfig(longest=256))
+    in_force(Presets(normal=TrainConfig(longest=256)))
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
     asked = replace(request(), quality="normal", precision=precision, ranks=(16, 24))

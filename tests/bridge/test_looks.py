@@ -5,18 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusedrf_cli.bridge.looks import SHOWN, Subject, between, looks, share_shown
+from fusedrf_cli.bridge.looks import LookConfig, Subject, between, looks, share_shown
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.judging import Judge
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, look_at
 from tests.analytic.fields import Box, Tint
-from tests.bridge.conftest import part
 from tests.bridge.test_views import FOCUS, photo
 from tests.formats.test_captures import looking_at
 from tests.formats.test_rig import rig_of
 
-WHOLE, MOST_OBJECTS = 3, 6
+WHOLE, MOST_OBJECTS = LookConfig.whole, LookConfig.most_objects
 BIG = (800, 600)
 BOX = np.array([-2.0, -2, -2, 2, 2, 2])
 PLACE = replace(
@@ -26,10 +25,9 @@ PLACE = replace(
 
 
 @pytest.fixture(autouse=True)
-def usual(monkeypatch):
+def usual(in_force):
     """Other tests of this package look at less."""
-    monkeypatch.setattr(part("looks"), "WHOLE", WHOLE)
-    monkeypatch.setattr(part("looks"), "MOST_OBJECTS", MOST_OBJECTS)
+    in_force(LookConfig())
 
 
 def subject(name: str, at, rig=None) -> Subject:
@@ -125,11 +123,11 @@ def test_views_of_an_object_are_drawn_anew_until_it_is_seen():
     tried = []
 
     def hardly(camera, of) -> float:
-        tried.append((0.9 * SHOWN / (2 + camera.camera_to_world[2, 3]), camera.camera_to_world))
+        tried.append((0.9 * LookConfig.shown / (2 + camera.camera_to_world[2, 3]), camera.camera_to_world))
         return tried[-1][0]
 
     (*_, last) = looks(None, BOX, [behind], WHOLE + 1, (32, 32), 0, hardly)
-    assert len(tried) == part("looks").TRIES
+    assert len(tried) == LookConfig.tries
     assert np.array_equal(last.camera.camera_to_world, max(tried, key=lambda one: one[0])[1])
 
 

@@ -229,7 +229,6 @@ def test_answers_are_those_of_the_composition_before_and_after(folder, report):
         (("delete", "four.rfpack", "cp", "dense", "sparse", "vm"), "would leave nothing"),
         (("crop", "four.rfpack", "cp", "50,50,50,1"), "its crop holds nothing of it"),
         (("add", "four.rfpack", "gone.rfpack", "--name", "x"), "no such file"),
-        (("extract", "four.rfpack", "--box", "0,0,0,1,1,1"), "fields of the kinds cp, dense, sparse, vm"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(folder, words, says):

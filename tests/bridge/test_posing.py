@@ -11,6 +11,7 @@ from formats.captures import read_capture
 from formats.points import Points
 from formats.posing import Posed
 from formats.views import View
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from tests.bridge.conftest import part
 from tests.bridge.test_captures import DRAFT, eyes
@@ -18,10 +19,8 @@ from tests.formats.test_captures import looking_at
 
 
 @pytest.fixture(autouse=True)
-def short(monkeypatch, tmp_path):
-    monkeypatch.setattr(
-        part("training"), "QUALITY", {"draft": TrainConfig(longest=16, steps=50, samples=1 << 12)}
-    )
+def short(monkeypatch, tmp_path, in_force):
+    in_force(Presets(draft=TrainConfig(longest=16, steps=50, samples=1 << 12)))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 

@@ -8,6 +8,7 @@ from PIL import Image
 
 from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.bridge.rendering import WorkConfig
 from fusedrf_cli.engine.rendering.metrics import psnr
 
 SMALL = ("--size", "32x24")
@@ -127,7 +128,7 @@ def test_what_cannot_be_rendered(run, folder, words, code, says):
     assert result.exit_code == code and says in result.stderr and sorted(folder.iterdir()) == before
 
 
-def test_what_takes_long_is_said_before_it_begins(run, folder, monkeypatch):
+def test_what_takes_long_is_said_before_it_begins(run, folder, in_force):
     """Many pixels, or a node so small beside another that each ray takes very many samples."""
     nodes = [
         make_node("whole", source="red.rfpack"),
@@ -136,11 +137,11 @@ def test_what_takes_long_is_said_before_it_begins(run, folder, monkeypatch):
     write_scene(folder / "tiny.json", SceneGraph(tuple(nodes)))
     few = "render", "tiny.json", "-o", "out.png", "-w", "--naive", "--size", "2x2"
     assert run(*few).stderr.count("may take long") == 0
-    monkeypatch.setattr("fusedrf_cli.bridge.rendering.MUCH_WORK", 1 << 16)
+    in_force(WorkConfig(much_work=1 << 16))
     said = run(*few).stderr
     assert "Warning: tiny.json: a ray takes up to " in said and "leave out what is smallest" in said
     assert run("render", "red.rfpack", "-o", "red.png", *SMALL).stderr.count("Warning") == 0
-    monkeypatch.setattr("fusedrf_cli.bridge.rendering.MANY_RAYS", 32 * 24)
+    in_force(WorkConfig(many_rays=32 * 24))
     result = run("render", "red.rfpack", "-o", "out.png", "-w", *SMALL)
     assert result.exit_code == 0
     assert "Warning: red.rfpack: 768 pixels may take long; give a smaller --size" in result.stderr

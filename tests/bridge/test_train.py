@@ -18,22 +18,25 @@ from formats.bundle import read_bundle
 from formats.checkpoints import read_checkpoint, write_checkpoint
 from formats.rig import read_rig
 from fusedrf_cli import signals
+from fusedrf_cli.bridge.running import RunningConfig
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.poses import changed_each, turns
 from fusedrf_cli.engine.fields.computed import ComputedField
+from fusedrf_cli.engine.settings import using
 from tests.bridge.conftest import done, part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
-LONGER = {"normal": TrainConfig(longest=24, steps=300, samples=1 << 13)}
+LONGER = Presets(normal=TrainConfig(longest=24, steps=300, samples=1 << 13))
 
 
 def train(report, output="out.rfpack", *more):
     return report("train", "photos", "-o", output, *WORDS, *more)
 
 
-def test_photos_become_a_field(report, folder, monkeypatch):
-    monkeypatch.setattr(part("training"), "QUALITY", LONGER)
+def test_photos_become_a_field(report, folder, in_force):
+    in_force(LONGER)
     said = train(report)
     assert said["views"] == 8 and said["steps"] == 300 and said["kind"] == "vm" and said["holdout"] is None
     assert said["bytes"] == (folder / "out.rfpack").stat().st_size
@@ -83,7 +86,7 @@ def test_an_interrupt_before_all_goes_on_to_the_same_bytes(report, run, folder, 
 
 
 def test_a_run_that_is_killed_goes_on_from_where_it_was_saved_last(
-    report, run, folder, straight, monkeypatch
+    report, run, folder, straight, monkeypatch, in_force
 ):
     class Killed(BaseException):
         """Nothing that anyone catches."""
@@ -96,8 +99,7 @@ def test_a_run_that_is_killed_goes_on_from_where_it_was_saved_last(
             raise Killed
         step(self, share)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(part("running"), "SAVED_EVERY", 0.0)
+    with monkeypatch.context() as patch, using(RunningConfig(saved_every=0.0)):
         patch.setattr(FitRun, "step", killed)
         with pytest.raises(Killed):
             run("train", "photos", "-o", "out.rfpack", *WORDS)
@@ -324,7 +326,7 @@ def test_a_checkpoint_in_the_way_is_left_alone(run, folder):
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS])
-def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, code):
+def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, in_force, code):
     """P5: a folder may have become read-only, too."""
     tries = []
 
@@ -333,7 +335,7 @@ def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, code
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(part("running"), "write_checkpoint", full)
-    monkeypatch.setattr(part("running"), "SAVED_EVERY", 0.0)
+    in_force(RunningConfig(saved_every=0.0))
     said = train(report)
     assert len(tries) > 5 and said["steps"] == 60
     assert len([text for text in said["warnings"] if "learning goes on" in text]) == 1

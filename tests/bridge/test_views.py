@@ -21,6 +21,7 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.kinds import registry
@@ -410,8 +411,8 @@ def test_a_picture_from_a_side(report, folder):
 
 
 @pytest.fixture
-def short(monkeypatch):
-    monkeypatch.setattr(part("training"), "QUALITY", {"draft": TrainConfig(longest=64, steps=5, samples=512)})
+def short(in_force):
+    in_force(Presets(draft=TrainConfig(longest=64, steps=5, samples=512)))
 
 
 def speckled_capture(folder, count: int = 6) -> list[View]:

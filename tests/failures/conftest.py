@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from fusedrf_cli.bridge.looks import LookConfig
 from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Student
@@ -73,17 +75,15 @@ def row(request) -> Row:
 
 
 @pytest.fixture
-def quick(monkeypatch) -> None:
+def quick(monkeypatch, in_force) -> None:
     """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 48)
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 48)
+    in_force(OccupancyConfig(scene_cells=48))
     monkeypatch.setattr(Student, "lesson", TinySettings())
     monkeypatch.setattr("fusedrf_cli.bridge.making.DistilConfig", TinySettings)  # for what is not taught
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.students.SHAPE", SHAPE)
     monkeypatch.setattr(blocks, "RANKS", (None,))  # others would be compiled
     monkeypatch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
-    monkeypatch.setattr("fusedrf_cli.bridge.looks.WHOLE", 2)
-    monkeypatch.setattr("fusedrf_cli.bridge.looks.MOST_OBJECTS", 0)
+    in_force(LookConfig(whole=2, most_objects=0))
 
 
 def pytest_generate_tests(metafunc):

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fusedrf_cli.bridge.training import QUALITY
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.fit import fit
@@ -50,7 +50,7 @@ def trained(preset: str) -> tuple:
         straight = found[..., :3] / np.maximum(found[..., 3:], 1e-6)
         images.append(np.rint(255 * np.concatenate([straight, found[..., 3:]], -1)).astype(np.uint8))
     started = time.perf_counter()
-    field = fit(cameras, np.stack(images), BOX, QUALITY[preset])
+    field = fit(cameras, np.stack(images), BOX, getattr(Presets, preset))
     return field, time.perf_counter() - started
 
 

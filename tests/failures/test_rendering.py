@@ -20,11 +20,13 @@ from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import fit
 from fusedrf_cli.engine.distillation.matter import occupancy_of
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import framing_camera, look_at, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, render_image, render_rays
+from fusedrf_cli.engine.rendering.volume import RenderConfig, render_image, render_rays
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 from fusedrf_cli.main import cli
 from tests.analytic import scenes
@@ -36,9 +38,7 @@ from tests.analytic.rays import affine, turn
 @pytest.fixture(scope="module", autouse=True)
 def coarse_grids():
     """Grids over scenes that are made in no time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 64)
-        patch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 64)
+    with using(OccupancyConfig(scene_cells=64)):
         yield
 
 
@@ -182,7 +182,7 @@ def test_d3_thin_fog_is_not_masked_away(row):
 # -- D4: early stop ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("early_stop", [1e-1, 1e-2, EARLY_STOP])
+@pytest.mark.parametrize("early_stop", [1e-1, 1e-2, RenderConfig.early_stop])
 def test_d4_stopping_early_costs_at_most_what_it_leaves(row, kind, early_stop):
     """Slabs of many depths, one behind the other: |ΔC| ≤ ε for every pixel."""
     scene = scenes.s1_slabs(2.0, 8.0)
@@ -191,7 +191,7 @@ def test_d4_stopping_early_costs_at_most_what_it_leaves(row, kind, early_stop):
     whole, stopped = (
         render_image(field, camera, origin=field.origin, early_stop=e).over(BLACK) for e in (0.0, early_stop)
     )
-    assert EARLY_STOP <= 1e-3
+    assert RenderConfig.early_stop <= 1e-3
     figure = abs(whole - stopped).max()
     row.check("D4", f"{kind}: largest change for ε = {early_stop:g}", figure, early_stop + 1e-6, at_most=True)
 
@@ -258,7 +258,7 @@ def test_d5_a_shortage_that_does_not_end_is_exit_5(row, tmp_path, monkeypatch):
     result = invoke(tmp_path, "render", path, "-o", "a.png", "--size", "16x16")
     assert not (tmp_path / "a.png").exists() and "not enough memory" in result.stderr
     row.check("D5", "exit code where memory never suffices", result.exit_code, 5)
-    row.check("D5", "attempts before that", len(tried), 1 + volume.HALVINGS, at_most=True)
+    row.check("D5", "attempts before that", len(tried), 1 + volume.RenderConfig.halvings, at_most=True)
 
 
 def test_d5_ssim_of_a_tiny_picture_is_refused_with_the_reason(row, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.bridge.training import QUALITY
+from fusedrf_cli.bridge.training import Presets
 from fusedrf_cli.engine.distillation import fit as module
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun, fit
@@ -275,7 +275,7 @@ def test_t12_no_seed_fails(row, images, unseen_psnr):
 @pytest.mark.slow
 def test_t13_the_rate_may_be_a_third_or_thrice(row, images, unseen_psnr):
     """Over as many steps as the shortest preset has; two seeds of one rate are up to 2 dB apart."""
-    settings = replace(LONG, steps=QUALITY["draft"].steps)
+    settings = replace(LONG, steps=Presets.draft.steps)
     found = []
     for factor in (1 / 3, 1, 3):
         changed = replace(settings, rate=factor * settings.rate)

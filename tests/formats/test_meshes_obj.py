@@ -352,6 +352,12 @@ def test_materials_of_one_name(folder):
     assert shows(same) and notes_of(same) == ""
 
 
+def test_lines_of_no_material_are_named(folder):
+    path = written(folder)
+    (folder / "a.mtl").write_text("Kd 1 0 0\nnewmtl wood\nmap_Kd wood.png\n")
+    assert shows(path) and "kd before its first newmtl belongs to no material" in notes_of(path)
+
+
 @pytest.mark.parametrize("line, said", [("Tf 0.2 0.5 1", True), ("Tf 1 1 1", False), ("Tf 0 0 0", False)])
 def test_light_filters_are_named(folder, line, said):
     assert ("Tf" in notes_of(written(folder, f"Kd 1 1 1\n{line}"))) == said

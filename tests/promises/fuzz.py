@@ -20,12 +20,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 from click.testing import CliRunner
 
 from formats.errors import FormatError
 from fusedrf_cli.bridge import deleting, editing, scene
-from fusedrf_cli.engine.kinds.vm import field as vm
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import FusedRFError
 from fusedrf_cli.main import cli
 from tests.promises.mutations import mutated
@@ -98,13 +98,13 @@ VERBS = {
 
 
 @contextmanager
-def patience():
+def patience(seconds: float = PATIENCE):
     def hung(*_):
         raise Hung
 
     before = [signal.signal(number, hung) for number in (signal.SIGALRM, signal.SIGPROF)]
     signal.setitimer(signal.ITIMER_REAL, WAITING)
-    signal.setitimer(signal.ITIMER_PROF, PATIENCE)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
         yield
     finally:
@@ -114,13 +114,13 @@ def patience():
             signal.signal(number, handler)
 
 
-def judged(path: Path, verb, damaged: bool, found: Counter) -> str | None:
-    """What a verb did wrong with the pack at `path`, if anything."""
+def judged(path: Path, verb, damaged: bool, found: Counter, seconds: float = PATIENCE) -> str | None:
+    """What a verb did wrong with the pack at `path`, if anything; it may compute for so many seconds."""
     began = time.process_time()
     try:
-        with patience():
+        with patience(seconds):
             taken = verb(str(path))
-        if time.process_time() - began > PATIENCE:
+        if time.process_time() - began > seconds:
             return "hung"
     except Hung:
         return "hung"
@@ -135,8 +135,7 @@ def fuzz(count: int, seed: int, folder: Path, first: int = 0) -> dict:
     good = [(GOLDEN / name).read_bytes() for name in GOOD]
     found: Counter = Counter()
     wrong, slowest = [], 0.0
-    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
-        patch.setattr(vm, "OWNERSHIP_CELLS", CELLS)
+    with using(OccupancyConfig(scene_cells=CELLS)), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for index in range(first, first + count):
             rng = random.Random(f"{seed}/{index}")

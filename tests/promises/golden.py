@@ -26,6 +26,7 @@ from formats.errors import FormatWarning
 from formats.rig import Rig
 from formats.scene import SHOWING_KEYS, Node, SceneGraph, make_node, write_scene
 from formats.views import View
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import Camera, look_at, open_scene
 from tests.promises.packs import GOLDEN
@@ -133,9 +134,9 @@ def asked(path: Path, case: Case, folder: Path) -> tuple[np.ndarray, np.ndarray]
 
 def keep(name: str, case: Case) -> None:
     """Write a case's bundle, what was kept of its past, and what it answers."""
-    from tests.bridge.conftest import make_tiny, stock_fields
+    from tests.bridge.conftest import TINY, make_tiny, stock_fields
 
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, using(*TINY):
         make_tiny(patch)
         patch.chdir(folder)
         stock_fields(Path(folder))

@@ -26,8 +26,9 @@ import pytest
 from formats import atomic, bundle, scene
 from formats.bundle import is_bundle, read_bundle
 from fusedrf_cli import bridge  # noqa: F401  (imported before the first fork)
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.main import cli
-from tests.bridge.conftest import make_tiny, stock_fields, write_views
+from tests.bridge.conftest import TINY, make_tiny, stock_fields, write_views
 from tests.promises.calls import At, watched
 
 HIDDEN = re.compile(r"\..*\.(tmp|old|fusedrf-lock)")
@@ -256,7 +257,7 @@ def stocked(folder: Path, names: list[str]) -> None:
 def tried(names: list[str], kills: int, seed: int, calls: bool, adds: int, defence=nullcontext) -> dict:
     """Kill each named command at random moments, at every call, or both; what became of it."""
     found = {}
-    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+    with pytest.MonkeyPatch.context() as patch, using(*TINY), tempfile.TemporaryDirectory() as folder:
         make_tiny(patch)
         stocked(Path(folder), names)
         for name in names:

@@ -12,6 +12,7 @@ import pytest
 
 from formats import archive, bundle, errors
 from formats.bundle import parse_bundle, read_bundle, read_summary
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from tests.promises.fuzz import VERBS, Crashed, fuzz, judged
 from tests.promises.mutations import DAMAGES, HOSTILITIES
 from tests.promises.packs import GOLDEN
@@ -172,9 +173,8 @@ def test_a_reader_without_checks_is_found_out(tmp_path, monkeypatch):
     assert any(problem["problem"] == "silent" for problem in fuzz(100, 0, tmp_path)["wrong"])
 
 
-def test_a_reader_that_stumbles_or_hangs_is_found_out(tmp_path, monkeypatch):
+def test_a_reader_that_stumbles_or_hangs_is_found_out(tmp_path):
     """P18: the fuzzer sees what it looks for."""
-    from tests.promises import fuzz as fuzzing
 
     def stumble(_):
         raise RecursionError
@@ -186,19 +186,17 @@ def test_a_reader_that_stumbles_or_hangs_is_found_out(tmp_path, monkeypatch):
     def crash(_):
         raise Crashed("exit 1")
 
-    monkeypatch.setattr(fuzzing, "PATIENCE", 0.2)
     assert judged(tmp_path, stumble, True, Counter()).startswith("crashed")
     assert judged(tmp_path, crash, True, Counter()).startswith("crashed")
-    assert judged(tmp_path, hang, True, Counter()) == "hung"
+    assert judged(tmp_path, hang, True, Counter(), 0.2) == "hung"
     assert judged(tmp_path, lambda _: True, True, Counter()) == "silent"
     assert judged(tmp_path, lambda _: True, False, Counter()) is None
 
 
-def test_good_packs_are_taken_by_every_verb(monkeypatch):
+def test_good_packs_are_taken_by_every_verb(in_force):
     """A fuzzer whose verbs refuse all would find nothing."""
-    from fusedrf_cli.engine.kinds.vm import field as vm
 
-    monkeypatch.setattr(vm, "OWNERSHIP_CELLS", 16)
+    in_force(OccupancyConfig(scene_cells=16))
     assert all(verb(str(GOLDEN / "pair.rfpack")) for verb in VERBS.values())
 
 

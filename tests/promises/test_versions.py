@@ -19,7 +19,7 @@ from formats.scene import dump_scene
 from fusedrf_cli.bridge.rendering import reference, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, placement
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -175,11 +175,10 @@ def test_keys_that_this_version_does_not_know_survive_a_round_trip(tmp_path):
     assert again.headers.keys() == bundle.headers.keys()
 
 
-def test_an_edit_keeps_what_it_does_not_know_of_the_scene(tmp_path, monkeypatch):
+def test_an_edit_keeps_what_it_does_not_know_of_the_scene(tmp_path, in_force):
     """P1, through a whole `delete`."""
-    from fusedrf_cli.engine.kinds.vm import field as vm
 
-    monkeypatch.setattr(vm, "OWNERSHIP_CELLS", 32)
+    in_force(OccupancyConfig(scene_cells=32))
     words = ["delete", str(GOLDEN / "later.rfpack"), "chair", "-o", str(tmp_path / "a.rfpack"), "--json"]
     result = CliRunner().invoke(cli, words)
     assert result.exit_code == 0, result.stderr

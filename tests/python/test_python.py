@@ -14,8 +14,8 @@ import fusedrf_cli
 from formats.errors import FormatError, OutputExists
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, write_field
-from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.composition.composite import as_composite
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.python import camera_rays, open_scene, rigid_motion
 from tests.analytic.export import vm_field
@@ -28,9 +28,9 @@ BALL = np.array([-0.9, -0.9, -0.9, 0.9, 0.9, 0.9])  # the box of a soft ball, wh
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch) -> Path:
+def folder(tmp_path, monkeypatch, in_force) -> Path:
     """The current folder, with three soft balls, a scene of them, and grids that are made in no time."""
-    monkeypatch.setattr(composed, "OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
     monkeypatch.chdir(tmp_path)
     for name, rgb in TINTS.items():
         ball = vm_field(Gaussian(20.0, (0, 0, 0), aabb=BALL, tint=Tint.of(*rgb)))

@@ -9,6 +9,7 @@ on points.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
 from fusedrf_cli.engine.kernels.reference import exact
-from fusedrf_cli.engine.spaces import unbounded
+from fusedrf_cli.engine.spaces import bounded
 
 WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
 CONDITION_LIMIT = 1e6  # a flatter placement cannot be inverted to float32's accuracy
@@ -60,8 +61,13 @@ class Placed:
 
     @cached_property
     def unbounded(self) -> bool:
-        """Whether the field fills all of space."""
-        return self.field.occupancy.space is unbounded
+        """Whether the field lies in a space without end."""
+        return self.space is not bounded
+
+    @property
+    def space(self) -> ModuleType:
+        """That the field lies in."""
+        return self.field.occupancy.space
 
     @property
     def as_it_is(self) -> bool:

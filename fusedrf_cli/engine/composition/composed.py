@@ -9,19 +9,21 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.fields.base import sampling_step
+from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.occupancy import (
-    SCENE_CELLS,
+    OccupancyConfig,
     OccupancyGrid,
-    Pace,
     frame_around,
+    mapped,
     placed_box,
     placed_cells,
     unbounded_cells,
 )
+from fusedrf_cli.engine.fields.pace import Pace
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import unbounded
 
-OCCUPANCY_CELLS = SCENE_CELLS
 RULES = ("max", "add")
 
 
@@ -73,14 +75,15 @@ class ComposedField:
     def occupancy(self) -> OccupancyGrid:
         """Cells that any placed field's occupied cells reach. In unbounded space each is sampled as finely as
         those that reach it need: most of it is far from anything that is fine."""
+        config = current(OccupancyConfig)
         grids = ((p.field.occupancy, p.object_to_world) for p in self.placed)
         if any(p.unbounded for p in self.placed):
             again = ((p.field.occupancy, p.object_to_world) for p in self.placed)
             steps = (sampling_step(p.field) for p in self.placed)
-            pace = Pace(OccupancyGrid.full(unbounded.WHOLE, OCCUPANCY_CELLS, unbounded))
-            marks = pace.kept(unbounded_cells(grids, OCCUPANCY_CELLS), again, steps)
+            pace = Pace(OccupancyGrid.full(unbounded.WHOLE, config.scene_cells, unbounded))
+            marks = pace.kept(unbounded_cells(grids, config.scene_cells), again, steps)
             return replace(pace.grid(reduce(np.logical_or, marks)), looked_at=self.subject)
-        aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, OCCUPANCY_CELLS)
+        aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, config.scene_cells)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
     @property
@@ -136,6 +139,19 @@ class ComposedField:
         seen = inside[found > 0]
         if with_colour and len(seen):
             rgb[seen] += found[found > 0, None] * placed.query(points[seen], dirs[seen])[1].double()
+
+
+def occupied_at(field: RadianceField, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: which points (N, 3) of its frame lie in occupied cells of a field, or of one of those that a
+    composed scene places: the cells that each has of its own."""
+    field = opened(field)
+    if not isinstance(field, ComposedField):
+        return field.occupancy.contains(mapped(points, field.occupancy.space))
+    found = np.zeros(len(points), bool)
+    for p in field.placed:
+        matrix = p.world_to_object
+        found |= occupied_at(p.field, points @ matrix[:3, :3].T + matrix[:3, 3])
+    return found
 
 
 def largest(placed: list[Placed]) -> Placed:

@@ -103,7 +103,7 @@ class Composite(ComposedField):
     def posed(self, poses: Mapping[str, np.ndarray]) -> "Composite":
         """See ComposedField."""
         other = super().posed(poses)
-        for name in ("groups", "leaves", "instances", "placed_instances", "sampling_step"):
+        for name in ("groups", "leaves", "instances", "placed_instances", "spaces", "sampling_step"):
             other.__dict__.pop(name, None)
         return other
 
@@ -153,8 +153,15 @@ class Composite(ComposedField):
             np.concatenate(list(skip.values())),
             np.array([sampling_step(field) for field in self.fields]),
             np.stack([sphere_around(p, f) for p, f in zip(self.leaves, self.fields, strict=True)]),
+            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.leaves], np.int64),
             np.array([(p.opacity, *p.tint) for p in self.leaves]),
         )
+
+    @cached_property
+    def spaces(self) -> tuple[ModuleType, ...]:
+        """Those without end that instances lie in, by name."""
+        found = {p.space for p in self.leaves if p.unbounded}
+        return tuple(sorted(found, key=lambda space: space.__name__))
 
     @cached_property
     def sampling_step(self) -> float:
@@ -277,6 +284,10 @@ class Waves:
         """An array of the segments, here."""
         return self.loops.on_host(getattr(self.segments, name))
 
+    def here(self) -> Segments:
+        """The segments, here."""
+        return Segments(*(self.told(name) for name in Segments._fields))
+
     def go_on(self) -> bool:
         """Take the rays that are left through their next segments; whether any are left behind them."""
         left = self.left
@@ -295,15 +306,14 @@ class Waves:
     def find(self, left: np.ndarray) -> None:
         """The next segments of rays left (M,). Where more instances meet than there is room for, they are
         looked for again with more room."""
-        arguments = self.rays, self.scene.placed_instances
+        arguments = self.rays, self.scene.placed_instances, self.scene.spaces
         self.segment_loops.next_segments(*arguments, left, self.segments)
         shared = left[self.told("instance")[left] == SHARED]
         if not len(shared):
             return
         meet, room = self.told("n_meeting")[shared], self.segments.meeting.shape[1]
         if meet.max() > room:
-            again = shared[meet > room]
-            found = Segments(*(self.told(name) for name in Segments._fields))
+            again, found = shared[meet > room], self.here()
             wider = np.empty((len(found.end), meet.max()), np.int64)
             wider[:, :room] = found.meeting
             found.end[again] = found.alone_from[again]
@@ -330,6 +340,12 @@ class Waves:
         merged = self.early_stop, groups, traces, found.end, self.out
         self.each("trace_ray", *slots, ends, traces)
         self.segment_loops.merge_samples(shared, start, *merged)
+        self.add_samples(shared, start, slots, ends, traces)
+
+    def add_samples(
+        self, shared: np.ndarray, start: np.ndarray, slots: tuple, ends: tuple, traces: Traces
+    ) -> None:
+        """Add what the samples of rays shared (M,) show, by the weights that they were given."""
         self.each("shade_ray", *slots, ends, traces)
         self.segment_loops.add_colours(shared, start, traces, self.out)
 
@@ -359,7 +375,7 @@ def room_for_traces(slots: int) -> Traces:
 
 def sphere_around(placed: Placed, field: RadianceField) -> np.ndarray:
     """(4,) centre and radius of a sphere around the occupied cells of a placed field, without end where they
-    lie in unbounded space."""
+    lie in a space without end."""
     if placed.unbounded:
         return np.array([0, 0, 0, FARTHEST])
     corners, matrix = box_corners(field.occupancy.tight_aabb(0)), placed.object_to_world

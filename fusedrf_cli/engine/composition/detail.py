@@ -5,8 +5,15 @@ from dataclasses import dataclass
 
 from fusedrf_cli.engine.composition.affine import Placed
 
-ENOUGH_VOXELS = 8  # across an object, under which there is no shape left
-LOST_NOTED = 0.01  # share of an object's cells
+
+@dataclass(frozen=True)
+class DetailConfig:
+    """What is said about an object's detail."""
+
+    enough_voxels: int = 8
+    """Across an object, under which there is no shape left."""
+    lost_noted: float = 0.01
+    """Share of an object's cells."""
 
 
 @dataclass(frozen=True)

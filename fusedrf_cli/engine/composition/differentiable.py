@@ -11,15 +11,15 @@ from functools import reduce
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.composition import composed
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.fields import differentiable
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import box_corners
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, box_corners
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kernels.reference import exact
+from fusedrf_cli.engine.settings import current
 
 Poses = Mapping[str, torch.Tensor]
 
@@ -146,7 +146,7 @@ def bounds(field: RadianceField, poses: Poses | None) -> torch.Tensor:
         corners.append(inner @ matrix[:3, :3].T + matrix[:3, 3])
     corners = torch.stack(corners)
     low, high = corners.amin((0, 1)), corners.amax((0, 1))
-    margin = (high - low).max() / composed.OCCUPANCY_CELLS  # as `occupancy.placed_cells` has it
+    margin = (high - low).max() / current(OccupancyConfig).scene_cells  # as `occupancy.placed_cells` has it
     same = torch.cat([low - margin, high + margin])
     return box + same - same.detach()
 

@@ -23,7 +23,7 @@ from fusedrf_cli.engine.distillation.losses import (
     mostly_seen,
     point_step,
 )
-from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, without_haze
+from fusedrf_cli.engine.distillation.matter import MatterConfig, without_haze
 from fusedrf_cli.engine.distillation.optimiser import Adam, alike
 from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
@@ -39,6 +39,7 @@ from fusedrf_cli.engine.distillation.teacher import (
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds.student import DistilConfig
+from fusedrf_cli.engine.settings import current
 
 
 @dataclass(frozen=True)
@@ -206,9 +207,10 @@ class DistillRun:
     def _leave_haze_out(self, pool: TeacherPool) -> None:
         """Leave out the room that cells had for matter to grow into, as `without_haze` does; what it shows is
         held against the teacher's pictures."""
+        config = current(MatterConfig)
         if self._has_cells_to_give() and not self.report.found_nothing:
-            rays = pool.rays_o[:RAYS_THAT_JUDGE], pool.rays_d[:RAYS_THAT_JUDGE]
-            truth = pool.pixels[:RAYS_THAT_JUDGE].numpy()
+            rays = pool.rays_o[: config.rays_that_judge], pool.rays_d[: config.rays_that_judge]
+            truth = pool.pixels[: config.rays_that_judge].numpy()
             self.student = self.student.with_occupancy(without_haze(self.student, *rays, truth=truth))
 
     def _prune(self) -> None:

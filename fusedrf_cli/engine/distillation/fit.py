@@ -17,22 +17,23 @@ from fusedrf_cli.engine.distillation.exposure import (
 )
 from fusedrf_cli.engine.distillation.guard import Guard
 from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
-from fusedrf_cli.engine.distillation.matter import RAYS_THAT_JUDGE, occupancy_of, without_haze
-from fusedrf_cli.engine.distillation.optimiser import BETA1, Adam, alike
+from fusedrf_cli.engine.distillation.matter import MatterConfig, occupancy_of, without_haze
+from fusedrf_cli.engine.distillation.optimiser import Adam, AdamConfig, alike
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
     changed,
     refined,
 )
-from fusedrf_cli.engine.distillation.smoothness import STRIPS, WEIGHT, add_roughness
+from fusedrf_cli.engine.distillation.smoothness import SmoothnessConfig, add_roughness
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.computed import AS_IT_IS, NONE_KNOWN, Batch
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, OccupancyGrid, cell_counts, texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import LEAST_TEXELS
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 
 
 def fit(
@@ -142,7 +143,8 @@ class FitRun:
 
     def fresh_optimiser(self) -> Adam:
         """An optimiser of the field as it is now."""
-        return Adam.of(self.field, self.config.unbounded_momentum if self.config.unbounded else BETA1)
+        usual = current(AdamConfig).beta1
+        return Adam.of(self.field, self.config.unbounded_momentum if self.config.unbounded else usual)
 
     def forget(self) -> None:
         """Let go of what only another step would need, several times the field's numbers."""
@@ -303,7 +305,7 @@ class FitRun:
                 return
             self.occupy(occupancy)
         if self.share() >= self.config.low_density_left_from or not self.refreshes:
-            rays_o, rays_d, *_ = self.pool.draw(RAYS_THAT_JUDGE)
+            rays_o, rays_d, *_ = self.pool.draw(current(MatterConfig).rays_that_judge)
             self.occupy(without_haze(self.field, rays_o, rays_d, self.config.near))
 
     def shown_cells(self) -> OccupancyGrid:
@@ -311,7 +313,7 @@ class FitRun:
         lies behind surfaces, is no matter."""
         field = self.field
         grid = field.occupancy
-        counts = cell_counts(grid.aabb, min(DEFAULT_CELLS, max(field.resolution)))
+        counts = cell_counts(grid.aabb, min(current(OccupancyConfig).cells, max(field.resolution)))
         if grid.occupied.shape != counts:  # as fine as those to be found, with the same cells occupied
             middles = OccupancyGrid.full(grid.aabb, max(counts)).centres()
             field = field.with_occupancy(grid.marked(grid.contains(middles).reshape(counts)))
@@ -396,9 +398,10 @@ class FitRun:
     def learn(self, sums: np.ndarray, rays: int, decay: float, known: int = 0) -> None:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
         of the next. Of `known` of them depths are known, and their colour errors are not in the sums."""
+        config = current(SmoothnessConfig)
         if self.config.smooth:
-            strip = int(torch.randint(STRIPS, (), generator=self.generator))
-            add_roughness(self.field, self.optimiser.gradient[0], WEIGHT * rays, strip)
+            strip = int(torch.randint(config.strips, (), generator=self.generator))
+            add_roughness(self.field, self.optimiser.gradient[0], config.weight * rays, strip)
         if self.steps % self.config.faded_each == 0:
             self.optimiser.fade(self.config.faded_each * decay * self.faded)
         self.optimiser.step(self.config.rate * decay)

@@ -2,17 +2,27 @@
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.settings import current
 
-WINDOW = 100  # steps over which bad ones are counted
-ALLOWED = 10  # bad steps in a window before the last good state is taken up again
-KEPT_EVERY = 200  # steps between two copies of a good state: a copy costs about a fifth of a step
-RATE_CUT = 1 / 3
-MOST_ROLL_BACKS = 3
+
+@dataclass(frozen=True)
+class GuardConfig:
+    """When bad steps are taken back."""
+
+    window: int = 100
+    """Steps over which bad ones are counted."""
+    allowed: int = 10
+    """Bad steps in a window before the last good state is taken up again."""
+    kept_every: int = 200
+    """Steps between two copies of a good state: a copy costs about a fifth of a step."""
+    rate_cut: float = 1 / 3
+    most_roll_backs: int = 3
 
 
 class Guard:
@@ -25,7 +35,7 @@ class Guard:
         self.rate = 1.0
         """What the learning rate is to be multiplied by."""
         self.skipped, self.roll_backs = 0, 0
-        self.recent: deque[bool] = deque(maxlen=WINDOW)
+        self.recent: deque[bool] = deque(maxlen=current(GuardConfig).window)
         self.kept: list[torch.Tensor] = []
         self.age = 0
 
@@ -36,7 +46,7 @@ class Guard:
         if not sound:
             optimiser.clear()
             self.skipped += 1
-            if sum(self.recent) > ALLOWED:
+            if sum(self.recent) > current(GuardConfig).allowed:
                 self.roll_back()
         return sound
 
@@ -47,7 +57,7 @@ class Guard:
 
     def keep(self) -> None:
         """Before every step: copy the numbers when that is due, or go back where they are not finite."""
-        if not self.kept or self.age >= KEPT_EVERY:
+        if not self.kept or self.age >= current(GuardConfig).kept_every:
             self.check()
             if len(self.kept) != len(now := self.numbers()):
                 self.kept = [torch.empty_like(values) for values in now]
@@ -68,7 +78,8 @@ class Guard:
     def roll_back(self) -> None:
         """Take up the last good numbers, at a third of the rate. Raises FloatingPointError when that has not
         helped before, or nothing good is known."""
-        if self.roll_backs == MOST_ROLL_BACKS or not self.kept:
+        config = current(GuardConfig)
+        if self.roll_backs == config.most_roll_backs or not self.kept:
             raise FloatingPointError(
                 f"{self.skipped} steps were not finite, after {self.roll_backs} returns to the last good "
                 "state at a third of the rate"
@@ -76,7 +87,7 @@ class Guard:
         for copy, values in zip(self.kept, self.numbers(), strict=True):
             values.copy_(copy)
         self.roll_backs += 1
-        self.rate *= RATE_CUT
+        self.rate *= config.rate_cut
         self.recent.clear()
         self.age = 0
 

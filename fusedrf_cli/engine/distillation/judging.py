@@ -12,12 +12,23 @@ from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.cameras import Camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
+from fusedrf_cli.engine.settings import current
 
-HELD_OUT = 1 << 12  # rays whose PSNR is the learning curve
-HELD_OUT_SEED = 9_000_001
+
+@dataclass(frozen=True)
+class JudgingConfig:
+    """What a student is judged on."""
+
+    held_out: int = 1 << 12
+    """Rays whose PSNR is the learning curve."""
+    held_out_seed: int = 9_000_001
+    covered: float = 0.5
+    """Of a pixel's light that a scene keeps from what is behind it."""
+    judged_seed: int = 7_000_001
+    """Views the student is judged on are drawn from a stream of their own."""
+
+
 WHITE = np.ones(3)
-COVERED = 0.5  # of a pixel's light that a scene keeps from what is behind it
-JUDGED_SEED = 7_000_001  # views the student is judged on are drawn from a stream of their own
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,7 @@ class Judge:
         self.cameras, self.origin = cameras, origin
         shots = [render_image(teacher, camera, origin=origin) for camera in cameras]
         self.truth = np.stack([shot.over(WHITE) for shot in shots])
-        self.covered = np.stack([shot.opacity > COVERED for shot in shots])
+        self.covered = np.stack([shot.opacity > current(JudgingConfig).covered for shot in shots])
 
     def shots(self, student: RadianceField) -> np.ndarray:
         """(views, H, W, 3) over white."""
@@ -71,7 +82,8 @@ def meets(rays_o: np.ndarray, rays_d: np.ndarray, box: np.ndarray) -> np.ndarray
 
 def scattered_judge(teacher: RadianceField, views: int, size: int, seed: int) -> Judge:
     """A judge by seeded views from around a teacher's matter."""
-    cameras = scattered(teacher.occupancy.subject, views, size, size, seed=JUDGED_SEED + seed)
+    config = current(JudgingConfig)
+    cameras = scattered(teacher.occupancy.subject, views, size, size, seed=config.judged_seed + seed)
     return Judge(teacher, cameras)
 
 
@@ -79,8 +91,9 @@ class HeldOut:
     """PSNR of a student on a few rays that nothing is trained on: quick to ask, for curves and schedules."""
 
     def __init__(self, teacher: RadianceField, sampler: RaySampler, step: float, seed: int):
-        generator = torch.Generator().manual_seed(HELD_OUT_SEED + seed)
-        self.rays, self.step = sampler.draw(HELD_OUT, generator), step
+        config = current(JudgingConfig)
+        generator = torch.Generator().manual_seed(config.held_out_seed + seed)
+        self.rays, self.step = sampler.draw(config.held_out, generator), step
         self.truth = over_white(ask(teacher, *self.rays, step, generator).pixels.numpy())
 
     def __call__(self, student: RadianceField) -> float:

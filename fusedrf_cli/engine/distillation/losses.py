@@ -1,19 +1,31 @@
 """The 3D losses: how a student's σ and colour at points differ from what a teacher said there."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.settings import current
 
-OPAQUE = 5.0  # optical depth of a step beyond which more density cannot be seen
-DEPTH_GAIN = 10.0  # in log1p(gain τ): how much thin fog counts
-FAINT = 1e-8  # optical depth of a step under which a student that should be denser learns as if it had it
-MOST_LIFT = 1e30
-COLOUR_WEIGHT = 2.0
-HIDDEN_SHARE = 0.3  # what a point counts that nothing is seen of from this ray: from another one it may be
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What points count in the 3D losses."""
+
+    opaque: float = 5.0
+    """Optical depth of a step beyond which more density cannot be seen."""
+    depth_gain: float = 10.0
+    """In log1p(gain τ): how much thin fog counts."""
+    faint: float = 1e-8
+    """Optical depth of a step under which a student that should be denser learns as if it had it."""
+    most_lift: float = 1e30
+    colour_weight: float = 2.0
+    hidden_share: float = 0.3
+    """What a point counts that nothing is seen of from this ray: from another one it may be."""
+
 
 DensityLoss = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 """Losses (N,) of the student's optical depths (N,) of a step against the wanted ones (N,), and their
@@ -23,19 +35,21 @@ Visibility = Callable[[torch.Tensor], torch.Tensor]
 
 
 def log_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(log1p(g τ_s) - log1p(g τ_t))², with depths beyond OPAQUE taken as equal: they look the same.
+    """(log1p(g τ_s) - log1p(g τ_t))², with depths beyond `opaque` taken as equal: they look the same.
 
     Raw σ is unstable for dense teachers, and alpha gives a saturated student no gradient; this does.
     """
-    wanted = wanted.clamp_max(OPAQUE)
-    error = torch.log1p(DEPTH_GAIN * depth) - torch.log1p(DEPTH_GAIN * wanted)
-    error[(depth >= OPAQUE) & (wanted >= OPAQUE)] = 0
-    return error**2, 2 * error * DEPTH_GAIN / (1 + DEPTH_GAIN * depth)
+    config = current(LossConfig)
+    wanted = wanted.clamp_max(config.opaque)
+    error = torch.log1p(config.depth_gain * depth) - torch.log1p(config.depth_gain * wanted)
+    error[(depth >= config.opaque) & (wanted >= config.opaque)] = 0
+    return error**2, 2 * error * config.depth_gain / (1 + config.depth_gain * depth)
 
 
 def mostly_seen(transmittance: torch.Tensor) -> torch.Tensor:
     """By what is seen of a point, with a share for all: what this ray does not show another one may."""
-    return HIDDEN_SHARE + (1 - HIDDEN_SHARE) * transmittance
+    config = current(LossConfig)
+    return config.hidden_share + (1 - config.hidden_share) * transmittance
 
 
 def point_step(
@@ -47,15 +61,16 @@ def point_step(
     visibility: Visibility = mostly_seen,
 ) -> float:
     """Mean loss of points, its gradient added to the optimiser's: the density's at optical depths τ = σ step,
-    and the squared length of the colour's error by COLOUR_WEIGHT times the teacher's alpha, both by
+    and the squared length of the colour's error by `colour_weight` times the teacher's alpha, both by
     visibility."""
+    config = current(LossConfig)
     sigma, rgb = student.query(points.where, points.dirs)
     tau, wanted = sigma * step, points.sigma * step
     loss, d_tau = density_loss(tau, wanted)
-    # σ = softplus(f) and its slope vanish together: far below FAINT the gradient would be too small a number
-    lift = torch.where(d_tau < 0, (FAINT / tau).clamp(1, MOST_LIFT), 1)
+    # σ = softplus(f) and its slope vanish together: far below `faint` the gradient would be too small
+    lift = torch.where(d_tau < 0, (config.faint / tau).clamp(1, config.most_lift), 1)
     counts = visibility(points.transmittance) / len(points)
-    shown = COLOUR_WEIGHT * counts * (1 - torch.exp(-wanted))
+    shown = config.colour_weight * counts * (1 - torch.exp(-wanted))
     off = rgb - points.rgb
     student.query_backward(
         points.where,

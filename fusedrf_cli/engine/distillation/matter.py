@@ -1,27 +1,41 @@
 """Cells of a field's grid that hold matter."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.occupancy import DEFAULT_CELLS, PROBES, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.settings import current
 
-EMPTY_BELOW = 0.01  # optical depth across a cell under which it counts as empty
+
+@dataclass(frozen=True)
+class MatterConfig:
+    """From when a cell counts as empty."""
+
+    empty_below: float = 0.01
+    """Optical depth across a cell under which it counts as empty."""
+    rays_that_judge: int = 1 << 13
+    """That tell whether anything is seen of haze."""
+    thick_haze: float = 16 * empty_below
+    """How thick haze is, across a cell, that is left out first where it is known what rays should show: haze
+    of a student is mostly what it failed to learn."""
+    thin_haze: float = empty_below / 64
+    """The haze that is tried last, where rays show all that is thicker."""
+    same: float = 1e-6
+    """Mean square by which pictures differ that show the same: 60 dB."""
+
+
 # Where in a cell haze is looked for: about as close together as the texels of a fine field.
 CLOSE_PROBES = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="ij"), -1).reshape(-1, 3)
-RAYS_THAT_JUDGE = 1 << 13  # whether anything is seen of haze
-# How thick haze is, across a cell, that is left out first where it is known what rays should show: haze of a
-# student is mostly what it failed to learn.
-THICK_HAZE = 16 * EMPTY_BELOW
-THIN_HAZE = EMPTY_BELOW / 64  # that is tried last, where rays show all that is thicker
-SAME = 1e-6  # mean square by which pictures differ that show the same: 60 dB
 
 
 def occupancy_of(
-    field: StoredField, box: np.ndarray | None = None, cells: int = DEFAULT_CELLS
+    field: StoredField, box: np.ndarray | None = None, cells: int = OccupancyConfig.cells
 ) -> OccupancyGrid:
     """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
-    optical depth across the cell passes EMPTY_BELOW somewhere, grown by one cell.
+    optical depth across the cell passes `empty_below` somewhere, grown by one cell.
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
     """
@@ -33,7 +47,7 @@ def occupancy_of(
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]
     sigma = field.peaks(box[:3], cell, index, PROBES)
     occupied = np.zeros(counts, bool)
-    occupied[tuple(index[sigma * cell.min() > EMPTY_BELOW].T)] = True
+    occupied[tuple(index[sigma * cell.min() > current(MatterConfig).empty_below].T)] = True
     return OccupancyGrid(box, occupied, space).dilated()
 
 
@@ -54,19 +68,20 @@ def without_haze(
     near: float = 0.0,
     truth: np.ndarray | None = None,
 ) -> OccupancyGrid:
-    """The field's occupancy but for cells in which the optical depth across the cell passes EMPTY_BELOW
-    nowhere; where rays (N, 3) from `near` on show it by more than SAME, but for those of haze a quarter as
+    """The field's occupancy but for cells in which the optical depth across the cell passes `empty_below`
+    nowhere; where rays (N, 3) from `near` on show it by more than `same`, but for those of haze a quarter as
     thick, and so on, and at last with all of them. Where it is known what rays should show, premultiplied rgb
-    and opacity `truth` (N, 4), it begins with THICK_HAZE, and rays must not be further from that by more.
+    and opacity `truth` (N, 4), it begins with `thick_haze`, and rays must not be further from that by more.
 
     Cells found while a field learns are grown by one, for matter to grow into; that room would be sampled in
     every picture.
     """
+    config = current(MatterConfig)
     grid, depth = field.occupancy, depths_across(field, CLOSE_PROBES)
     whole = render_rays(field, rays_o, rays_d, near=near)[:, :4]
-    expected, most = (whole, EMPTY_BELOW) if truth is None else (truth, THICK_HAZE)
-    allowed = np.square(whole - expected).mean() + SAME
-    while most >= THIN_HAZE:
+    expected, most = (whole, config.empty_below) if truth is None else (truth, config.thick_haze)
+    allowed = np.square(whole - expected).mean() + config.same
+    while most >= config.thin_haze:
         fewer = grid.marked(grid.occupied & (depth > most))
         if fewer.occupied.any():
             found = render_rays(field.with_occupancy(fewer), rays_o, rays_d, near=near)[:, :4]

@@ -8,8 +8,17 @@ import torch
 
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
+from fusedrf_cli.engine.settings import current
 
-BETA1, BETA2, EPS = 0.9, 0.99, 1e-15  # TensoRF's; a gradient here can be tiny, so eps must not damp it
+
+@dataclass(frozen=True)
+class AdamConfig:
+    """Adam's numbers: TensoRF's but for eps."""
+
+    beta1: float = 0.9
+    beta2: float = 0.99
+    eps: float = 1e-15
+    """A gradient here can be tiny, which it must not damp."""
 
 
 def alike(array: np.ndarray, own: torch.Tensor | np.ndarray, name: str) -> np.ndarray:
@@ -26,7 +35,7 @@ class Adam:
 
     field: ComputedField
     parts: int
-    beta1: float = BETA1
+    beta1: float = AdamConfig.beta1
     """How much of the moves before each step goes on; with 0 no first moment is kept."""
 
     def __post_init__(self):
@@ -40,7 +49,7 @@ class Adam:
         self.steps = 0
 
     @classmethod
-    def of(cls, field: ComputedField, beta1: float = BETA1) -> "Adam":
+    def of(cls, field: ComputedField, beta1: float = AdamConfig.beta1) -> "Adam":
         """An optimiser with as many rows of gradients as the field's loops add to."""
         return cls(field, field.gradient_rows, beta1)
 
@@ -71,9 +80,10 @@ class Adam:
 
     def step(self, rate: float) -> None:
         """Apply and clear the gradients: each group of numbers at `rate` times its own."""
+        config = current(AdamConfig)
         self.steps += 1
-        correction1, correction2 = 1 / (1 - self.beta1**self.steps), 1 / (1 - BETA2**self.steps)
-        rest = [np.float32(x) for x in (self.beta1, BETA2, EPS, correction1, correction2)]
+        correction1, correction2 = 1 / (1 - self.beta1**self.steps), 1 / (1 - config.beta2**self.steps)
+        rest = [np.float32(x) for x in (self.beta1, config.beta2, config.eps, correction1, correction2)]
         moved = self.field.arrays.params, self.grads, self.moment1, self.moment2
         for group in self.field.groups():
             own = np.float32(rate * group.rate)

@@ -8,11 +8,17 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 
-WHOLE_SCENE_SHARE = (
-    0.5  # of the rays; the others are shared out over the objects, so that a small one is not missed
-)
-BELOW_SHARE = 0.1  # of the rays that look from under the horizon
+
+@dataclass(frozen=True)
+class SamplerConfig:
+    """Where the rays of a student come from."""
+
+    whole_scene_share: float = 0.5
+    """Of the rays; the others are shared out over the objects, so that a small one is not missed."""
+    below_share: float = 0.1
+    """Of the rays that look from under the horizon."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +44,7 @@ class RaySampler:
     def draw(self, count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
         """rays_o, rays_d (count, 3) float64, rays_d of unit length, in random order."""
         others = self.boxes[1:] or ([] if self.views else self.boxes)
-        whole = int(count * WHOLE_SCENE_SHARE) if others else count
+        whole = int(count * current(SamplerConfig).whole_scene_share) if others else count
         parts = [
             through(self.views, whole, generator) if self.views else around(self.boxes[0], whole, generator)
         ]
@@ -55,7 +61,7 @@ def around(box: np.ndarray, count: int, generator: torch.Generator) -> tuple[np.
     uniform = torch.rand(count, 7, generator=generator, dtype=torch.float64).numpy()
     lo, hi = box[:3], box[3:]
     centre, radius = (lo + hi) / 2, np.linalg.norm(hi - lo) / 2
-    z = np.where(uniform[:, 0] < BELOW_SHARE, -uniform[:, 1], uniform[:, 1])
+    z = np.where(uniform[:, 0] < current(SamplerConfig).below_share, -uniform[:, 1], uniform[:, 1])
     ring, angle = np.sqrt(1 - z * z), 2 * np.pi * uniform[:, 2]
     away = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
     rays_o = centre + away * (radius * (1.2 + 2.0 * uniform[:, 3:4]))

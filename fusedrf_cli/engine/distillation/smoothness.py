@@ -2,23 +2,34 @@
 al. 2022, section 4.4). Few photos see each far texel, and what they leave open would be noise, drawn out
 along the axes."""
 
+from dataclasses import dataclass
+
 import torch
 
 from fusedrf_cli.engine.fields.computed import ComputedField
+from fusedrf_cli.engine.settings import current
 
-WEIGHT = 8e-6  # against the squared error of a ray; four times that blurs what photos do show
-STRIPS = 8  # that planes are cut into: a step smooths one of them, and that by so many times as much
+
+@dataclass(frozen=True)
+class SmoothnessConfig:
+    """How planes are kept smooth."""
+
+    weight: float = 8e-6
+    """Against the squared error of a ray; four times that blurs what photos do show."""
+    strips: int = 8
+    """That planes are cut into: a step smooths one of them, and that by so many times as much."""
 
 
 def add_roughness(field: ComputedField, gradient: torch.Tensor, weight: float, strip: int) -> None:
-    """Add to gradients (P,) those of the roughness of one strip of each of a field's planes, times STRIPS.
+    """Add to gradients (P,) those of the roughness of one strip of each of a field's planes, times `strips`.
 
     Roughness is `weight` times twice the sum of the squared differences between neighbouring texels, of rows
     and of columns, over the number of texels times components, summed over the planes.
     """
+    config = current(SmoothnessConfig)
     for plane, slope in zip(field.planes(field.params), field.planes(gradient), strict=True):
-        height = -(-plane.shape[0] // STRIPS)
-        start, scale = strip * height, 4 * weight * STRIPS / plane.numel()
+        height = -(-plane.shape[0] // config.strips)
+        start, scale = strip * height, 4 * weight * config.strips / plane.numel()
         part = plane[start : start + height]
         across = part[:, 1:] - part[:, :-1]
         slope[start : start + height, 1:].add_(across, alpha=scale)

@@ -1,8 +1,9 @@
 """A student on a grid while it learns: half its resolution first, and the cells it gives up."""
 
-from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, depths_across
+from fusedrf_cli.engine.distillation.matter import MatterConfig, depths_across
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
+from fusedrf_cli.engine.settings import current
 
 LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
 
@@ -26,6 +27,6 @@ def resampled_like(student: StoredField, other: StoredField) -> StoredField:
 def pruned(student: StoredField) -> OccupancyGrid:
     """The student's occupancy without the cells in which it turned out to hold nothing."""
     grid, depth = student.occupancy, depths_across(student, PROBES)
-    occupied = depth > harmless_depth(depth, EMPTY_BELOW, LOST_DEPTH)
+    occupied = depth > harmless_depth(depth, current(MatterConfig).empty_below, LOST_DEPTH)
     kept = grid.marked(occupied).dilated().occupied & grid.occupied
     return grid.marked(kept)

@@ -12,18 +12,28 @@ from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import (
-    RAYS_AT_ONCE,
-    SEEN_WEIGHT,
+    RenderConfig,
     reach_of,
     render_rays,
     waves,
     weights_from_depths,
 )
+from fusedrf_cli.engine.settings import current
 
-SEEN = 1e-2  # transmittance under which what lies behind is not worth learning
-MATTER = 1e-3  # optical depth of a step from which a sample counts as matter
-EMPTY_SHARE = 0.15  # of the samples with less that are kept: nine in ten are such, and without them fog stays
-RECKONED_RAYS = 2000  # of which the number of points is reckoned
+
+@dataclass(frozen=True)
+class TeacherConfig:
+    """Which samples of a teacher's rays are kept as points."""
+
+    seen: float = 1e-2
+    """Transmittance under which what lies behind is not worth learning."""
+    matter: float = 1e-3
+    """Optical depth of a step from which a sample counts as matter."""
+    empty_share: float = 0.15
+    """Of the samples with less that are kept: nine in ten are such, and without them fog stays."""
+    reckoned_rays: int = 2000
+    """Of which the number of points is reckoned."""
+
 
 Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """The chances (N,) that samples are kept as points, by their optical depths (N,) and transmittances (N,)."""
@@ -31,7 +41,8 @@ Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 def matter_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
     """All that can be seen of matter, and a share of the emptiness before it."""
-    return torch.where(depth > MATTER, 1.0, EMPTY_SHARE)
+    config = current(TeacherConfig)
+    return torch.where(depth > config.matter, 1.0, config.empty_share)
 
 
 @dataclass
@@ -88,7 +99,7 @@ def ask(
     step: float,
     generator: torch.Generator,
     chance: Chance = matter_first,
-    at_once: int = RAYS_AT_ONCE,
+    at_once: int = RenderConfig.rays_at_once,
 ) -> TeacherPool:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
@@ -129,9 +140,10 @@ def _like(rows: torch.Tensor, count: int) -> torch.Tensor:
 
 def points_kept(teacher: RadianceField, sampler: RaySampler, rays: int, step: float, seed: int) -> int:
     """About how many points `ask` keeps of so many rays, reckoned from a few of them."""
+    config = current(TeacherConfig)
     generator = torch.Generator().manual_seed(seed)
-    few = sampler.draw(RECKONED_RAYS, generator)
-    return len(ask(teacher, *few, step, generator).points) * rays // RECKONED_RAYS
+    few = sampler.draw(config.reckoned_rays, generator)
+    return len(ask(teacher, *few, step, generator).points) * rays // config.reckoned_rays
 
 
 def _ask_part(
@@ -142,6 +154,8 @@ def _ask_part(
     generator: torch.Generator,
     chance: Chance,
 ) -> tuple[torch.Tensor, ...]:
+    teacher_config = current(TeacherConfig)
+    config = current(RenderConfig)
     n = len(rays_o)
     trans, pixels = np.ones(n, np.float32), np.zeros((n, 4), np.float32)
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
@@ -158,9 +172,11 @@ def _ask_part(
         before = torch.from_numpy((trans[ray][:, None] - np.cumsum(weights, 1) + weights)[mask])
         trans[ray] = after
         depth = found * torch.from_numpy(spans[mask]).float()
-        chosen = (before > SEEN) & (torch.rand(len(points), generator=generator) < chance(depth, before))
+        chosen = (before > teacher_config.seen) & (
+            torch.rand(len(points), generator=generator) < chance(depth, before)
+        )
         # most samples are empty, and a colour costs more than a density
-        shown = torch.from_numpy(weights[mask] > SEEN_WEIGHT) | (chosen & (depth > SEEN_WEIGHT))
+        shown = torch.from_numpy(weights[mask] > config.seen_weight) | (chosen & (depth > config.seen_weight))
         colour = torch.zeros(len(points), 3)
         if shown.any():
             colour[shown] = teacher.query(points[shown], dirs[shown])[1].float()

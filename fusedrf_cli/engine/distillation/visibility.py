@@ -1,16 +1,26 @@
 """Which cells of unbounded space can hold what a capture's photos show: what no photo shows, and what lies
 before all that a photo shows, can only be learnt as fog."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import unbounded
 
-CELLS = 64
-BEYOND = 0.06  # of a picture's side: how far outside a cell's centre may be seen that reaches into it
-HALF_DIAGONAL = 0.87  # of a cube, in its sides
+
+@dataclass(frozen=True)
+class VisibilityConfig:
+    """How cells that no picture shows are found."""
+
+    cells: int = 64
+    beyond: float = 0.06
+    """Of a picture's side: how far outside a cell's centre may be seen that reaches into it."""
+    half_diagonal: float = 0.87
+    """Of a cube, in its sides."""
 
 
 def shown_cells(cameras: list[Camera], near: float, clear: list[float]) -> OccupancyGrid:
@@ -21,12 +31,13 @@ def shown_cells(cameras: list[Camera], near: float, clear: list[float]) -> Occup
     Cameras and distances are in the field's frame. Lenses count as pinholes, and cells that are seen are
     grown by one; a camera that sees more than half of all directions counts as seeing everything.
     """
-    counts = cell_counts(unbounded.WHOLE, CELLS)
-    grid = OccupancyGrid.full(unbounded.WHOLE, CELLS, unbounded)
+    config = current(VisibilityConfig)
+    counts = cell_counts(unbounded.WHOLE, config.cells)
+    grid = OccupancyGrid.full(unbounded.WHOLE, config.cells, unbounded)
     centres = grid.centres()
     real = (np.abs(centres) < 1).sum(1) >= 2  # beyond the core's edges coordinates stand for no place
     points = unbounded.placed(torch.from_numpy(centres)).numpy()
-    reach = HALF_DIAGONAL * grid.cell.max() / unbounded.rates(torch.from_numpy(centres)).numpy()
+    reach = config.half_diagonal * grid.cell.max() / unbounded.rates(torch.from_numpy(centres)).numpy()
     seen, empty = np.zeros(len(points), bool), np.zeros(len(points), bool)
     for camera, distance in zip(cameras, clear, strict=True):
         rest = np.flatnonzero(real & ~seen)
@@ -58,12 +69,13 @@ def within(camera: Camera, x, y, depth) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen_by(camera: Camera, points: np.ndarray, near: float) -> np.ndarray:
-    """(N,) bool: which points (N, 3) a camera sees beyond `near`, within BEYOND of its picture."""
+    """(N,) bool: which points (N, 3) a camera sees beyond `near`, within `beyond` of its picture."""
+    config = current(VisibilityConfig)
     local = (points - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, :3]
     away = np.linalg.norm(local, axis=1)
     if camera.fisheye:
         return away > near
     depth = np.maximum(-local[:, 2], 1e-9)
     column, row = within(camera, local[:, 0], local[:, 1], depth)
-    inside = (column < 0.5 + BEYOND) & (row < 0.5 + BEYOND)
+    inside = (column < 0.5 + config.beyond) & (row < 0.5 + config.beyond)
     return inside & (local[:, 2] < 0) & (away > near)

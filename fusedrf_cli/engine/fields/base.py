@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid
+from fusedrf_cli.engine.settings import current
 
 
 @runtime_checkable
@@ -75,13 +76,20 @@ def sampling_step(field: RadianceField) -> float:
     return grid.unit or grid.space.picture_step(field.voxel_size)
 
 
-MOST_SAMPLES = 1 << 16
-"""Of a ray in a field over one grid: twice as many as one of 8,192 texels a side needs."""
-MOST_OF_SEVERAL = 1 << 20
-"""The same where several are placed in one field, and most samples of a ray meet none of them."""
+@dataclass(frozen=True)
+class SamplingConfig:
+    """How many samples a ray may take, and how cells are probed."""
+
+    most_samples: int = 1 << 16
+    """Of a ray in a field over one grid: twice as many as one of 8,192 texels a side needs."""
+    most_of_several: int = 1 << 20
+    """The same where several are placed in one field, and most samples of a ray meet none of them."""
+    nothing: float = 1e-4
+    """Optical depth through a whole box under which a field shows nothing."""
+    probed_at_once: int = 1 << 16
 
 
-def check_samples(samples: float, what: str, most: int = MOST_SAMPLES) -> None:
+def check_samples(samples: float, what: str, most: int = SamplingConfig.most_samples) -> None:
     """Raise ValueError where a ray would take more samples than is bearable: of a box that is far thinner, or
     has far finer texels, along one axis than along another."""
     if not samples <= most:
@@ -91,21 +99,18 @@ def check_samples(samples: float, what: str, most: int = MOST_SAMPLES) -> None:
         )
 
 
-NOTHING = 1e-4  # optical depth through a whole box under which a field shows nothing
-PROBED_AT_ONCE = 1 << 16
-
-
 def holds_matter(field: RadianceField) -> bool:
     """Whether a field is dense enough anywhere to be seen, by asking it in the middle and at eight points of
     every occupied cell."""
+    config = current(SamplingConfig)
     grid = field.occupancy
     middles, through = grid.centres(), np.linalg.norm(grid.aabb[3:] - grid.aabb[:3])
     offsets = np.concatenate([np.zeros((1, 3)), PROBES - 0.5]) * grid.cell
-    for start in range(0, len(middles), PROBED_AT_ONCE):
+    for start in range(0, len(middles), config.probed_at_once):
         for offset in offsets:
-            at = torch.from_numpy(middles[start : start + PROBED_AT_ONCE] + offset)
+            at = torch.from_numpy(middles[start : start + config.probed_at_once] + offset)
             points = grid.space.placed(at)
             sigma, _ = field.query(points, torch.eye(3, dtype=torch.float64)[[0] * len(points)], False)
-            if bool((sigma / grid.space.rates(at) * through > NOTHING).any()):
+            if bool((sigma / grid.space.rates(at) * through > config.nothing).any()):
                 return True
     return False

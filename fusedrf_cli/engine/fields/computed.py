@@ -148,7 +148,7 @@ class ComputedField:
         """σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it, by `reference`."""
         at = self.space.contracted(points)
         sigma, rgb = self.reference(params, at, dirs)
-        return sigma * self.space.rates(at).to(sigma.dtype), rgb
+        return sigma * self.space.density_rates(at, dirs.to(at)).to(sigma.dtype), rgb
 
     # -- the same field otherwise ------------------------------------------------------------------------
 

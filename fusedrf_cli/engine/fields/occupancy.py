@@ -11,21 +11,23 @@ import torch
 
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.plain import mark_cells
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-DEFAULT_CELLS = 128
-SCENE_CELLS = 160  # along the longest axis of a scene, and of what it is fused to: both are framed alike
-THINNEST = 12  # texels across a flat box
+
+@dataclass(frozen=True)
+class OccupancyConfig:
+    """How fine grids of cells are."""
+
+    cells: int = 128
+    """Along the longest axis of a field's own grid, at most."""
+    scene_cells: int = 160
+    """Along the longest axis of a scene, and of what it is fused to: both are framed alike."""
+    points_at_once: int = 1 << 18
+    """Of a placed grid: some 20 MB."""
+
+
 MAX_STRIDE = 255
-UNITS = 8  # at least, of the distance of samples where they lie closest: strides are whole numbers of units
-ALIKE = 1 + 1e-3  # times apart: distances of samples so close to each other are one
-ROUNDED = 1e-9  # cells: faces that lie so close are the same
-OWN = 0.4999  # of a cell, from its middle: a corner that is the cell's own
-NEARBY = 5.0  # n in unbounded space, up to which is looked at what lies before cameras that look one way
-POINTS_AT_ONCE = 1 << 18  # of a placed grid: some 20 MB
-ORDINARY = (2.0**-10, 2.0**12)
-"""Longest sides of a box between which densities, per unit of length, fit the floats that they are stored as;
-they are learnt as well at any."""
 # where in a cell its density is probed
 PROBES = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), -1).reshape(-1, 3)
 
@@ -118,19 +120,18 @@ class OccupancyGrid:
     @property
     def subject(self) -> np.ndarray:
         """(6,) box of the field's frame that views of it look at: that around the occupied cells, or, in
-        unbounded space, the middle of the core; of a grid that does not reach there, since all cameras stand
-        in the core and look one way, the middle half of the cells that are no farther than NEARBY."""
+        spaces without end, the middle of the core; of a grid that does not reach there, since all cameras
+        stand in the core and look one way, the middle half of the cells no farther than 5 from it."""
         if self.looked_at is not None:
             return self.looked_at
-        if self.space is not unbounded:
+        if self.space is bounded:
             return self.tight_aabb(0)
-        if (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
-            return unbounded.SUBJECT
-        centres = self.centres()
-        near = np.abs(centres).max(1) < 2 - 1 / NEARBY
-        chosen = centres[near] if near.any() else centres
-        points = unbounded.placed(torch.from_numpy(chosen)).numpy()
-        return np.concatenate(np.quantile(points, [0.25, 0.75], axis=0))
+        if hasattr(self.space, "SUBJECT") and (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
+            return self.space.SUBJECT
+        points = self.space.placed(torch.from_numpy(self.centres())).numpy()
+        near = np.abs(points).max(1) < 5
+        chosen = points[near] if near.any() else points
+        return np.concatenate(np.quantile(chosen, [0.25, 0.75], axis=0))
 
     def within(self, aabb: np.ndarray) -> "OccupancyGrid":
         """The cells of a box (6,) whose faces are, but for rounding, those of cells."""
@@ -141,9 +142,9 @@ class OccupancyGrid:
     def limited(self, limits: "OccupancyGrid") -> "OccupancyGrid":
         """The occupied cells that those of another grid of this space reach into; all where none does."""
         reached, middles = np.zeros_like(self.occupied), limits.centres()
-        # Spots in a cell of the limits, its corners among them, no farther apart than own cells are wide.
+        # Spots in a cell of the limits, its corners about, no farther apart than own cells are wide.
         counts = 1 + np.ceil(limits.cell / self.cell).astype(int)
-        axes = [OWN * np.linspace(-c, c, n) for c, n in zip(limits.cell, counts, strict=True)]
+        axes = [0.4999 * np.linspace(-c, c, n) for c, n in zip(limits.cell, counts, strict=True)]
         for spot in np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3):
             index = np.floor((middles + spot - self.aabb[:3]) / self.cell).astype(int)
             inside = ((index >= 0) & (index < self.occupied.shape)).all(1)
@@ -197,91 +198,6 @@ class OccupancyGrid:
         return self.aabb[:3] + (np.argwhere(self.occupied) + 0.5) * self.cell
 
 
-class Pace:
-    """How far apart samples may lie in each cell of a grid over several placed fields: as the finest of those
-    that reach it needs, and no farther than it is to cells that need finer ones."""
-
-    def __init__(self, grid: OccupancyGrid):
-        """grid: its box, cells and space."""
-        self.whole, self.spacing = grid, np.full(grid.occupied.shape, np.inf, np.float32)
-
-    def kept(
-        self,
-        marks: Iterable[np.ndarray],
-        placed: Iterable[tuple[OccupancyGrid, np.ndarray]],
-        steps: Iterable[float],
-    ) -> Iterator[np.ndarray]:
-        """The marks as they come, noted: the cells (X, Y, Z) bool that each of several placed grids reaches,
-        which is sampled at a step of its own; placed as in `placed_cells`."""
-        for mark, (grid, matrix), step in zip(marks, placed, steps, strict=True):
-            self.spacing[mark] = np.minimum(self.spacing[mark], self.needed(mark, grid, matrix, step))
-            yield mark
-
-    def needed(self, mark: np.ndarray, grid: OccupancyGrid, object_to_field: np.ndarray, step: float):
-        """How far apart in the coordinates of this space samples may lie that a placed grid needs: a number,
-        or one for each of the cells of `mark`.
-
-        What is d long in the frame is, with n as in unbounded.py, d / n long across and d / n² along the way
-        out, in each of the two spaces by its own n.
-        """
-        finest = step * squeezed(object_to_field)
-        space, same = self.whole.space, np.array_equal(object_to_field, np.eye(4))
-        alike = space is grid.space and (space is bounded or same)
-        if grid.stride is None and alike:
-            return finest
-        back = np.linalg.inv(object_to_field)
-        here = torch.from_numpy(self.whole.marked(mark).centres())
-        frame = space.placed(here).numpy()
-        there = grid.space.contracted(torch.from_numpy(frame @ back[:3, :3].T + back[:3, 3]))
-        if alike:
-            return finest * grid.strides_at(there.numpy())
-        ratio = (space.rates(here) / grid.space.rates(there)).sqrt().numpy()
-        if space is not bounded:  # to the far side of a cell
-            ratio *= np.maximum(1 - self.whole.cell[0] / 2 / space.rates(here).sqrt().numpy(), 0.1)
-        return finest * np.minimum(ratio, ratio**2) * grid.strides_at(there.numpy())
-
-    def stepping_over_nothing(self) -> np.ndarray:
-        """The spacing (X, Y, Z) with which no sample stands for what lies in cells that need finer ones: that
-        of a cell k cells away, or the k cells up to the matter in it, whichever is more. Cells are reached up
-        to one around matter, so matter k cells away is k whole cells away. In other spaces than bounded ones
-        lengths change from cell to cell: there it is a cell at most."""
-        from scipy.ndimage import minimum_filter
-
-        spacing, near, cell = self.spacing, self.spacing, self.whole.cell.min()
-        if self.whole.space is not bounded:
-            return np.minimum(spacing, cell)
-        known = np.isfinite(spacing)
-        most, least = spacing[known].max(), spacing[known].min()
-        if most <= max(cell, least):
-            return spacing
-        for away in range(1, int(np.ceil(most / cell))):
-            near = minimum_filter(near, 3)
-            spacing = np.minimum(spacing, np.maximum(near, away * cell))
-        return spacing
-
-    def grid(self, occupied: np.ndarray) -> OccupancyGrid:
-        """The grid with those cells (X, Y, Z) bool."""
-        grid = self.whole.marked(occupied)
-        known = np.isfinite(self.spacing)
-        if not known.any():
-            return grid
-        spacing = self.stepping_over_nothing()
-        most, least = float(spacing[known].max()), float(spacing[known].min())
-        unit = self.unit(most, least)
-        strides = np.where(known, spacing, unit) / unit + 1e-4  # up to a rounding
-        stride = np.clip(strides, 1, MAX_STRIDE).astype(np.uint16)
-        return replace(grid, stride=None if stride.max() == 1 else stride, unit=unit)
-
-    def unit(self, most: float, least: float) -> float:
-        """That of strides where samples lie from `least` to `most` apart. In a place it is a part of `most`,
-        by which all that lies behind what stands in it is sampled: so its samples come where they come
-        without that, and do not move with what else is there. In a box it is `least`, by which all of a scene
-        is sampled before it is fused."""
-        if self.whole.space is bounded or most <= ALIKE * least:
-            return max(least, most / MAX_STRIDE)
-        return most / min(np.ceil(UNITS * most / least), MAX_STRIDE)
-
-
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:
     """The largest optical depth, at most `most`, up to which cells may be left out of a grid of optical
     depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin fog is no
@@ -300,10 +216,10 @@ def cell_counts(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
     return tuple(int(n) for n in np.maximum(np.ceil(extent / extent.max() * longest - 1e-9), 1))
 
 
-def texels(aabb: np.ndarray, longest: int) -> tuple[int, int, int]:
-    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets THINNEST
+def texels(aabb: np.ndarray, longest: int, thinnest: int = 12) -> tuple[int, int, int]:
+    """Texels per axis of near-cubic voxels, `longest` on the longest axis; a flat box still gets `thinnest`
     across."""
-    return tuple(max(min(THINNEST, longest), n) for n in cell_counts(aabb, longest))
+    return tuple(max(min(thinnest, longest), n) for n in cell_counts(aabb, longest))
 
 
 def placed_cells(
@@ -331,24 +247,26 @@ def reached_cells(
     grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, longest: int, space: ModuleType
 ) -> np.ndarray:
     """(X, Y, Z) bool: cells of a field's box, in the coordinates of its space, that a placed grid of either
-    space may reach; where that fills all of space, the field's does."""
-    if grid.space is unbounded:
+    space may reach; where that has no end, the field's has none."""
+    if grid.space is not bounded:
         return shared_cells(grid, object_to_field, longest)
     return marked_cells(grid, object_to_field, aabb, longest, space)
 
 
 def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int) -> np.ndarray:
-    """(X, Y, Z) bool: cells of a grid over unbounded space that occupied cells of another such grid, placed
-    by a (4, 4), reach: those that share a volume with one where it lies as it is, else those whose middle
-    lies in or beside one."""
-    if np.array_equal(object_to_field, np.eye(4)):
+    """(X, Y, Z) bool: cells of a grid over unbounded space that occupied cells of a grid in a space without
+    end, placed by a (4, 4), reach: those that share a volume with one where it lies as it is, else those
+    whose middle lies in or beside one."""
+    if grid.space is unbounded and np.array_equal(object_to_field, np.eye(4)):
         return overlapped(grid, longest)
     own, back = grid.dilated(), np.linalg.inv(object_to_field)
     wanted = OccupancyGrid.full(unbounded.WHOLE, longest, unbounded)
     found = []
-    for part in np.array_split(wanted.centres(), -(-wanted.occupied.size // POINTS_AT_ONCE)):
+    for part in np.array_split(
+        wanted.centres(), -(-wanted.occupied.size // current(OccupancyConfig).points_at_once)
+    ):
         at = unbounded.placed(torch.from_numpy(part)).numpy() @ back[:3, :3].T + back[:3, 3]
-        found.append(own.contains(mapped(at, unbounded)))
+        found.append(own.contains(mapped(at, grid.space)))
     return np.concatenate(found).reshape(wanted.occupied.shape)
 
 
@@ -361,7 +279,7 @@ def overlapped(grid: OccupancyGrid, longest: int, aabb: np.ndarray = unbounded.W
         low, side = grid.aabb[axis], grid.aabb[axis + 3] - grid.aabb[axis]
         edges = aabb[axis] + sides[axis] / wanted[axis] * np.arange(wanted[axis] + 1)
         at = (edges - low) / side * count
-        at = np.where(abs(at - np.rint(at)) < ROUNDED, np.rint(at), at)
+        at = np.where(abs(at - np.rint(at)) < 1e-9, np.rint(at), at)  # faces but for rounding
         first, last = np.floor(at[:-1]).astype(int), np.ceil(at[1:]).astype(int)
         runs = zip(np.clip(first, 0, count), np.clip(last, 0, count), strict=True)
         found = np.stack([found.take(range(a, b), axis).any(axis) for a, b in runs], axis)
@@ -400,7 +318,9 @@ def marked_cells(
         return OccupancyGrid(aabb, found).dilated().occupied
     # Many cells and few steps, or, in a coarse grid, the other way round: loop over the fewer.
     fewer, more = sorted((corners, steps * grid.cell), key=len)
-    for part in np.array_split(more, -(-len(more) // POINTS_AT_ONCE)) if len(more) else ():
+    for part in (
+        np.array_split(more, -(-len(more) // current(OccupancyConfig).points_at_once)) if len(more) else ()
+    ):
         for offset in fewer:
             at = mapped((part + offset) @ object_to_field[:3, :3].T + object_to_field[:3, 3], space)
             index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
@@ -433,7 +353,8 @@ def frame_around(box: np.ndarray) -> np.ndarray:
     where the box is of no ordinary size, a placement (4, 4). Its unit is then a power of two, by which
     scaling is exact."""
     middle, side = (box[:3] + box[3:]) / 2, float((box[3:] - box[:3]).max())
-    if side == 0 or ORDINARY[0] <= side <= ORDINARY[1]:
+    # Longest sides between which densities, per unit of length, fit the floats that they are stored as.
+    if side == 0 or 2.0**-10 <= side <= 2.0**12:
         return middle
     frame = placement(middle)
     frame[:3, :3] *= 2.0 ** np.floor(np.log2(side))
@@ -443,6 +364,8 @@ def frame_around(box: np.ndarray) -> np.ndarray:
 def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(4, 4) of an object seen from a frame that lies at `origin`: a position (3,), or a placement (4, 4)."""
     frame, matrix = placement(origin), object_to_world.copy()
+    if np.array_equal(frame, matrix):
+        return np.eye(4)
     matrix[:3, 3] -= frame[:3, 3]  # first, so that it is exact however far away both are
     if origin.shape == (4, 4):
         matrix[:3] = np.linalg.inv(frame[:3, :3]) @ matrix[:3]

@@ -2,20 +2,21 @@
 their samples stay there; which instance each ray meets comes back, since work is sorted by fields here.
 """
 
-from functools import lru_cache
-from types import SimpleNamespace
+from functools import cache
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 from numba import cuda
 
 from fusedrf_cli.engine.kernels import segments, specialise
-from fusedrf_cli.engine.kernels.cuda import as_device_functions, kernel_of, launch
+from fusedrf_cli.engine.kernels.cuda import as_device_functions, device, kernel_of, launch
 from fusedrf_cli.engine.kernels.segments import (
     Groups,
     RayBatch,
     Segments,
     goes_on,
     merge_task,
+    next_in_any,
     segment_task,
 )
 from fusedrf_cli.engine.spaces import bounded, unbounded
@@ -23,25 +24,21 @@ from fusedrf_cli.engine.spaces import bounded, unbounded
 NEAR_AT_ONCE = 1 << 24  # numbers of instances that rays may meet: room for 128 MB of them
 
 
-@lru_cache(maxsize=1)
-def ray_kernels() -> SimpleNamespace:
-    """Kernels over the functions of segments.py, in which those of a space mean the GPU's."""
-    in_box, in_space = (
-        as_device_functions(specialise.specialised(None, {}, s)[1]) for s in (bounded, unbounded)
-    )
-    spaces = {
-        "next_in_box": in_box["next_change"],
-        "next_in_space": in_space["next_change"],
-        "ray_in_instance": in_box["ray_in_instance"],
+@cache
+def ray_kernels(spaces: tuple[ModuleType, ...] = ()) -> SimpleNamespace:
+    """Kernels over the functions of segments.py, in which those of the spaces mean the GPU's."""
+    own = {
+        s: as_device_functions(specialise.specialised(None, {}, s)[1]) for s in (bounded, unbounded, *spaces)
     }
-    plain = {name: value for name, value in vars(segments).items() if name not in spaces}
+    tag = "segments_" + "_".join(space.__name__ for space in spaces)
+    in_space = next_in_any([own[s]["next_change"] for s in spaces or (unbounded,)], tag, device)
+    found = {"next_in_box": own[bounded]["next_change"], "next_in_space": in_space}
+    found["ray_in_instance"] = own[bounded]["ray_in_instance"]
+    plain = {name: value for name, value in vars(segments).items() if name not in found}
     names = as_device_functions(plain)
-    names |= spaces | {"cuda": cuda}
-    made = {
-        t.__name__: kernel_of(t, names, "segments")
-        for t in (near_thread, merge_thread, add_thread, left_thread)
-    }
-    return SimpleNamespace(**made)
+    names |= found | {"cuda": cuda}
+    templates = near_thread, merge_thread, add_thread, left_thread
+    return SimpleNamespace(**{t.__name__: kernel_of(t, names, tag) for t in templates})
 
 
 def near_thread(rays, instances, chosen, near, begins, segments):
@@ -79,12 +76,14 @@ def left_thread(chosen, rays, segments, rendered, early_stop, left):
 # -- as segments.py has them ---------------------------------------------------------------------------------
 
 
-def next_segments(rays: RayBatch, instances, chosen: np.ndarray, found: Segments) -> None:
+def next_segments(
+    rays: RayBatch, instances, spaces: tuple[ModuleType, ...], chosen: np.ndarray, found: Segments
+) -> None:
     """See segments.py."""
     count = len(instances.step)
     threads = max(1, min(len(chosen), NEAR_AT_ONCE // count))
     near, begins = (cuda.device_array((threads, count), kind) for kind in (np.int64, np.float64))
-    launch(ray_kernels().near_thread, threads, (rays, instances, chosen, near, begins), (found,))
+    launch(ray_kernels(spaces).near_thread, threads, (rays, instances, chosen, near, begins), (found,))
 
 
 def merge_samples(

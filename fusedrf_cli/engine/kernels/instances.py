@@ -39,6 +39,7 @@ class Instances(NamedTuple):
     skip: object  # flat uint8, see GridArrays
     step: object  # (B,) at which it is sampled, in its own coordinates
     spheres: object  # (B, 4) centre and radius around its occupied cells, in the scene's frame; or infinite
+    space: object  # (B,) int64 of an instance without end its number among the spaces of these; else 0
     shown: object  # (B, 4) what its density is multiplied by, and its colours: red, green and blue
 
 
@@ -172,11 +173,11 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
         index, many = next_sample(grid, origin, way, u0, u1, step, index)
         while index >= 0 and trans > slots.early_stop:
             u = u0 + 0.5 * between(index, many) * step
-            p = along(origin, way, u)
+            p = position_at(origin, way, u)
             standing(field, many, scratch)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0:
-                tau = thick * sigma * optical_length(warp, p, u, many, steps, step)
+                tau = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
                 weight = trans * (1.0 - math.exp(-tau))
                 if slots.early_stop > 0.0 and trans - weight <= REST_FROM:
                     weight = trans
@@ -219,11 +220,11 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
         index, many = next_sample(grid, origin, way, u0, u1, step, index)
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
             u = u0 + 0.5 * between(index, many) * step
-            p = along(origin, way, u)
+            p = position_at(origin, way, u)
             standing(field, many, scratch)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0 and sigma > 0.0:
-                depth = thick * sigma * optical_length(warp, p, u, many, steps, step)
+                depth = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
                 low, high = interval(warp, u + 0.5 * (steps - 1) * many * step, steps * many * step)
                 out.low[s, count], out.high[s, count] = low / length, high / length
                 out.middle[s, count] = distance(warp, u) / length
@@ -279,8 +280,8 @@ def point_in_instance(field, grid, query, i):
             if query.with_colour:
                 ahead_colour(field, field.params, 0, p)
     o, d, length = ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[i])
-    p = point(o)
-    return p, (d[0] / length, d[1] / length, d[2] / length), rate(p) * length * query.shown[b, 0]
+    p, d = point(o), (d[0] / length, d[1] / length, d[2] / length)
+    return p, d, rate(p, d) * length * query.shown[b, 0]
 
 
 def densest_at(field, grid, query, i, scratch, memory, out):

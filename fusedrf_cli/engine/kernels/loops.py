@@ -10,7 +10,7 @@ gradients are gathered:
     sizes(field)                       for Python: constants of the namespace by name; SCRATCH and KEPT, the
                                        numbers kept per shaded sample for the way back, are among them
     density(field, grid, k, p, d, scratch)
-                                       (σ, pre, steps, place): σ per length of the space's coordinates; `pre`
+                                       (σ, pre, steps, place): σ in the unit of the space (`rate`); `pre`
                                        what `backward` needs of it; for how many steps of the ray the sample k
                                        stands, 0 where there is nothing to sample; `place`, an int or a
                                        tuple, what the other functions need to know of where p lies
@@ -36,7 +36,6 @@ from numba import prange
 
 from fusedrf_cli.engine.kernels.parts import (  # noqa: F401
     accumulate,
-    along,
     cell_of,
     compared,
     next_sample,
@@ -218,22 +217,22 @@ def between(k, many):
     return 2 * k + many - 1
 
 
-def optical_length(course, p, u, many, steps, step):
-    """How much of a ray, by the unit that σ at p is of, a sample at u stands for: `many` steps around it, and
-    as many again behind it for each of `steps` beyond the first."""
-    return rate(p) * span(course, u + 0.5 * (steps - 1) * many * step, steps * many * step)
+def optical_length(course, p, d, u, many, steps, step):
+    """How much of a ray along d, by the unit that σ at p is of, a sample at u stands for: `many` steps around
+    it, and as many again behind it for each of `steps` beyond the first."""
+    return rate(p, d) * span(course, u + 0.5 * (steps - 1) * many * step, steps * many * step)
 
 
 def met(field, grid, line, k, many, u, step, d, scratch):
     """What a ray meets at u of a piece, line (origin, direction, course), in `many` steps from step k on: the
     point; the share of the light that is lost there; and what `density` says besides σ."""
     origin, way, course = line
-    p = along(origin, way, u)
+    p = position_at(origin, way, u)
     standing(field, many, scratch)
     sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
     opacity = 0.0
     if steps > 0:
-        opacity = 1.0 - math.exp(-sigma * optical_length(course, p, u, many, steps, step))
+        opacity = 1.0 - math.exp(-sigma * optical_length(course, p, d, u, many, steps, step))
     return p, opacity, pre, steps, place
 
 
@@ -251,7 +250,7 @@ def query_point(field, grid, asked, i, scratch, memory, out):
     if known(field, grid, p):
         sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
         if steps > 0:
-            out.sigma[i] = rate(p) * sigma
+            out.sigma[i] = rate(p, d) * sigma
             if asked.with_colour and sigma > 0:
                 begin(field, frame_of(place), d, scratch)
                 rgb = colour(field, place, p, d, scratch, memory, 0)
@@ -278,7 +277,7 @@ def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
             if shaded:
                 begin(field, frame, d, scratch)
                 rgb = colour(field, place, p, d, scratch, kept.memory, 0)
-            d_sigma = rate(p) * float(sent.d_sigma[i])
+            d_sigma = rate(p, d) * float(sent.d_sigma[i])
             backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, kept.memory, 0, grad)
             if shaded:
                 end(field, frame, d, scratch, grad)
@@ -312,7 +311,7 @@ def ask_for(field, held, origin, way, u0, step, k, many):
     is of the one before it. Planes and rows lie all over memory: asked for one sample early, their misses
     overlap with the work on the one before."""
     if k >= 0:
-        p = along(origin, way, u0 + 0.5 * between(k, many) * step)
+        p = position_at(origin, way, u0 + 0.5 * between(k, many) * step)
         ahead_density(field, field.params, held, p)
         ahead_colour(field, field.params, held, p)
 
@@ -409,7 +408,7 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
             number = kept.piece[q]
             origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
         u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
-        p = along(origin, way, u)
+        p = position_at(origin, way, u)
         place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
         rgb, d_rgb = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         if at >= 0:
@@ -423,13 +422,13 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
                 colour(field, place, p, d, scratch, kept.memory, last)
             carried = kept.carried[q]
             d_rgb = d_colour[0] * carried, d_colour[1] * carried, d_colour[2] * carried
-        length = optical_length(course, p, u, kept.many[q], kept.steps[q], step)
+        length = optical_length(course, p, d, u, kept.many[q], kept.steps[q], step)
         spread = far * astray(kept.along[q], depth) if far > 0.0 else 0.0
         if batch.distortion > 0.0:
             here = kept.along[q]
             before = before[0] - weight, before[1] - weight * here
             apart = here * (before[0] - beyond[0]) - (before[1] - beyond[1])
-            apart += weight * length / rate(p) * (1.0 - here) * (1.0 - here) / 3.0
+            apart += weight * length / rate(p, d) * (1.0 - here) * (1.0 - here) / 3.0
             spread += 2.0 * batch.distortion / batch.target.shape[0] * apart
             beyond = beyond[0] + weight, beyond[1] + weight * here
         d_sigma = length * (after * (own + spread) - behind)
@@ -500,13 +499,14 @@ def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
 
 
 def peak_of_cell(field, grid, cells, i, scratch, memory, out):
-    """Largest σ of a frame, in its units, over `offsets` in cell i."""
+    """Largest σ of a frame, in its units, per length of the coordinates, over `offsets` in cell i."""
     best = 0.0
     for q in range(cells.offsets.shape[0]):
         x = cells.lo[0] + (cells.cells[i, 0] + cells.offsets[q, 0]) * cells.cell[0]
         y = cells.lo[1] + (cells.cells[i, 1] + cells.offsets[q, 1]) * cells.cell[1]
         z = cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2]
-        best = max(best, unstretched(field, grid, cells.frame, (x, y, z), scratch))
+        sigma = unstretched(field, grid, cells.frame, (x, y, z), scratch)
+        best = max(best, depth_per_coordinate((x, y, z)) * sigma)
     out[i] = best
 
 

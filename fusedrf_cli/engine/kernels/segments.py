@@ -3,6 +3,8 @@ there, and how the samples of several are merged. Loops for the CPU.
 """
 
 import math
+from functools import cache
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +13,8 @@ from numba import get_num_threads, prange
 from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER, FARTHEST
 from fusedrf_cli.engine.kernels.parts import along, body
 from fusedrf_cli.engine.kernels.plain import loop, task
-from fusedrf_cli.engine.kernels.specialise import loops_for
+from fusedrf_cli.engine.kernels.specialise import body as inlined
+from fusedrf_cli.engine.kernels.specialise import loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 TILE = 256  # rays, which lie close together in pictures
@@ -231,9 +234,10 @@ def segment_task(rays, instances, chosen, low, high, near, begins, segments):
                 note_meeting(rays, instances, r, near, begins, count, begin, segments.end[r], segments)
 
 
-def next_segments(rays, instances, chosen, segments):
-    """The next segments of rays chosen (M,), from where their last ended."""
-    segments_loop(rays, instances, chosen, get_num_threads(), segments)
+def next_segments(rays, instances, spaces, chosen, segments):
+    """The next segments of rays chosen (M,), from where their last ended. spaces are those that instances
+    without end lie in, as Instances.space counts them."""
+    segments_loop_in(spaces)(rays, instances, chosen, get_num_threads(), segments)
 
 
 @loop
@@ -248,6 +252,43 @@ def segments_loop(rays, instances, chosen, threads, segments):
         if low < high:
             near, begins = np.empty(instances.step.shape[0], np.int64), np.empty(instances.step.shape[0])
             segment_task(rays, instances, chosen, low, high, near, begins, segments)
+
+
+# -- other spaces than bounded and unbounded ones ------------------------------------------------------------
+
+
+def next_in_either(instances, b, o, d, t, end, gap):
+    """`next_change` of an instance in one space, or in one of others."""
+    if instances.space[b] == NUMBER:
+        return next_in_this(instances, b, o, d, t, end, gap)
+    return next_in_others(instances, b, o, d, t, end, gap)
+
+
+def next_in_any(changes, tag, compiled):
+    """`next_change` of instances in several spaces, by that of each, as `compiled` makes functions."""
+    found = changes[-1]
+    for number in range(len(changes) - 2, -1, -1):
+        names = {"next_in_this": changes[number], "next_in_others": found, "NUMBER": number}
+        found = compiled(rebound(next_in_either, names, f"{tag}_{number}"))
+    return found
+
+
+@cache
+def segments_loop_in(spaces: tuple[ModuleType, ...]):
+    """`segments_loop` for instances in some spaces. What most scenes have is compiled without the others."""
+    if spaces in ((), (unbounded,)):
+        return segments_loop
+    loops = [loops_for(None, (), space) for space in spaces]
+    tag = "_".join(each.tag for each in loops)
+    names = globals() | {"next_in_space": next_in_any([one.names["next_change"] for one in loops], tag, task)}
+    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting):
+        name = function.py_func.__name__
+        names[name] = inlined(rebound(function.py_func, names, tag))
+    names["segment_task"] = task(rebound(segment_task.py_func, names, tag))
+    return loop(rebound(segments_loop.py_func, names, tag))
+
+
+# -- slots and rays ------------------------------------------------------------------------------------------
 
 
 @task

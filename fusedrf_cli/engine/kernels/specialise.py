@@ -70,11 +70,17 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
 
 def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, space, *(family(bodies) if bodies else ())]
+    modules = [loops, instances, *bases_of(space), space, *(family(bodies) if bodies else ())]
     names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
     own = {module.__name__ for module in modules}
     found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}
     return names, found | getattr(bodies, "functions", {})
+
+
+def bases_of(space: ModuleType) -> list[ModuleType]:
+    """The modules of other spaces that a space takes functions from."""
+    taken = {f.__module__ for f in vars(space).values() if isinstance(f, FunctionType)}
+    return [sys.modules[name] for name in sorted(taken - {space.__name__})]
 
 
 def family(bodies: ModuleType) -> list[ModuleType]:

@@ -139,12 +139,13 @@ class Kind:
 
     def cut_out(self, field: StoredField, selection: Selection) -> StoredField | None:
         """A selected object as a field in the frame of the field, with the numbers that it has there; None
-        where there is nothing of it. Raises ValueError where the kind cannot be taken apart."""
+        where there is nothing of it. The selection may be one in a scene that places the field
+        (`Selection.seen_from`). Raises ValueError where the kind cannot be taken apart."""
         return splitting.cut_out(self.on_one_grid(field), field.box, selection)
 
     def cut_away(self, field: StoredField, selection: Selection) -> StoredField | None:
-        """A field without a selected object, with its numbers; None where nothing is left. Raises ValueError
-        as `cut_out`."""
+        """A field without a selected object, with its numbers: itself where it has nothing of it, None where
+        nothing is left. Raises ValueError as `cut_out`."""
         return splitting.cut_away(self.on_one_grid(field), selection)
 
     def cropped(self, field: StoredField, holds: Holds) -> StoredField | None:

@@ -8,8 +8,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import POINTS_AT_ONCE, PROBES, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid, cell_counts
 from fusedrf_cli.engine.selection.cells import Selection
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 FINEST = 320
@@ -25,13 +26,6 @@ Holds = Callable[[np.ndarray], np.ndarray]
 """Which points (N, 3) of a frame are kept, (N,) bool."""
 KeepsCells = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Which cells, by their middles (N, 3) and their size (3,), are kept, (N,) bool."""
-ToField = Callable[[np.ndarray], np.ndarray]
-"""Points (N, 3) of the coordinates of a grid to those of the field that was selected in."""
-
-
-def as_it_is(points: np.ndarray) -> np.ndarray:
-    """The map of a grid that lies in the field's own coordinates."""
-    return points
 
 
 def refined(grid: OccupancyGrid, voxel: float) -> OccupancyGrid:
@@ -42,24 +36,22 @@ def refined(grid: OccupancyGrid, voxel: float) -> OccupancyGrid:
     return grid.marked(finer)
 
 
-def without_object(
-    grid: OccupancyGrid, voxel: float, selection: Selection, to_field: ToField = as_it_is
-) -> OccupancyGrid:
+def without_object(grid: OccupancyGrid, voxel: float, selection: Selection) -> OccupancyGrid:
     """A grid of a field with such voxels without the cells that hold cells of the object and no other matter,
     so that nothing of that is lost; the grid itself where there are none."""
     finer = refined(grid, voxel)
     index = np.argwhere(finer.occupied)
     kept, matter = finer.occupied.copy(), Matter(selection)
-    for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
-        kept[tuple(part[emptied(finer, part, matter, to_field)].T)] = False
+    for part in np.array_split(index, -(-len(index) // current(OccupancyConfig).points_at_once) or 1):
+        kept[tuple(part[emptied(finer, part, matter)].T)] = False
     return grid if (kept == finer.occupied).all() else grid.marked(kept)
 
 
 class Matter:
-    """What the cells of a selection hold, by points."""
+    """What the cells of a selection hold, by points of the coordinates of the lattice."""
 
     def __init__(self, selection: Selection):
-        grid = selection.lattice.grid
+        grid, self.selection = selection.lattice.grid, selection
         self.low, self.cell, self.box = grid.aabb[:3], grid.cell, selection.object.tight_aabb(1)
         # a cell more on each side, where there is nothing
         held = np.where(selection.object.occupied, OWN, selection.other.occupied * OTHER)
@@ -73,15 +65,24 @@ class Matter:
         return self.flat[(index[:, 0] * rows + index[:, 1]) * columns + index[:, 2]]
 
 
-def emptied(grid: OccupancyGrid, index: np.ndarray, matter: Matter, to_field: ToField) -> np.ndarray:
+def emptied(grid: OccupancyGrid, index: np.ndarray, matter: Matter) -> np.ndarray:
     """(N,) bool: which cells (N, 3) of a grid hold cells of the object and no other matter."""
+
+    def to_lattice(points: np.ndarray) -> np.ndarray:
+        return matter.selection.lattice_points(points, grid.space)
+
     middles = grid.aabb[:3] + (index + 0.5) * grid.cell
-    at, corners = to_field(middles), to_field(middles + grid.cell / 2)
-    reach = 2 * np.abs(corners - at).max(initial=0)  # cells of the selection may be narrower, or wider
+    at, diagonals = (
+        to_lattice(middles),
+        CORNERS[:1] if matter.selection.is_aligned(grid.space) else CORNERS[:4],
+    )
+    corners = (to_lattice(middles + corner * grid.cell) for corner in diagonals)
+    # Cells of the selection may be narrower, or wider.
+    reach = 2 * max(np.abs(corner - at).max(initial=0) for corner in corners)
     left = np.flatnonzero(((at > matter.box[:3] - reach) & (at < matter.box[3:] + reach)).all(1))
     held = matter.at(at[left]) & OWN
     for probe in PROBES:
-        held |= matter.at(to_field(middles[left] + (probe - 0.5) * grid.cell))
+        held |= matter.at(to_lattice(middles[left] + (probe - 0.5) * grid.cell))
         alone = held & OTHER == 0
         left, held = left[alone], held[alone]
     found = np.zeros(len(index), bool)
@@ -102,19 +103,17 @@ def with_object(
     return cells.marked(own.reshape(cell_counts(box, longest))) if own.any() else None
 
 
-def cut_out(field, box: np.ndarray, selection: Selection, to_field: ToField = as_it_is):
+def cut_out(field, box: np.ndarray, selection: Selection):
     """The object as a field over the texels around it of a field that has `resampled` over a box (6,); None
     where there is nothing of it."""
-    narrowest = float(selection.lattice.grid.cell.min())
-    looked_in = field.occupancy.aabb
-    if to_field is as_it_is:
-        looked_in = common_box(looked_in, selection.object.tight_aabb(1))
-    return within(field, box, narrowest, lambda at, size: selection.object.contains(to_field(at)), looked_in)
+    looked_in = selection.box_in(field.occupancy)
+    if (looked_in[3:] <= looked_in[:3]).any():
+        return None
 
+    def inside(points: np.ndarray, size: np.ndarray) -> np.ndarray:
+        return selection.object.contains(selection.lattice_points(points, field.space))
 
-def common_box(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(6,) what two boxes (6,) have in common."""
-    return np.concatenate([np.maximum(one[:3], other[:3]), np.minimum(one[3:], other[3:])])
+    return within(field, box, selection.cell_in(), inside, looked_in)
 
 
 def cropped(field, box: np.ndarray, holds: Holds):
@@ -129,7 +128,7 @@ def restricted(field, holds: Holds):
     parts of its own cells, so that nothing shows that was empty before. None where nothing is left."""
     grid = refined(field.occupancy, field.voxel_size)
     index, kept = np.argwhere(grid.occupied), grid.occupied.copy()
-    for part in np.array_split(index, -(-len(index) // POINTS_AT_ONCE) or 1):
+    for part in np.array_split(index, -(-len(index) // current(OccupancyConfig).points_at_once) or 1):
         kept[tuple(part.T)] = wholly(field, holds, grid.aabb[:3] + (part + 0.5) * grid.cell, grid.cell)
     return field.with_occupancy(grid.marked(kept)) if kept.any() else None
 
@@ -178,20 +177,13 @@ def on_texels(
     return faces, tuple(int(n) for n in last - first + 1)
 
 
-def cut_away(field, selection: Selection, to_field: ToField = as_it_is):
-    """A field on one grid without an object; None where nothing is left."""
-    left = without_object(field.occupancy, field.voxel_size, selection, to_field)
-    return field.with_occupancy(left) if left.occupied.any() else None
-
-
-def placed_in(field, object_to_field: np.ndarray, space) -> ToField:
-    """The map from the coordinates of a grid in `space`, of an object placed in a field by a (4, 4), to those
-    of the field."""
-    if space is field.space and np.array_equal(object_to_field, np.eye(4)):
-        return as_it_is
-
-    def to_field(points: np.ndarray) -> np.ndarray:
-        at = placed(points, space) @ object_to_field[:3, :3].T
-        return field.space.contracted(torch.from_numpy(at + object_to_field[:3, 3])).numpy()
-
-    return to_field
+def cut_away(field, selection: Selection):
+    """A field without an object: itself where it has nothing of it; None where nothing is left."""
+    around = selection.box_in(field.occupancy)
+    if (around[3:] <= around[:3]).any():
+        return field
+    left = without_object(field.occupancy, field.voxel_size, selection)
+    if left is field.occupancy:
+        return field
+    part = field.with_occupancy(left) if left.occupied.any() else field
+    return None if part is field else part

@@ -12,6 +12,7 @@ import numpy as np
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.kernels.parts import NEWTON_NEAR, NEWTON_STEPS
 from fusedrf_cli.engine.kernels.parts import bend as bend_numbers
+from fusedrf_cli.engine.settings import current
 
 TILE = 16  # pixels along the side of a tile
 bend = bend_numbers.py_func  # of arrays
@@ -223,18 +224,29 @@ def azimuth_of(away: np.ndarray, up: np.ndarray) -> float:
     return float(np.arctan2(away @ north, away @ east))
 
 
-FRAMING_FOV = 0.6911112  # radians, horizontal: the field of view of NeRF-Synthetic's cameras
-AZIMUTH, ELEVATION = 0.9, 0.45  # radians, from which a box is framed
+@dataclass(frozen=True)
+class FramingConfig:
+    """From where a box is framed."""
+
+    fov: float = 0.6911112
+    """Radians, horizontal: the field of view of NeRF-Synthetic's cameras."""
+    azimuth: float = 0.9
+    """Radians about +z from +x, from which a box is framed."""
+    elevation: float = 0.45
+    """Radians above the horizon."""
 
 
 def framing_lens(width: int, height: int) -> Camera:
     """The camera, at the origin, that boxes are framed with."""
-    focal = 0.5 * width / np.tan(FRAMING_FOV / 2)
+    focal = 0.5 * width / np.tan(current(FramingConfig).fov / 2)
     return Camera(np.eye(4), focal, focal, width / 2, height / 2, width, height, name="view")
 
 
 def framing(
-    aabb: np.ndarray, lens: Camera, azimuth: float = AZIMUTH, elevation: float = ELEVATION
+    aabb: np.ndarray,
+    lens: Camera,
+    azimuth: float = FramingConfig.azimuth,
+    elevation: float = FramingConfig.elevation,
 ) -> Outlook:
     """The outlook from which a camera that stands outside a box (6,) frames its bounding ball."""
     centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
@@ -252,7 +264,7 @@ def framing_camera(
 
 
 def orbit(
-    aabb: np.ndarray, count: int, width: int, height: int, elevation: float = ELEVATION
+    aabb: np.ndarray, count: int, width: int, height: int, elevation: float = FramingConfig.elevation
 ) -> list[Camera]:
     """`count` cameras evenly around a box, all at one elevation."""
     lens = framing_lens(width, height)

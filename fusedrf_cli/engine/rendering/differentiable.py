@@ -26,7 +26,8 @@ from fusedrf_cli.engine.fields.differentiable import settle
 from fusedrf_cli.engine.kernels.reference import exact, interval
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.rendering.volume import EARLY_STOP, reach_of, waves, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import RenderConfig, reach_of, waves, weights_from_depths
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 
 
@@ -54,7 +55,7 @@ def render_rays(
     origin: np.ndarray | None = None,
     near: float = 0.0,
     step: float | None = None,
-    early_stop: float = EARLY_STOP,
+    early_stop: float | None = None,
 ) -> torch.Tensor:
     """Render rays (N, 3), directions of unit length, of the frame of a field, placed or composed or neither:
     (N, 5) premultiplied rgb, opacity and Σ w t, on the field's device. With `origin`, where that frame lies
@@ -135,10 +136,11 @@ def visible_samples(
     rays_d: np.ndarray,
     near: float,
     step: float,
-    early_stop: float,
+    early_stop: float | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rays (S,) int64, ascending, distances (S,) and the lengths (S,) that they stand for of the samples up
     to where a ray is opaque, in order."""
+    early_stop = current(RenderConfig).early_stop if early_stop is None else early_stop
     trans = np.ones(len(rays_o))
     rays, distances, lengths = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
     middle = np.full(len(rays_o), 0.5)
@@ -194,7 +196,7 @@ def render_image(
     origin: np.ndarray | None = None,
     near: float = 0.0,
     step: float | None = None,
-    early_stop: float = EARLY_STOP,
+    early_stop: float | None = None,
 ) -> Picture:
     """Render one view from `pose` (4, 4), camera to world, in place of the camera's own; see `render_rays`
     for origin. Differentiable as that is, and in `pose`."""

@@ -10,17 +10,29 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.rendering.cameras import TILE, Camera, tile_order
+from fusedrf_cli.engine.settings import current
 
-EARLY_STOP = 1e-3  # remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level
-SEEN_WEIGHT = 1e-6  # samples lighter than this stay black
-RAYS_AT_ONCE = 1 << 14  # of any field: waves through many fields would take more memory than these do
-WORK_AT_ONCE = {"cpu": 1 << 24, "cuda": 1 << 28}
-"""Samples that compiled loops take, at most, before an interrupt is heard: seconds on one core."""
-COLOURS = 500  # of a ray, at most: each stands for a share of the light (LENT_FROM of loops.py)
-CUDA_ERRORS = ("CudaAPIError", "CudaDriverError", "CudaRuntimeError")  # of numba-cuda, which may not be there
-HALVINGS = 6  # of the rays done at once, where memory is short
-SAMPLES_PER_WAVE = 32
-ROWS_AT_ONCE_PIXELS = 1 << 18
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """How rays are marched, and how many at a time."""
+
+    early_stop: float = 1e-3
+    """Remaining transmittance; bounds the error of a pixel by a quarter of an 8-bit level."""
+    seen_weight: float = 1e-6
+    """Samples lighter than this stay black."""
+    rays_at_once: int = 1 << 14
+    """Of any field: waves through many fields would take more memory than these do."""
+    work_at_once: int = 1 << 24
+    """Samples that compiled loops take, at most, before an interrupt is heard: seconds on one core."""
+    work_at_once_cuda: int = 1 << 28
+    """The same on a GPU."""
+    colours: int = 500
+    """Of a ray, at most: each stands for a share of the light (LENT_FROM of loops.py)."""
+    halvings: int = 6
+    """Of the rays done at once, where memory is short."""
+    samples_per_wave: int = 32
+    pixels_at_once: int = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -47,16 +59,19 @@ def render_rays(
     near: float | np.ndarray = 0.0,
     far: float | np.ndarray = np.inf,
     step: float | None = None,
-    early_stop: float = EARLY_STOP,
+    early_stop: float | None = None,
 ) -> np.ndarray:
     """Render rays (N, 3) float64 of the field's frame, from distance `near` to `far`, of all rays or of each
     (N,): (N, 5) float32 premultiplied rgb, opacity, Σ w t.
 
-    A ray's numbers do not depend on which others it is rendered with. So many are done at once as take
-    WORK_AT_ONCE; where memory is short, fewer are. MemoryError (or torch's own) when even that does not help.
-    Raises ValueError for a direction of no length, along which there is no end, or one that is not finite.
+    A ray's numbers do not depend on which others it is rendered with. So many are done at once as
+    `RenderConfig` says, where memory is short, fewer; it says the `early_stop` of None, too. MemoryError (or
+    torch's own) when even that does not help. Raises ValueError for a direction of no length, along which
+    there is no end, or one that is not finite.
     """
+    config = current(RenderConfig)
     check_directions(rays_d)
+    early_stop = config.early_stop if early_stop is None else early_stop
     step, reach = step or sampling_step(field), reach_of(len(rays_o), near, far)
     out = np.zeros((len(rays_o), 5), np.float32)
     compiled = getattr(field, "device_loops", True) is not None
@@ -68,7 +83,7 @@ def render_rays(
         else:
             march_rays(field, rays_o[part], rays_d[part], reach[part], step, early_stop, out[part])
 
-    at_once = getattr(field, "rays_at_once", RAYS_AT_ONCE)
+    at_once = getattr(field, "rays_at_once", config.rays_at_once)
     if fast is not None and not hasattr(field, "rays_at_once"):
         at_once = rays_at_once(field, step)
     for start in range(0, len(rays_o), at_once):
@@ -77,11 +92,12 @@ def render_rays(
 
 
 def rays_at_once(field: RadianceField, step: float) -> int:
-    """How many rays of a computed field take WORK_AT_ONCE samples, if none of them ends early."""
-    device = "cpu" if field.device_loops is cpu else "cuda"
+    """How many rays of a computed field take all samples of `work_at_once`, if none of them ends early."""
+    config = current(RenderConfig)
+    most = config.work_at_once if field.device_loops is cpu else config.work_at_once_cuda
     samples = field.occupancy.most_samples(step)
-    shading = field.loops.names["SHADING_COST"] * min(samples, COLOURS)
-    return max(1, WORK_AT_ONCE[device] // max(samples + shading, 1))
+    shading = field.loops.names["SHADING_COST"] * min(samples, config.colours)
+    return max(1, most // max(samples + shading, 1))
 
 
 def reach_of(rays: int, near: float | np.ndarray, far: float | np.ndarray) -> np.ndarray:
@@ -99,8 +115,10 @@ def check_directions(rays_d: np.ndarray) -> None:
         raise ValueError(f"ray {np.argmax(~sound)} has no direction")
 
 
-def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: int = HALVINGS) -> None:
-    """render(slice(start, stop)), or its halves one after the other where memory does not suffice."""
+def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: int | None = None) -> None:
+    """render(slice(start, stop)), or its halves one after the other where memory does not suffice; parts are
+    halved so often at most."""
+    halvings = current(RenderConfig).halvings if halvings is None else halvings
     try:
         return render(slice(start, stop))
     except Exception as error:
@@ -115,11 +133,12 @@ def in_halves(render: Callable[[slice], None], start: int, stop: int, halvings: 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error says that memory could not be had, here or on a GPU; torch says so by a RuntimeError,
     the GPU's compiler by an error of CUDA's."""
+    of_cuda = "CudaAPIError", "CudaDriverError", "CudaRuntimeError"  # numba-cuda, which may not be there
     said = str(error).lower().replace("_", " ")
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError)
         and ("alloc" in said or "out of memory" in said)
-        or type(error).__name__ in CUDA_ERRORS
+        or type(error).__name__ in of_cuda
         and "out of memory" in said
     )
 
@@ -133,8 +152,7 @@ def march_rays(
     early_stop: float,
     out: np.ndarray,
 ) -> None:
-    """The general path for any field: waves of at most SAMPLES_PER_WAVE samples per living ray, into out (N,
-    5)."""
+    """The general path for any field: waves of some samples per living ray, into out (N, 5)."""
     n = len(rays_o)
     trans = np.ones(n, np.float32)
     total = np.zeros((n, 5), np.float32)
@@ -150,7 +168,7 @@ def march_rays(
         )
         sigma[mask] = found.numpy()
         weights, trans[ray] = weights_from_depths(sigma * spans.astype(np.float32), trans[ray])
-        seen = weights > SEEN_WEIGHT
+        seen = weights > current(RenderConfig).seen_weight
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
             _, found = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
@@ -184,7 +202,7 @@ def waves(
     (M,))."""
     n = len(rays_o)
     start = np.zeros(n, np.int64)
-    ts, spans, counts = *np.zeros((2, n, SAMPLES_PER_WAVE)), np.zeros(n, np.int64)
+    ts, spans, counts = *np.zeros((2, n, current(RenderConfig).samples_per_wave)), np.zeros(n, np.int64)
     loops = cpu.loops_for(None, (), field.occupancy.space)
     while True:
         places = ts, spans, counts
@@ -204,7 +222,7 @@ def render_image(
     near: float = 0.0,
     far: float = np.inf,
     step: float | None = None,
-    early_stop: float = EARLY_STOP,
+    early_stop: float | None = None,
 ) -> RenderedImage:
     """Render what one view shows from the distance `near` to `far` along its rays; origin is where the
     field's frame lies in the world: its origin's position (3,), or its placement (4, 4); float64, so that
@@ -229,11 +247,11 @@ def render_bands(
     near: float = 0.0,
     far: float = np.inf,
     step: float | None = None,
-    early_stop: float = EARLY_STOP,
+    early_stop: float | None = None,
 ) -> Iterator[RenderedImage]:
     """The view of `render_image` as bands of whole rows from the top, for pictures that memory does not hold;
     put together they are that picture to the bit."""
-    rows = max(TILE, ROWS_AT_ONCE_PIXELS // camera.width // TILE * TILE)
+    rows = max(TILE, current(RenderConfig).pixels_at_once // camera.width // TILE * TILE)
     for top in range(0, camera.height, rows):
         order = tile_order(camera.width, min(rows, camera.height - top))
         rays_o, rays_d, per_length = rays_from(origin, camera, slice(top, top + rows), order)

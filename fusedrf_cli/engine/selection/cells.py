@@ -1,29 +1,43 @@
 """Which cells of a field are an object's."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from types import ModuleType
 
 import numpy as np
 import torch
 from scipy.ndimage import label, uniform_filter
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts, mapped, transformed_aabb
+from fusedrf_cli.engine.settings import current
+from fusedrf_cli.engine.spaces import bounded
 
-COARSE, FINE = 128, 192
-"""Cells along the longest side: of a first look at all of a field, of a second one at the object's box."""
-DENSE = 0.02
-"""Optical depth along a cell from which it holds matter that shows."""
-ASIDE = 0.05
-"""A piece with less than so much of the largest one's weight is not the object's."""
-ISLAND = 0.05
-"""Of the object's cells: a piece of other matter with fewer, inside of its box and touching nothing outside,
-cannot stand without it."""
-MIXED, WINDOW = 2, 4
-"""Cells from other matter up to which a cell may hold some of it, and up to which colours are compared."""
-FOREIGN, CONTRAST = 2.0, 0.15
-"""How many times farther from the object's colours nearby than from those of other matter a cell's colour is
-that is not its, and how far these must lie apart, of 1 in each channel."""
-ASKED_AT_ONCE = 1 << 20
+
+@dataclass(frozen=True)
+class CellConfig:
+    """How an object's cells are told from others."""
+
+    coarse: int = 128
+    """Cells along the longest side of a field, of a first look at all of it."""
+    fine: int = 192
+    """Of a second look at the object's box."""
+    dense: float = 0.02
+    """Optical depth along a cell from which it holds matter that shows."""
+    aside: float = 0.05
+    """A piece with less than so much of the largest one's weight is not the object's."""
+    island: float = 0.05
+    """Of the object's cells: a piece of other matter with fewer, inside of its box and touching nothing
+    outside, cannot stand without it."""
+    mixed: int = 2
+    """Cells from other matter up to which a cell may hold some of it."""
+    window: int = 4
+    """Cells up to which colours are compared."""
+    foreign: float = 2.0
+    """How many times farther from the object's colours nearby than from those of other matter a cell's colour
+    is that is not its."""
+    contrast: float = 0.15
+    """How far these colours must lie apart, of 1 in each channel."""
+    asked_at_once: int = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +88,14 @@ class Lattice:
     @cached_property
     def dense(self) -> np.ndarray:
         """(M,) bool: those with matter that shows."""
+        config = current(CellConfig)
         at = torch.from_numpy(self.points)
         ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
         found = [
             self.field.query(part, ahead.expand(len(part), 3), False)[0].numpy()
-            for part in at.split(ASKED_AT_ONCE)
+            for part in at.split(config.asked_at_once)
         ]
-        return np.concatenate([*found, np.zeros(0)]) * self.widths > DENSE
+        return np.concatenate([*found, np.zeros(0)]) * self.widths > config.dense
 
     def colours(self) -> np.ndarray:
         """(M, 3) colours in the middles of the cells, mean of what is seen along the axes."""
@@ -101,9 +116,9 @@ class Lattice:
         return grown[self.grid.occupied]
 
     def means(self, values: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """(M, D) the mean of values (M, D) of some cells, (M,) bool, up to WINDOW cells away; nan where there
-        are none."""
-        side, held = 2 * WINDOW + 1, cells.astype(np.float32)
+        """(M, D) the mean of values (M, D) of some cells, (M,) bool, up to `window` cells away; nan where
+        there are none."""
+        side, held = 2 * current(CellConfig).window + 1, cells.astype(np.float32)
         columns = [held, *(values * held[:, None]).T.astype(np.float32)]
         low, high = self.index.min(0), self.index.max(0) + 1
         whole = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
@@ -128,7 +143,7 @@ class Lattice:
             return chosen
         sums = np.bincount(found[self.grid.occupied], weights, count + 1)
         sums[0] = 0
-        kept = self.grid.marked((sums >= ASIDE * sums.max())[found] & (found > 0))
+        kept = self.grid.marked((sums >= current(CellConfig).aside * sums.max())[found] & (found > 0))
         return chosen & kept.dilated(2).occupied[self.grid.occupied]
 
 
@@ -141,6 +156,40 @@ class Selection:
     """(M,) bool: its cells."""
     sure: float = 1.0
     """How far those who chose agree, from 0 to 1."""
+    object_to_lattice: np.ndarray = field(default_factory=partial(np.eye, 4))
+    """(4, 4) from the frame of the field that is cut to that of the field that was selected in."""
+
+    def seen_from(self, object_to_frame: np.ndarray) -> "Selection":
+        """The same object for a field that lies in this one's frame by a (4, 4)."""
+        return replace(self, object_to_lattice=self.object_to_lattice @ object_to_frame)
+
+    def lattice_points(self, points: np.ndarray, space: ModuleType) -> np.ndarray:
+        """(N, 3) points of the coordinates of a space, of the field that is cut, in those of the lattice."""
+        if self.is_aligned(space):
+            return points
+        at = space.placed(torch.from_numpy(points)).numpy() @ self.object_to_lattice[:3, :3].T
+        return mapped(at + self.object_to_lattice[:3, 3], self.lattice.grid.space)
+
+    def is_aligned(self, space: ModuleType) -> bool:
+        """Whether the coordinates of a space, of the field that is cut, are those of the lattice."""
+        return space is self.lattice.grid.space and np.array_equal(self.object_to_lattice, np.eye(4))
+
+    def box_in(self, grid: OccupancyGrid) -> np.ndarray:
+        """(6,) the box of a grid of the field that is cut, or so much of it as is known to hold the object;
+        its upper corner lies below the lower one where it holds nothing of it."""
+        box, core = self.object.tight_aabb(1), self.lattice.grid.space is bounded
+        if not self.is_aligned(grid.space):
+            if grid.space is not bounded or not (
+                core or np.abs(box).max() <= 1
+            ):  # as the frame's in the core
+                return grid.aabb
+            box = transformed_aabb(box, np.linalg.inv(self.object_to_lattice))
+        return np.concatenate([np.maximum(box[:3], grid.aabb[:3]), np.minimum(box[3:], grid.aabb[3:])])
+
+    def cell_in(self) -> float:
+        """The narrowest side of its cells in the frame of the field that is cut."""
+        stretch = np.linalg.svd(self.object_to_lattice[:3, :3], compute_uv=False)[0]
+        return float(self.lattice.grid.cell.min() / stretch)
 
     @cached_property
     def object(self) -> OccupancyGrid:
@@ -156,7 +205,7 @@ class Selection:
         """The object with small pieces of other matter that hang in its box."""
         found, count = label(self.other.occupied, np.ones((3, 3, 3)))
         sizes = np.bincount(found.ravel(), minlength=count + 1)
-        lost = sizes < ISLAND * (self.chosen & self.lattice.dense).sum()
+        lost = sizes < current(CellConfig).island * (self.chosen & self.lattice.dense).sum()
         lost[0] = False
         for side in (found[[0, -1]], found[:, [0, -1]], found[:, :, [0, -1]]):
             lost[side.ravel()] = False
@@ -165,29 +214,30 @@ class Selection:
     def without_foreign(self) -> "Selection":
         """The object without cells beside other matter that have its colour and not the object's: of what the
         object touches, a little comes along."""
+        config = current(CellConfig)
         around = self.lattice.around
         own, other = self.chosen & self.lattice.dense, ~self.chosen & self.lattice.dense
-        near_own, near_other = around(own, MIXED), around(other, MIXED)
-        band = (own & around(other, WINDOW)) | (other & around(own, WINDOW))
+        near_own, near_other = around(own, config.mixed), around(other, config.mixed)
+        band = (own & around(other, config.window)) | (other & around(own, config.window))
         if not band.any():
             return self
         inner = self.lattice.kept(band)
         colours = inner.colours()
         means = [inner.means(colours, sure[band]) for sure in (own & ~near_other, other & ~near_own)]
         away = [((colours - mean) ** 2).sum(1) for mean in means]
-        differ = ((means[0] - means[1]) ** 2).sum(1) > 3 * CONTRAST**2
+        differ = ((means[0] - means[1]) ** 2).sum(1) > 3 * config.contrast**2
         foreign = np.zeros(len(own), bool)
-        foreign[band] = differ & (away[0] > FOREIGN**2 * away[1])
+        foreign[band] = differ & (away[0] > config.foreign**2 * away[1])
         return self.without(foreign & own & near_other)
 
     def without(self, cells: np.ndarray) -> "Selection":
         """The object without some cells, (M,) bool, and without small pieces that then lie apart."""
         left = self.chosen & ~cells
-        return Selection(self.lattice, self.lattice.pieces(left, np.ones(len(left))), self.sure)
+        return replace(self, chosen=self.lattice.pieces(left, np.ones(len(left))))
 
     def joined(self, cells: np.ndarray) -> "Selection":
         """The object with some cells, (M,) bool."""
-        return Selection(self.lattice, self.chosen | cells, self.sure)
+        return replace(self, chosen=self.chosen | cells)
 
     @property
     def shows(self) -> bool:

@@ -1,18 +1,27 @@
 """Choosing by points: a random walker (Grady 2006) from the cells that were pointed at, which seldom steps
 from one colour to another."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import cg
 
 from fusedrf_cli.engine.selection.cells import Lattice, Selection
+from fusedrf_cli.engine.settings import current
 
-COLOUR = 0.08
-"""Difference of colour at which a step is 1/e as likely."""
-LEAST = 1e-4
-REACH = 1.8
-"""Cells around a point that are as it is."""
-TOLERANCE, STEPS = 1e-4, 2000
+
+@dataclass(frozen=True)
+class GrowingConfig:
+    """How a random walker steps from cell to cell."""
+
+    colour: float = 0.08
+    """Difference of colour at which a step is 1/e as likely."""
+    least: float = 1e-4
+    reach: float = 1.8
+    """Cells around a point that are as it is."""
+    tolerance: float = 1e-4
+    steps: int = 2000
 
 
 def chosen_by_points(lattice: Lattice, inside: np.ndarray, outside: np.ndarray, cut: np.ndarray) -> Selection:
@@ -39,10 +48,11 @@ def chosen_by_points(lattice: Lattice, inside: np.ndarray, outside: np.ndarray, 
 
 def seeds(lattice: Lattice, points: np.ndarray) -> np.ndarray:
     """(M,) bool: the cells around points (K, 3) of the field's frame."""
+    config = current(GrowingConfig)
     found = np.zeros(len(lattice.points), bool)
     for point in points:
         away = np.linalg.norm(lattice.points - point, axis=1)
-        found |= away < np.maximum(REACH * lattice.widths, away.min(initial=np.inf) * 1.001)
+        found |= away < np.maximum(config.reach * lattice.widths, away.min(initial=np.inf) * 1.001)
     return found
 
 
@@ -54,6 +64,7 @@ def at_border(lattice: Lattice) -> np.ndarray:
 
 def walked(lattice: Lattice, own: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(M,) the probability that a walker comes to one of its own cells before one of the others."""
+    config = current(GrowingConfig)
     answer = own.astype(float)
     free = ~own & ~other
     if not free.any():
@@ -67,13 +78,14 @@ def walked(lattice: Lattice, own: np.ndarray, other: np.ndarray) -> np.ndarray:
     system = diags(degree[free]) - inner[:, free]
     told = inner[:, own].sum(1)
     scale = diags(1 / degree[free])
-    found, _ = cg(system, np.asarray(told).ravel(), rtol=TOLERANCE, maxiter=STEPS, M=scale)
+    found, _ = cg(system, np.asarray(told).ravel(), rtol=config.tolerance, maxiter=config.steps, M=scale)
     answer[free] = found
     return answer
 
 
 def steps(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """(E, 2) pairs of cells that lie side by side, and (E,) how likely a step from one to the other is."""
+    config = current(GrowingConfig)
     number = np.full(lattice.grid.occupied.shape, -1)
     number[lattice.grid.occupied] = np.arange(len(lattice.index))
     pairs = []
@@ -84,4 +96,4 @@ def steps(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
         pairs.append(np.stack([low[both], high[both]], 1))
     found, colours = np.concatenate(pairs), lattice.colours()
     differs = ((colours[found[:, 0]] - colours[found[:, 1]]) ** 2).sum(1)
-    return found, np.exp(-differs / COLOUR**2) + LEAST
+    return found, np.exp(-differs / config.colour**2) + config.least

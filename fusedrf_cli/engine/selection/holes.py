@@ -17,30 +17,36 @@ from scipy.sparse.linalg import spsolve
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
 from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.settings import current
 
-COLUMNS = 96
-"""Along the longer side of what is looked at: the object's box and what is beside it."""
-BESIDE = 0.4
-"""How far beside, in the box's longer side."""
-SHOWS = 0.5
-"""Opacity from which a column has a surface."""
-FLAT = 0.04
-"""Of the box's longest side: how far from a plane surfaces may lie that it counts as theirs."""
-BEHIND = 0.3
-"""Of the box's depth: how far behind it surfaces are looked for."""
-RING = (2, 10)
-"""Columns from what the object covered: those between tell what it touched."""
-AGREEING = 0.4
-"""Share of these that must lie in one plane."""
-BEFORE = 0.8
-"""Share of the covered columns in which the object must not lie behind that plane."""
-LEAST_HOLE = 0.01
-"""Share of the columns of the box: fewer are no hole."""
-DRAWS = 300
-THICK = 2.0
-"""Columns that a filled surface is thick."""
-OPTICAL_DEPTH = 12.0
-"""Through it."""
+
+@dataclass(frozen=True)
+class HoleConfig:
+    """How a hole is looked for and filled."""
+
+    columns: int = 96
+    """Along the longer side of what is looked at: the object's box and what is beside it."""
+    beside: float = 0.4
+    """How far beside, in the box's longer side."""
+    shows: float = 0.5
+    """Opacity from which a column has a surface."""
+    flat: float = 0.04
+    """Of the box's longest side: how far from a plane surfaces may lie that it counts as theirs."""
+    behind: float = 0.3
+    """Of the box's depth: how far behind it surfaces are looked for."""
+    ring: tuple[int, int] = (2, 10)
+    """Columns from what the object covered: those between tell what it touched."""
+    agreeing: float = 0.4
+    """Share of these that must lie in one plane."""
+    before: float = 0.8
+    """Share of the covered columns in which the object must not lie behind that plane."""
+    least_hole: float = 0.01
+    """Share of the columns of the box: fewer are no hole."""
+    draws: int = 300
+    thick: float = 2.0
+    """Columns that a filled surface is thick."""
+    optical_depth: float = 12.0
+    """Through it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +73,7 @@ class Patch:
     @property
     def thickness(self) -> float:
         """Of the surface, along its columns."""
-        return THICK * self.pitch
+        return current(HoleConfig).thick * self.pitch
 
     @cached_property
     def aabb(self) -> np.ndarray:
@@ -109,7 +115,7 @@ class Patch:
         u, v, height, inside = self.local(points.numpy())
         below = self.heights[u, v] - height
         solid = inside & (below >= 0) & (below <= self.thickness)
-        sigma = np.where(solid, OPTICAL_DEPTH / self.thickness, 0.0)
+        sigma = np.where(solid, current(HoleConfig).optical_depth / self.thickness, 0.0)
         return torch.from_numpy(sigma).float(), torch.from_numpy(self.colours[u, v]).float()
 
 
@@ -136,7 +142,6 @@ class Columns:
         """(A, B) bool: columns through the box."""
         u, v = ((np.arange(n) + 0.5) * self.pitch - self.beside for n in self.heights.shape)
         return np.outer((u >= 0) & (u < self.size[0]), (v >= 0) & (v < self.size[1]))
-
 
 
 def patches(
@@ -168,30 +173,31 @@ def columns(
     rest: RadianceField, box: np.ndarray, way: np.ndarray, gone: RadianceField | None = None
 ) -> Columns:
     """Look along -way at the back of a box (6,) and at what is beside it."""
+    config = current(HoleConfig)
     first = np.cross(way, np.eye(3)[np.abs(way).argmin()])
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(way, first), way], 1)
     corners = np.stack(np.meshgrid(*box.reshape(2, 3).T, indexing="ij"), -1).reshape(-1, 3) @ axes
     low, size = corners.min(0), np.ptp(corners, 0)
-    beside = BESIDE * float(size[:2].max())
-    pitch = float((size[:2].max() + 2 * beside) / COLUMNS)
+    beside = config.beside * float(size[:2].max())
+    pitch = float((size[:2].max() + 2 * beside) / config.columns)
     counts = np.ceil((size[:2] + 2 * beside) / pitch).astype(int)
     frame = np.eye(4)
     frame[:3, :3], frame[:3, 3] = axes, axes @ (low - [beside, beside, 0])
-    deepest, top = -BEHIND * size[2] - 2 * pitch, size[2] * 1.02
+    deepest, top = -config.behind * size[2] - 2 * pitch, size[2] * 1.02
     u, v = np.meshgrid(*((np.arange(n) + 0.5) * pitch for n in counts), indexing="ij")
     starts = np.stack([u, v, np.full_like(u, top)], -1).reshape(-1, 3) @ axes.T + frame[:3, 3]
     down = np.broadcast_to(-way, starts.shape).copy()
     shown = render_rays(rest, starts, down, far=float(top - deepest)).reshape(*counts, 5)
     opacity = shown[..., 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        heights = np.where(opacity > SHOWS, top - shown[..., 4] / opacity, np.nan)
-        colours = np.where(opacity[..., None] > SHOWS, shown[..., :3] / opacity[..., None], 0)
+        heights = np.where(opacity > config.shows, top - shown[..., 4] / opacity, np.nan)
+        colours = np.where(opacity[..., None] > config.shows, shown[..., :3] / opacity[..., None], 0)
     seen = Columns(frame, pitch, tuple(size), beside, heights.astype(np.float64), colours, None, None)
     covered, tops = seen.of_box, np.full(tuple(counts), size[2] / 2)
     if gone is not None:
         there = render_rays(gone, starts, down).reshape(*counts, 5)
-        covered = covered & (there[..., 3] > SHOWS)
+        covered = covered & (there[..., 3] > config.shows)
         tops[covered] = top - there[covered, 4] / there[covered, 3]
     return replace(seen, covered=covered, tops=tops)
 
@@ -200,15 +206,16 @@ def mended(seen: Columns) -> tuple[Patch | None, float]:
     """The surface that fills the covered columns where none is seen near the plane of what is beside them,
     and their share; None where what is beside lies in no plane near the back of the box, or there is no
     hole."""
+    config = current(HoleConfig)
     plane = plane_of(seen)
     if plane is None:
         return None, 0.0
     u, v = np.indices(seen.heights.shape)
     level = plane[0] * u + plane[1] * v + plane[2]
-    own = np.abs(np.nan_to_num(seen.heights, nan=np.inf) - level) < FLAT * max(seen.size)
+    own = np.abs(np.nan_to_num(seen.heights, nan=np.inf) - level) < config.flat * max(seen.size)
     hole = seen.covered & ~own
     share = float(hole.sum() / max(1, seen.covered.sum()))
-    if share < LEAST_HOLE:
+    if share < config.least_hole:
         return None, 0.0
     # The rim of a hole is thin, and shows what is behind it.
     hole = binary_dilation(hole, iterations=2) & seen.of_box
@@ -222,7 +229,8 @@ def mended(seen: Columns) -> tuple[Patch | None, float]:
 def plane_of(seen: Columns) -> np.ndarray | None:
     """(3,) a, b, c of the plane a u + b v + c, by columns, in which most surfaces lie that are seen close
     beside the object and do not hide it (RANSAC, Fischler and Bolles 1981); None where too few do."""
-    near, far = (binary_dilation(seen.covered, iterations=n) for n in RING)
+    config = current(HoleConfig)
+    near, far = (binary_dilation(seen.covered, iterations=n) for n in config.ring)
     ring = far & ~near
     places = np.argwhere(ring & np.isfinite(seen.heights))
     heights = seen.heights[tuple(places.T)]
@@ -230,18 +238,18 @@ def plane_of(seen: Columns) -> np.ndarray | None:
         return None
     rows = np.c_[places, np.ones(len(places))]
     under = np.c_[np.argwhere(seen.covered), np.ones(int(seen.covered.sum()))]
-    tops, flat = seen.tops[seen.covered], FLAT * max(seen.size)
+    tops, flat = seen.tops[seen.covered], config.flat * max(seen.size)
     g, best = np.random.default_rng(0), np.zeros(len(places), bool)
-    for _ in range(DRAWS):
+    for _ in range(config.draws):
         three = g.choice(len(places), 3, replace=False)
         try:
             plane = np.linalg.solve(rows[three], heights[three])
         except np.linalg.LinAlgError:
             continue
         near = np.abs(rows @ plane - heights) < flat
-        if near.sum() > best.sum() and (under @ plane < tops + flat).mean() >= BEFORE:
+        if near.sum() > best.sum() and (under @ plane < tops + flat).mean() >= config.before:
             best = near
-    if best.sum() < max(3, AGREEING * ring.sum()):
+    if best.sum() < max(3, config.agreeing * ring.sum()):
         return None
     return np.linalg.lstsq(rows[best], heights[best], rcond=None)[0]
 

@@ -7,20 +7,26 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 
-from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.rendering.cameras import Camera, projected
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.engine.selection.cells import Lattice, Selection
+from fusedrf_cli.engine.selection.weights import cell_weights
+from fusedrf_cli.engine.settings import current
 
-ENOUGH = 0.02
-"""Votes from which a cell is decided by them."""
-BEHIND = 2.0
-"""Cells behind what a pixel shows, from which its mask says nothing."""
-POINTED = 50.0
-"""How many votes one of a pixel that was pointed at counts for."""
-WELL_SEEN = 90
-"""Percentile of an object's cells, by the weight that cameras give them, from which one is well seen."""
-SEED = 6_000_011
+
+@dataclass(frozen=True)
+class VotingConfig:
+    """How masks vote for cells."""
+
+    enough: float = 0.02
+    """Votes from which a cell is decided by them."""
+    behind: float = 2.0
+    """Cells behind what a pixel shows, from which its mask says nothing."""
+    pointed: float = 50.0
+    """How many votes one of a pixel that was pointed at counts for."""
+    well_seen: int = 90
+    """Percentile of an object's cells, by the weight that cameras give them, from which one is well seen."""
+    seed: int = 6_000_011
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,7 @@ def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
     leave room for them there and the nearest decided cell is its; smoothed, and in one piece."""
     against, votes = tallied(lattice, looks)
     total, share = smoothed(lattice, against, votes)
-    decided = total > ENOUGH
+    decided = total > current(VotingConfig).enough
     room, shut = hull(lattice, looks)
     known = decided | shut
     own = np.where(decided, share > 0.5, False)
@@ -60,13 +66,13 @@ def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
 def shown_by(field, lattice: Lattice, cameras: Sequence[Camera]) -> np.ndarray:
     """(M,) how much cameras in the frame see of each cell in a field, which may be the lattice's own without
     something: the largest sum of weights (NeRF, eq. 3) in the cell or one beside it."""
-    found, step = np.zeros(len(lattice.index)), sampling_step(lattice.field)
+    found = np.zeros(len(lattice.index))
     for camera in cameras:
         rays_o, rays_d = camera.rays()
         met = reaching(lattice, rays_o, rays_d)
         rays_o, rays_d = rays_o[met], rays_d[met]
-        half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), np.uint8)
-        sums = field.votes(rays_o, rays_d, half, every, step, lattice.grid)
+        half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), bool)
+        sums = cell_weights(field, rays_o, rays_d, half, every, lattice.grid)
         found += sums[1][lattice.grid.occupied]
     return maximum_filter(lattice.spread(found), 3)[lattice.grid.occupied]
 
@@ -81,7 +87,7 @@ def reaching(lattice: Lattice, rays_o: np.ndarray, rays_d: np.ndarray) -> np.nda
 def well_shown(selection: Selection, shown: np.ndarray) -> float:
     """How much (`shown_by`, (M,)) cameras see of a cell of a selected object that they see well."""
     own = shown[selection.chosen & selection.lattice.dense]
-    return float(np.percentile(own, WELL_SEEN)) if len(own) else 0.0
+    return float(np.percentile(own, current(VotingConfig).well_seen)) if len(own) else 0.0
 
 
 def agreement(votes: np.ndarray, against: np.ndarray) -> float:
@@ -94,16 +100,17 @@ def agreement(votes: np.ndarray, against: np.ndarray) -> float:
 def tallied(lattice: Lattice, looks: Sequence[Look]) -> np.ndarray:
     """(2, M) what the pixels outside and inside of the masks show of each cell: sums of weights (NeRF,
     eq. 3)."""
-    generator, found = np.random.default_rng(SEED), 0.0
+    config = current(VotingConfig)
+    generator, found = np.random.default_rng(config.seed), 0.0
     for look in looks:
         rays_o, rays_d = look.camera.rays()
         jitter, weight = generator.random(len(rays_o)), 1.0
         asked = reaching(lattice, rays_o, rays_d)
         if look.counted is not None:
             asked &= look.counted.ravel()
-            weight = POINTED
+            weight = config.pointed
         rays = rays_o[asked], rays_d[asked], jitter[asked], look.inside.ravel()[asked]
-        sums = lattice.field.votes(*rays, sampling_step(lattice.field), lattice.grid)
+        sums = cell_weights(lattice.field, *rays, lattice.grid)
         found = found + weight * sums[:, lattice.grid.occupied]
     return found
 
@@ -133,7 +140,7 @@ def hull(lattice: Lattice, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarra
         outside = np.flatnonzero(shown)[~inside]
         surface = look.depths(lattice.field)[row[~inside], column[~inside]]
         distance = np.linalg.norm(lattice.points[outside] - look.camera.camera_to_world[:3, 3], axis=1)
-        shut[outside[distance < surface + BEHIND * lattice.widths[outside]]] = True
+        shut[outside[distance < surface + current(VotingConfig).behind * lattice.widths[outside]]] = True
     return room & ~shut, shut
 
 

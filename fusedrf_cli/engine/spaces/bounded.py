@@ -1,16 +1,23 @@
 """The space of a field in a finite box: coordinates are those of the field's frame.
 
 What every space has, as scalar functions that the loops of kernels/loops.py are compiled with. A ray is cut
-into PIECES; in each, positions are a straight line in the space's coordinates, and u is length along it.
+into PIECES, on each of which samples lie evenly in u. Where pieces are straight lines in the space's
+coordinates, u is length along them. Where they are not (curved.py), a length of u is at most as long in the
+coordinates, origin and direction of a piece are whatever its `position_at` reads, u begins at 0, and the
+space has a `next_sample` and a `next_change` of its own in place of those of the loops.
 """
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import hit_box
+from fusedrf_cli.engine.kernels.parts import along, hit_box
 
 PIECES = 1  # of a ray, at most
 STEP_PER_VOXEL = 0.5  # of a field's finest voxel, at which pictures sample it
+
+
+position_at = along
+"""(origin, direction, u): the coordinates at u of a piece."""
 
 
 def point(p):
@@ -23,9 +30,15 @@ def frame_point(q):
     return q
 
 
-def rate(q):
-    """How many units of the coordinates a unit of length of the frame is at `q`: what a field's numbers say
-    of σ is per unit of the coordinates."""
+def rate(q, d):
+    """What σ at `q`, as a field's numbers say it, is to be multiplied by to be per unit of length of the
+    frame, along a unit direction of it."""
+    return 1.0
+
+
+def depth_per_coordinate(q):
+    """The optical depth of a unit of length of the coordinates at `q`, about, where the numbers say a σ of
+    1."""
     return 1.0
 
 
@@ -36,8 +49,8 @@ def entered(o, d, t):
 
 def stretch(begun, grid, o, d, far):
     """(origin, direction, u0, u1, course) of the piece of a ray, in t < far, that begins there, and where the
-    next one begins: positions are origin + u direction for u in [u0, u1), empty where u1 <= u0. `course` is
-    what `distance` and `span` need."""
+    next one begins: positions are position_at(origin, direction, u) for u in [u0, u1), empty where u1 <= u0.
+    `course` is what `distance` and `span` need."""
     t0, t1 = hit_box(o, d, grid.lo, grid.hi)
     return (o, d, max(t0, begun), min(t1, far), 0.0), far
 
@@ -88,5 +101,11 @@ def placed(points: torch.Tensor) -> torch.Tensor:
 
 
 def rates(points: torch.Tensor) -> torch.Tensor:
-    """`rate` at each of coordinates (N, 3): (N,)."""
+    """(N,) how many units of the coordinates a unit of length of the frame is, along the way out, at each of
+    coordinates (N, 3)."""
+    return points.new_ones(len(points))
+
+
+def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
+    """(N,) `rate` at each of coordinates (N, 3) along unit dirs (N, 3), differentiable."""
     return points.new_ones(len(points))

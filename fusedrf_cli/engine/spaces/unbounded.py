@@ -18,7 +18,7 @@ import math
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import hit_box
+from fusedrf_cli.engine.kernels.parts import along, hit_box
 
 PIECES = 6  # a straight line meets at most five of the seven regions, and a sixth by rounding at an edge
 STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (decision 001) in 1.5 times the time
@@ -30,6 +30,7 @@ REACH = 2.0  # coordinates lie between -REACH and REACH
 LEARN_FROM, LENT_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
 WHOLE = np.array([-REACH] * 3 + [REACH] * 3)
 SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
+position_at = along
 
 
 def point(p):
@@ -60,10 +61,15 @@ def frame_point(q):
     return x, y, z / m
 
 
-def rate(q):
+def rate(q, d):
     """How many units of the coordinates a unit of length of the frame is at `q`, radially: 1 / n²."""
     m = max(abs(q[0]), max(abs(q[1]), abs(q[2])))
     return 1.0 if m <= 1.0 else max(2.0 - m, 1.0 / FAR) ** 2
+
+
+def depth_per_coordinate(q):
+    """See bounded.py: what the numbers say of σ is per unit of the coordinates."""
+    return 1.0
 
 
 def region_at(o, d, t):
@@ -226,6 +232,11 @@ def rates(points: torch.Tensor) -> torch.Tensor:
     """`rate` at each of coordinates (N, 3): (N,)."""
     most = points.abs().amax(1)
     return torch.where(most > 1, (2 - most).clamp_min(1 / FAR) ** 2, 1)
+
+
+def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
+    """(N,) `rate` at each of coordinates (N, 3)."""
+    return rates(points)
 
 
 def placed(points: torch.Tensor) -> torch.Tensor:

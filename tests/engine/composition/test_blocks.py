@@ -6,6 +6,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.vm.blocks import (
     MAX_BLOCKS,
     blocks_of,
@@ -30,10 +31,9 @@ PAIRS = {
 
 
 @pytest.fixture(autouse=True)
-def coarse_ownership(monkeypatch):
+def coarse_ownership(in_force):
     """Grids that are made in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 32)
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 32)
+    in_force(OccupancyConfig(scene_cells=32))
 
 
 def small(seed: int, **options):

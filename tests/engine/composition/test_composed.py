@@ -8,7 +8,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.occupancy import seen_box, seen_change
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, seen_box, seen_change
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
@@ -17,9 +17,9 @@ from tests.engine.conftest import BOX, Ball, Gaussian, Slab, points_in, unit
 
 
 @pytest.fixture(autouse=True)
-def coarse_occupancy(monkeypatch):
+def coarse_occupancy(in_force):
     """A grid that is made in no time: analytic fields have full occupancies anyway."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
 
 
 class Painted(Slab):

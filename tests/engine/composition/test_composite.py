@@ -12,7 +12,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import Composite, can_be_composite
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels.instances import MAX_TRACED
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import unbounded
@@ -27,9 +27,9 @@ SMALL = 0.4 * turn(70, (0, 1, 1))
 
 
 @pytest.fixture(autouse=True)
-def coarse_occupancy(monkeypatch):
+def coarse_occupancy(in_force):
     """A grid of the naive composition that is made in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
 
 
 @cache

@@ -5,6 +5,7 @@ import pytest
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.detail import details_at_voxel, opacity_off
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.details import block_details, lost_shares
 from tests.analytic.export import vm_field
@@ -23,8 +24,8 @@ def test_what_a_stretch_costs_is_the_largest_gap_of_two_exponentials(condition):
     assert opacity_off(1.0) == 0
 
 
-def test_voxels_across_are_of_the_fused_field(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 24)
+def test_voxels_across_are_of_the_fused_field(in_force):
+    in_force(OccupancyConfig(scene_cells=24))
     placed = [Placed("big", BLOCK, np.eye(4)), Placed("flat", BLOCK, affine((0.2, 0.2, 0.1), (2, 0, 0)))]
     big, flat = details_at_voxel(placed, 0.25)
     assert (big.voxels_across, flat.voxels_across) == (pytest.approx(4), pytest.approx(0.8))
@@ -34,9 +35,9 @@ def test_voxels_across_are_of_the_fused_field(monkeypatch):
     assert big.held_voxel == pytest.approx(big.own_voxel) and flat.opacity_off == 0
 
 
-def test_the_third_of_three_in_a_cell_is_lost_and_told(monkeypatch):
+def test_the_third_of_three_in_a_cell_is_lost_and_told(in_force):
     """Three slivers side by side in one cell of a grid over a wide scene."""
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 8)
+    in_force(OccupancyConfig(scene_cells=8))
     spots = ((0.0, 0, 0), (0.03, 0, 0), (0.06, 0, 0), (9.0, 9, 0))
     placed = [Placed(f"n{i}", BLOCK, affine(0.02, at)) for i, at in enumerate(spots)]
     shares = lost_shares(blocks_of(placed))

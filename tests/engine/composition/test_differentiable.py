@@ -8,6 +8,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.differentiable import bounds, device_of, float_type, numbers, query
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.fields.streamed import StreamedField
 from tests.analytic.rays import SHEAR, affine, turn
 
@@ -17,9 +18,9 @@ CHECK = {"fast_mode": True, "eps": 1e-7, "atol": 1e-6, "rtol": 1e-6}
 
 
 @pytest.fixture(autouse=True)
-def coarse_occupancy(monkeypatch):
+def coarse_occupancy(in_force):
     """A grid that is made in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
 
 
 def three(rule: str, dtype=torch.float64) -> ComposedField:

@@ -16,7 +16,7 @@ from fusedrf_cli.engine.distillation.distill import DistillRun, distill
 from fusedrf_cli.engine.distillation.judging import scattered_judge
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.student import pruned
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, texels
 from fusedrf_cli.engine.kinds.student import DistilConfig, finest_within
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
@@ -34,9 +34,9 @@ WAY = way_of(THIRTY_TWO)
 
 
 @pytest.fixture(autouse=True)
-def small_steps(monkeypatch):
+def small_steps(in_force):
     """Coarse grids: seconds, not minutes."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
 
 
 def taught(settings: DistilConfig, rgb: bool = True):

@@ -10,6 +10,7 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.rays import affine, turn
@@ -17,9 +18,9 @@ from tests.engine.conftest import BOX, THIRTY_TWO, random_vm
 
 
 @pytest.fixture
-def pair(monkeypatch):
+def pair(in_force):
     """Two blocks over two tensors, and the same at less than half their resolution."""
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 32)
+    in_force(OccupancyConfig(scene_cells=32))
     one, two = (
         random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32, seed=s).resampled(BOX, (20, 21, 22))
         for s in (1, 2)

@@ -12,7 +12,7 @@ from fusedrf_cli.engine.distillation.fit import FitRun, fit, occupancy_of
 from fusedrf_cli.engine.distillation.keypoints import Known
 from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.fields.hashed import Hashed
-from fusedrf_cli.engine.fields.occupancy import THINNEST, OccupancyGrid, texels
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
@@ -213,7 +213,7 @@ def test_pictures_of_several_sizes_and_pixels_that_are_ignored():
 
 def test_texels_are_near_cubic_but_for_flat_boxes():
     assert texels(np.array([0.0, 0, 0, 1, 2, 4]), 64) == (16, 32, 64)
-    assert texels(np.array([0.0, 0, 0, 1e-3, 2, 4]), 64) == (THINNEST, 32, 64)
+    assert texels(np.array([0.0, 0, 0, 1e-3, 2, 4]), 64) == (12, 32, 64)
 
 
 def test_occupancy_finds_matter_and_forgets_nothing_known_empty():

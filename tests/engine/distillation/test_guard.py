@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.guard import ALLOWED, KEPT_EVERY, MOST_ROLL_BACKS, WINDOW, Guard
+from fusedrf_cli.engine.distillation.guard import Guard, GuardConfig
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from tests.engine.conftest import THIRTY_TWO, random_vm
 
@@ -39,7 +39,7 @@ def test_a_bad_gradient_of_the_basis_is_no_step(parts, value):
 
 def test_fine_steps_are_accepted_and_not_told(parts):
     _, optimiser, guard = parts
-    for _ in range(3 * KEPT_EVERY):
+    for _ in range(3 * GuardConfig.kept_every):
         guard.keep()
         optimiser.grads[:, ::1000] = 1e-3
         assert guard.accepts(FINE, optimiser)
@@ -70,7 +70,7 @@ def test_more_than_ten_in_a_hundred_go_back(parts):
     good = field.params.clone()
     field.params += 1
     optimiser.moment1 += 1
-    for i in range(ALLOWED + 1):
+    for i in range(GuardConfig.allowed + 1):
         assert guard.roll_backs == 0, i
         guard.keep()
         guard.accepts(BAD, optimiser)
@@ -80,18 +80,18 @@ def test_more_than_ten_in_a_hundred_go_back(parts):
 
 def test_ten_in_a_hundred_are_borne_for_ever(parts):
     _, optimiser, guard = parts
-    for i in range(5 * WINDOW):
+    for i in range(5 * GuardConfig.window):
         guard.keep()
-        guard.accepts(BAD if i % WINDOW < ALLOWED else FINE, optimiser)
-    assert guard.roll_backs == 0 and guard.skipped == 5 * ALLOWED
+        guard.accepts(BAD if i % GuardConfig.window < GuardConfig.allowed else FINE, optimiser)
+    assert guard.roll_backs == 0 and guard.skipped == 5 * GuardConfig.allowed
 
 
 def test_the_fourth_time_is_the_last(parts):
     _, optimiser, guard = parts
     guard.keep()
-    for _ in range((MOST_ROLL_BACKS + 1) * (ALLOWED + 1) - 1):
+    for _ in range((GuardConfig.most_roll_backs + 1) * (GuardConfig.allowed + 1) - 1):
         guard.accepts(BAD, optimiser)
-    assert guard.roll_backs == MOST_ROLL_BACKS and guard.rate == pytest.approx(1 / 27)
+    assert guard.roll_backs == GuardConfig.most_roll_backs and guard.rate == pytest.approx(1 / 27)
     with pytest.raises(FloatingPointError, match="44 steps were not finite"):
         guard.accepts(BAD, optimiser)
 
@@ -102,7 +102,7 @@ def test_poisoned_numbers_are_found_when_a_copy_is_due(parts):
     guard.keep()
     good = field.params.clone()
     field.params[7] = float("nan")
-    for _ in range(KEPT_EVERY):
+    for _ in range(GuardConfig.kept_every):
         guard.keep()
         guard.accepts(FINE, optimiser)
     assert guard.roll_backs == 1 and torch.equal(field.params, good)
@@ -118,10 +118,10 @@ def test_nothing_good_to_go_back_to(parts):
 def test_a_restored_guard_counts_on(parts):
     _, optimiser, guard = parts
     guard.keep()
-    for _ in range(ALLOWED):
+    for _ in range(GuardConfig.allowed):
         guard.accepts(BAD, optimiser)
     other = Guard(guard.numbers)
     other.restore(guard.state())
     other.keep()
     other.accepts(BAD, optimiser)
-    assert other.figures() == {"skipped_steps": ALLOWED + 1, "roll_backs": 1}
+    assert other.figures() == {"skipped_steps": GuardConfig.allowed + 1, "roll_backs": 1}

@@ -6,7 +6,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.losses import OPAQUE, log_depth, mostly_seen, point_step
+from fusedrf_cli.engine.distillation.losses import LossConfig, log_depth, mostly_seen, point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
@@ -34,7 +34,7 @@ def test_the_slope_of_the_density_loss_is_finite_differences():
         _, slope = log_depth(depth, target)
         h = 1e-6 * depth
         numeric = (log_depth(depth + h, target)[0] - log_depth(depth - h, target)[0]) / (2 * h)
-        away = (depth - OPAQUE).abs() > 1e-3
+        away = (depth - LossConfig.opaque).abs() > 1e-3
         torch.testing.assert_close(slope[away], numeric[away], rtol=1e-4, atol=1e-8)
     assert not log_depth(torch.tensor([6.0, 80.0]), torch.tensor([1e4, 5.0]))[0].any()
 
@@ -44,7 +44,7 @@ def test_the_gradient_of_a_step_is_finite_differences():
     teacher = random_vm(SIXTY_FOUR, (5, 6, 7), seed=1)
     student = random_vm(SIXTY_FOUR, (5, 6, 7), seed=2)
     points = points_of(teacher, 300, 3)
-    points.sigma = points.sigma.clamp_max(0.9 * OPAQUE / STEP)  # away from the kink
+    points.sigma = points.sigma.clamp_max(0.9 * LossConfig.opaque / STEP)  # away from the kink
     optimiser = Adam(student, 1)
     point_step(student, points, STEP, optimiser)
     way = torch.from_numpy(np.random.default_rng(0).normal(size=student.params.shape))

@@ -4,7 +4,7 @@ the same, and fog that they show stays."""
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.distillation.matter import EMPTY_BELOW, SAME, occupancy_of, without_haze
+from fusedrf_cli.engine.distillation.matter import MatterConfig, occupancy_of, without_haze
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.volume import render_rays
@@ -25,6 +25,7 @@ def ball(cells: int = 24):
     sections["density_plane_0"][..., 1] = 1
     sections["density_line_0"][:, 1] = -80 * at**2
     return field.with_occupancy(occupancy_of(field, BOX, cells))
+
 
 def fog(depth: float):
     """Fog of an optical depth across each of 32 x 32 x 32 cells, all occupied."""
@@ -48,24 +49,28 @@ def test_the_room_around_matter_goes_and_rays_show_the_same():
     kept = without_haze(field, *rays)
     gone = field.occupancy.occupied & ~kept.occupied
     assert 0.1 < gone.sum() / field.occupancy.occupied.sum() < 0.9
-    assert deepest(field, np.argwhere(gone)).max() < 4 * EMPTY_BELOW  # between probes it grows steeply
-    assert deepest(field, np.argwhere(kept.occupied)).min() > EMPTY_BELOW
+    assert (
+        deepest(field, np.argwhere(gone)).max() < 4 * MatterConfig.empty_below
+    )  # between probes it grows steeply
+    assert deepest(field, np.argwhere(kept.occupied)).min() > MatterConfig.empty_below
     apart = render_rays(field.with_occupancy(kept), *rays) - render_rays(field, *rays)
-    assert np.square(apart[:, :4]).mean() < SAME
+    assert np.square(apart[:, :4]).mean() < MatterConfig.same
 
 
 def test_fog_that_rays_show_stays():
     """0.008 across each of 32 cells is a quarter of what a ray shows; a thousandth of that is nothing."""
-    field, rays = fog(0.8 * EMPTY_BELOW), rays_at(BOX, 3000, 5)
+    field, rays = fog(0.8 * MatterConfig.empty_below), rays_at(BOX, 3000, 5)
     seen = render_rays(field, *rays)[:, 3].max()
-    assert deepest(field, np.argwhere(field.occupancy.occupied)).max() < EMPTY_BELOW and seen > 0.15
+    assert (
+        deepest(field, np.argwhere(field.occupancy.occupied)).max() < MatterConfig.empty_below and seen > 0.15
+    )
     assert without_haze(field, *rays).occupied.all()
 
 
 def test_thick_haze_goes_where_rays_should_not_show_it_and_stays_where_they_should():
     """Fog of 0.03 across each cell, three times what counts as empty, beside matter a hundred times as
     dense: as what a student failed to learn, and as what its teacher shows."""
-    field, dense = fog(3 * EMPTY_BELOW), fog(300 * EMPTY_BELOW)
+    field, dense = fog(3 * MatterConfig.empty_below), fog(300 * MatterConfig.empty_below)
     plane, solid = (f.sections(0)["density_plane_0"] for f in (field, dense))
     plane[: len(plane) // 2] = solid[: len(plane) // 2]
     rays, grid = rays_at(BOX, 3000, 7), field.occupancy

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.distillation.smoothness import STRIPS, add_roughness
+from fusedrf_cli.engine.distillation.smoothness import SmoothnessConfig, add_roughness
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
 
@@ -23,7 +23,7 @@ def test_the_mean_over_all_strips_is_the_gradient_of_the_formula(kind):
     field, weight = untrained(kind), 0.37
     field = field.with_params(field.params.double())
     found = torch.zeros_like(field.params)
-    for strip in range(STRIPS):
+    for strip in range(SmoothnessConfig.strips):
         add_roughness(field, found, weight, strip)
     numbers = field.params.clone().requires_grad_()
     rough = sum(
@@ -32,7 +32,7 @@ def test_the_mean_over_all_strips_is_the_gradient_of_the_formula(kind):
     )
     (wanted,) = torch.autograd.grad(rough, numbers)
     assert len(field.planes(numbers)) == 6 and wanted.abs().max() > 0
-    torch.testing.assert_close(found / STRIPS, wanted, rtol=1e-9, atol=1e-15)
+    torch.testing.assert_close(found / SmoothnessConfig.strips, wanted, rtol=1e-9, atol=1e-15)
 
 
 def test_planes_are_those_of_the_field():

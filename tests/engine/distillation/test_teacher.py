@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.distillation.teacher import EMPTY_SHARE, MATTER, ask
+from fusedrf_cli.engine.distillation.teacher import TeacherConfig, ask
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.engine.conftest import BOX, Gaussian, Slab
 
@@ -46,9 +46,9 @@ def test_all_matter_is_kept_and_a_share_of_the_emptiness():
     field, rays = Gaussian(density=8.0), RaySampler([BOX]).draw(2000, seeded())
     whole = ask(field, *rays, 0.05, seeded(3), everything).points
     kept = ask(field, *rays, 0.05, seeded(3)).points
-    matter = [(points.sigma * 0.05 > MATTER).sum() for points in (whole, kept)]
+    matter = [(points.sigma * 0.05 > TeacherConfig.matter).sum() for points in (whole, kept)]
     assert matter[0] == matter[1] > 1000
-    assert abs((len(kept) - matter[1]) / (len(whole) - matter[0]) - EMPTY_SHARE) < 0.02
+    assert abs((len(kept) - matter[1]) / (len(whole) - matter[0]) - TeacherConfig.empty_share) < 0.02
 
 
 def test_transmittance_of_points_is_the_rays():

@@ -8,7 +8,6 @@ import pytest
 
 from fusedrf_cli.engine.fields.occupancy import (
     OccupancyGrid,
-    Pace,
     cell_counts,
     harmless_depth,
     marked_cells,
@@ -16,10 +15,12 @@ from fusedrf_cli.engine.fields.occupancy import (
     placed_cells,
     transformed_aabb,
 )
+from fusedrf_cli.engine.fields.pace import Pace
 from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import BOX, points_in
 
 UNIT = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 9, 2), (6, 5, 7)])
 @pytest.mark.parametrize("share", [0.02, 0.3])

@@ -31,9 +31,8 @@ def test_large_ones_are_asked_for_in_large_pages(monkeypatch):
             asked.append((len(self), *advice))
 
     monkeypatch.setattr(pages.mmap, "mmap", Memory)
-    monkeypatch.setattr(pages, "ADVICE", 14)
-    pages.zeros(MANY - 1)
-    pages.zeros(MANY)
+    pages.zeros(MANY - 1, advice=14)
+    pages.zeros(MANY, advice=14)
     assert asked == [(pages.LARGE, 14)]
 
 
@@ -43,10 +42,8 @@ def test_a_system_without_them_gives_small_ones(monkeypatch):
             raise OSError(22, "Invalid argument")
 
     monkeypatch.setattr(pages.mmap, "mmap", Memory)
-    monkeypatch.setattr(pages, "ADVICE", 14)
-    assert not pages.zeros(MANY).any()
-    monkeypatch.setattr(pages, "ADVICE", None)
-    assert not pages.zeros(MANY).any()
+    assert not pages.zeros(MANY, advice=14).any()
+    assert not pages.zeros(MANY, advice=None).any()
 
 
 @pytest.mark.skipif(pages.ADVICE is None, reason="a system without large pages")

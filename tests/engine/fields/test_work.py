@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.base import MOST_SAMPLES
+from fusedrf_cli.engine.fields.base import SamplingConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.rendering import volume
-from fusedrf_cli.engine.rendering.volume import is_out_of_memory, rays_at_once, render_rays
+from fusedrf_cli.engine.rendering.volume import RenderConfig, is_out_of_memory, rays_at_once, render_rays
 from fusedrf_cli.engine.spaces import bounded, unbounded
 from tests.engine.conftest import random_vm
 from tests.engine.kinds.cases import BOXED, random_boxed
@@ -53,7 +52,7 @@ def test_a_detail_that_is_too_fine_is_refused():
 def test_cubic_voxels_are_always_bearable():
     """8,192 texels along each side, the most that a stored field has."""
     box = np.array([0.0, 0, 0, 1, 1, 1])
-    assert bounded.most_samples(box, bounded.picture_step(1 / 8191)) < MOST_SAMPLES
+    assert bounded.most_samples(box, bounded.picture_step(1 / 8191)) < SamplingConfig.most_samples
 
 
 @pytest.mark.parametrize("space", [bounded, unbounded])
@@ -78,7 +77,7 @@ def test_no_ray_takes_more_samples_than_told(space, strided):
     assert (start == -1).all() and counts.max() <= most and most <= space.most_samples(box, 0.01)
 
 
-def test_rays_are_done_in_pieces_and_show_the_same(monkeypatch):
+def test_rays_are_done_in_pieces_and_show_the_same(monkeypatch, in_force):
     """So that an interrupt is heard between two of them."""
     field = random_vm(dtype=torch.float32)
     rng = np.random.default_rng(0)
@@ -91,7 +90,7 @@ def test_rays_are_done_in_pieces_and_show_the_same(monkeypatch):
 
     step = 0.5 * field.voxel_size
     monkeypatch.setattr(type(field), "render_rays", noted)
-    monkeypatch.setattr(volume, "WORK_AT_ONCE", {"cpu": 1000 * field.occupancy.most_samples(step)})
+    in_force(RenderConfig(work_at_once=1000 * field.occupancy.most_samples(step)))
     assert rays_at_once(field, step) == 1000
     assert np.array_equal(render_rays(field, *rays), whole) and pieces == [1000] * 3
 

@@ -155,6 +155,7 @@ def test_every_function_carries_the_name():
 HOOKS = {
     "started", "standing", "begin", "end", "frame_of", "keep", "again", "advance", "known", "unstretched",
     "ahead_density", "ahead_colour", "COLOUR_FROM", "LEARN_FROM", "LENT_FROM", "REST_FROM", "SHADING_COST",
+    "next_sample", "next_change", "optical_length",
 }  # fmt: skip
 """What a kind or a space may have in place of the loops' own, see loops.py."""
 

@@ -10,7 +10,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.hashed import Hashed
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.boxes import BoxKind
 from fusedrf_cli.engine.kinds.student import Way
@@ -85,6 +85,6 @@ KINDS = {
 
 
 @pytest.fixture(autouse=True)
-def coarse_ownership(monkeypatch):
+def coarse_ownership(in_force):
     """A grid that is made in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))

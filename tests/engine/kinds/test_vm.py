@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
 from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
 
 
 @pytest.fixture(autouse=True)
-def coarse(monkeypatch):
+def coarse(in_force):
     """Ownership grids small enough to settle in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.OWNERSHIP_CELLS", 30)
+    in_force(OccupancyConfig(scene_cells=30))
 
 
 def ask(field, points):

@@ -9,6 +9,7 @@ from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.composition.affine import Placed, rigid_motion
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.computed import ComputedField
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.rendering import volume
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera
 from fusedrf_cli.engine.rendering.differentiable import (
@@ -27,9 +28,9 @@ CHECK = {"fast_mode": True, "eps": 1e-7, "atol": 1e-6, "rtol": 1e-6}
 
 
 @pytest.fixture(autouse=True)
-def coarse_occupancy(monkeypatch):
+def coarse_occupancy(in_force):
     """A grid that is made in no time."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
 
 
 TRIED = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW_TO_COMPILE else name for name in KINDS]

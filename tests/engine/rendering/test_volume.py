@@ -9,7 +9,13 @@ import torch
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import framing_camera
-from fusedrf_cli.engine.rendering.volume import rays_from, render_image, render_rays, weights_from_depths
+from fusedrf_cli.engine.rendering.volume import (
+    RenderConfig,
+    rays_from,
+    render_image,
+    render_rays,
+    weights_from_depths,
+)
 from tests.engine.conftest import (
     BOX,
     DIRECTIONS_26,
@@ -129,13 +135,13 @@ def test_weights_continue_a_wave():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (13, 7)])
-def test_pictures_of_any_size(size, monkeypatch):
+def test_pictures_of_any_size(size, in_force):
     """A picture is its rays, row by row, whatever bands it is rendered in."""
     field, camera = random_vm(THIRTY_TWO, dtype=torch.float32), framing_camera(BOX, 0.7, 0.4, *size)
     picture = render_image(field, camera)
     rays = render_rays(field, *camera.rays()).reshape(size[1], size[0], 5)
     assert np.array_equal(picture.rgb, rays[..., :3]) and np.array_equal(picture.opacity, rays[..., 3])
-    monkeypatch.setattr("fusedrf_cli.engine.rendering.volume.ROWS_AT_ONCE_PIXELS", 3)
+    in_force(RenderConfig(pixels_at_once=3))
     assert np.array_equal(render_image(field, camera).rgb, picture.rgb)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples
+from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
     PER_CELL_MADE,
@@ -38,6 +38,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     check_counts,
     table_entries,
 )
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
 PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
@@ -100,8 +101,14 @@ class SparseField(ComputedField):
     def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":
         """The same numbers without the voxels that lie in empty cells alone; itself where that would leave
         none."""
-        lattice = training.within(self.fine, occupancy)
+        lattice = training.within(self.fine, occupancy.contains)
         return self if lattice is None else self.on(lattice, occupancy.space)
+
+    def reaching(self, contains: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
+        """The same numbers of the voxels that reach where `contains` says so of points (N, 3) of the
+        coordinates of the space; None where there is none."""
+        lattice = training.within(self.fine, contains)
+        return None if lattice is None else self.on(lattice, self.lies_in)
 
     def with_voxels(self, holds: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
         """The same numbers of the voxels of whose corners (N, 3), in the coordinates of the space, `holds`
@@ -123,7 +130,7 @@ class SparseField(ComputedField):
         axis, where this one's cells are occupied. Raises ValueError for a field of several levels."""
         training.check_one_level(self)
         lattice = training.whole_lattice(np.asarray(aabb, np.float64), resolution)
-        return training.carried(self, training.within(lattice, self.occupancy) or lattice)
+        return training.carried(self, training.within(lattice, self.occupancy.contains) or lattice)
 
     def stored(self, as_stored: StoredAs) -> "SparseField":
         """See ComputedField; where the bricks are stays as it is, and need not be found again."""
@@ -327,6 +334,7 @@ class SparseField(ComputedField):
 
 def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     """The tree of a stored field. Raises ValueError naming what does not fit."""
+    config = current(SamplingConfig)
     counts = metadata["counts"]
     if not isinstance(counts, list) or len(counts) != 3:
         raise ValueError(f"counts should be three whole numbers, found {counts}")
@@ -353,7 +361,7 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     tree = replace(tree, phase=tuple(whole(n, "phase", 0, 1) for n in phase))
     if not tree.mask.any():
         raise ValueError("array 'masks' should have an active voxel")
-    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", MOST_OF_SEVERAL)
+    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", config.most_of_several)
     tree.tables  # noqa: B018  (made now, so that what is too large is refused here)
     return tree
 

@@ -107,7 +107,7 @@ class SparseKind(Kind):
 
     def cut_out(self, field: SparseField, selection: Selection) -> SparseField | None:
         """The voxels that cells of the object reach into."""
-        return field.with_occupancy(selection.object) if selection.chosen.any() else None
+        return field.reaching(lambda at: selection.object.contains(selection.lattice_points(at, field.space)))
 
     def cut_away(self, field: SparseField, selection: Selection) -> SparseField | None:
         """The voxels that any other cell reaches into."""

@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.asking import OCTANTS
 from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
@@ -25,12 +24,13 @@ def whole_lattice(box: np.ndarray, resolution: tuple[int, int, int]) -> Lattice:
     return Lattice(tree, SIDE)
 
 
-def within(lattice: Lattice, grid: OccupancyGrid) -> Lattice | None:
-    """The lattice of those active voxels that reach into an occupied cell of a grid; None where none does."""
+def within(lattice: Lattice, contains: Callable[[np.ndarray], np.ndarray]) -> Lattice | None:
+    """The lattice of those active voxels in which some of nine points lie where contains((N, 3)) says so;
+    None where there is none."""
     low, high = lattice.places[lattice.corners[:, 0]], lattice.places[lattice.corners[:, 7]]
-    found = grid.contains((low + high) / 2)
+    found = contains((low + high) / 2)
     for octant in INSIDE + (1 - 2 * INSIDE) * OCTANTS:
-        found |= grid.contains(low + (high - low) * octant)
+        found |= contains(low + (high - low) * octant)
     return of_voxels(lattice, found)
 
 

@@ -391,8 +391,9 @@ def crossed(field, b, p, stretch):
     """What makes block b's density one per length of the coordinates at p: the stretch of its placement, and
     for a block that does not lie in the field's own space the length that those coordinates stand for."""
     if CROSSING != 0 and field.crossing[b] != 0:
-        own = 1.0 if field.crossing[b] == 1 else rate(point(affine(field.to_unit, b, frame_point(p))))
-        return stretch * own / rate(p)
+        d = 0.0, 0.0, 1.0  # of which this space's rate knows nothing
+        own = 1.0 if field.crossing[b] == 1 else rate(point(affine(field.to_unit, b, frame_point(p))), d)
+        return stretch * own / rate(p, d)
     return stretch
 
 

@@ -18,17 +18,18 @@ from fusedrf_cli.engine.selection.cells import Selection
 
 def cut_out(field: VMField, selection: Selection) -> VMField | None:
     """What of each block is a selected object's, see splitting.py."""
-    return apart(
-        field,
-        lambda own, block: splitting.cut_out(
-            own, own.tensors[0].aabb, selection, to_field(field, own, block)
-        ),
-    )
+
+    def part(own: VMField, block: Block) -> VMField | None:
+        return splitting.cut_out(own, own.tensors[0].aabb, selection.seen_from(block.object_to_field))
+
+    return apart(field, part)
 
 
 def cut_away(field: VMField, selection: Selection) -> VMField | None:
     """What of each block is not a selected object's, see splitting.py."""
-    return apart(field, lambda own, block: splitting.cut_away(own, selection, to_field(field, own, block)))
+    return apart(
+        field, lambda own, block: splitting.cut_away(own, selection.seen_from(block.object_to_field))
+    )
 
 
 def cropped(field: VMField, holds: splitting.Holds) -> VMField | None:
@@ -53,13 +54,10 @@ def in_blocks(field: VMField, holds: splitting.Holds, part_of: Callable) -> VMFi
     return apart(field, part)
 
 
-def to_field(field: VMField, own: VMField, block: Block) -> splitting.ToField:
-    """The map from the coordinates of a block's tensor, alone in `own`, to those of the field."""
-    return splitting.placed_in(field, block.object_to_field, own.space)
-
-
 def apart(field: VMField, part_of: Callable[[VMField, Block], VMField | None]) -> VMField | None:
     """A part of each block's tensor, placed as the block; None where none has any."""
+    if len(field.blocks) == 1 and np.array_equal(field.blocks[0].object_to_field, np.eye(4)):
+        return part_of(field, field.blocks[0])
     found = []
     for block in field.blocks:
         part = part_of(tensor_field(field, block.tensor), block)

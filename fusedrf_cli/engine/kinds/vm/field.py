@@ -19,7 +19,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.encodings.plane_line import MODES
 from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.base import MOST_OF_SEVERAL, FieldNeeds, check_samples, sampling_step
+from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples, sampling_step
 from fusedrf_cli.engine.fields.box import (
     DENSITY_SCALE_PER_EXTENT,
     DENSITY_SHIFT,
@@ -44,20 +44,20 @@ from fusedrf_cli.engine.fields.computed import (
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, Hashed, Held
 from fusedrf_cli.engine.fields.occupancy import (
     PROBES,
-    SCENE_CELLS,
+    OccupancyConfig,
     OccupancyGrid,
-    Pace,
     placed_cells,
     squeezed,
     transformed_aabb,
     unbounded_cells,
 )
+from fusedrf_cli.engine.fields.pace import Pace
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kinds.vm import bodies, reference
 from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named, unbounded
 
-OWNERSHIP_CELLS = SCENE_CELLS  # along the longest axis of a field of several blocks
 ROUNDING = 1e-6  # share of a ball's radius by which it is larger
 CELLS_PER_NUMBER = 4  # of a tensor, from which on its cells are stored in bricks where these are smaller
 PER_OWNED_CELL = 8  # bytes of a cell of several blocks: owners, distances, strides
@@ -248,17 +248,18 @@ class VMField(ComputedField):
     ) -> "VMField":
         """A field whose occupancy and ownership follow from its blocks: each cell is owned by the one or two
         densest there, and sampled as the finest there needs."""
+        config = current(OccupancyConfig)
         if len(blocks) == 1 and np.array_equal(blocks[0].object_to_field, np.eye(4)):
             return cls(shape, tensors, blocks, params, tensors[blocks[0].tensor].occupancy)
         grids = [(tensors[b.tensor].occupancy, b.object_to_field) for b in blocks]
         if any(grid.space is unbounded for grid, _ in grids):
-            marks = unbounded_cells(marked_as(grids), OWNERSHIP_CELLS)
+            marks = unbounded_cells(marked_as(grids), config.scene_cells)
             space, aabb = unbounded, unbounded.WHOLE
         else:
             boxes = np.stack([transformed_aabb(grid.tight_aabb(0), matrix) for grid, matrix in grids])
-            space, (aabb, marks) = bounded, placed_cells(boxes, marked_as(grids), OWNERSHIP_CELLS)
+            space, (aabb, marks) = bounded, placed_cells(boxes, marked_as(grids), config.scene_cells)
         steps = [tensors[b.tensor].step for b in blocks]
-        pace = Pace(OccupancyGrid.full(aabb, OWNERSHIP_CELLS, space))
+        pace = Pace(OccupancyGrid.full(aabb, config.scene_cells, space))
         first, second, count = claimed_cells(pace.kept(marks, grids, steps))
         occupancy = pace.grid(count > 0)
         unsettled = cls(shape, tensors, blocks, params, occupancy, owners=(first, second))
@@ -493,17 +494,19 @@ class VMField(ComputedField):
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs; of several blocks with the grids that say which is asked where."""
+        config = current(OccupancyConfig)
         numbers = sum(aligned(math.prod(s)) for name, s in shapes.items() if not name.endswith(".occupancy"))
         cells = [math.prod(tensor["occupancy"]) for tensor in metadata["tensors"]]
         held, made = 4 * numbers + PER_CELL * sum(cells), PER_CELL_MADE * max(cells)
         if len(metadata["blocks"]) > 1:
-            held += PER_OWNED_CELL * OWNERSHIP_CELLS**3
-            made = PER_PLACED_CELL * max(cells) + PER_OWNED_CELL_MADE * OWNERSHIP_CELLS**3
+            held += PER_OWNED_CELL * config.scene_cells**3
+            made = PER_PLACED_CELL * max(cells) + PER_OWNED_CELL_MADE * config.scene_cells**3
         return FieldNeeds(held, made)
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
         """Inverse of `state`. Every number is checked before it can size an array or index one."""
+        config = current(SamplingConfig)
         shape = VMShape(**metadata["shape"])
         tensors = tuple(stored_tensor(i, t, arrays, shape) for i, t in enumerate(metadata["tensors"]))
         blocks = tuple(stored_block(i, b, len(tensors)) for i, b in enumerate(metadata["blocks"]))
@@ -524,7 +527,9 @@ class VMField(ComputedField):
                     view[torch.from_numpy(held.rows)] = numbers
             check_answers(t, tensors[t], unplaced.sections(t))
         field = cls.assembled(shape, tensors, blocks, params)
-        check_samples(field.occupancy.most_samples(sampling_step(field)), "its blocks", MOST_OF_SEVERAL)
+        check_samples(
+            field.occupancy.most_samples(sampling_step(field)), "its blocks", config.most_of_several
+        )
         return field
 
 
@@ -682,7 +687,7 @@ def settle_crowded(field: VMField, crowded: np.ndarray, first: np.ndarray, secon
         return
     grid, cells, each, side = field.occupancy, crowded, slice(None), 1
     cost = len(field.blocks) * len(PROBES) * field.shape.density_rank
-    while len(cells) * cost > MOST_PROBED and side < OWNERSHIP_CELLS:
+    while len(cells) * cost > MOST_PROBED and side < current(OccupancyConfig).scene_cells:
         side *= 2
         numbers = np.ravel_multi_index(tuple((crowded // side).T), grid.occupied.shape)
         numbers, each = np.unique(numbers, return_inverse=True)

@@ -10,7 +10,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.computed import BRICK
 from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
-from fusedrf_cli.engine.fields.occupancy import SCENE_CELLS, OccupancyGrid, overlapped
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import (
@@ -29,6 +29,7 @@ from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
 from fusedrf_cli.engine.kinds.vm.places import place_student
 from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated, without_unasked
 from fusedrf_cli.engine.selection.cells import Selection
+from fusedrf_cli.engine.settings import current
 
 SHAPE = VMShape(16, 24, 2)
 BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
@@ -147,7 +148,7 @@ def place_of(background: Placed, plan: Plan, scene: ComposedField) -> VMField | 
         return None
     if plan.way.ranks is not None and shape != shape_of(plan.way):
         return None
-    grid = OccupancyGrid(box, overlapped(cells, SCENE_CELLS, box), cells.space)
+    grid = OccupancyGrid(box, overlapped(cells, current(OccupancyConfig).scene_cells, box), cells.space)
     own = reshaped(field, shape)
     return own.with_params(own.params.clone()).with_occupancy(grid)
 

@@ -1,0 +1,198 @@
+"""Bundles of an object that was cut out, and of what is left without it, before they are written."""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from formats.bundle import BundleWriter, FieldSet, OpenBundle
+from formats.embedding import as_one
+from formats.graph import free_name, lifted, placement_of, renamed, with_leaves, with_nodes
+from formats.history import summed_up
+from formats.records import BITS, FieldRecord
+from formats.scene import Leaf, Node, SceneGraph, dump_scene
+from fusedrf_cli import __version__
+from fusedrf_cli.bridge.cutting import Fields, Whole
+from fusedrf_cli.bridge.fusing import NODES
+from fusedrf_cli.bridge.scene import part_shown, stored
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.kinds import registry
+
+OBJECT = "object"
+"""The node of an object that was not chosen by its name."""
+
+
+class Cutout:
+    """Nodes of a bundle with parts of their fields: a graph, and the bytes that it names."""
+
+    def __init__(self, whole: Whole, fields: Fields, precision: str | None, rounded: bool):
+        """fields: by the names of visible nodes; those of the bundle keep their bytes. precision: of
+        all numbers; None: a part is stored as its node's field, or, where that would round its numbers once
+        more and they may not be `rounded`, in float16."""
+        self.whole, self.precision, self.rounded = whole, precision, rounded
+        self.writer, self.stored = BundleWriter(), {}
+        members = {leaf.name: self.member(leaf, fields.get(leaf.name)) for leaf, _ in whole.nodes}
+        self.graph = with_leaves(whole.scene, lambda node: self.in_place_of(node, members))
+
+    def in_place_of(self, node: Node, members: dict[str, str | None]) -> Node | None:
+        """A node with its part of the field; None without one, and of what is hidden."""
+        member = members.get(node.name)
+        return None if member is None else replace(node, field=member)
+
+    def member(self, leaf: Leaf, part: StoredField | None) -> str | None:
+        """What a part of a node's field is stored as; None of what shows nothing."""
+        bundle = self.whole.draft.bundle
+        if part is self.whole.raw[leaf.name]:
+            return self.copied(leaf.field)
+        if part is None or part_shown(part, leaf, self.whole.path) is None:
+            return None
+        part = registry.kind(part.kind).trimmed(part)
+        precision = self.precision or bundle.headers[leaf.field].precision
+        if self.precision is None and not self.rounded and precision in BITS:
+            same = torch.equal(stored(part, precision).params, part.params)
+            precision = precision if same else "float16"
+        return self.put(part, precision)
+
+    def copied(self, member: str) -> str:
+        """A member of the bundle, byte for byte but where another precision was asked for."""
+        bundle = self.whole.draft.bundle
+        if self.precision is not None:
+            return self.writer.add_field(bundle.field(member), self.precision)
+        return self.writer.copy_field(bundle, member)
+
+    def put(self, field: StoredField, precision: str) -> str:
+        """A field as a member."""
+        return self.writer.add_field(FieldRecord(field.kind, *field.state()), precision)
+
+    @property
+    def size(self) -> int:
+        """Bytes of its fields and of its graph."""
+        return sum(map(len, self.writer.members.values())) + len(dump_scene(self.graph))
+
+    def alone(self) -> "Cutout":
+        """The same nodes without a history and what it needs."""
+        other = copy(self)
+        other.writer, placed = BundleWriter(), {leaf.field for leaf in self.graph.leaves()}
+        other.graph = replace(self.graph, history=(), extras={})
+        for member in placed:
+            other.writer.copy_field(self.fields, member)
+        return other
+
+    def take(self, smaller: OpenBundle) -> None:
+        """Have the nodes of another bundle, which shows the same, in place of its own."""
+        for leaf in self.graph.leaves():
+            self.writer.members.pop(leaf.field, None)
+        for leaf in smaller.scene.leaves():
+            self.writer.copy_field(smaller, leaf.field)
+        nodes, own = smaller.scene.nodes, self.graph.nodes
+        if len(nodes) == len(own) == 1 and nodes[0].name != own[0].name:
+            nodes = (renamed(nodes[0], nodes[0].name, own[0].name, apart=True),)
+        self.graph = replace(self.graph, nodes=nodes, composition=smaller.scene.composition)
+
+    @property
+    def fields(self) -> FieldSet:
+        """Those that it has, and those of the bundle."""
+        return self.whole.draft.bundle.with_fields(self.writer.members)
+
+    @property
+    def kind_to_fuse(self) -> str:
+        """The way in which its fields become smaller."""
+        return self.kinds if self.kinds != "vm" and "," not in self.kinds else NODES
+
+    @property
+    def kinds(self) -> str:
+        """Of its fields."""
+        return self.said("kind")
+
+    @property
+    def precisions(self) -> str:
+        """In which its numbers are stored."""
+        return self.said("precision")
+
+    def said(self, word: str) -> str:
+        """What the headers of its fields say, each once."""
+        fields = self.fields
+        placed = {leaf.field for leaf in self.graph.leaves()}
+        return ", ".join(sorted({getattr(fields.headers[member], word) for member in placed}))
+
+    def write(self, output: str, overwrite: bool) -> int:
+        """Write it; the bytes written."""
+        self.writer.write(output, self.graph, overwrite=overwrite)
+        return Path(output).stat().st_size
+
+
+class ObjectCutout(Cutout):
+    """The object, as a bundle of its own: one node, or a group of several."""
+
+    def __init__(
+        self,
+        whole: Whole,
+        fields: Fields,
+        precision: str | None,
+        name: str | None,
+        framing: Sequence[float],
+        cameras: dict | None,
+    ):
+        """name: by which it was chosen. framing: (6,) in the world."""
+        super().__init__(whole, fields, precision, False)
+        nodes = tuple(lifted(node, {name} if name else ()) for node in self.graph.nodes)
+        self.graph = SceneGraph(
+            self.named(nodes, name),
+            self.graph.composition,
+            framing=tuple(float(x) for x in framing),
+            cameras=cameras,
+            generator=f"fusedrf {__version__}",
+        )
+
+    def in_place_of(self, node: Node, members: dict[str, str | None]) -> Node | None:
+        """See Cutout: what stands free is no background."""
+        node = super().in_place_of(node, members)
+        return node and replace(node, background=False)
+
+    def named(self, nodes: tuple[Node, ...], name: str | None) -> tuple[Node, ...]:
+        """Nodes that were chosen by a name, as they are; else one node, called OBJECT."""
+        if name is not None:
+            return nodes
+        if len(nodes) == 1:
+            return (renamed(nodes[0], nodes[0].name, OBJECT, apart=True),)
+        rule = self.graph.composition
+        return (as_one(SceneGraph(nodes, rule), OBJECT, np.eye(4), rule),)
+
+
+class RestCutout(Cutout):
+    """What is left, with all else that the bundle has."""
+
+    def __init__(self, whole: Whole, fields: Fields, precision: str | None, names: Sequence[str]):
+        """names: of what was taken out."""
+        super().__init__(whole, fields, precision, True)
+        bundle, draft = whole.draft.bundle, whole.draft
+        placed = {leaf.field for leaf in whole.scene.leaves()}
+        for member in bundle.headers:  # what no node places was kept for the history
+            if member not in placed and member not in self.writer.members:
+                self.writer.copy_field(bundle, member)
+        entry = {"event": "extracted", "names": list(names)}
+        used = {leaf.field for leaf in self.graph.leaves()}
+        self.graph = replace(
+            self.graph,
+            history=summed_up((*self.graph.history, entry), used),
+            framing=draft.framing,
+            generator=f"fusedrf {__version__}",
+        )
+
+    def in_place_of(self, node: Node, members: dict[str, str | None]) -> Node | None:
+        """See Cutout: what is hidden stays."""
+        if node.name not in members:
+            return replace(node, field=self.copied(node.field))
+        return super().in_place_of(node, members)
+
+    def add(self, one: Placed) -> None:
+        """One more node, of a field that lies in the whole's frame."""
+        at = placement(self.whole.origin) @ one.object_to_world
+        member = self.put(one.field, self.precision or self.whole.precision)
+        name = free_name(one.name, {node.name for node, _, _ in self.graph.walk()})
+        self.graph = with_nodes(self.graph, [Node(name, member, None, placement_of(at))])

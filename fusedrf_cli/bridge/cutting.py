@@ -1,0 +1,191 @@
+"""A bundle taken apart by its nodes: what of each field is an object's, and what stays. Every field is cut by
+its own kind; the fields of nodes that lie wholly on one side keep their bytes."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from formats.graph import belongs
+from formats.records import BYTES_PER_NUMBER
+from formats.scene import Leaf, SceneGraph
+from fusedrf_cli.bridge.editing import Draft
+from fusedrf_cli.bridge.memory import Memory, ownership, sources
+from fusedrf_cli.bridge.scene import LoadedScene, grouped, make_field, part_shown
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField, occupied_at
+from fusedrf_cli.engine.composition.composite import as_composite
+from fusedrf_cli.engine.fields.base import RadianceField, StoredField
+from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.selection.cells import CellConfig, Selection
+from fusedrf_cli.engine.selection.voting import shown_by
+from fusedrf_cli.engine.settings import current
+from fusedrf_cli.errors import InvalidInput
+
+COPIES = 3.0
+"""Of the largest field in memory, while it is taken apart."""
+CELLS_BYTES = 400e6
+"""Of cells and votes."""
+VEILED = 0.2
+"""Of how much cameras see of a cell without the object: it was hidden where they saw less before."""
+LAYERS, FEW_REVEALED = 4, 1e-4
+"""How often what was hidden is taken away, at most, and the share of cells from which it is."""
+Fields = Mapping[str, StoredField]
+"""What is there of the fields of visible nodes, by their names: those of the bundle, and parts of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Whole:
+    """A bundle out of which an object is taken, and the field of all that it shows."""
+
+    draft: Draft
+    loaded: LoadedScene
+    field: RadianceField
+    origin: np.ndarray
+    """Where its frame lies in the world: a position (3,), or a placement (4, 4)."""
+    raw: dict[str, StoredField] = field(default_factory=dict)
+    """The fields of nodes as they are stored, by the nodes' names."""
+
+    @classmethod
+    def read(cls, path: str, memory: Memory) -> "Whole":
+        """The bundle at a path, with all its fields in memory."""
+        draft = Draft(path, memory)
+        loaded = draft.before
+        lone = loaded.lone()
+        field, origin = lone or ((scene := as_composite(loaded.composed())), scene.origin)
+        memory.expect(
+            sources(loaded.sizes, copies=COPIES) | ownership(field.aabb) | {"its cells": CELLS_BYTES},
+            advice="take an object out of a smaller field",
+        )
+        loaded.shelf.resize(sum(loaded.sizes))
+        whole = cls(draft, loaded, field, origin)
+        for leaf, placed in whole.nodes:
+            own = make_field(draft.bundle.field(leaf.field), path) if leaf.crops else placed.field
+            whole.raw[leaf.name] = opened(own)
+        return whole
+
+    @property
+    def path(self) -> str:
+        """Of the bundle."""
+        return self.draft.path
+
+    @property
+    def scene(self) -> SceneGraph:
+        """Of the bundle."""
+        return self.draft.bundle.scene
+
+    @property
+    def nodes(self) -> list[tuple[Leaf, Placed]]:
+        """The visible nodes that hold a field, and these as they are shown."""
+        leaves = [leaf for leaf in self.scene.leaves() if leaf.visible and leaf.field is not None]
+        return list(zip(leaves, self.loaded.placed, strict=True))
+
+    def object_to_frame(self, leaf: Leaf) -> np.ndarray:
+        """(4, 4) where a node's field lies in the frame."""
+        return seen_placement(leaf.object_to_world, self.origin)
+
+    def composed(self, fields: Fields) -> RadianceField | None:
+        """What some fields show, in the frame; None where that is nothing."""
+        found, groups = [], []
+        for (leaf, placed), source in zip(self.nodes, self.loaded.fields, strict=True):
+            part = fields.get(leaf.name)
+            if part is not None and part is not self.raw[leaf.name]:
+                part = part_shown(part, leaf, self.path)
+                placed = part and replace(placed, field=part)
+            if part is not None:
+                found.append(placed)
+                groups.append(source.groups)
+        if not found:
+            return None
+        if len(self.nodes) == 1 and self.loaded.lone() is not None:
+            return opened(found[0].field)
+        rule = self.loaded.composition
+        return as_composite(ComposedField(grouped(found, groups, rule), rule, origin=self.origin))
+
+    def named(self, name: str) -> tuple[Fields, Fields]:
+        """The fields of the nodes that go by a name, or are in one that does, and all others."""
+        own: set[str] = set()
+        for node, _, _ in self.scene.walk():
+            if belongs(node.name, {name}):
+                own |= {leaf.name for leaf in SceneGraph((node,)).leaves()}
+        found = {key: one for key, one in self.raw.items() if key in own}
+        return found, {key: one for key, one in self.raw.items() if key not in own}
+
+    @property
+    def precision(self) -> str:
+        """The most exact one of its fields."""
+        told = {self.draft.bundle.headers[leaf.field].precision for leaf, _ in self.nodes}
+        return max(told, key=BYTES_PER_NUMBER.get)
+
+
+# -- cutting -------------------------------------------------------------------------------------------------
+
+
+def cut(whole: Whole, selection: Selection, both: bool, guessed: bool) -> tuple[Fields, Fields]:
+    """A selected object, and what is left. Without `both` nothing need be known of what is left. guessed:
+    where masks or points told of it, it is none of the nodes that it merely touches."""
+    found, rest = {}, dict(whole.raw)
+    touched = holders(whole, selection) if guessed and len(whole.nodes) > 1 else set(whole.raw)
+    around = selection.object.tight_aabb(1)
+    for leaf, _ in whole.nodes:
+        if leaf.name not in touched:
+            continue
+        raw, matrix = whole.raw[leaf.name], whole.object_to_frame(leaf)
+        kind, own = registry.kind(raw.kind), selection.seen_from(matrix)
+        try:
+            part = kind.cut_out(raw, own)
+            inside = len(whole.nodes) > 1 and holds(around, transformed_aabb(raw.occupancy.subject, matrix))
+            left = kind.cut_away(raw, own) if part is not None and (both or inside) else raw
+        except ValueError as error:
+            raise InvalidInput(f"{whole.path}: node '{leaf.name}': {error}") from error
+        if part is None:
+            continue
+        if left is None:
+            del rest[leaf.name]
+            found[leaf.name] = raw
+        else:
+            rest[leaf.name], found[leaf.name] = left, part
+    return found, rest
+
+
+def holders(whole: Whole, selection: Selection) -> set[str]:
+    """The nodes in whose occupied cells more than a share (CellConfig.aside) of an object's cells lie."""
+    points = selection.lattice.points[selection.chosen & selection.lattice.dense]
+    found = set()
+    for leaf, placed in whole.nodes:
+        inverse = np.linalg.inv(whole.object_to_frame(leaf))
+        own = occupied_at(placed.field, points @ inverse[:3, :3].T + inverse[:3, 3])
+        if own.mean() > current(CellConfig).aside:
+            found.add(leaf.name)
+    return found
+
+
+def holds(box: np.ndarray, other: np.ndarray) -> bool:
+    """Whether a box (6,) holds another."""
+    return bool((box[:3] <= other[:3]).all() and (other[3:] <= box[3:]).all())
+
+
+def cut_with_hidden(
+    whole: Whole, selection: Selection, shown: np.ndarray, least: float, cameras: list[Camera], guessed: bool
+) -> tuple[Fields, Fields]:
+    """As `cut`, and what is left is without what then shows where the object was to cameras that did not see
+    it before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it
+    lies more of it."""
+    found, rest = cut(whole, selection, True, guessed)
+    gone = selection.with_islands()  # of photos: what hangs in the air is an error
+    if (gone.chosen != selection.chosen).any():
+        rest = cut(whole, gone, True, guessed)[1]
+    for _ in range(LAYERS):
+        left = whole.composed(rest)
+        if left is None:
+            break
+        now = shown_by(left, selection.lattice, cameras)
+        revealed = ~gone.chosen & (now > least) & (shown < VEILED * now)
+        if revealed.mean() < FEW_REVEALED:
+            break
+        gone = gone.joined(revealed)
+        rest = cut(whole, gone, True, guessed)[1]
+    return found, rest

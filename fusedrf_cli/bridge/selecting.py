@@ -1,0 +1,247 @@
+"""Which cells of a bundle are an object's, by what a request says: masks of views, points, and shapes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from formats.captures import read_cameras
+from formats.errors import BadMask
+from formats.hulls import Hull
+from formats.images import read_mask
+from formats.photos import pictures
+from formats.rig import read_rig
+from formats.views import View
+from fusedrf_cli.bridge.cutting import Whole
+from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.selection.cells import CellConfig, Lattice, Selection
+from fusedrf_cli.engine.selection.growing import chosen_by_points
+from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks
+from fusedrf_cli.engine.settings import current
+from fusedrf_cli.errors import InvalidInput, UsageProblem
+from fusedrf_cli.requests import ExtractRequest
+
+LONGEST = 512
+"""Pixels along the longer side of a view, in which masks are looked at."""
+AROUND = 2
+"""Cells around an object that was found in a first look."""
+RADIUS = 3
+"""Pixels of LONGEST around a point that say what it does, beside masks."""
+SEEN_SIDE = 96
+"""Pixels a side of the views that tell what of an object was ever seen."""
+WATCHING = 48
+"""Cameras of a capture that tell what was seen, at most."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What tells of the object, in the field's frame."""
+
+    shapes: Callable[[np.ndarray], np.ndarray] | None
+    """Which points (N, 3) may be its, (N,) bool; None: all."""
+    masks: list[Look]
+    pointed: list[Look]
+    inside: np.ndarray
+    """(K, 3) points on it."""
+    outside: np.ndarray
+    """(L, 3) points that are not."""
+
+    @property
+    def is_guess(self) -> bool:
+        """Whether what is the object's is made out by what pictures show, not by shapes alone."""
+        return bool(self.masks or len(self.inside))
+
+
+# -- what tells of it ----------------------------------------------------------------------------------------
+
+
+def rig_for(request: ExtractRequest, fused: Whole) -> dict[str, View]:
+    """The views that masks and points are of, by name."""
+    if request.cameras is not None:
+        return {view.name: view for view in read_cameras(request.cameras)}
+    if fused.scene.cameras is None:
+        return {}
+    rig = read_rig(fused.scene.cameras)
+    return {view.name: view for view in rig.test + rig.train}
+
+
+def told_by(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress) -> Told:
+    """What a request says, read and checked."""
+    if not (request.masks or request.points or request.boxes or request.spheres or request.mesh):
+        raise UsageProblem("say which object: --masks, --points, --box, --sphere, --mesh or --name")
+    if (request.masks or request.points) and not rig:
+        raise InvalidInput(
+            f"{request.field}: it keeps no cameras that masks or points could be of; give --cameras"
+        )
+    masks = masked(request, fused, rig, progress) if request.masks else []
+    pointed = [pointed_at(one, request, fused, rig) for one in request.points]
+    if pointed and not masks and not any(shows for *_, shows in request.points):
+        raise UsageProblem("--points: none of them shows the object; give one without ,out")
+    places = {True: [], False: []}
+    for look, (view, column, row, shows) in zip(pointed, request.points, strict=True):
+        places[shows].append(surface_at(fused.field, look, f"--points {view}:{column:g},{row:g}"))
+    own, other = (np.array(places[shows]).reshape(-1, 3) for shows in (True, False))
+    return Told(within(request, fused), masks, pointed, own, other)
+
+
+def within(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Which points of the frame lie in the shapes: in any of the boxes, if there are some, in any of the
+    spheres, and in the mesh."""
+    hull = Hull(request.mesh) if request.mesh else None
+    if not (request.boxes or request.spheres or hull):
+        return None
+    origin = placement(fused.origin)
+    boxes, spheres = np.array(request.boxes).reshape(-1, 6), np.array(request.spheres).reshape(-1, 4)
+
+    def holds(points: np.ndarray) -> np.ndarray:
+        at = points @ origin[:3, :3].T + origin[:3, 3]
+        found = np.ones(len(at), bool)
+        if len(boxes):
+            found &= np.any([((at >= b[:3]) & (at <= b[3:])).all(1) for b in boxes], 0)
+        if len(spheres):
+            found &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
+        return found & hull.contains(at) if hull else found
+
+    return holds
+
+
+def masked(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress) -> list[Look]:
+    """The masks of a folder, each with the view that is named as it."""
+    files = pictures(Path(request.masks))
+    if not files:
+        raise InvalidInput(
+            f"{request.masks}: no folder of pictures; give one of masks, each named as the view that it masks"
+        )
+    pairs = [(path, rig.get(path.stem) or rig.get(Path(path.stem).stem)) for path in files]
+    known = [(path, view) for path, view in pairs if view is not None]
+    if not known:
+        names = ", ".join(list(rig)[:3])
+        raise InvalidInput(
+            f"{request.masks}: none of its {len(files)} pictures is named as a view; the views are {names}, "
+            f"… ({len(rig)} in all)"
+        )
+    if len(known) < len(files):
+        progress.warn(
+            f"{request.masks}: {len(files) - len(known)} pictures are named as no view, and left out"
+        )
+    found = [looked_at(view, path, fused) for path, view in known]
+    shares = [look.inside.mean() for look in found]
+    if not any(shares) or min(shares) == 1:
+        raise BadMask(
+            f"{request.masks}: the masks are {'black' if not any(shares) else 'white'} all over; paint the "
+            "object white and all else black"
+        )
+    return found
+
+
+def looked_at(view: View, path: Path, fused: Whole) -> Look:
+    """A mask and its view, at most LONGEST pixels a side. Raises BadMask where their shapes differ."""
+    mask = read_mask(path)
+    high, wide = mask.shape
+    if abs(wide * view.height - high * view.width) > 0.01 * wide * view.height:
+        raise BadMask(
+            f"{path}: {wide}x{high} pixels, but the view '{view.name}' has {view.width}x{view.height}; paint "
+            "masks on pictures of that size"
+        )
+    smaller = small(view, LONGEST)
+    rows = ((np.arange(smaller.height) + 0.5) * high / smaller.height).astype(int)
+    columns = ((np.arange(smaller.width) + 0.5) * wide / smaller.width).astype(int)
+    return Look(in_frame(smaller, fused), mask[np.ix_(rows, columns)])
+
+
+def small(view: View, longest: int) -> View:
+    """A view with at most so many pixels along its longer side."""
+    share = min(1.0, longest / max(view.width, view.height))
+    return (
+        view if share == 1 else view.reframed(*(max(1, round(n * share)) for n in (view.width, view.height)))
+    )
+
+
+def in_frame(view: View, fused: Whole) -> Camera:
+    """The camera of a view in the field's frame."""
+    return camera_of(view).seen_from(placement(fused.origin))
+
+
+def pointed_at(point: tuple, request: ExtractRequest, fused: Whole, rig: dict[str, View]) -> Look:
+    """The pixels around a point, which say whether they show the object."""
+    name, column, row, shows = point
+    if name not in rig:
+        names = ", ".join(list(rig)[:3])
+        raise InvalidInput(
+            f"{request.field}: there is no view '{name}'; the views are {names}, … ({len(rig)} in all)"
+        )
+    view = rig[name]
+    if column >= view.width or row >= view.height:
+        raise UsageProblem(
+            f"--points: {column:g},{row:g} lies outside of the view '{name}' of {view.width}x{view.height} "
+            "pixels"
+        )
+    smaller = small(view, LONGEST)
+    x, y = column * smaller.width / view.width, row * smaller.height / view.height
+    away = np.hypot(np.arange(smaller.width) + 0.5 - x, (np.arange(smaller.height) + 0.5 - y)[:, None])
+    near = away <= max(RADIUS, away.min() + 1e-9)
+    return Look(in_frame(smaller, fused), near & shows, near)
+
+
+def surface_at(field: RadianceField, look: Look, what: str) -> np.ndarray:
+    """(3,) the point of the frame that the middle of a pointed look shows; InvalidInput where there is
+    nothing."""
+    rays_o, rays_d = look.camera.rays()
+    away = look.depths(field).ravel()[look.counted.ravel()]
+    if not np.isfinite(away).any():
+        raise InvalidInput(f"{what}: there is nothing to be seen; point at what shows")
+    chosen = look.counted.ravel()
+    middle = np.median(away[np.isfinite(away)])
+    way = rays_d[chosen].mean(0)
+    return rays_o[chosen][0] + middle * way / np.linalg.norm(way)
+
+
+def watching(fused: Whole) -> list[Camera]:
+    """Cameras of the capture, in the field's frame, that tell what of it was ever seen; of a field that
+    keeps none, none."""
+    views = [] if fused.scene.cameras is None else read_rig(fused.scene.cameras).views
+    chosen = np.unique(np.linspace(0, len(views) - 1, WATCHING).astype(int)) if views else []
+    return [in_frame(small(views[i], SEEN_SIDE), fused) for i in chosen]
+
+
+# -- choosing ------------------------------------------------------------------------------------------------
+
+
+def selected(field: RadianceField, told: Told) -> Selection:
+    """The object in two looks: at all of the field in coarse cells, and at the box that it lies in. Where it
+    touches other matter colours correct what masks say."""
+    config = current(CellConfig)
+    found = choice(Lattice.over(field, field.occupancy.aabb, config.coarse), told)
+    if not found.shows:
+        return found
+    held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
+    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), config.fine), told)
+    return fine.without_foreign() if told.masks else fine
+
+
+def choice(lattice: Lattice, told: Told) -> Selection:
+    """What masks, points or, without these, the shapes alone say, within the shapes."""
+    allowed = np.ones(len(lattice.points), bool) if told.shapes is None else told.shapes(lattice.points)
+    if not allowed.any():
+        return Selection(lattice, allowed)
+    inner = lattice.kept(allowed)
+    if told.masks:
+        found = chosen_by_masks(inner, [*told.masks, *told.pointed])
+    elif len(told.inside):
+        found = chosen_by_points(inner, told.inside, told.outside, lattice.beside(allowed))
+    else:
+        found = Selection(inner, np.ones(len(inner.points), bool))
+    chosen = allowed.copy()
+    chosen[allowed] = found.chosen
+    return Selection(lattice, chosen, found.sure)
+
+
+def nothing(request: ExtractRequest) -> str:
+    """Why nothing was chosen."""
+    if request.masks or request.points:
+        return "what the masks or points show holds nothing of the field; look at it from those views"
+    return "there is nothing in the given shape; shapes are in the units of the world (see fusedrf info)"

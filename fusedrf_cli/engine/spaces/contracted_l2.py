@@ -1,0 +1,182 @@
+"""Contraction of all of space by the Euclidean norm (curved.py): x → (2 - 1/|x|) x/|x| outside the unit ball
+(Mip-NeRF 360, Barron et al. 2022, eq. 10), and with SHELL < 1 that of DVGO's unbounded scenes.
+
+A ray is told by its distance b from the origin and by τ, its length from the point there: |x|² = b² + τ².
+Outside the ball it moves in the coordinates, with B = SHELL, by
+    √(B² τ² + b² ((1 + B) |x| - B)²) / |x|³ <= c / (b² + τ²),  c = √(B² + (1 + B)² b²)
+for a unit of τ, and the integral of that bound is u: from τ0 on, with q = tan(u b / c) / b,
+    τ(u) = (τ0 + b² q) / (1 - τ0 q).
+"""
+
+import math
+
+import torch
+
+from fusedrf_cli.engine.kernels.parts import along
+from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
+    clearance,
+    contracted_by,
+    density_rates_by,
+    next_change,
+    next_sample,
+    placed_by,
+    position_at,
+    rates_by,
+    scale_of,
+    size_before,
+)
+from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
+    FAR,
+    LEARN_FROM,
+    LENT_FROM,
+    REST_FROM,
+    SUBJECT,
+    WHOLE,
+    picture_step,
+)
+
+PIECES = 3  # up to the ball, or to where the ray is nearest to the origin; in the ball; behind it
+INWARDS, INSIDE, OUTWARDS, BEYOND = 0, 1, 2, 3  # regions of a ray, in order
+CLOSEST = 1e-9  # b at least
+SHELL = 1.0
+CONTRACTED_DENSITY = 0.0  # 1: σ is per length of the coordinates along the ray (DVGO); 0: of the frame
+CONSTANTS = {"shell": (1e-3, 1.0), "contracted_density": (0.0, 1.0)}
+
+
+def length_of(p):
+    """The Euclidean norm."""
+    return math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+
+
+def point(p):
+    """Where a point of the field's frame lies in the space's coordinates."""
+    n = length_of(p)
+    s = scale_of(n) if n > 1.0 else 1.0
+    return p[0] * s, p[1] * s, p[2] * s
+
+
+def frame_point(q):
+    """Inverse of `point`; what lies beyond FAR comes back at FAR."""
+    m = length_of(q)
+    s = size_before(m) / m if m > 1.0 else 1.0
+    return q[0] * s, q[1] * s, q[2] * s
+
+
+def rate(q, d):
+    """See bounded.py."""
+    m = length_of(q)
+    if CONTRACTED_DENSITY == 0.0 or m <= 1.0:
+        return 1.0
+    n, out = size_before(m), (q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / m
+    across = scale_of(n) * n * n
+    return math.sqrt(SHELL * SHELL * out * out + max(1.0 - out * out, 0.0) * across * across) / (n * n)
+
+
+def depth_per_coordinate(q):
+    """See bounded.py: by the way out."""
+    m = length_of(q)
+    return 1.0 if CONTRACTED_DENSITY != 0.0 or m <= 1.0 else size_before(m) ** 2 / SHELL
+
+
+def nearest(o, d):
+    """Of a ray, d of any length: the t at which it is nearest to the origin, how near (b), the length of d,
+    and where in τ the unit ball and the ball of radius FAR end, 0 where it does not come there."""
+    speed = length_of(d)
+    middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (speed * speed)
+    b = max(length_of(along(o, d, middle)), CLOSEST)
+    return middle, b, speed, math.sqrt(max(1.0 - b * b, 0.0)), math.sqrt(max(FAR * FAR - b * b, 0.0))
+
+
+def entered(o, d, t):
+    """See bounded.py; the region at t comes with it."""
+    middle, _, speed, edge, _ = nearest(o, d)
+    tau = (t - middle) * speed
+    return t, INWARDS if tau < -edge else (INSIDE if tau < edge else OUTWARDS)
+
+
+def stretch(begun, grid, o, d, far):
+    """See bounded.py; `course` is (t and τ where it begins; b; b / c, or 0 inside; length in u; 1 / |d|)."""
+    t0, region = begun
+    middle, b, speed, edge, last = nearest(o, d)
+    low = -last if region == INWARDS else (-edge if region == INSIDE else edge)
+    high = -edge if region == INWARDS else (edge if region == INSIDE else last)
+    following = max(middle + high / speed, t0), min(region + 1, BEYOND)
+    low, high = max((t0 - middle) * speed, low), min((far - middle) * speed, high)
+    per, length = 0.0, high - low
+    if region != INSIDE:
+        per = b / math.sqrt(SHELL * SHELL + (1.0 + SHELL) * (1.0 + SHELL) * b * b)
+        length = math.atan2(b * (high - low), b * b + low * high) / per
+    if region == BEYOND or high <= low:
+        length = -1.0
+    course = middle, low, b, per, length, 1.0 / speed
+    return (o, (d, course), 0.0, length, course), following
+
+
+def piece(number, grid, o, d, near, far):
+    """See bounded.py."""
+    begun = entered(o, d, near)
+    for _ in range(number):
+        begun = stretch(begun, grid, o, d, far)[1]
+    return stretch(begun, grid, o, d, far)[0]
+
+
+def distance(course, u):
+    """The distance t along the ray, in the field's frame."""
+    middle, low, b, per, _, slow = course
+    if per == 0.0:
+        return middle + (low + u) * slow
+    q = math.tan(u * per) / b
+    return middle + (low + b * b * q) / (1.0 - low * q) * slow
+
+
+def length_at(course, t):
+    """See bounded.py."""
+    middle, low, b, per, length, slow = course
+    tau = max((t - middle) / slow, low)
+    if per == 0.0:
+        return min(tau - low, length)
+    return min(math.atan2(b * (tau - low), b * b + low * tau) / per, length)
+
+
+def interval(course, u, length):
+    """See bounded.py; where there is less than another such length before or behind it in the piece, that is
+    its own too."""
+    low, high = u - 0.5 * length, u + 0.5 * length
+    low = 0.0 if u < length else low
+    high = course[4] if u + length >= course[4] else high
+    return distance(course, low), distance(course, high)
+
+
+def span(course, u, length):
+    """See bounded.py."""
+    low, high = interval(course, u, length)
+    return high - low
+
+
+def most_samples(aabb, step: float) -> int:
+    """See bounded.py: outside the ball pieces are longest where b = 1."""
+    return int((2 + math.pi * math.hypot(SHELL, 1 + SHELL)) / step) + 2 * PIECES
+
+
+def contracted(points: torch.Tensor) -> torch.Tensor:
+    """`point` of each of points (N, 3), differentiable."""
+    return contracted_by(points, points.norm(dim=1, keepdim=True), SHELL)
+
+
+def placed(points: torch.Tensor) -> torch.Tensor:
+    """`frame_point` of each of coordinates (N, 3), differentiable."""
+    return placed_by(points, points.norm(dim=1, keepdim=True), SHELL, FAR)
+
+
+def rates(points: torch.Tensor) -> torch.Tensor:
+    """See bounded.py."""
+    return rates_by(points.norm(dim=1), SHELL, FAR)
+
+
+def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
+    """See bounded.py."""
+    if not CONTRACTED_DENSITY:
+        return points.new_ones(len(points))
+    x = placed(points)
+    n = x.norm(dim=1, keepdim=True)
+    return density_rates_by(x, dirs, n, (x * dirs).sum(1, keepdim=True) / n.clamp_min(1), SHELL)
