@@ -17,7 +17,8 @@ def objects_in(scene: SceneGraph, headers: dict[str, FieldHeader]) -> list[dict]
     """Name, kind, placement, world box, size and bytes of every object in a bundle, JSON-able.
 
     `bytes` are those of the object's own field, which `shared_by` nodes use; both are None for an object that
-    was distilled into one field with others. `kind` is that of the field which holds the object.
+    was distilled into one field with others, and `inside` names the node of that. `kind` is that of the field
+    which holds the object.
     """
     leaves = [leaf for leaf in scene.leaves() if leaf.field is not None]
     users = Counter(leaf.field for leaf in leaves)
@@ -30,8 +31,10 @@ def objects_in(scene: SceneGraph, headers: dict[str, FieldHeader]) -> list[dict]
         aabb = header.metadata.get("aabb")
         box = world_aabb(aabb, matrix) if aabb else None
         found.append(_row(leaf.name, header.kind, matrix, box, header.size, users[leaf.field]))
-    kind = next((headers[leaf.field].kind for leaf in leaves), None)
-    return found + [_row(n.name, kind, np.array(n.object_to_world), n.aabb) for n in inside]
+    holders = [leaf for leaf in leaves if belongs(leaf.name, UNNAMED)] or leaves
+    kind = headers[holders[0].field].kind if holders else None
+    field = holders[0].name if holders else None
+    return found + [_row(n.name, kind, np.array(n.object_to_world), n.aabb, inside=field) for n in inside]
 
 
 def distilled_nodes(scene: SceneGraph) -> Iterator[DistilledNode]:
@@ -59,6 +62,7 @@ def _row(
     box: list[float] | None,
     size: int | None = None,
     shared_by: int | None = None,
+    inside: str | None = None,
 ) -> dict:
     with np.errstate(all="ignore"):
         extent = None if box is None else np.subtract(box[3:], box[:3]).tolist()
@@ -70,4 +74,5 @@ def _row(
         "size": extent,
         "bytes": size,
         "shared_by": shared_by,
+        "inside": inside,
     }

@@ -56,17 +56,17 @@ def with_field(scene: SceneGraph, name: str, member: str | None) -> SceneGraph:
 
 
 def with_leaves(scene: SceneGraph, becoming: Callable[[Node], Node | None]) -> SceneGraph:
-    """The scene whose nodes that hold a field became others, one after the other in document order; None:
-    without it."""
+    """The scene whose nodes that hold a field, each without its children, became others, in document order;
+    None: without it."""
 
     def after(node: Node) -> tuple[Node, ...]:
-        own = node if node.field is None else becoming(node)
+        own = replace(node, children=())
+        own = own if node.field is None else becoming(own)
         children = tuple(one for child in node.children for one in after(child))
-        if own is None:
-            return (replace(node, field=None, children=children),) if children else ()
-        if node.children and not children and own.field is None:
+        if not children and (own is None or node.children and own.field is None and not own.children):
             return ()
-        return (replace(own, children=children) if node.children else own,)
+        own = replace(node, field=None, children=()) if own is None else own
+        return (replace(own, children=(*own.children, *children)),)
 
     return replace(scene, nodes=tuple(one for node in scene.nodes for one in after(node)))
 

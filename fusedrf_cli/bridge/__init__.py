@@ -8,7 +8,6 @@ whole or not at all, and returns a JSON-able report.
 from fusedrf_cli.bridge.charting import chart
 from fusedrf_cli.bridge.converting import convert
 from fusedrf_cli.bridge.deleting import delete
-from fusedrf_cli.bridge.editing import add, duplicate, move, rename, show
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.extracting import extract
 from fusedrf_cli.bridge.fusing import fuse
@@ -17,6 +16,7 @@ from fusedrf_cli.bridge.posing import pose
 from fusedrf_cli.bridge.rendering import render
 from fusedrf_cli.bridge.replacing import replace
 from fusedrf_cli.bridge.training import train
+from fusedrf_cli.bridge.transforming import add, duplicate, move, rename, show
 
 __all__ = [
     "add",

@@ -16,15 +16,11 @@ from formats.records import BITS, FieldRecord
 from formats.scene import Leaf, Node, SceneGraph, dump_scene
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.cutting import Fields, Whole
-from fusedrf_cli.bridge.fusing import NODES
 from fusedrf_cli.bridge.scene import part_shown, stored
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.kinds import registry
-
-OBJECT = "object"
-"""The node of an object that was not chosen by its name."""
 
 
 class Cutout:
@@ -100,11 +96,6 @@ class Cutout:
         return self.whole.draft.bundle.with_fields(self.writer.members)
 
     @property
-    def kind_to_fuse(self) -> str:
-        """The way in which its fields become smaller."""
-        return self.kinds if self.kinds != "vm" and "," not in self.kinds else NODES
-
-    @property
     def kinds(self) -> str:
         """Of its fields."""
         return self.said("kind")
@@ -134,15 +125,16 @@ class ObjectCutout(Cutout):
         whole: Whole,
         fields: Fields,
         precision: str | None,
-        name: str | None,
+        name: str,
+        keeps_names: bool,
         framing: Sequence[float],
         cameras: dict | None,
     ):
-        """name: by which it was chosen. framing: (6,) in the world."""
+        """keeps_names: whether it is nodes of that name as they are. framing: (6,) in the world."""
         super().__init__(whole, fields, precision, False)
-        nodes = tuple(lifted(node, {name} if name else ()) for node in self.graph.nodes)
+        nodes = tuple(lifted(node, {name} if keeps_names else ()) for node in self.graph.nodes)
         self.graph = SceneGraph(
-            self.named(nodes, name),
+            nodes if keeps_names else self.as_one(nodes, name),
             self.graph.composition,
             framing=tuple(float(x) for x in framing),
             cameras=cameras,
@@ -154,14 +146,12 @@ class ObjectCutout(Cutout):
         node = super().in_place_of(node, members)
         return node and replace(node, background=False)
 
-    def named(self, nodes: tuple[Node, ...], name: str | None) -> tuple[Node, ...]:
-        """Nodes that were chosen by a name, as they are; else one node, called OBJECT."""
-        if name is not None:
-            return nodes
+    def as_one(self, nodes: tuple[Node, ...], name: str) -> tuple[Node, ...]:
+        """Nodes as one of a name, which holds them."""
         if len(nodes) == 1:
-            return (renamed(nodes[0], nodes[0].name, OBJECT, apart=True),)
+            return (renamed(nodes[0], nodes[0].name, name, apart=True),)
         rule = self.graph.composition
-        return (as_one(SceneGraph(nodes, rule), OBJECT, np.eye(4), rule),)
+        return (as_one(SceneGraph(nodes, rule), name, np.eye(4), rule),)
 
 
 class RestCutout(Cutout):

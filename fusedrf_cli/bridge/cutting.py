@@ -1,7 +1,7 @@
 """A bundle taken apart by its nodes: what of each field is an object's, and what stays. Every field is cut by
 its own kind; the fields of nodes that lie wholly on one side keep their bytes."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -124,11 +124,10 @@ class Whole:
 # -- cutting -------------------------------------------------------------------------------------------------
 
 
-def cut(whole: Whole, selection: Selection, both: bool, guessed: bool) -> tuple[Fields, Fields]:
-    """A selected object, and what is left. Without `both` nothing need be known of what is left. guessed:
-    where masks or points told of it, it is none of the nodes that it merely touches."""
+def cut(whole: Whole, selection: Selection, both: bool, touched: Container[str]) -> tuple[Fields, Fields]:
+    """A selected object out of nodes of some names, and what is left. Without `both` nothing need be known of
+    what is left."""
     found, rest = {}, dict(whole.raw)
-    touched = holders(whole, selection) if guessed and len(whole.nodes) > 1 else set(whole.raw)
     around = selection.object.tight_aabb(1)
     for leaf, _ in whole.nodes:
         if leaf.name not in touched:
@@ -151,8 +150,9 @@ def cut(whole: Whole, selection: Selection, both: bool, guessed: bool) -> tuple[
     return found, rest
 
 
-def holders(whole: Whole, selection: Selection) -> set[str]:
-    """The nodes in whose occupied cells more than a share (CellConfig.aside) of an object's cells lie."""
+def nodes_of(whole: Whole, selection: Selection) -> set[str]:
+    """The nodes in whose occupied cells more than a share (CellConfig.aside) of an object's cells lie: it is
+    none of those that it merely touches."""
     points = selection.lattice.points[selection.chosen & selection.lattice.dense]
     found = set()
     for leaf, placed in whole.nodes:
@@ -169,15 +169,20 @@ def holds(box: np.ndarray, other: np.ndarray) -> bool:
 
 
 def cut_with_hidden(
-    whole: Whole, selection: Selection, shown: np.ndarray, least: float, cameras: list[Camera], guessed: bool
+    whole: Whole,
+    selection: Selection,
+    shown: np.ndarray,
+    least: float,
+    cameras: list[Camera],
+    touched: Container[str],
 ) -> tuple[Fields, Fields]:
     """As `cut`, and what is left is without what then shows where the object was to cameras that did not see
     it before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it
     lies more of it."""
-    found, rest = cut(whole, selection, True, guessed)
+    found, rest = cut(whole, selection, True, touched)
     gone = selection.with_islands()  # of photos: what hangs in the air is an error
     if (gone.chosen != selection.chosen).any():
-        rest = cut(whole, gone, True, guessed)[1]
+        rest = cut(whole, gone, True, touched)[1]
     for _ in range(LAYERS):
         left = whole.composed(rest)
         if left is None:
@@ -187,5 +192,5 @@ def cut_with_hidden(
         if revealed.mean() < FEW_REVEALED:
             break
         gone = gone.joined(revealed)
-        rest = cut(whole, gone, True, guessed)[1]
+        rest = cut(whole, gone, True, touched)[1]
     return found, rest

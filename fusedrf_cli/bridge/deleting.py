@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from formats.blocks import UNNAMED
 from formats.bundle import PART
-from formats.graph import belongs, with_field, without
-from formats.scene import Leaf
+from formats.graph import belongs, placement_of, with_field, without
+from formats.scene import WHITE, Leaf, Node
+from fusedrf_cli.bridge.distilled import holders_in, inside
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit
 from fusedrf_cli.bridge.mending import LEARNT, Frame, Teacher, hole_of, learnt_from, learnt_surfaces, up_of
 from fusedrf_cli.bridge.rendering import renderable
@@ -112,10 +112,8 @@ class Deletion:
             self.progress.warn("--refit is not needed: what the deleted objects hid is known")
 
     def holders(self, box: np.ndarray) -> list[Leaf]:
-        """The nodes of the fields that objects were distilled into, and of what filled earlier cuts, as far
-        as they reach into a box (6,) of the world."""
-        leaves = [leaf for leaf in self.draft.graph.leaves() if leaf.field is not None]
-        own = [leaf for leaf in leaves if belongs(leaf.name, UNNAMED)] or leaves
+        """Of `holders_in` those that reach into a box (6,) of the world."""
+        own = holders_in(self.draft.graph)
         return [leaf for leaf in own if self.placed(leaf).reaches(box)] or own[:1]
 
     def placed(self, leaf: Leaf) -> Placed:
@@ -137,7 +135,7 @@ class Deletion:
         """Add a node that shows what a field has in a box (6,) of the world, and in cells that reach into it;
         widest: the side of those that were emptied."""
         grown = box + (widest + OVERLAP * side_of(one)) * np.repeat([-1, 1], 3)
-        part = self.part(one, "cropped", lambda at: ((at >= grown[:3]) & (at <= grown[3:])).all(1))
+        part = self.part(one, "cropped", lambda at: inside(at, grown))
         if part is not None:
             part = registry.kind(part.kind).trimmed(part)
             name = one.name if belongs(one.name, (RESTORED,)) else f"{RESTORED}/{one.name}"
@@ -198,6 +196,41 @@ class Deletion:
         """In which most of the bundle's fields are stored."""
         told = [header.precision for header in self.draft.bundle.headers.values() if header.kind != PART]
         return max(told, key=told.count)
+
+
+def released(deletion: Deletion, name: str, new_name: str) -> Node:
+    """An object that was distilled as a node of another name: with the numbers of its source where that is
+    found, else with those that the field has in its box."""
+    draft, told = deletion.draft, deletion.draft.inside[name]
+    leaf = replace(leaf_of(told), name=new_name)
+    own = source_of(told, leaf, draft.bundle, Elsewhere(None), deletion.allow_outside)
+    nodes = []
+    for part, file, member in own:
+        draft.writer.copy_field(file, member)
+        tint = {} if part.tint == WHITE else {"tint": list(part.tint)}
+        nodes.append(Node(part.name, member, None, placement_of(part.object_to_world), showing=tint))
+    if not own:
+        deletion.progress.warn(
+            f"the source of '{name}' is gone, has changed, or lies outside of the folder: what its box holds "
+            "of the field is taken for it"
+        )
+        box = np.asarray(told["aabb"], np.float64)
+        for number, holder in enumerate(deletion.holders(box)):
+            one = deletion.placed(holder)
+            grown = box + side_of(one) * np.repeat([-1, 1], 3)
+            part = deletion.part(one, "cropped", lambda at, box=grown: inside(at, box))
+            if part is not None:
+                part = registry.kind(part.kind).trimmed(part)
+                member = draft.put(part, draft.fields.headers[holder.field].precision)
+                words = f"{new_name}/{number}", member, None, placement_of(one.object_to_world)
+                nodes.append(
+                    Node(
+                        *words,
+                    )
+                )
+    if not nodes:
+        raise InvalidInput(f"{draft.path}: there is nothing of '{name}' in its field; delete it")
+    return replace(nodes[0], name=new_name) if len(nodes) == 1 else Node(new_name, children=tuple(nodes))
 
 
 def meet(one: np.ndarray, other: np.ndarray) -> bool:

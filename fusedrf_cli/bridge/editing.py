@@ -1,5 +1,5 @@
-"""Edits of a bundle's scene graph: objects put in, taken out, placed, named and shown otherwise. No field is
-changed: those that stay keep their bytes, and those that come have the bytes of the bundle they come from."""
+"""A bundle that is being edited: its scene graph, and the fields that come to those it has, which keep their
+bytes."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -14,14 +14,10 @@ from formats.bundle import BundleWriter, FieldSet, OpenBundle, is_bundle
 from formats.embedding import Embedding, as_one
 from formats.graph import (
     belongs,
-    changed,
     chosen,
     free_name,
     leaf_names,
-    moved,
     placement_of,
-    renamed,
-    shown,
     with_nodes,
 )
 from formats.history import check_history, distilled, summed_up
@@ -30,18 +26,16 @@ from formats.scene import Node
 from formats.undo import keep
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.running import engine, written_somewhere
+from fusedrf_cli.bridge.running import written_somewhere
 from fusedrf_cli.bridge.scene import LoadedScene, load_bundle
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import (
     AddRequest,
-    ArrangeRequest,
     EditRequest,
     Learning,
     ReplaceRequest,
-    ShowRequest,
 )
 
 SAME_BITS = "an edit of the scene graph: all fields keep their bits"
@@ -104,22 +98,16 @@ class Draft:
                 f"{', '.join(sorted(self.names)) or 'nothing that has a name'}"
             )
 
-    def check_node(self, name: str) -> None:
-        """InvalidInput where there is no node of a name."""
-        self.check(name)
-        if name in self.inside:
-            raise InvalidInput(
-                f"{self.path}: '{name}' is no node of its own, since it was distilled into one field with "
-                "others; fuse the scene with --kind blocks, or delete the object and add it again"
-            )
-
     def check_free(self, name: str) -> None:
         """InvalidInput where an object has a name already."""
         if name in self.names:
             raise InvalidInput(f"{self.path}: there is a '{name}' already; choose another name")
 
     def box(self, names: Iterable[str]) -> np.ndarray | None:
-        """(6,) in the world around nodes as they were; None where none of them is visible."""
+        """(6,) in the world around objects as they were; None where none of them is visible."""
+        inside = [np.asarray(self.inside[name]["aabb"]) for name in names if name in self.inside]
+        if inside:
+            return enclosing(inside)
         return box_of(self.before, leaf_names(chosen(self.bundle.scene, set(names))))
 
     @cached_property
@@ -159,69 +147,6 @@ def box_of(scene: LoadedScene, names: set[str]) -> np.ndarray | None:
 
 
 # -- edits ---------------------------------------------------------------------------------------------------
-
-
-def add(request: AddRequest, progress) -> dict:
-    """Put one more object into a bundle, as a node that is placed."""
-    with engine("cpu", None, progress):
-        edit = Edit(request, progress)
-        draft = edit.draft
-        draft.check_free(request.name)
-        node = brought(draft, request, request.name, request.object_to_world)
-        draft.graph = with_nodes(draft.graph, [node])
-        return edit.done("added", [request.name], [node])
-
-
-def move(request: ArrangeRequest, progress) -> dict:
-    """Place an object anew: scaled and turned about the middle of its box, then moved."""
-    return arrange(request, "moved", progress)
-
-
-def duplicate(request: ArrangeRequest, progress) -> dict:
-    """Put a copy of an object beside it, which places the same field."""
-    return arrange(request, "duplicated", progress)
-
-
-def rename(request: ArrangeRequest, progress) -> dict:
-    """Give an object another name."""
-    return arrange(request, "renamed", progress)
-
-
-def arrange(request: ArrangeRequest, event: str, progress) -> dict:
-    """Do one of the three."""
-    with engine("cpu", None, progress):
-        edit = Edit(request, progress)
-        draft, name, new_name = edit.draft, request.name, request.new_name or request.name
-        draft.check_node(name)
-        if request.new_name is not None:
-            draft.check_free(request.new_name)
-        matrix, copies = request.object_to_world, event == "duplicated"
-        if not request.absolute and not np.array_equal(matrix[:3, :3], np.eye(3)):
-            box = draft.box({name})
-            if box is None:
-                raise InvalidInput(f"{request.fused}: '{name}' is hidden, and has no middle; give --matrix")
-            matrix = about(matrix, (box[:3] + box[3:]) / 2)
-
-        def arranged(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
-            still = np.array_equal(matrix, np.eye(4))
-            one = node if still else moved(node, parent, matrix)
-            one = renamed(one, name, new_name, copies) if new_name != name else one
-            return (node, one) if copies else (one,)
-
-        draft.graph = changed(draft.graph, {name}, arranged)
-        before = () if copies else (name,)
-        renamed_from = {"names": [name]} if event == "renamed" else {}
-        return edit.done(event, [new_name], chosen(draft.graph, {new_name}), before, renamed_from)
-
-
-def show(request: ShowRequest, progress) -> dict:
-    """Show an object otherwise: cropped, tinted, or thinner."""
-    with engine("cpu", None, progress):
-        edit = Edit(request, progress)
-        draft, name = edit.draft, request.name
-        draft.check_node(name)
-        draft.graph = changed(draft.graph, {name}, lambda node, _: (shown(node, request.showing),))
-        return edit.done(request.event, [name], chosen(draft.graph, {name}))
 
 
 class Edit:
@@ -290,10 +215,3 @@ def brought(
     if not leaf_names([node]):
         raise InvalidInput(f"{source}: it holds no field; choose another source")
     return node
-
-
-def about(matrix: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """(4, 4) that scales and turns about a point (3,) as `matrix` does about the origin, and then moves."""
-    found = matrix.copy()
-    found[:3, 3] += centre - matrix[:3, :3] @ centre
-    return found

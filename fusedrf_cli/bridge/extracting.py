@@ -14,7 +14,8 @@ from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph
 from formats.views import View
 from fusedrf_cli.bridge.cutouts import Cutout, ObjectCutout, RestCutout
-from fusedrf_cli.bridge.cutting import Fields, Whole, cut, cut_with_hidden
+from fusedrf_cli.bridge.cutting import Fields, Whole, cut, cut_with_hidden, nodes_of
+from fusedrf_cli.bridge.distilled import DistilledShape, holders_in
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.mending import Frame, mended
@@ -24,6 +25,7 @@ from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.selecting import (
     SEEN_SIDE,
+    Told,
     in_frame,
     nothing,
     rig_for,
@@ -35,13 +37,16 @@ from fusedrf_cli.bridge.selecting import (
 from fusedrf_cli.bridge.sources import as_it_is
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import placed_box
+from fusedrf_cli.engine.fields.occupancy import placed_box, placement, squeezed
+from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.selection.voting import shown_by, well_shown
 from fusedrf_cli.engine.selection.weights import cell_weights
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest, FuseRequest
 
+OBJECT = "object"
+"""The node of an object that was not chosen by a name."""
 SEEN_FROM = 2e-3
 """Weight of what was seen of an object."""
 SEEN = 0.1
@@ -77,7 +82,9 @@ def extract(request: ExtractRequest, progress) -> dict:
                 cutout.add(one)
         else:
             cameras = own_cameras(whole.scene, box)
-            cutout = ObjectCutout(whole, found, request.precision, request.name, box, cameras)
+            named = request.name not in (None, *whole.draft.inside)
+            name = request.name or OBJECT
+            cutout = ObjectCutout(whole, found, request.precision, name, named, box, cameras)
         if request.max_size is not None:
             figures |= within_size(request, cutout, progress)
         with held_back(request.output):
@@ -108,9 +115,10 @@ def parted(
 ) -> tuple[Fields, Fields, dict]:
     """The object's fields, those that are left, and what the report says of how it was chosen. InvalidInput
     where there is no such object."""
-    if request.name is not None:
-        return *named(request, whole), {}
-    told = told_by(request, whole, rig, progress)
+    by_name = request.name is not None
+    told = told_by_name(request, whole) if by_name else told_by(request, whole, rig, progress)
+    if told is None:
+        return *whole.named(request.name), {}
     selection = selected(whole.field, told)
     cameras = watching(whole)
     shown = shown_by(whole.field, selection.lattice, cameras)
@@ -124,11 +132,15 @@ def parted(
             "give more masks or points"
         )
     progress.phase("cutting", None)
+    touched = set(whole.raw)
+    if by_name:
+        touched = {leaf.name for leaf in holders_in(whole.scene)}
+    elif told.is_guess and len(touched) > 1:
+        touched = nodes_of(whole, selection)
     if request.invert and cameras:
-        found, rest = cut_with_hidden(whole, selection, shown, well, cameras, told.is_guess)
+        found, rest = cut_with_hidden(whole, selection, shown, well, cameras, touched)
     else:
-        both = bool(request.invert or request.preview)
-        found, rest = cut(whole, selection, both, told.is_guess)
+        found, rest = cut(whole, selection, bool(request.invert or request.preview), touched)
     object_shown = whole.composed(found)
     if object_shown is None:
         raise InvalidInput(f"{request.field}: {nothing(request)}")
@@ -136,15 +148,28 @@ def parted(
     return found, rest, {"sure": round(selection.sure, 3), "seen": share}
 
 
-def named(request: ExtractRequest, whole: Whole) -> tuple[Fields, Fields]:
-    """The fields of the nodes that go by a name, and what is left without them."""
+def told_by_name(request: ExtractRequest, whole: Whole) -> Told | None:
+    """What tells of an object that was distilled into a field with others: where it stood, and the cells of
+    its source; of what they stood in, that it is none of them. None of one that is a node."""
     if request.masks or request.points or request.boxes or request.spheres or request.mesh:
         raise UsageProblem("--name takes a whole part; leave out what else tells of the object")
-    found, rest = whole.named(request.name)
-    if not found:
-        held = ", ".join(sorted(whole.draft.names))
-        raise InvalidInput(f"{request.field}: there is no part '{request.name}'; it holds {held}")
-    return found, rest
+    name, inside = request.name, whole.draft.inside
+    if name not in inside:
+        if not whole.named(name)[0]:
+            held = ", ".join(sorted(whole.draft.names))
+            raise InvalidInput(f"{request.field}: there is no part '{name}'; it holds {held}")
+        return None
+    origin, background = placement(whole.origin), bool(inside[name].get("background"))
+    beside = 0.5 * whole.field.voxel_size * squeezed(origin)
+    told = [node for key, node in inside.items() if background is not bool(key == name)]
+    shapes = [DistilledShape(node, whole.draft.bundle, beside) for node in told]
+
+    def holds(points: np.ndarray) -> np.ndarray:
+        at = points @ origin[:3, :3].T + origin[:3, 3]
+        return np.any([shape.holds(at) for shape in shapes], 0) != background
+
+    none = np.zeros((0, 3))
+    return Told(holds, [], [], none, none, touches=True)
 
 
 def subject(field: RadianceField) -> np.ndarray:
@@ -215,7 +240,7 @@ def within_size(request: ExtractRequest, cutout: Cutout, progress) -> dict:
         alone.write(pieces, False)
         fused = fuse(
             FuseRequest(
-                pieces, smaller, kind=cutout.kind_to_fuse, max_size=max(1, request.max_size - beside),
+                pieces, smaller, kind=registry.INSTANCES, max_size=max(1, request.max_size - beside),
                 precision=request.precision, memory=request.memory, time_budget=request.time_budget,
                 seed=request.seed, device=request.device, threads=request.threads,
             ),

@@ -1,16 +1,14 @@
-"""`fuse`: a scene to one field, of any kind, by one search over the ways and sizes it can be made in."""
+"""`fuse`: a scene to a bundle, of any kinds, by one search over the ways and sizes it can be made in."""
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 
-from formats.bundle import BundleWriter, OpenBundle
-from formats.embedding import Embedding
-from formats.scene import dump_scene
-from fusedrf_cli import __version__
+from formats.bundle import OpenBundle
+from fusedrf_cli.bridge.background import Background, kept_background
+from fusedrf_cli.bridge.bundling import FusedBundle, stored_bytes, unchanged_bytes
 from fusedrf_cli.bridge.choose import Choosing, Tried, flags
-from fusedrf_cli.bridge.making import Kept, Maker, MakingConfig, Scene
+from fusedrf_cli.bridge.making import Kept, Maker, MakingConfig, Result, Scene
 from fusedrf_cli.bridge.memory import Memory, MemoryConfig, asking_in_waves, learning_is_asked, stages
 from fusedrf_cli.bridge.memory import sources as in_memory
 from fusedrf_cli.bridge.rendering import tell_of_work
@@ -25,30 +23,23 @@ from fusedrf_cli.bridge.running import (
     load_checkpoint,
     written_somewhere,
 )
-from fusedrf_cli.bridge.scene import (
-    LoadedScene,
-    check_graph,
-    history_nodes,
-    refuse_options,
-    unusable_kind,
-    write_field,
-)
-from fusedrf_cli.bridge.sizes import BundleSizes, graph_bytes
+from fusedrf_cli.bridge.scene import LoadedScene, refuse_options, unusable_kind
+from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, DetailConfig
 from fusedrf_cli.engine.fields.base import holds_matter
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.instances import distinct_fields
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student, StudentRequest, TooSmall
+from fusedrf_cli.engine.rendering.metrics import PSNR_CAP
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
 
 DEFAULT_MAX_SIZE = 25_000_000  # and what the places among the sources take
-FUSED = "fused"  # the node of the field
-NODES = "blocks"  # the word by which nothing is learnt: every source stays a node with a field of its own
 CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
 
 
@@ -59,65 +50,45 @@ Load = Callable[[FuseRequest, Memory, str, object], LoadedScene]
 def fuse(
     request: FuseRequest, progress, load: Load = load_to_fuse, somewhere: Callable = written_somewhere
 ) -> dict:
-    """Turn a composed scene into one field and write it with the scene's history; `somewhere` writes, as
-    `written_somewhere` does."""
+    """Turn a composed scene into a bundle of it, of one field or of a field for each source, with the scene's
+    history; `somewhere` writes, as `written_somewhere` does."""
     with engine(request.device, request.threads, progress) as place:
         progress.phase("reading", None)
         check_checkpoint(request.output, request.resume, request.overwrite)
         saved = load_checkpoint(request.output, "fuse") if request.resume else None
         memory = Memory(request.memory)
-        loaded = load(request, memory, place, progress)
-        loaded = without_empty(loaded, request.scene, progress)
+        everything = load(request, memory, place, progress)
+        loaded = without_empty(everything, request.scene, progress)
         scene = Scene.of(loaded)
-        if request.kind == NODES and registry.kind(NODES).suits(scene.composed).score is None:
-            return as_nodes(request, loaded, scene.composed, memory, progress)
         kind, suits = choose_kind(request.kind, loaded, scene.composed)
         refuse_options(kind, request)
         started = time.monotonic()
-        kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
-        nodes = history_nodes(loaded, request.output, kept)
+        bundle = FusedBundle(request, everything, loaded, kind.field is not None)
         cameras = kept_cameras(loaded, progress)
-        framing = kept_framing(loaded, scene.composed, cameras)
-        check_graph(request.output, FUSED, scene.composed.origin, framing, cameras)
+        bundle.shown_as(kept_framing(loaded, scene.composed, cameras), cameras)
         pixels = current(MakingConfig).views * DistilConfig.view_size**2
         tell_of_work(request.scene, scene.composed, pixels, progress)
-        overhead = graph_bytes(nodes, cameras)
-        found, student, figures_of_it = best_of(
-            request, scene, kind, overhead, memory, place, progress, saved
-        )
+        made = best_of(request, scene, kind, bundle.overhead, memory, place, progress, saved)
         entry = {
             "event": "fused",
             "kind": kind.name,
             "composition": loaded.composition,
-            "nodes": nodes,
             "settings": {
                 "seed": request.seed,
-                "max_size": student.request.limit,
+                "max_size": made.student.request.limit,
                 "rgb": request.rgb,
                 "from_scratch": request.from_scratch,
             },
-            "psnr": reached_by(found, student),
+            "psnr": reached_by(made.kept, made.student),
         }
         with held_back(request.output):  # what was made comes before what is found out about it
             size = somewhere(
-                request.output,
-                lambda output: write_field(
-                    output,
-                    found.field,
-                    FUSED,
-                    precision=found.tried.way.precision,
-                    overwrite=request.overwrite,
-                    origin=scene.composed.origin,
-                    history=(entry,),
-                    kept=kept,
-                    framing=framing,
-                    cameras=cameras,
-                ),
+                request.output, lambda output: bundle.write(output, made.kept, made.background, entry)
             )
             checkpoint_path(request.output).unlink(missing_ok=True)
-        details = student.details(found.field)
+        details = made.details()
         warn_of_detail(details, remedy(kind, loaded, scene.composed), progress)
-        figures = figures_of_it()
+        figures = made.figures()
     report = {
         "output": request.output,
         "bytes": size,
@@ -133,46 +104,23 @@ def fuse(
     return report
 
 
-def as_nodes(
-    request: FuseRequest, loaded: LoadedScene, composed: ComposedField, memory: Memory, progress
-) -> dict:
-    """Write a scene whose fields are kept whole, whatever their kinds and rules: the graph, and the bytes of
-    every field that it places. UsageProblem where that takes more than is allowed."""
-    started = time.monotonic()
-    for word in ("ranks", "sh_degree", "target_psnr"):
-        if getattr(request, word) is not None:
-            option = f"--{word.replace('_', '-')}"
-            raise UsageProblem(f"{option} applies to scenes of vm fields by 'max' alone; leave it out")
-    writer = BundleWriter()
-    graph = Embedding(writer, request.allow_outside, request.precision).of(loaded.graph, loaded.path)
-    cameras = kept_cameras(loaded, progress)
-    framing = kept_framing(loaded, composed, cameras)
-    entry = {"event": "fused", "kind": NODES, "objects": [node.name for node in graph.nodes]}
-    graph = replace(
-        graph,
-        history=(entry,),
-        generator=f"fusedrf {__version__}",
-        framing=None if framing is None else tuple(float(number) for number in framing),
-        cameras=cameras,
-    )
-    size = sum(len(data) for data in writer.members.values()) + len(dump_scene(graph))
-    if request.max_size is not None and size > request.max_size:
-        raise UsageProblem(
-            f"--max-size is too small: the fields as they are take {readable_size(size)}, and only fields of "
-            "kind vm are made smaller, by 'max' composition; give more, or another --kind"
-        )
-    writer.write(request.output, graph, overwrite=request.overwrite)
-    return {
-        "output": request.output,
-        "bytes": Path(request.output).stat().st_size,
-        "source_bytes": source_bytes(loaded),
-        "kind": NODES,
-        "nodes": len(graph.leaves()),
-        "fields": len(writer.members),
-        "why": "every field as its source has it",
-        "total_seconds": time.monotonic() - started,
-        "memory": memory.report(),
-    }
+@dataclass(frozen=True)
+class Made:
+    """The best of what was made of a scene."""
+
+    kept: Kept
+    student: Student
+    figures: Callable[[], dict]
+    """What tells of it for the report, which may try more."""
+    background: Background | None = None
+    """That stays beside it."""
+
+    def details(self) -> list[Detail]:
+        """What it holds of the scene's objects."""
+        if self.background is None:
+            return self.student.details(self.kept.field)
+        _, learnt = self.kept.field.placed
+        return [self.background.detail, *self.student.details(learnt.field)]
 
 
 def best_of(
@@ -184,26 +132,43 @@ def best_of(
     place: str,
     progress,
     saved: Saved | None = None,
-) -> tuple[Kept, Student, Callable[[], dict]]:
-    """The best stand of a kind for a scene, and what tells of it for the report, which may try more;
-    overhead: bytes of the bundle besides its field. UsageProblem where nothing fits the size that is
-    allowed."""
+) -> Made:
+    """The best stand of a kind for a scene; overhead: bytes of the bundle besides its fields. UsageProblem
+    where nothing fits the size that is allowed."""
     asked = student_request(request, scene, overhead)
+    background = kept_background(kind, scene.composed, asked)
+    composed = scene.composed
+    if background is not None:
+        composed, asked = background.objects, replace(asked, overhead=overhead + background.bytes)
     try:
-        student = kind.student(scene.composed, asked)
+        student = kind.student(composed, asked)
+        if student.unchanged() is not None:
+            return as_it_is(student, scene)
         together = make_room(memory, student, scene, request)
-        maker, choosing, seconds = begin(student, scene, request, place, progress, together)
-        found = search(maker, choosing, student, request, saved, seconds)
+        maker, choosing, seconds = begin(student, scene, request, place, progress, together, background)
+        kept = search(maker, choosing, student, request, saved, seconds)
     except TooSmall as error:
         raise UsageProblem(
             f"--max-size is too small: the file takes {readable_size(error.smallest)} at its coarsest, "
             f"where {readable_size(asked.limit)} were allowed; give more"
         ) from error
-    return found, student, lambda: figures_of(found, maker, choosing, seconds)
+    return Made(kept, student, lambda: figures_of(kept, maker, choosing, seconds), background)
+
+
+def as_it_is(student: Student, scene: Scene) -> Made:
+    """A scene whose fields are all as their sources have them: it shows what the scene does."""
+    whole, way = student.unchanged(), student.plain()
+    tried = Tried(way, student.request.limit, whole.bytes, PSNR_CAP, PSNR_CAP, True, True)
+    kept = Kept(tried, whole.field)
+
+    def figures() -> dict:
+        return {"psnr": reached_by(kept, student), "seconds": {}} | chosen_of(kept, student, scene, 1, {})
+
+    return Made(kept, student, figures)
 
 
 def student_request(request: FuseRequest, scene: Scene, overhead: int) -> StudentRequest:
-    """What is asked of the kind's student; overhead: bytes of the bundle besides its field."""
+    """What is asked of the kind's student; overhead: bytes of the bundle besides its fields."""
     return StudentRequest(
         sizes=BundleSizes(),
         limit=request.max_size or DEFAULT_MAX_SIZE + place_bytes(scene.loaded),
@@ -213,6 +178,8 @@ def student_request(request: FuseRequest, scene: Scene, overhead: int) -> Studen
         ranks=request.ranks,
         sh_degree=request.sh_degree,
         source_bytes=tuple(scene.loaded.sizes),
+        stored_bytes=stored_bytes(scene.loaded),
+        unchanged_bytes=unchanged_bytes(scene.loaded),
         seconds=request.time_budget,
         from_scratch=request.from_scratch,
         views=scene.views,
@@ -254,12 +221,18 @@ def remedy(kind: Kind, loaded: LoadedScene, composed: ComposedField) -> str:
 
 
 def begin(
-    student: Student, scene: Scene, request: FuseRequest, place: str, progress, together: bool
+    student: Student,
+    scene: Scene,
+    request: FuseRequest,
+    place: str,
+    progress,
+    together: bool,
+    background: Background | None = None,
 ) -> tuple[Maker, Choosing, dict[str, float]]:
     """What makes students, what chooses among them, and the seconds that measuring the scene took."""
     started = time.monotonic()
     progress.phase("measuring", None)
-    maker = Maker(student, scene, request, place, progress, together)
+    maker = Maker(student, scene, request, place, progress, together, background)
     choosing = Choosing(maker.make, student.kind.name, progress.note)
     progress.phase(student.kind.name, None)
     return maker, choosing, {"measuring the scene": time.monotonic() - started}
@@ -319,13 +292,12 @@ def reached_by(found: Kept, student: Student) -> dict:
 def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str, float]) -> dict:
     """What the report says of a choice."""
     tried, did, student, request = found.tried, found.did, maker.student, maker.request
-    kind = student.kind.name
     learnt = did is not None and student.learnt
     count = len(choosing.tried)
     started = time.monotonic()
     neighbours = {}
     if student.learnt and count > 1:
-        neighbours = {"next_smaller": choosing.tried[-2].report(kind)}
+        neighbours = {"next_smaller": choosing.tried[-2].report(student.kind.name)}
     elif not student.learnt and (count > 1 or request.target_psnr is not None) and not maker.budget.over:
         neighbours = choosing.neighbours(tried)
         seconds["neighbours"] = time.monotonic() - started
@@ -336,24 +308,47 @@ def figures_of(found: Kept, maker: Maker, choosing: Choosing, seconds: dict[str,
     if learnt:
         figures["steps"] = did.steps
         figures["curve"] = [dict(zip(("seconds", "steps", "psnr"), p, strict=True)) for p in did.curve]
-    return figures | {
+    told = chosen_of(found, student, maker.scene, count, neighbours, maker.background)
+    return figures | told | (did.numeric if did is not None else {})
+
+
+def chosen_of(
+    found: Kept,
+    student: Student,
+    scene: Scene,
+    count: int,
+    neighbours: dict,
+    background: Background | None = None,
+) -> dict:
+    """What the report says of what was chosen, of so many choices, and of how many nodes it is."""
+    field, tried = found.field, found.tried
+    nodes = len(field.leaves()) if isinstance(field, ComposedField) else 1
+    fields = len(distinct_fields(field)) if isinstance(field, ComposedField) else 1
+    own = field if background is None else field.placed[1].field
+    return {
+        "nodes": nodes,
+        "fields": fields,
         "chosen": {
-            **student.kind.describe(found.field),
+            **student.kind.describe(own),
             "precision": tried.way.precision,
-            "flags": flags(kind, tried.way, tried.limit),
-            "why": why(found, student, request, count),
+            "flags": flags(student.kind.name, tried.way, tried.limit),
+            "why": why(found, own, student, count, background),
             **({"start": found.start} if found.start else {}),
-            "voxel": float(found.field.voxel_size),
-            "finest_teacher_voxel": float(maker.scene.composed.voxel_size),
+            "voxel": float(own.voxel_size),
+            "finest_teacher_voxel": float(scene.composed.voxel_size),
             **neighbours,
         },
-        **(did.numeric if did is not None else {}),
     }
 
 
-def why(found: Kept, student: Student, request: FuseRequest, count: int) -> str:
-    """One sentence on the choice."""
-    what, target = student.why(found.field), request.target_psnr
+def why(
+    found: Kept, field: Result, student: Student, count: int, background: Background | None = None
+) -> str:
+    """One sentence on the choice of a field."""
+    what, target = student.why(field), student.request.target
+    if background is not None:
+        name, kind = background.placed.name, student.kind.name
+        what = f"'{name}' as it is, and one {kind} field for all that stands in it"
     if target is not None and found.tried.psnr >= target:
         return f"{what}: the smallest that reaches {target:g} dB, of {count} choices tried"
     if count > 1:
@@ -427,8 +422,8 @@ def make_room(memory: Memory, student: Student, scene: Scene, request: FuseReque
 
 
 def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
-    """Say which objects a fused field will not hold as they are: stretched translucent ones, those it has too
-    few voxels for, and those that share their cells with more than two."""
+    """Say which objects a fused field will not hold as they are: stretched translucent ones, and those it has
+    too few voxels for."""
     config = current(DetailConfig)
     for d in details:
         if d.opacity_off and d.stretch > CONDITION_NOTED:
@@ -438,11 +433,6 @@ def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
             )
         if d.voxels_across < config.enough_voxels:
             progress.warn(f"'{d.name}' is only {d.voxels_across:.2g} voxels across; use {remedy}")
-        if d.lost > config.lost_noted:
-            progress.warn(
-                f"{d.lost:.0%} of '{d.name}' is not shown, since more than two objects meet there in one "
-                "cell of a grid over the whole scene; render the scene itself, or fuse its parts apart"
-            )
     coarse = [d for d in details if d.held_voxel > d.own_voxel * (1 + 1e-6)]
     if coarse:
         worst = max(coarse, key=lambda d: d.held_voxel / d.own_voxel)

@@ -1,13 +1,13 @@
 """Makes, stores and measures a kind's students of one scene, and keeps the best of them as it is."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
 
+from fusedrf_cli.bridge.background import Background
 from fusedrf_cli.bridge.budget import Budget
 from fusedrf_cli.bridge.choose import FINALISTS, Tried
 from fusedrf_cli.bridge.looks import looks_of, views_of_place
@@ -23,6 +23,7 @@ from fusedrf_cli.engine.distillation.judging import Judge, JudgingConfig
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.instances import distinct_fields
 from fusedrf_cli.engine.kinds.student import NOTHING, DistilConfig, MadeStudent, Plan, Student, Way
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.settings import current
@@ -66,12 +67,21 @@ class Scene:
         return replace(found, field=opened(found.field).to("cpu"))
 
 
+Result = StoredField | ComposedField
+"""What is fused: one field, or a scene of fields that are nodes, in the composed scene's frame."""
+
+
+def with_fields(result: Result, change: Callable[[StoredField], StoredField]) -> Result:
+    """What is fused, of other fields: what `change` makes of each."""
+    return result.with_fields(change) if isinstance(result, ComposedField) else change(result)
+
+
 @dataclass(frozen=True)
 class Kept:
     """A try, its field with the very numbers that were measured, and what its learning did."""
 
     tried: Tried
-    field: StoredField
+    field: Result
     did: DistillReport | None = None
     start: str | None = None
     """What it started from."""
@@ -80,16 +90,6 @@ class Kept:
 def same_texels(field: StoredField, other: StoredField) -> bool:
     """Whether a field has texels where another has them, so that all of that one's detail is in it."""
     return field.voxel_size == other.voxel_size and np.array_equal(field.aabb, other.aabb)
-
-
-def as_written(field: StoredField) -> RadianceField:
-    """A field as its bundle is drawn: one that holds several objects as the nodes that they become."""
-    blocks = getattr(field, "blocks", ())
-    if len(blocks) < 2:
-        return field
-    pairs = zip(blocks, field.alone, strict=True)
-    nodes = [Placed(block.name, alone, block.object_to_field) for block, alone in pairs]
-    return as_composite(ComposedField(nodes, origin=np.zeros(3)))
 
 
 class Maker:
@@ -103,9 +103,11 @@ class Maker:
         place: str,
         progress,
         together: bool = True,
+        background: Background | None = None,
     ):
-        """together: whether memory holds all sources at once, and they are answered by compiled loops."""
-        self.student, self.scene, self.request = student, scene, request
+        """together: whether memory holds all sources at once, and they are answered by compiled loops.
+        background: that stays beside what the student makes."""
+        self.student, self.scene, self.request, self.background = student, scene, request, background
         self.place, self.progress = place, progress
         self.budget = Budget(request.time_budget)
         lesson = student.lesson or DistilConfig()
@@ -113,26 +115,51 @@ class Maker:
         self.views = current(MakingConfig).views if compares else lesson.views
         size = lesson.view_size, lesson.view_size
         seed = current(JudgingConfig).judged_seed, 3, request.seed
-        answered = as_composite if together else lambda scene: scene
-        truth = self.teacher = answered(scene.composed)
+        self.answered = as_composite if together else lambda scene: scene
+        self.sources = {id(leaf.field) for leaf in scene.composed.leaves()}
+        truth = self.teacher = self.answered(scene.composed)
         self.looks = looks_of(scene.loaded, truth, self.views, size, seed)
+        self.sampler = scene.sampler
         if student.scene is not scene.composed:
-            self.teacher = answered(student.scene)
+            self.teacher = self.answered(student.scene)
+            self.sampler = RaySampler.of(student.scene, scene.views)
         self.judge = Judge(truth, [look.camera for look in self.looks], truth.origin)
         self.best: Kept | None = None
         self.finished_tries = 0
+        self.lessons: dict[tuple[int, int], RayLesson] = {}
         self.saved: Saved | None = None
         """What an interrupted run left, until it is taken up."""
 
-    def measured(self, field: StoredField, way: Way) -> float:
-        """PSNR (dB) of the field as it will be read back."""
-        return self.judge(as_written(stored(field, way.precision).to(self.place)))
+    def measured(self, field: Result, way: Way) -> float:
+        """PSNR (dB) of what is fused as it will be read back."""
+        return self.judge(self.read_back(field, way))
+
+    def read_back(self, field: Result, way: Way) -> RadianceField:
+        """What is fused as its bundle will be drawn: with numbers as they are stored, but for fields that
+        keep the bytes of their sources."""
+        kept = self.background and self.background.placed.field
+
+        def back(one: StoredField) -> StoredField:
+            if id(one) in self.sources:
+                return one
+            precision = self.background.precision if one is kept else way.precision
+            return stored(one, precision).to(self.place)
+
+        changed = with_fields(field, back)
+        return self.answered(changed) if isinstance(changed, ComposedField) else changed
+
+    def on_device(self, field: Result, place: str) -> Result:
+        """What is fused with its numbers on a device, but for the sources."""
+        return with_fields(field, lambda one: one if id(one) in self.sources else one.to(place))
+
+    def whole(self, field: StoredField) -> Result:
+        """What is fused, where the student made a field of it, in the composed scene's frame."""
+        return field if self.background is None else self.background.with_learnt(field)
 
     def verdict(self, kept: Kept) -> dict:
         """What the report says of the views of a try as it will be read back: how many there are, the PSNR of
         what the scene covers of them, and the object that is shown worst in a view of its own."""
-        field = stored(kept.field, kept.tried.way.precision).to(self.place)
-        found = self.judge.verdict(as_written(field))
+        found = self.judge.verdict(self.read_back(kept.field, kept.tried.way))
         said = {"views": len(self.looks), "covered": found.covered, "covered_share": found.share}
         objects = [(v, look.of) for v, look in zip(found.views, self.looks, strict=True) if look.of]
         if not objects:
@@ -141,8 +168,9 @@ class Maker:
         return said | {"worst_object": {"name": name, "psnr": worst}}
 
     def judged_whole(self, field: StoredField) -> float:
-        """PSNR (dB) of the whole field, in float32, that a student is part of."""
-        return self.judge(as_written(self.student.whole(field).to(self.place)))
+        """PSNR (dB) of what a field is fused to, in float32."""
+        found = self.whole(field)
+        return self.judge(self.answered(found) if isinstance(found, ComposedField) else found)
 
     def offer(self, kept: Kept) -> None:
         """Keep a finished try where it is the best so far: what was measured is what will be written."""
@@ -158,31 +186,29 @@ class Maker:
         made = student.made(way, limit)
         if made is None:
             return None
-        field, size, did = made.field.to(self.place), made.bytes, None
-        before = psnr = self.measured(field, way)
+        field, size, did = self.on_device(made.field, self.place), made.bytes, None
+        before = psnr = self.measured(self.whole(field), way)
         if finished and not made.exact and self.request.rgb and not self.budget.over:
             learnt, did = self.finished(field)
-            found, learnt_size = self.measured(learnt, way), student.bytes_of(learnt, way)
+            found, learnt_size = self.measured(self.whole(learnt), way), student.bytes_of(learnt, way)
             if found > before and learnt_size <= limit:
                 field, psnr, size = learnt, found, learnt_size
         tried = Tried(way, limit, size, psnr, before, made.whole, made.exact)
         if finished or made.exact:
-            self.offer(Kept(tried, field.to("cpu"), did))
+            start = self.background and self.background.start
+            self.offer(Kept(tried, self.on_device(self.whole(field), "cpu"), did, start))
         return tried
 
-    def finished(self, field: StoredField) -> tuple[StoredField, DistillReport | None]:
-        """A field after it learnt from rays of the scene; the one that is given stays as it is."""
-        learnt = field.with_params(field.params.clone())
+    def finished(self, field: Result) -> tuple[Result, DistillReport | None]:
+        """What was made after it learnt from rays of the scene; what is given stays as it is."""
         seconds = self.budget.part(self.tries_to_come())
         self.finished_tries += 1
-        if self.student.lesson is None:
-            rays = self.rays
-            with self.budget.learning():
-                rays.teach(learnt, seconds=seconds)
-            return learnt, None
+        if isinstance(field, ComposedField):
+            return self.finetuned(field, seconds), None
+        learnt = field.with_params(field.params.clone())
         lesson = self.student.lesson_of(field.params.numel(), seconds)
         settings = replace(lesson, seed=self.request.seed)
-        run = DistillRun(self.teacher, learnt, self.scene.sampler, settings, True, judge=self.judge)
+        run = DistillRun(self.teacher, learnt, self.sampler, settings, True, judge=self.judged_whole)
         with self.saving(run) as uninterrupted:
             student, did = run.finish(*self.telling(), uninterrupted)
         self.budget.spent += run.learnt_seconds
@@ -199,8 +225,8 @@ class Maker:
         that came before the numbers would have to be saved as well."""
         if not self.tries_once or self.finished_tries > 1:
             return nullcontext(nullcontext)
-        boxes = self.scene.sampler.boxes
-        return self.resumed(run, {"kind": self.student.kind.name, "limit": self.request_limit}, boxes)
+        made_with = {"kind": self.student.kind.name, "limit": self.request_limit}
+        return self.resumed(run, made_with, self.sampler.boxes)
 
     def resumed(self, run: DistillRun, made_with: dict, boxes: list[np.ndarray]):
         """`resumable` for a run, which goes on from what was saved; with other words that would be something
@@ -236,10 +262,27 @@ class Maker:
             return max(2, config.tries - self.finished_tries)  # how many a search takes is not known
         return max(1, (FINALISTS if self.student.compares else 1) - self.finished_tries)
 
-    @cached_property
-    def rays(self) -> RayLesson:
-        """What there is to learn from, drawn once."""
-        return RayLesson(self.teacher, self.scene.sampler, self.request.seed)
+    def finetuned(self, scene: ComposedField, seconds: float | None) -> ComposedField:
+        """A scene of smaller fields, each of which learnt from rays of its own source."""
+        pairs = zip(distinct_fields(self.scene.composed), distinct_fields(scene), strict=True)
+        changed = [(source, one) for source, one in pairs if one is not source]
+        learnt = {}
+        for source, one in changed:
+            lesson = self.lesson_of(source, len(changed))
+            learnt[id(one)] = own = one.with_params(one.params.clone())
+            with self.budget.learning():
+                lesson.teach(own, seconds=None if seconds is None else seconds / len(changed))
+        return scene.with_fields(lambda one: learnt.get(id(one), one))
+
+    def lesson_of(self, source: StoredField, count: int) -> RayLesson:
+        """What there is to learn from of a source, one of so many; drawn once."""
+        if (id(source), count) not in self.lessons:
+            leaf = next(p for p in self.scene.composed.leaves() if p.field is source)
+            alone = ComposedField([Placed(leaf.name, source, np.eye(4))], origin=np.zeros(3))
+            views = [view.seen_from(leaf.object_to_world) for view in self.scene.views if leaf.unbounded]
+            rays = RayLesson(opened(source), RaySampler.of(alone, views), self.request.seed, share=1 / count)
+            self.lessons[id(source), count] = rays
+        return self.lessons[id(source), count]
 
     # -- students that learn from nothing --------------------------------------------------------------------
 
@@ -257,7 +300,7 @@ class Maker:
                 continue  # the run that was interrupted had grown further
             field, did = self.taught(begun.to(self.place), start, changes, len(plans) - i)
             before = field.to("cpu")
-            whole = self.student.whole(before)
+            whole = self.whole(before)
             for way in ways:
                 size = self.student.bytes_of_plan(plan, way)
                 limit = self.request_limit if plan is plans[-1] and way == ways[-1] else size
@@ -278,6 +321,9 @@ class Maker:
         config = current(MakingConfig)
         generator = torch.Generator().manual_seed(self.request.seed)
         wanted = before is None and self.student.kind.takes_over and not self.request.from_scratch
+        if self.background is not None:
+            field, start = self.student.begun(plan, before, None, generator)
+            return field, start if before is not None else self.background.start, {}
         background = self.scene.background() if wanted else None
         field, start = self.student.begun(plan, before, background, generator)
         if wanted and start == NOTHING:
@@ -295,11 +341,10 @@ class Maker:
         request, seconds = self.request, self.budget.part(tries)
         config = self.student.lesson_of(field.params.numel(), seconds)
         config = replace(config, seed=request.seed, **changes)
-        sampler = RaySampler.of(self.student.scene, self.scene.views)
-        run = DistillRun(self.teacher, field, sampler, config, request.rgb, judge=self.judged_whole)
+        run = DistillRun(self.teacher, field, self.sampler, config, request.rgb, judge=self.judged_whole)
         # one that grows to a target goes on from whatever it started from
         made_with = {"kind": self.student.kind.name, "start": start if request.target_psnr is None else None}
-        with self.resumed(run, made_with, sampler.boxes) as uninterrupted:
+        with self.resumed(run, made_with, self.sampler.boxes) as uninterrupted:
             student, did = run.finish(*self.telling(), uninterrupted)
         self.budget.spent += run.learnt_seconds
         warn_of_numbers(did.numeric, self.progress)

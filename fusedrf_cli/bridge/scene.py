@@ -57,6 +57,8 @@ class SourceField:
     needs: FieldNeeds
     whole: bool = True
     """Whether it is shown as the bundle has it."""
+    cropped: bool = False
+    """Whether the field is what crops leave of the bundle's."""
     groups: tuple[tuple[str, str], ...] = ()
     """The groups of nodes that it is in which have a rule of their own, from the root down, and their
     rules."""
@@ -314,7 +316,8 @@ class _Loader:
             raise error.within(str(self.path)) from error
         except ValueError as error:
             raise InvalidInput(f"{bundle.path}: {error}; give an invertible placement") from error
-        return SourceField(placed, leaf.background, bundle, member, needs, leaf.whole, leaf.groups)
+        shown = leaf.whole, bool(leaf.crops), leaf.groups
+        return SourceField(placed, leaf.background, bundle, member, needs, *shown)
 
 
 def key_of(leaf: Leaf, member: str) -> str:

@@ -49,6 +49,8 @@ class Told:
     """(K, 3) points on it."""
     outside: np.ndarray
     """(L, 3) points that are not."""
+    touches: bool = False
+    """Whether shapes are no closer around it than cells are wide."""
 
     @property
     def is_guess(self) -> bool:
@@ -220,7 +222,7 @@ def selected(field: RadianceField, told: Told) -> Selection:
         return found
     held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
     fine = choice(Lattice.over(field, held.tight_aabb(AROUND), config.fine), told)
-    return fine.without_foreign() if told.masks else fine
+    return fine.without_foreign() if told.masks or told.touches else fine
 
 
 def choice(lattice: Lattice, told: Told) -> Selection:

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.blocks import UNNAMED
+from formats.blocks import RULE, UNNAMED
 from formats.bundle import OpenBundle, is_bundle, sha256_of
-from formats.graph import belongs
+from formats.embedding import in_place_of
+from formats.graph import belongs, placement_of, with_leaves, with_nodes
 from formats.history import check_history, distilled, sources
-from formats.scene import Leaf, SceneGraph
+from formats.scene import WHITE, Leaf, Node, SceneGraph
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.scene import FoundField, LoadedScene, load_found, load_scene
 from fusedrf_cli.errors import InvalidInput, UsageProblem
@@ -29,13 +30,11 @@ def load_to_fuse(request: FuseRequest, memory: Memory, place: str, progress) -> 
             raise UsageProblem(f"--sources applies to a fused bundle; {request.scene} tells of no sources")
         return load_scene(request.scene, request.allow_outside, memory, place)
     check_history(graph, request.scene)
-    found, missing = all_sources(bundle, Elsewhere(request.sources), request.allow_outside)
+    anew, homes, missing = with_sources(bundle, Elsewhere(request.sources), request.allow_outside)
     if not missing:
+        found = [(leaf, homes[leaf.field], leaf.field) for leaf in anew.leaves() if leaf.visible]
         progress.tell(f"{request.scene} is fused anew from its {len(found)} sources")
-        inside = distilled(graph.history)
-        composition = graph.history[0].get("composition", "max") if inside else graph.composition
-        scene = replace(graph, history=(), composition=composition)
-        return load_found(Path(request.scene), scene, found, memory, place)
+        return load_found(Path(request.scene), anew, found, memory, place)
     told = f"{request.scene}: the source of '{missing[0]}' is not found as it was"
     if request.sources:
         raise InvalidInput(f"{told}, neither where its history says nor in {request.sources}")
@@ -53,29 +52,45 @@ def was_fused(graph: SceneGraph) -> bool:
     return bool(graph.history) and graph.history[0].get("event") == "fused"
 
 
-def all_sources(
+def with_sources(
     bundle: OpenBundle, elsewhere: "Elsewhere", allow_outside: bool
-) -> tuple[list[FoundField], list[str]]:
-    """The objects that are in a fused bundle now, and the names of those of which no file is found. A node is
-    its own source where its field is that of the source."""
-    found, missing = [], []
-    made_of, inside = sources(bundle.scene.history), distilled(bundle.scene.history)
-    for leaf in bundle.scene.leaves():
-        if leaf.field is None or inside and belongs(leaf.name, UNNAMED):  # which stands for those inside
-            continue
-        told = made_of.get(leaf.field)
-        own = (
-            [(leaf, bundle, leaf.field)]
-            if told is None
-            else source_of(told, leaf, bundle, elsewhere, allow_outside)
-        )
-        found += own
-        missing += [] if own else [leaf.name]
-    for node in inside.values():
-        own = source_of(node, leaf_of(node), bundle, elsewhere, allow_outside)
-        found += own
-        missing += [] if own else [node["name"]]
-    return found, missing
+) -> tuple[SceneGraph, dict[str, OpenBundle], list[str]]:
+    """The scene of a fused bundle with the fields that it was made of, the bundle in which each member lies,
+    and the names of objects of which no file is found. A node is its own source where its field is that of
+    the source."""
+    scene, homes, missing = bundle.scene, {}, []
+    made_of, inside = sources(scene.history), distilled(scene.history)
+
+    def placed(name: str, told: dict) -> tuple[Node, ...]:
+        own = source_of(told, Leaf(name, None, None, np.eye(4), False), bundle, elsewhere, allow_outside)
+        missing.extend([] if own else [name])
+        homes.update({member: file for _, file, member in own})
+        alone = f"{name}/source" if len(own) == 1 else None
+        return tuple(node_of(leaf, alone or leaf.name, member) for leaf, _, member in own)
+
+    def with_source(node: Node) -> Node | None:
+        if inside and belongs(node.name, UNNAMED):  # it stands for those inside
+            return None
+        if node.field not in made_of:
+            homes[node.field] = bundle
+            return node
+        own = placed(node.name, made_of[node.field])
+        return in_place_of(replace(node, field=None), own, scene.composition, RULE) if own else node
+
+    scene = with_leaves(scene, with_source)
+    for name, told in inside.items():
+        matrix = np.asarray(told["object_to_world"], np.float64)
+        node = Node(name, None, None, placement_of(matrix), bool(told.get("background")))
+        if own := placed(name, told):
+            scene = with_nodes(scene, [in_place_of(node, own, scene.composition, RULE)])
+    composition = scene.history[0].get("composition", "max") if inside else scene.composition
+    return replace(scene, history=(), composition=composition), homes, missing
+
+
+def node_of(leaf: Leaf, name: str, member: str) -> Node:
+    """A node of a member that lies as a leaf does."""
+    tint = {} if leaf.tint == WHITE else {"tint": list(leaf.tint)}
+    return Node(name, member, None, placement_of(leaf.object_to_world), leaf.background, (), {}, tint)
 
 
 def leaf_of(node: dict) -> Leaf:

@@ -61,6 +61,7 @@ def _inside(summary: dict) -> list[dict]:
         {
             "name": part["name"],
             "kind": part["kind"],
+            "inside": part["inside"],
             "at": [row[3] for row in part["object_to_world"][:3]],
             "size": part["size"],
             "bytes": part["bytes"],
@@ -84,8 +85,8 @@ def command(**words):
     SCENE is a bundle, a scene.json, - for a scene on stdin, or a capture or mesh as `fusedrf train` takes it:
     of those photos, lenses, box, masks and notes are told. Of one that was learnt from photos their
     cameras are counted. Of a fused bundle the objects are listed with kind, place, size in the world and
-    bytes; an object that was distilled into one field with others has no bytes of its own. Damage is found,
-    but arrays are not decoded, so the answer is quick.
+    bytes; an object that was distilled into one field with others has no bytes of its own, but the node
+    of that field inside which it is. Damage is found, but arrays are not decoded, so the answer is quick.
 
     \b
     Example:

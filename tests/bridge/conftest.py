@@ -26,8 +26,8 @@ from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
+from fusedrf_cli.engine.kinds import instances
 from fusedrf_cli.engine.kinds.asked import AskedStudent
-from fusedrf_cli.engine.kinds.blocks import students as blocks
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student
 from fusedrf_cli.engine.kinds.vm import students
@@ -119,7 +119,7 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     for made in (SparseStudent, AskedStudent):
         patch.setattr(made, "lesson", replace(made.lesson, points_per_step=1 << 13, views=2, view_size=32))
     patch.setattr(students, "SHAPE", SHAPE)
-    patch.setattr(blocks, "RANKS", (None,))  # others would be compiled
+    patch.setattr(instances.InstancesStudent, "ranks", (None,))  # others would be compiled
     patch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
 
 

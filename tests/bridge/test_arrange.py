@@ -95,7 +95,6 @@ def test_a_renamed_object_goes_by_its_new_name(report, run, picture, folder):
     [
         (("move", "blocks.rfpack", "red"), 2, "say where to"),
         (("move", "blocks.rfpack", "chair", *UP), 3, "there is no 'chair'; it holds floor, red"),
-        (("move", "vm.rfpack", "red", *UP), 3, "'red' is no node of its own"),
         (("move", "red.rfpack", "blue", *UP), 3, "there is no 'blue'"),
         (("duplicate", "blocks.rfpack", "red", "floor"), 3, "there is a 'floor' already"),
         (("rename", "blocks.rfpack", "red", "red"), 3, "there is a 'red' already"),

@@ -16,8 +16,7 @@ import pytest
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.ladders import flags_of, in_words
 from fusedrf_cli.commands.fuse import command as fuse_command
-from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.blocks import students as blocks
+from fusedrf_cli.engine.kinds import instances, registry
 from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor, shrinking
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
 from fusedrf_cli.options import BYTES
@@ -36,8 +35,8 @@ def charted(shop, tmp_path_factory):
     module, made = part("charting"), []
     with pytest.MonkeyPatch.context() as patch:
         for name in ("LADDER_PRECISIONS", "LADDER_FINISHED"):
-            patch.setattr(blocks, name, ("float16",))
-        patch.setattr(blocks, "LADDER_RANKS", (None,))
+            patch.setattr(instances, name, ("float16",))
+        patch.setattr(instances, "LADDER_RANKS", (None,))
 
         def noted(*words):
             report = fuse(*words)

@@ -31,8 +31,8 @@ HALF = {"floor": (1.4, 0.8, 0.2), "red": (0.3, 0.3, 0.3), "blue": (0.3, 0.3, 0.3
 COLOUR = {"floor": (0.6, 0.6, 0.5), "red": (0.9, 0.1, 0.1), "blue": (0.1, 0.2, 0.9), "green": (0.1, 0.8, 0.2)}
 AT = {
     "floor": affine(1.0, (0, 0, -0.7)),
-    "red": affine(turn(30) @ np.diag([1.0, 1.0, 1.5]), (-0.6, 0, 0)),
-    "blue": affine(turn(45), (0.7, 0, -0.1)),
+    "red": affine(turn(30, (0, 0, 1)) @ np.diag([1.0, 1.0, 1.5]), (-0.6, 0, 0)),
+    "blue": affine(turn(45, (0, 0, 1)), (0.7, 0, -0.1)),
     "green": affine(turn(20), (0.0, 0.55, -0.2)),
 }
 RED = ("--box", "-1.1,-0.5,-0.45,-0.1,0.5,0.6")
@@ -134,7 +134,8 @@ def members(path) -> dict[str, str]:
 
 @pytest.mark.parametrize("words", [RED, TOP, CORNER], ids=["a node", "a part of one", "parts of two"])
 def test_together_they_show_what_it_showed(folder, report, words):
-    """At every point, as the denser of the two; nodes that are not cut keep their bytes."""
+    """At every point that is a voxel away from the cut, as the denser of the two; nodes that are not cut keep
+    their bytes."""
     said = report("extract", "three.rfpack", *words, "-o", "object.rfpack")
     report("extract", "three.rfpack", *words, "--invert", "-o", "rest.rfpack")
     rng = np.random.default_rng(0)
@@ -144,12 +145,15 @@ def test_together_they_show_what_it_showed(folder, report, words):
     before, found, rest = (
         densities(folder / f"{name}.rfpack", points, dirs) for name in ("three", "object", "rest")
     )
-    np.testing.assert_allclose(np.maximum(found, rest), before, rtol=2e-3, atol=2e-3)
+    box = np.array([float(x) for x in words[1].split(",")])
+    outside = np.maximum(box[:3] - points, points - box[3:]).max(1)
+    away = np.abs(outside) > 0.06
+    np.testing.assert_allclose(np.maximum(found, rest)[away], before[away], rtol=2e-3, atol=2e-3)
+    assert (np.maximum(found, rest) < before - 0.01).mean() < 0.002
     was, left = members(folder / "three.rfpack"), members(folder / "rest.rfpack")
     cut = {"red"} if words != CORNER else {"red", "floor"}
     assert {name: left[name] for name in left if name not in cut} == {n: was[n] for n in was if n not in cut}
-    box = [float(x) for x in words[1].split(",")]
-    inside = ((points > np.array(box[:3]) + 0.1) & (points < np.array(box[3:]) - 0.1)).all(1)
+    inside = outside < -0.1
     assert rest[inside].max() < 0.01 and found[inside & (before > 1)].min() > 1
     assert said["nodes"] == (2 if words == CORNER else 1)
 

@@ -16,7 +16,7 @@ import pytest
 from fusedrf_cli.bridge.looks import LookConfig
 from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
-from fusedrf_cli.engine.kinds.blocks import students as blocks
+from fusedrf_cli.engine.kinds import instances
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Student
 from tests.analytic.export import SHAPE, NotExportable
@@ -81,7 +81,7 @@ def quick(monkeypatch, in_force) -> None:
     monkeypatch.setattr(Student, "lesson", TinySettings())
     monkeypatch.setattr("fusedrf_cli.bridge.making.DistilConfig", TinySettings)  # for what is not taught
     monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.students.SHAPE", SHAPE)
-    monkeypatch.setattr(blocks, "RANKS", (None,))  # others would be compiled
+    monkeypatch.setattr(instances.InstancesStudent, "ranks", (None,))  # others would be compiled
     monkeypatch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
     in_force(LookConfig(whole=2, most_objects=0))
 

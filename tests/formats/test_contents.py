@@ -78,6 +78,7 @@ def test_what_was_distilled_together_has_a_place_but_no_bytes(tmp_path):
     assert cup == {
         "name": "cup", "kind": "vm", "object_to_world": moved(1, 2, 3),
         "world_aabb": [0, 1, 2, 2, 3, 4], "size": [2, 2, 2], "bytes": None, "shared_by": None,
+        "inside": "fused",
     }  # fmt: skip
     assert (pole["name"], pole["bytes"]) == ("pole", None)
 

@@ -1,6 +1,6 @@
 """A composed scene: several placed fields that together are one radiance field."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import replace
 from functools import cached_property, reduce
@@ -70,6 +70,31 @@ class ComposedField:
             replace(p, object_to_world=poses[p.name]) if p.name in poses else p for p in self.placed
         ]
         return other
+
+    def leaves(self) -> list[Placed]:
+        """The fields that it places, in this frame; of composed scenes among them those that these place."""
+        found = []
+        for p in self.placed:
+            inner = p.field.leaves() if isinstance(p.field, ComposedField) else None
+            found += [p] if inner is None else [replace(q.within(p), name=q.name) for q in inner]
+        return found
+
+    def with_fields(self, change: Callable[[RadianceField], RadianceField]) -> "ComposedField":
+        """The same scene of other fields: what `change` makes of each distinct one, in the order of
+        `leaves`."""
+        changed: dict[int, RadianceField] = {}
+
+        def of(scene: ComposedField) -> ComposedField:
+            other = ComposedField.__new__(ComposedField)
+            other.rule, other.origin, other.placed = scene.rule, scene.origin, []
+            for p in scene.placed:
+                if id(p.field) not in changed:
+                    inner = isinstance(p.field, ComposedField)
+                    changed[id(p.field)] = of(p.field) if inner else change(p.field)
+                other.placed.append(replace(p, field=changed[id(p.field)]))
+            return other
+
+        return of(self)
 
     @cached_property
     def occupancy(self) -> OccupancyGrid:

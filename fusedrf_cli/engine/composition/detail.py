@@ -12,8 +12,6 @@ class DetailConfig:
 
     enough_voxels: int = 8
     """Across an object, under which there is no shape left."""
-    lost_noted: float = 0.01
-    """Share of an object's cells."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +29,6 @@ class Detail:
     """The finest that the fused field tells apart there."""
     voxels_across: float
     """Of the fused field, along the object's longest side."""
-    lost: float = 0.0
-    """Share of its cells of matter that the fused field does not show."""
 
 
 def details_at_voxel(placed: list[Placed], voxel: float) -> list[Detail]:

@@ -38,11 +38,20 @@ class RayLesson:
 
     config = FinetuneConfig()
 
-    def __init__(self, teacher: RadianceField, sampler: RaySampler, seed: int, rays: int | None = None):
-        """The sampler draws rays, as many as the config says by default, in the teacher's frame."""
+    def __init__(
+        self,
+        teacher: RadianceField,
+        sampler: RaySampler,
+        seed: int,
+        rays: int | None = None,
+        share: float = 1.0,
+    ):
+        """The sampler draws rays, as many as the config says by default, in the teacher's frame. share: of
+        the rays, and of those of a step, where the teacher is one of several that share them."""
         self.seed = seed
+        self.rays_per_step = max(1, round(share * self.config.rays_per_step))
         generator = torch.Generator().manual_seed(seed)
-        self.rays_o, self.rays_d = sampler.draw(rays or self.config.rays, generator)
+        self.rays_o, self.rays_d = sampler.draw(rays or max(1, round(share * self.config.rays)), generator)
         self.shown = render_rays(teacher, self.rays_o, self.rays_d)[:, :4]
         """(R, 4) float32, premultiplied."""
 
@@ -69,7 +78,7 @@ class RayLesson:
             if share >= 1:
                 break
             guard.keep()
-            sums = optimiser.learn_rays(rays.batch(config.rays_per_step, *how))
+            sums = optimiser.learn_rays(rays.batch(self.rays_per_step, *how))
             guard.step(sums, optimiser, config.rate * config.rate_decay**share)
             advance((i + 1) / steps)
         guard.check()

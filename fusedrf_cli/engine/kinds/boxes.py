@@ -10,7 +10,16 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.box import BoxField, used_vertices
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Way, finest_within
+from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
+from fusedrf_cli.engine.kinds.student import (
+    Contents,
+    Plan,
+    Section,
+    Student,
+    StudentRequest,
+    Way,
+    finest_within,
+)
 
 COUNTED = 3  # times the used vertices are counted to find how many fit
 MOST_HELD = 60_000_000  # numbers in memory: with what learning adds, some 1.5 GB
@@ -45,6 +54,19 @@ class BoxKind(Kind):
         parts = self.field.parts_of(self.shape(Way()), (2, 2, 2))
         on_vertices = any(part.on_vertices for part in parts)
         return (GridStudent if on_vertices else Student)(self, scene, request)
+
+    def reduction(self, outline: BoxField, voxel: float, way: Way) -> Reduction:
+        """See Kind: fewer texels."""
+        box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
+        same, none = resolution == outline.resolution, outline.params
+        unit = outline.scale, outline.shift
+        bare = type(outline)(outline.shape, box, resolution, *unit, none, outline.occupancy)
+        sections = [Section(part.name, bare.stored_shape(part)) for part in bare.parts]
+
+        def make(field: BoxField) -> BoxField:
+            return field if same else field.resampled(box, resolution)
+
+        return Reduction(Contents(sections, outline.occupancy.occupied.size), make, same)
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> BoxField:
         """See Kind."""

@@ -14,10 +14,11 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
 from fusedrf_cli.engine.fields.base import FieldNeeds, RadianceField, StoredField
 from fusedrf_cli.engine.fields.box import BoxField
-from fusedrf_cli.engine.fields.computed import Reads
+from fusedrf_cli.engine.fields.computed import ComputedField, Reads
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
+from fusedrf_cli.engine.kinds.reduction import Reduction
 from fusedrf_cli.engine.kinds.splitting import Holds
 from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Suits, Way, finest_within
 from fusedrf_cli.engine.selection.cells import Selection
@@ -40,6 +41,9 @@ class Kind:
     """Whether its fields may have a hashed detail (`Way.hashed`)."""
     takes_over = False
     """Whether a student may start as the scene's background (`taken_over`)."""
+    beside_background = True
+    """Whether a field of it is learnt beside the background of a captured unbounded scene, which stays as it
+    is."""
     precisions: tuple[str, ...] = ("int4", "int8")
     """That are tried where a quality is asked for, the cheapest first."""
     faithful = "float16"
@@ -110,6 +114,17 @@ class Kind:
     def grown(self, before: StoredField, plan: Plan) -> StoredField:
         """A field with what a smaller one has learnt, as planned."""
         return before.resampled(plan.box, plan.resolution)
+
+    # -- making smaller --------------------------------------------------------------------------------------
+
+    def outline(self, field: StoredField) -> StoredField:
+        """A field without its numbers, as far as that goes: what `reduction` needs of it."""
+        return field.with_params(field.params.new_zeros(0)) if isinstance(field, ComputedField) else field
+
+    def reduction(self, outline: StoredField, voxel: float, way: Way) -> Reduction:
+        """The same field with texels no finer than `voxel`, in the field's coordinates, and at most the ranks
+        and SH degree of a way; of a kind that has no such, the field as it is."""
+        return Reduction(None, lambda field: field, True)
 
     # -- telling ---------------------------------------------------------------------------------------------
 

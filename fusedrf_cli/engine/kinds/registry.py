@@ -1,5 +1,5 @@
-"""Finds the kinds of field: each is a folder beside this file, or comes from another package by an entry
-point of the group GROUP, and says what it is in an object named KIND.
+"""Finds the kinds of field: each is a folder beside this file, or one of WAYS, or comes from another package
+by an entry point of the group GROUP, and says what it is in an object named KIND.
 
 Names are found without importing anything, for `--help`; a kind is imported when it is used.
 """
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 GROUP = "fusedrf.kinds"
 AUTO = "auto"  # the name under which a kind is chosen by what the kinds say of a scene
+INSTANCES = "blocks"  # the name under which nothing is learnt: every source stays a field of its own
+WAYS = {INSTANCES: f"{__package__}.instances"}
+"""Ways of fusing whose fields are of other kinds, and the modules that hold them."""
 DEFAULT = "vm"  # what photos become where no kind is named
 
 
@@ -31,7 +34,7 @@ class BrokenKind(ValueError):
 def own_kinds() -> dict[str, str]:
     """Names of the kinds that come with the package, and the modules that hold them."""
     folders = sorted(path.parent.name for path in Path(__file__).parent.glob("*/__init__.py"))
-    return {name.replace("_", "-"): f"{__package__}.{name}" for name in folders}
+    return {name.replace("_", "-"): f"{__package__}.{name}" for name in folders} | WAYS
 
 
 def plugged_in() -> dict[str, EntryPoint]:

@@ -3,7 +3,7 @@
 Bytes are told by whoever knows files (`StoredSizes`): nothing here does.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -147,6 +147,10 @@ class StudentRequest:
     sh_degree: int | None = None
     source_bytes: tuple[int, ...] = ()
     """In memory, of the distinct sources."""
+    stored_bytes: Mapping[int, int] = field(default_factory=dict)
+    """Of distinct sources that their files have as they are, by the field's id."""
+    unchanged_bytes: int | None = None
+    """Of all sources as their files have them, where that is known."""
     seconds: float | None = None
     """Of learning; None: as many as its lesson takes."""
     from_scratch: bool = False
@@ -267,6 +271,10 @@ class Student:
             rays = min(rays, int(RAYS_PER_SECOND * seconds) + 1)
         return replace(self.lesson, rays=rays, steps=steps, time_budget=seconds)
 
+    def unchanged(self) -> "Made | None":
+        """The scene itself, where nothing of it is to be changed; None where a student stands for it."""
+        return None
+
     # -- ways and sizes --------------------------------------------------------------------------------------
 
     def ways(self) -> list[list[Way]]:
@@ -341,10 +349,6 @@ class Student:
         box = scene.occupancy.aabb
         fresh = self.kind.create(replace(plan, box=box), generator, "fused")
         return fresh.with_occupancy(scene.occupancy), NOTHING
-
-    def whole(self, field: StoredField) -> StoredField:
-        """What is stored once a field has learnt: that field, with what it did not have to learn."""
-        return field
 
     # -- telling ---------------------------------------------------------------------------------------------
 

@@ -60,14 +60,8 @@ def march(
 ) -> None:
     """Add the weights of rays through any field, by asking it at each sample."""
     trans, reach = np.ones(len(rays_o), np.float32), reach_of(len(rays_o), 0.0, np.inf)
-    rays = (
-        rays_o,
-        rays_d,
-        reach,
-        jitter,
-        sampling_step(field),
-        lambda: trans > current(RenderConfig).early_stop,
-    )
+    early_stop = current(RenderConfig).early_stop
+    rays = rays_o, rays_d, reach, jitter, sampling_step(field), lambda: trans > early_stop
     for ray, distances, spans, counts in waves(field, *rays):
         mask = np.arange(distances.shape[1]) < counts[:, None]
         points = rays_o[ray][:, None] + distances[..., None] * rays_d[ray][:, None]
@@ -83,10 +77,8 @@ def count_instances(
 ) -> None:
     """Add the weights of rays through a scene, with the samples and the step of each instance."""
     reach = np.minimum(reach_of(len(rays_o), 0.0, np.inf), FARTHEST)
-    rays = RayBatch(exact(rays_o), exact(rays_d), reach)
-    counting = WeightWaves(
-        scene, rays, 1.0, current(RenderConfig).early_stop, np.zeros((len(rays_o), 5), np.float32)
-    )
+    rays, out = RayBatch(exact(rays_o), exact(rays_d), reach), np.zeros((len(rays_o), 5), np.float32)
+    counting = WeightWaves(scene, rays, 1.0, current(RenderConfig).early_stop, out)
     counting.inside, counting.tally = inside, tally
     while counting.go_on():
         pass

@@ -19,6 +19,7 @@ from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     density_rates_by,
     next_change,
     next_sample,
+    optical_length,
     placed_by,
     position_at,
     rates_by,
@@ -138,12 +139,23 @@ def length_at(course, t):
     return min(math.atan2(b * (tau - low), b * b + low * tau) / per, length)
 
 
-def interval(course, u, length):
-    """See bounded.py; where there is less than another such length before or behind it in the piece, that is
-    its own too."""
+def slope(course, u):
+    """The derivative of `distance`."""
+    middle, _, b, per, _, slow = course
+    tau = (distance(course, u) - middle) / slow
+    return slow if per == 0.0 else (b * b + tau * tau) * slow * per / b
+
+
+def ends_of(course, u, length):
+    """From and to which u of a piece a length of u around `u` stands; where there is less than another such
+    length before or behind it in the piece, that is its own too."""
     low, high = u - 0.5 * length, u + 0.5 * length
-    low = 0.0 if u < length else low
-    high = course[4] if u + length >= course[4] else high
+    return 0.0 if u < length else low, course[4] if u + length >= course[4] else high
+
+
+def interval(course, u, length):
+    """See bounded.py."""
+    low, high = ends_of(course, u, length)
     return distance(course, low), distance(course, high)
 
 

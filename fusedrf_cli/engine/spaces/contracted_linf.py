@@ -19,6 +19,7 @@ from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     density_rates_by,
     next_change,
     next_sample,
+    optical_length,
     placed_by,
     position_at,
     rates_by,
@@ -114,6 +115,19 @@ def stretch(begun, grid, o, d, far):
         return (o, (d, course), 0.0, -1.0, course), following
     course = t0, t1 - t0, n0, n1, 1.0 / length
     return (o, (d, course), 0.0, length, course), following
+
+
+def slope(course, u):
+    """The derivative of `distance`."""
+    _, length, n0, n1, per = course
+    n = u * per * n0 + (1.0 - u * per) * n1
+    return length * per * n0 * n1 / (n * n)
+
+
+def ends_of(course, u, length):
+    """From and to which u of a piece a length of u around `u` stands, see `share_of`."""
+    low, high = share_of(course, u, length)
+    return low / course[4], high / course[4]
 
 
 def most_samples(aabb, step: float) -> int:

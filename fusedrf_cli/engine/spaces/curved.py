@@ -30,6 +30,17 @@ def size_before(m):
     return SHELL / max(1.0 + SHELL - m, SHELL / FAR)
 
 
+def optical_length(course, p, d, u, many, steps, step):
+    """See kernels/loops.py. Where σ is per length of the coordinates, their length at the sample counts: far
+    out an interval of t is of no use, since there t goes up manifold in one step."""
+    length = steps * many * step
+    middle = u + 0.5 * (length - many * step)
+    if CONTRACTED_DENSITY == 0.0:
+        return span(course, middle, length)
+    low, high = ends_of(course, middle, length)
+    return rate(p, d) * slope(course, u) * (high - low)
+
+
 def clearance(p, lo, hi, cell, index, empty):
     """How far a point of the coordinates may move along any axis before it comes to an occupied cell: it is
     outside a grid's box, or in the cell `index` that is `empty` cells away from one (GridArrays); -1 where it

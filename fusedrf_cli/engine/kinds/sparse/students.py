@@ -62,6 +62,7 @@ class SparseKind(Kind):
     field = SparseField
     takes = frozenset({"sh_degree"})
     precisions = ("int8", "float16")
+    beside_background = False  # its bricks are as coarse as the background where that is all there is
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:

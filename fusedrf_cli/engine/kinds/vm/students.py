@@ -2,6 +2,7 @@
 taken over."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,25 +14,31 @@ from fusedrf_cli.engine.fields.hashed import PER_BLOCK, TOGETHER, WIDTH
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
 from fusedrf_cli.engine.kinds.student import (
     Contents,
     Plan,
     Section,
-    Student,
-    StudentRequest,
     Suits,
     Way,
     finest_within,
 )
 from fusedrf_cli.engine.kinds.vm import editing
 from fusedrf_cli.engine.kinds.vm.blocks import LEARNT, common_shape, reshaped, without
-from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kinds.vm.places import place_student
-from fusedrf_cli.engine.kinds.vm.trimming import read_texels, truncated, without_unasked
+from fusedrf_cli.engine.kinds.vm.field import MAX_RANK, Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.trimming import (
+    read_texels,
+    smaller_shape,
+    truncated,
+    without_unasked,
+    without_unread,
+)
 from fusedrf_cli.engine.selection.cells import Selection
 from fusedrf_cli.engine.settings import current
 
 SHAPE = VMShape(16, 24, 2)
+MAX_DEGREE = 3
+COARSER = 1.5  # times its own voxel: how coarse a tensor can get before it is left without its detail
 BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
 NOISE = 0.03  # of the factors of a student that takes over others' numbers
 
@@ -40,6 +47,12 @@ def shape_of(way: Way) -> VMShape:
     """The shape of a field in a way, SHAPE's where that leaves a choice."""
     ranks = way.ranks or (SHAPE.density_rank, SHAPE.colour_rank)
     return VMShape(*ranks, SHAPE.sh_degree if way.sh_degree is None else way.sh_degree)
+
+
+def shape_within(way: Way) -> VMShape:
+    """The most components and bands that a way lets a field have."""
+    ranks = way.ranks or (MAX_RANK, MAX_RANK)
+    return VMShape(*ranks, MAX_DEGREE if way.sh_degree is None else way.sh_degree)
 
 
 def tensor_of(way: Way, resolution: tuple[int, int, int]) -> VMTensor:
@@ -75,11 +88,6 @@ class VMKind(Kind):
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
         return Suits(1.0, "one tensor over the scene learns any sources by any rule")
 
-    def student(self, scene: ComposedField, request: StudentRequest) -> Student:
-        """See Kind; of objects that stand in a place one tensor beside it."""
-        asked = shape_of(Way("", request.ranks, request.sh_degree))
-        return place_student(self, scene, request, asked) or Student(self, scene, request)
-
     def taken_over(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
     ) -> VMField | None:
@@ -94,6 +102,22 @@ class VMKind(Kind):
         if plan.way.ranks is not None:
             moved = truncated(moved, shape_of(plan.way))
         return widened(moved, plan, scene, generator)
+
+    def reduction(self, outline: VMField, voxel: float, way: Way) -> Reduction:
+        """See Kind: fewer texels, without the detail where they are more than COARSER times as wide; fewer
+        components and bands, chosen by energy. What no occupied cell reads is 0."""
+        (tensor,) = outline.tensors
+        shape = smaller_shape(outline.shape, shape_within(way))
+        resolution = coarser(tensor.aabb, tensor.resolution, voxel)
+        wide = max(tensor.resolution) > COARSER * max(resolution)
+        small = replace(tensor, resolution=resolution, **({"hashed": None, "held": None} if wide else {}))
+        same = resolution == tensor.resolution
+
+        def make(field: VMField) -> VMField:
+            kept = without_detail(field) if wide else field
+            return without_unread(truncated(kept if same else kept.resampled(tensor.aabb, resolution), shape))
+
+        return Reduction(contents_of(shape, [small], 1), make, same and shape == outline.shape)
 
     def describe(self, field: VMField) -> dict:
         """Texels per axis of its tensor, or of each of its tensors, ranks, SH degree, and rows of detail."""
@@ -168,6 +192,13 @@ def upright(background: Placed) -> VMField | None:
     tensor = VMTensor(source.resolution, box, source.scale / scale, source.shift)
     params = field.params[: tensor.size(field.shape)]  # the detail is the last section
     return VMField(field.shape, (tensor,), (Block(0, np.eye(4), LEARNT),), params, OccupancyGrid.full(box))
+
+
+def without_detail(field: VMField) -> VMField:
+    """A field of one tensor without what is finer than its texels."""
+    tensor = replace(field.tensors[0], hashed=None, held=None)
+    params = field.params[: tensor.size(field.shape)].clone()  # the detail is the last section
+    return VMField(field.shape, (tensor,), field.blocks, params, tensor.occupancy)
 
 
 def widened(field: VMField, plan: Plan, scene: ComposedField, generator: torch.Generator) -> VMField:

@@ -1,0 +1,107 @@
+"""A captured background that a learnt `fuse` keeps: it stays a node, and one field, with texels as fine as
+the objects', learns all that stands in it. So what is far away costs nothing to fuse, and no object is
+blurred to the texels of a background."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.detail import Detail, extent
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.student import StudentRequest
+
+MOST_OF_FILE = 0.7  # that a background may take, so that what stands in it has numbers enough
+PRECISIONS = ("float16", "int8", "int4")  # the dearest first
+ALIKE = 1e-3  # entries of two rotations that count as one
+LEARNT = "fused"  # the node of what was learnt
+
+
+@dataclass(frozen=True)
+class Background:
+    """What stays as it is of a scene, and what is learnt beside it."""
+
+    placed: Placed
+    """In the composed scene's frame; of the field of the source, or of one that is stored anew."""
+    precision: str | None
+    """In which its field is stored; None: with the bytes of its source."""
+    bytes: int
+    """Of the file."""
+    turn: np.ndarray
+    """(4, 4) from the frame in which the others are learnt to that of the composed scene."""
+    objects: ComposedField
+    """The others, turned as most of them are."""
+
+    def with_learnt(self, field: StoredField) -> ComposedField:
+        """The scene of the background and a field that stands for the others, in the composed scene's
+        frame."""
+        learnt = Placed(LEARNT, field, self.turn @ placement(self.objects.origin))
+        return ComposedField([self.placed, learnt], origin=np.zeros(3))
+
+    @property
+    def start(self) -> str:
+        """What a report says that learning began from."""
+        return f"'{self.placed.name}' as it is"
+
+    @property
+    def detail(self) -> Detail:
+        """That it is held as it is."""
+        p = self.placed
+        return Detail(p.name, p.condition, 0.0, p.voxel_size, p.voxel_size, extent(p) / p.voxel_size)
+
+
+def kept_background(kind: Kind, scene: ComposedField, asked: StudentRequest) -> Background | None:
+    """What a learnt field of a kind stands beside: the only unbounded field of a scene by `max`. None of any
+    other scene, where numbers are not to be taken over, and where it would take too much of the file."""
+    around = [p for p in scene.placed if p.unbounded]
+    others = [p for p in scene.placed if not p.unbounded]
+    if asked.from_scratch or scene.rule != "max" or len(around) != 1 or not others:
+        return None
+    if not kind.beside_background or isinstance(around[0].field, ComposedField):
+        return None
+    turn = turn_of(others)
+    back = np.linalg.inv(turn)
+    objects = ComposedField([replace(p, object_to_world=back @ p.object_to_world) for p in others])
+    for field, precision, size in ways_to_store(around[0].field, asked):
+        if size <= MOST_OF_FILE * (asked.limit - asked.overhead):
+            return Background(replace(around[0], field=field), precision, size, turn, objects)
+    return None
+
+
+def ways_to_store(
+    field: StoredField, asked: StudentRequest
+) -> Iterator[tuple[StoredField, str | None, int]]:
+    """A field, the precision that it is stored in, and its bytes: as its source has it, then in fewer bits
+    each time."""
+    own = asked.stored_bytes.get(id(field))
+    if asked.precision is None and own is not None:
+        yield field, None, own
+    trimmed = registry.kind(field.kind).trimmed(opened(field).to("cpu"))
+    for precision in (asked.precision,) if asked.precision else PRECISIONS:
+        yield trimmed, precision, asked.sizes.exactly(trimmed, precision)
+
+
+def turn_of(objects: list[Placed]) -> np.ndarray:
+    """(4, 4) the turn by which most of the objects' texels are placed: a decomposition holds them best along
+    their own axes. Of as many either way, one that does not depend on the objects' order."""
+    turns = [turned_only(p.object_to_world[:3, :3]) for p in objects]
+    texels = np.array([(extent(p) / p.voxel_size) ** 2 for p in objects])
+    alike = np.array([[np.abs(a - b).max() < ALIKE for a in turns] for b in turns])
+    ranked = [(float(f"{n:.6g}"), turn.tolist()) for n, turn in zip(alike @ texels, turns, strict=True)]
+    found, most = np.eye(4), np.array(max(ranked)[1])
+    if np.abs(most - np.eye(3)).max() >= ALIKE:
+        found[:3, :3] = most
+    return found
+
+
+def turned_only(linear: np.ndarray) -> np.ndarray:
+    """(3, 3) the rotation nearest to a linear map, or, of one that mirrors, to it with the third axis
+    reversed."""
+    u, _, v = np.linalg.svd(linear)
+    return u @ v @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])

@@ -1,0 +1,204 @@
+"""The bundle that `fuse` writes: a node for every source, or one of what was learnt, their fields, and a
+history that tells what they were made of."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from formats.bundle import BundleWriter, OpenBundle
+from formats.embedding import Embedding
+from formats.errors import FormatError
+from formats.graph import free_name, placement_of, with_leaves
+from formats.records import FieldRecord
+from formats.scene import Leaf, Node, SceneGraph, dump_scene
+from fusedrf_cli import __version__
+from fusedrf_cli.bridge.background import LEARNT, Background
+from fusedrf_cli.bridge.making import Kept
+from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
+from fusedrf_cli.bridge.sizes import BESIDES
+from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.fields.base import StoredField
+from fusedrf_cli.engine.fields.occupancy import placement
+from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kinds.instances import distinct_fields
+from fusedrf_cli.requests import FuseRequest
+
+
+class FusedBundle:
+    """What a scene is fused to, but for its numbers."""
+
+    def __init__(self, request: FuseRequest, everything: LoadedScene, loaded: LoadedScene, learnt: bool):
+        """everything: the scene with those of its fields that show nothing, which are left out; learnt:
+        whether one field is learnt from it, and its sources are no nodes. Raises the FormatError of a scene
+        that cannot be written."""
+        self.request, self.loaded, self.learnt = request, loaded, learnt
+        self.kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
+        self.nodes = history_nodes(loaded, request.output, self.kept)
+        self.composed = loaded.composed()
+        self.graph = SceneGraph(()) if learnt else named_graph(request, everything, loaded)
+        self.framing: tuple[float, ...] | None = None
+        self.cameras: dict | None = None
+
+    def shown_as(self, framing: np.ndarray | None, cameras: dict | None) -> None:
+        """Keep what pictures of the scene show. Raises the FormatError of a scene that cannot be written."""
+        self.framing = None if framing is None else tuple(float(number) for number in framing)
+        self.cameras = cameras
+        try:
+            self.overhead = BESIDES + len(dump_scene(self.scene(self.skeleton, {"nodes": self.nodes})))
+        except FormatError as error:
+            raise error.within(self.request.output) from error
+
+    @property
+    def skeleton(self) -> SceneGraph:
+        """The graph before its fields are made."""
+        return SceneGraph((self.learnt_node(NO_MEMBER),)) if self.learnt else self.graph
+
+    def learnt_node(self, member: str) -> Node:
+        """The node of what was learnt, in the composed scene's frame."""
+        return Node(LEARNT, member, None, placement_of(placement(self.composed.origin)))
+
+    def scene(self, graph: SceneGraph, entry: dict) -> SceneGraph:
+        """A graph as it is written, with an entry of its history."""
+        return replace(
+            graph,
+            history=(entry,),
+            generator=f"fusedrf {__version__}",
+            framing=self.framing,
+            cameras=self.cameras,
+        )
+
+    def write(self, output: str, made: Kept, background: Background | None, entry: dict) -> int:
+        """Write what was made as a bundle; its bytes. entry: of its history, but for what it was made of."""
+        writer = BundleWriter()
+        how = self.of_learnt(writer, made, background) if self.learnt else self.of_instances(writer, made)
+        graph = writer.unfolded(how)
+        names = [leaf.name for leaf in graph.leaves() if not self.learnt or leaf.name != LEARNT]
+        if self.learnt:
+            entry = entry | {"nodes": [node for node in self.nodes if node["name"] not in names]}
+        sources = self.sources_of(graph)
+        for member, bundle in self.kept.items():
+            writer.copy_field(bundle, member)
+        entry = entry | ({"objects": names} if names else {}) | ({"sources": sources} if sources else {})
+        writer.write(output, self.scene(graph, entry), overwrite=self.request.overwrite)
+        return Path(output).stat().st_size
+
+    def of_learnt(self, writer: BundleWriter, made: Kept, background: Background | None) -> SceneGraph:
+        """The graph of what was learnt, and of a background that stays."""
+        precision = made.tried.way.precision
+        if background is None:
+            return SceneGraph((self.learnt_node(add(writer, made.field, precision)),))
+        source = self.background_source
+        stays, learnt = made.field.placed
+        member = add(writer, learnt.field, precision)
+        if background.precision is None:
+            own = writer.copy_field(source.bundle, source.member)
+        else:
+            own = add(writer, stays.field, background.precision)
+        name = free_name(source.placed.name, {LEARNT})
+        at, showing = placement_of(source.placed.object_to_world), showing_of(stays)
+        node = Node(name, own, None, at, True, showing=showing)
+        place = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
+        return SceneGraph((node, Node(LEARNT, member, None, place)))
+
+    def of_instances(self, writer: BundleWriter, made: Kept) -> SceneGraph:
+        """The scene's graph with the fields that were made of its own."""
+        result = made.field
+        fields = distinct_fields(result) if isinstance(result, ComposedField) else [result]
+        of_source = dict(zip(map(id, distinct_fields(self.composed)), fields, strict=True))
+        # what crops leave of a field is a field of its own where numbers are stored anew
+        cuts = [leaf.crops and of_source[id(f.placed.field)] is not f.placed.field for leaf, f in self.leaves]
+        cut, members = any(cuts), {}
+
+        def member(leaf: Leaf, source: SourceField) -> str:
+            field = of_source[id(source.placed.field)]
+            if field is source.placed.field and not (cut and leaf.crops):
+                return writer.copy_field(source.bundle, source.member)
+            if id(field) not in members:
+                unchanged = field is source.placed.field
+                precision = source.bundle.headers[source.member].precision if unchanged else None
+                members[id(field)] = add(writer, opened(field), precision or made.tried.way.precision)
+            return members[id(field)]
+
+        named = iter([member(leaf, source) for leaf, source in self.leaves])
+        graph = with_leaves(self.graph, lambda node: replace(node, field=next(named)))
+        return uncropped(graph) if cut else graph
+
+    @property
+    def leaves(self) -> list[tuple[Leaf, SourceField]]:
+        """The graph's leaves, and the sources that they are."""
+        return list(zip(self.graph.leaves(), self.loaded.fields, strict=True))
+
+    @property
+    def background_source(self) -> SourceField:
+        """The source that is unbounded."""
+        return next(f for f in self.loaded.fields if f.placed.unbounded)
+
+    def sources_of(self, graph: SceneGraph) -> dict[str, dict]:
+        """What the members of a graph were made of that are not those of their sources."""
+        placed = [leaf for leaf in graph.leaves() if not self.learnt or leaf.name != LEARNT]
+        own = self.loaded.fields if not self.learnt else [self.background_source for _ in placed]
+        found: dict[str, dict] = {}
+        for leaf, f in zip(placed, own, strict=True):
+            if leaf.field == f.member or f.cropped:
+                continue
+            told = {"field": f.member}
+            if f.member not in self.kept:
+                folder = Path(self.request.output).resolve().parent
+                told["source"] = os.path.relpath(f.bundle.path.resolve(), folder)
+                told["sha256"] = f.bundle.sha256
+            found.setdefault(leaf.field, told)
+        return found
+
+
+def add(writer: BundleWriter, field: StoredField, precision: str) -> str:
+    """The member of a field that is stored in a precision."""
+    return writer.add_field(FieldRecord(field.kind, *field.state()), precision)
+
+
+class Named(Embedding):
+    """A scene whose nodes name all fields by the members of the bundles that they are in."""
+
+    def __init__(self, allow_outside: bool):
+        super().__init__(BundleWriter(), allow_outside)
+
+    def member(self, bundle: OpenBundle, member: str) -> str:
+        """See Embedding: its own name, which is made of its bytes."""
+        return member
+
+
+def named_graph(request: FuseRequest, everything: LoadedScene, loaded: LoadedScene) -> SceneGraph:
+    """The graph of a scene with the nodes of all its sources, but for those that show nothing."""
+    graph = Named(request.allow_outside).of(everything.graph, everything.path)
+    shown = {id(f) for f in loaded.fields}
+    visible = iter([leaf.visible for leaf in graph.leaves()])
+    fields = iter(everything.fields)
+
+    def after(node: Node) -> Node | None:
+        return node if next(visible) and id(next(fields)) in shown else None
+
+    return with_leaves(graph, after)
+
+
+def uncropped(graph: SceneGraph) -> SceneGraph:
+    """A graph none of whose nodes is cropped."""
+
+    def after(node: Node) -> Node:
+        showing = {word: value for word, value in node.showing.items() if word != "crop"}
+        return replace(node, showing=showing, children=tuple(map(after, node.children)))
+
+    return replace(graph, nodes=tuple(map(after, graph.nodes)))
+
+
+def stored_bytes(loaded: LoadedScene) -> Mapping[int, int]:
+    """Bytes of the members of fields that their bundles have, by the field's id."""
+    known = (f for f in loaded.fields if f.member in f.bundle.headers and not f.cropped)
+    return {id(f.placed.field): f.bundle.headers[f.member].size for f in known}
+
+
+def unchanged_bytes(loaded: LoadedScene) -> int | None:
+    """Bytes of the members of all fields; None: they are not known."""
+    sizes = {f.member: f.bundle.headers[f.member].size for f in loaded.fields if f.member in f.bundle.headers}
+    return sum(sizes.values()) if all(f.member in sizes for f in loaded.fields) else None
