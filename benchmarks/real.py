@@ -12,6 +12,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +29,25 @@ from fusedrf_cli.bridge.pictures import WHITE, camera_of, truth_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.volume import render_image
+from fusedrf_cli.engine.settings import current
 
 EVERY = 8
 BUDGETS = {"fox": (30, 120, 600), "bear": (120, 600), "cup": (300, 900), "fern": (300,)}
 """Seconds of learning."""
-OTHERS = (120,)
-"""Of captures that are not named."""
-FRAME_WIDTH, FRAMES = 800, 3
+
+
+@dataclass(frozen=True)
+class RealConfig:
+    """How captures are learnt and shown."""
+
+    others: tuple[float, ...] = (120,)
+    """Of captures that are not named."""
+    frame_width: int = 800
+    """Pixels."""
+    frames: int = 3
+    """That are timed."""
+
+
 SHOWN_WIDTH = 320
 """Pixels of a picture on the page, of which two stand side by side."""
 QUALITY = 80
@@ -45,7 +58,8 @@ ABOUT = (
     "best, which the photo itself tells; *gap* is the training PSNR less the held-out one; *mean colour* and "
     "*nearest photo* are what the mean colour of the training photos and a copy of the nearest one reach. "
     "*Minutes* are the time budget of learning, *seconds* those of the whole command, with reading and "
-    f"measuring; *frame* is the median of {FRAMES} pictures of a held-out view, {FRAME_WIDTH} pixels wide."
+    f"measuring; *frame* is the median of {RealConfig.frames} pictures of a held-out view, "
+    f"{RealConfig.frame_width} pixels wide."
 )
 
 
@@ -92,11 +106,13 @@ def measured(folder: Path, name: str, capture: Capture, seconds: float, field: P
 
 
 def frame_seconds(field: Path, view: View) -> float:
-    """The median of FRAMES pictures of a view, FRAME_WIDTH wide, after one that loads kernels."""
+    """The median of `frames` pictures of a view, `frame_width` wide, after one that loads kernels."""
+    config = current(RealConfig)
     shown, origin = renderable(load_scene(str(field)))
-    camera = camera_of(view.reframed(FRAME_WIDTH, round(FRAME_WIDTH * view.height / view.width)))
+    wide = config.frame_width
+    camera = camera_of(view.reframed(wide, round(wide * view.height / view.width)))
     took = []
-    for _ in range(1 + FRAMES):
+    for _ in range(1 + config.frames):
         started = time.perf_counter()
         render_image(shown, camera, origin=origin)
         took.append(time.perf_counter() - started)
@@ -156,7 +172,7 @@ def main() -> None:
         field = Path(folder) / "field.rfpack"
         for name, capture in captures(asked.data):
             rows = kept_rows(asked.out / "real.csv", "capture", {name})
-            for seconds in BUDGETS.get(name, OTHERS):
+            for seconds in BUDGETS.get(name, current(RealConfig).others):
                 rows.append(measured(asked.data / name, name, capture, seconds * asked.share, field))
             write_pair(field, capture.test[len(capture.test) // 2], asked.out / f"{name}.jpg")
             write_page(asked.out, rows)

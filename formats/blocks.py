@@ -12,8 +12,9 @@ import numpy as np
 
 from formats.graph import belongs, free_name, placement_of
 from formats.history import distilled, listed
+from formats.nodes import WHITE
 from formats.records import CodedSpec, FieldHeader, decode_header, encode_stored, mapped_array, member_name
-from formats.scene import WHITE, Box, Matrix4, Node, SceneGraph
+from formats.scene import Box, Matrix4, Node, SceneGraph
 
 KIND = "vm"
 UNNAMED = ("", "fused", "restored")

@@ -23,6 +23,7 @@ from formats.errors import (
     UnknownMember,
 )
 from formats.inputs import open_input
+from formats.nodes import WHITE
 from formats.records import (
     FieldHeader,
     FieldRecord,
@@ -34,16 +35,7 @@ from formats.records import (
     sha256_of_bytes,
 )
 from formats.rig import read_rig
-from formats.scene import (
-    FORMAT,
-    MEMBER,
-    WHITE,
-    SceneGraph,
-    dump_scene,
-    make_node,
-    parse_scene,
-    read_scene,
-)
+from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, make_node, parse_scene, read_scene
 
 SCENE = "scene.json"
 SHARED = "shared"  # of a field's metadata: its parts that are members of their own

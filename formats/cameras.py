@@ -56,11 +56,12 @@ def read_cameras(path: Path | str, size: tuple[int, int] | None = None) -> tuple
 # --- transforms.json ----------------------------------------------------------------------------------------
 
 
-def read_document(path: Path) -> dict:
-    """A JSON object, in which // and /* */ comments are allowed as instant-ngp allows them."""
+def read_document(path: Path, most: int = MAX_VALUES) -> dict:
+    """A JSON object, in which // and /* */ comments are allowed as instant-ngp allows them.
+    Raises LimitExceeded for more than `most` values, BadJson, BadSchema."""
     data = read_input(path, MAX_JSON)
-    if data.count(b",") > MAX_VALUES:
-        raise LimitExceeded(f"{path}: JSON of more than {MAX_VALUES:,} values; at most so many are read")
+    if data.count(b",") > most:
+        raise LimitExceeded(f"{path}: JSON of more than {most:,} values; at most so many are read")
     try:
         text = decoded(data)
         if not text.strip():

@@ -11,6 +11,7 @@ import struct
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
@@ -30,7 +31,7 @@ from formats.frame_list import once, read_sound
 from formats.inputs import decoded, open_input, read_input
 from formats.matching import stem_key
 from formats.photos import folders
-from formats.points import Points, points_notes, stride
+from formats.points import MAX_POINTS, Points, points_notes, stride
 from formats.rotations import matrices
 from formats.views import FARTHEST, View
 
@@ -170,8 +171,9 @@ def _has(folder: Path, name: str) -> bool:
     return any((folder / f"{name}.{ending}").is_file() for ending in ("bin", "txt"))
 
 
-def read_model(folder: Path) -> Model:
-    """The model of a folder; binary files are preferred. Points are optional.
+def read_model(folder: Path, most_points: int = MAX_POINTS) -> Model:
+    """The model of a folder; binary files are preferred. Points are optional, and of more than `most_points`
+    only some are read.
 
     Raises BadIntrinsics, BadModel, BadPose, LimitExceeded, MissingFile, ResourceError, UnsupportedCamera.
     """
@@ -180,7 +182,7 @@ def read_model(folder: Path) -> Model:
     if not listed:
         raise BadModel(f"{folder}: its images file is empty; export the model again")
     try:
-        known, notes = _points(folder), []
+        known, notes = _points(folder, most_points), []
     except ResourceError:
         raise
     except FormatError as error:
@@ -214,10 +216,10 @@ def _images(folder: Path) -> list[tuple]:
     return _read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES)
 
 
-def read_points(folder: Path) -> tuple[Points | None, dict[str, np.ndarray]]:
-    """The points alone, None where the model has none; and, by the `stem_key` of each photo's file, which of
-    them were found in it (View.seen). Photos that share a stem are left out."""
-    known = _points(folder)
+def read_points(folder: Path, most: int = MAX_POINTS) -> tuple[Points | None, dict[str, np.ndarray]]:
+    """The points alone, at most so many, None where the model has none; and, by the `stem_key` of each
+    photo's file, which of them were found in it (View.seen). Photos that share a stem are left out."""
+    known = _points(folder, most)
     if known is None:
         return None, {}
     named = [(stem_key(PurePosixPath(name).name), ids) for _, name, *_, ids in _images(folder)]
@@ -225,10 +227,11 @@ def read_points(folder: Path) -> tuple[Points | None, dict[str, np.ndarray]]:
     return known.points, {stem: known.sure(known.found(ids)) for stem, ids in named if stems[stem] == 1}
 
 
-def _points(folder: Path) -> Listed | None:
+def _points(folder: Path, most: int) -> Listed | None:
     if not _has(folder, "points3D"):
         return None
-    return _read(folder, "points3D", {"bin": _binary_points, "txt": _text_points}, MAX_BYTES)
+    parsers = {"bin": partial(_binary_points, most), "txt": partial(_text_points, most)}
+    return _read(folder, "points3D", parsers, MAX_BYTES)
 
 
 def _read(folder: Path, name: str, parsers: dict, limit: int):
@@ -408,10 +411,10 @@ HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "
 BLOCK = 1 << 16
 
 
-def _binary_points(path: Path, data: bytes) -> Listed:
+def _binary_points(most: int, path: Path, data: bytes) -> Listed:
     (count,) = struct.unpack_from("<Q", data)
     _check_count(path, count, len(data), HEAD.itemsize)
-    step, at, track = stride(count), 8, struct.Struct("<Q").unpack_from
+    step, at, track = stride(count, most), 8, struct.Struct("<Q").unpack_from
     heads, kept = np.empty(-(-count // step), HEAD), []
     for i in range(count):
         (length,) = track(data, at + 43)
@@ -433,8 +436,8 @@ def _gather(data: bytes, starts: list[int], heads: np.ndarray) -> None:
     heads[len(heads) - len(starts) :] = np.frombuffer(data, np.uint8)[rows].view(HEAD)[:, 0]
 
 
-def _text_points(path: Path, data: bytes) -> Listed:
-    step, rows, ids = stride(data.count(b"\n")), [], []
+def _text_points(most: int, path: Path, data: bytes) -> Listed:
+    step, rows, ids = stride(data.count(b"\n"), most), [], []
     numbered = (item for item in _lines(path, data) if item[1])
     for line, text in islice(numbered, 0, None, step):
         words = text.split(None, 8)

@@ -9,7 +9,8 @@ import numpy as np
 from formats.bundle import BundleWriter, OpenBundle, is_bundle
 from formats.errors import BadSchema
 from formats.graph import placement_of
-from formats.scene import Node, SceneGraph, expand_scene, resolve_source
+from formats.scene import Node, SceneGraph
+from formats.sources import expand_scene, resolve_source
 
 
 class Embedding:

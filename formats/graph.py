@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from formats.errors import FormatError
-from formats.scene import WHITE, Node, SceneGraph, check_name, multiplied
+from formats.nodes import WHITE, check_name, multiplied
+from formats.scene import Node, SceneGraph
 
 Becoming = Callable[[Node, np.ndarray], tuple[Node, ...]]
 """What becomes of a node, whose parent's frame lies in the world by a (4, 4)."""

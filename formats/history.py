@@ -13,7 +13,8 @@ import msgspec
 import numpy as np
 
 from formats.errors import BadSchema, FormatError
-from formats.scene import Matrix4, SceneGraph, check_affine
+from formats.nodes import check_affine
+from formats.scene import Matrix4, SceneGraph
 
 KEPT = 32
 """Edits that are told one by one; twice as many before they are summed up."""

@@ -34,8 +34,6 @@ PER_STORED_PIXEL = 8
 """Bytes while a photo is decoded: Pillow's 4, and what the decoder of a progressive JPEG keeps."""
 TAIL = 1 << 12
 """Bytes in which the end of a whole picture is looked for; one that goes on behind it is decoded."""
-BAND = 1 << 20
-"""Stored pixels that are converted at once, about."""
 DECODING_ERRORS = (
     OSError,
     SyntaxError,
@@ -78,6 +76,7 @@ def read_image(
     alpha: bool = True,
     out: np.ndarray | None = None,
     premultiplied: bool = False,
+    at_once: int = 1 << 20,
 ) -> np.ndarray:
     """(H, W, 4) uint8, straight alpha, 255 where the file has none, or all over where `alpha` is False.
 
@@ -85,8 +84,8 @@ def read_image(
     too, unless `orientation` (as EXIF counts them) asks for one. With `reduction` each is the mean of so many
     a side of the turned picture, colours weighted by alpha; what is left over at the right and below is cut
     off. `out` takes the pixels where it is given. Colours of a file that are `premultiplied` are divided by
-    alpha. Raises BadImage, LimitExceeded (before decoding), MissingExtra, MissingFile, MixedSizes (`out` has
-    another shape).
+    alpha. About `at_once` stored pixels are converted at a time. Raises BadImage, LimitExceeded (before
+    decoding), MissingExtra, MissingFile, MixedSizes (`out` has another shape).
     """
     with _decoded(path) as image:
         (left, wide), (top, high) = _kept_spans(image.size, orientation, reduction)
@@ -97,7 +96,7 @@ def read_image(
             found, expected = (f"{w}x{h}" for h, w in (shape, out.shape[:2]))
             raise MixedSizes(f"{path} is {found} now, expected {expected}; read it again")
         stored = as_stored(out, orientation)
-        rows = max(1, BAND // (image.width * reduction))
+        rows = max(1, at_once // (image.width * reduction))
         for row in range(0, high, rows):
             end = min(row + rows, high)
             box = (left, top + row * reduction, left + wide * reduction, top + end * reduction)

@@ -56,9 +56,9 @@ class Points:
         return replace(self, positions=self.positions @ matrix[:3, :3].T + matrix[:3, 3])
 
 
-def stride(count: int) -> int:
-    """How many points of a file one is read of, so that there are at most MAX_POINTS."""
-    return max(1, -(-count // MAX_POINTS))
+def stride(count: int, most: int = MAX_POINTS) -> int:
+    """How many points of a file one is read of, so that there are at most so many."""
+    return max(1, -(-count // most))
 
 
 def points_notes(path: Path | str, points: Points | None) -> list[str]:
@@ -66,7 +66,7 @@ def points_notes(path: Path | str, points: Points | None) -> list[str]:
     notes = []
     if points is not None and points.thinned > 1:
         notes.append(
-            f"{path}: of more than {MAX_POINTS:,} sparse points one in {points.thinned} is read, "
+            f"{path}: of its many sparse points one in {points.thinned} is read, "
             f"{len(points.positions):,} in all"
         )
     if points is not None and points.damaged:
@@ -75,9 +75,9 @@ def points_notes(path: Path | str, points: Points | None) -> list[str]:
     return notes
 
 
-def read_ply_points(path: Path | str) -> Points:
-    """The vertices of a .ply, text or binary, without those that are NaN, infinite or beyond 1e30; of many
-    only some (`thinned`). Other elements are ignored.
+def read_ply_points(path: Path | str, most: int = MAX_POINTS) -> Points:
+    """The vertices of a .ply, text or binary, without those that are NaN, infinite or beyond 1e30; of more
+    than `most` only some (`thinned`). Other elements are ignored.
 
     Raises BadModel, LimitExceeded (before anything is allocated), MissingFile.
     """
@@ -89,9 +89,9 @@ def read_ply_points(path: Path | str) -> Points:
     names = [name for name, _ in fields]
     if not {"x", "y", "z"} <= set(names):
         raise BadModel(f"{path}: its vertices lack x, y or z; export the points again")
-    step = stride(count)
+    step = stride(count, most)
     if coding == "ascii":
-        table = _text_table(path, data, end.end(), count, len(fields))
+        table = _text_table(path, data, end.end(), count, step, len(fields))
         columns = {name: table[:, i] for i, name in enumerate(names)}
     else:
         order = "<" if coding == "binary_little_endian" else ">"
@@ -153,11 +153,11 @@ def _count(path: Path | str, digits: str) -> int:
     return count
 
 
-def _text_table(path: Path | str, data: bytes, start: int, count: int, width: int) -> np.ndarray:
-    """(N, width) numbers of every `stride`-th of `count` lines from a byte on."""
+def _text_table(path: Path | str, data: bytes, start: int, count: int, step: int, width: int) -> np.ndarray:
+    """(N, width) numbers of every `step`-th of `count` lines from a byte on."""
     if not count:
         return np.empty((0, width))
-    step, lines = stride(count), io.BytesIO(data)
+    lines = io.BytesIO(data)
     lines.seek(start)
     expected = -(-count // step)
     try:

@@ -208,7 +208,7 @@ def decode_field(data: bytes | memoryview, where: str) -> FieldRecord:
     return FieldRecord(header.kind, arrays, header.metadata)
 
 
-def decode_header(data: bytes | memoryview, where: str) -> FieldHeader:
+def decode_header(data: bytes | memoryview, where: str, most: int = MAX_DECODED_BYTES) -> FieldHeader:
     """Everything but the arrays, checked as in `decode_field`; costs the header only."""
     size = len(data)
     length = int.from_bytes(data[:8], "little")
@@ -227,9 +227,9 @@ def decode_header(data: bytes | memoryview, where: str) -> FieldHeader:
     _check_cover(specs, 8 + length, size, where)
     coded = {name: _coded_spec(name, entry, specs, where) for name, entry in coded.items()}
     found = FieldHeader(kind, metadata, specs, coded, size)
-    if found.decoded_size > MAX_DECODED_BYTES:
+    if found.decoded_size > most:
         raise LimitExceeded(
-            f"{where}: decodes to {found.decoded_size:,} bytes, but at most {MAX_DECODED_BYTES:,} are read"
+            f"{where}: decodes to {found.decoded_size:,} bytes, but at most {most:,} are read"
         )
     return found
 

@@ -271,14 +271,15 @@ def _photo_key(view: View) -> str:
     return stem_key(view.image_path.name)
 
 
-def sparse_points(path: Path, document: dict, views: tuple[View, ...]) -> Sparse:
+def sparse_points(path: Path, document: dict, views: tuple[View, ...], most: int = MAX_POINTS) -> Sparse:
     """The points of the COLMAP model that the capture was made from, where it lies beside and is of the same
-    photos, or else those that `ply_file_path` names; and a note where they were to be there but are not."""
+    photos, or else those that `ply_file_path` names, at most so many; and a note where they were to be there
+    but are not."""
     written, sparse = written_path(document, "ply_file_path"), Sparse()
     ply = find_file(path.parent, written) if written else None
     if "applied_transform" in document and (folder := colmap.model_folder(path.parent)) is not None:
         try:
-            points, seen = colmap.read_points(folder)
+            points, seen = colmap.read_points(folder, most)
         except ResourceError:
             raise
         except FormatError as error:
@@ -287,7 +288,7 @@ def sparse_points(path: Path, document: dict, views: tuple[View, ...]) -> Sparse
             sparse = _agreeing(Sparse(_placed(path, document, points, views), seen), views)
     if sparse.seen is None and ply:
         try:
-            points = read_ply_points(ply)
+            points = read_ply_points(ply, most)
         except ResourceError:
             raise
         except FormatError as error:

@@ -38,16 +38,16 @@ def check_past(bundle: Path | str, output: Path | str) -> None:
         check_space(folder, os.path.getsize(bundle))
 
 
-def keep(bundle: Path | str, output: Path | str) -> str:
+def keep(bundle: Path | str, output: Path | str, most: int = KEPT) -> str:
     """Keep a bundle and its own earlier ones as what an output will have been; its SHA-256. Of those in the
-    folder at most KEPT stay, the output's own before all.
+    folder at most so many stay, the output's own before all.
 
     Where the file system can, the bytes are shared with the bundle that is there. Raises ResourceError."""
     checksum = sha256_of(bundle)
     share(bundle, bundle, output)
     folder = made(past_of(output))
     link(Path(bundle), folder / f"{checksum}.rfpack", checksum)
-    prune(folder, [checksum, *chain(folder, bundle)])
+    prune(folder, [checksum, *chain(folder, bundle)], most)
     sync_folder(folder)
     return checksum
 
@@ -77,14 +77,14 @@ def chain(folder: Path, bundle: Path | str) -> list[str]:
     return found
 
 
-def prune(folder: Path, own: list[str]) -> None:
-    """Remove bundles until at most KEPT are there: first those that are none of an output's `own`, which come
-    the latest first, and then its earliest. What this module did not put there is left alone: whatever is not
-    named by the checksum that it has."""
+def prune(folder: Path, own: list[str], most: int) -> None:
+    """Remove bundles until at most so many are there: first those that are none of an output's `own`, which
+    come the latest first, and then its earliest. What this module did not put there is left alone: whatever
+    is not named by the checksum that it has."""
     held = {path.stem for path in folder.glob("*.rfpack") if CHECKSUM.fullmatch(path.stem)}
     paths = {checksum: folder / f"{checksum}.rfpack" for checksum in held}
     others = sorted(held - set(own), key=lambda checksum: paths[checksum].lstat().st_mtime)
-    for checksum in [*others, *reversed([c for c in own if c in held])][: max(0, len(held) - KEPT)]:
+    for checksum in [*others, *reversed([c for c in own if c in held])][: max(0, len(held) - most)]:
         path = paths[checksum]
         if path.is_file() and sha256_of(path) == checksum:
             path.unlink(missing_ok=True)

@@ -13,13 +13,12 @@ from formats.scene import (
     Node,
     SceneGraph,
     dump_scene,
-    inline_scenes,
     make_node,
     parse_scene,
     read_scene,
-    resolve_source,
     write_scene,
 )
+from formats.sources import inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import (

@@ -25,7 +25,7 @@ Shape = Annotated[tuple[float, ...], Meta(min_length=4, max_length=6)]
 """A box, or a sphere's centre and radius."""
 Row = tuple[float, float, float, float]
 Size = tuple[Count, Count]
-Precision = Literal["float32", "float16", "int8", "int4"]
+Precision = Literal["float16", "float32", "int8", "int4"]
 ShDegree = Annotated[int, Meta(ge=0, le=3)]
 
 

@@ -1,22 +1,31 @@
 """PSNR and SSIM of every kind of fused field: with and without RGB finishing, by seed, and close up."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.paper.sources import TINY, four_objects, with_a_tiny_one
-from benchmarks.paper.work import KINDS, MOST_BYTES, SIZES, Work, course, fusedrf, tell, write_csv
+from benchmarks.paper.work import SIZES, FusedConfig, Work, course, fusedrf, tell, write_csv
+from fusedrf_cli.engine.settings import current
 
-SIZE = 400  # pixels a side
-SEEDS = 5
-FEWER = (5_000_000, 2_000_000)  # bytes
+
+@dataclass(frozen=True)
+class QualityConfig:
+    """How fused fields are compared."""
+
+    size: int = 400
+    """Pixels a side."""
+    seeds: int = 5
+    fewer: tuple[int, ...] = (5_000_000, 2_000_000)
+    """Bytes."""
 
 
 def kinds(work: Work) -> dict[str, str]:
     """Write kinds.csv; the figures of the table."""
     scene = four_objects(work)
-    held, rows = course(scene, SIZE), []
-    for kind in KINDS:
+    held, rows = course(scene, current(QualityConfig).size), []
+    for kind in current(FusedConfig).kinds:
         for rgb in ("--no-rgb", "--rgb"):
             found, seconds = fused(held, scene, kind, rgb)
             rows.append({"kind": kind, "rgb": rgb == "--rgb"} | found | {"seconds": seconds})
@@ -29,11 +38,12 @@ def kinds(work: Work) -> dict[str, str]:
 
 def seeds(work: Work) -> dict[str, str]:
     """Write seeds.csv; the figures of the table."""
+    config = current(QualityConfig)
     scene = four_objects(work)
-    held, rows = course(scene, SIZE // 2), []
-    drawn = [kind for kind in KINDS if kind not in SIZES]
+    held, rows = course(scene, config.size // 2), []
+    drawn = [kind for kind in current(FusedConfig).kinds if kind not in SIZES]
     for kind in drawn:
-        for seed in range(SEEDS):
+        for seed in range(config.seeds):
             rows.append({"kind": kind, "seed": seed} | fused(held, scene, kind, "--seed", str(seed))[0])
             write_csv(work.out / "seeds.csv", rows)
     spread = {k: float(np.ptp([r["psnr"] for r in rows if r["kind"] == k])) for k in drawn}
@@ -42,9 +52,10 @@ def seeds(work: Work) -> dict[str, str]:
 
 def sizes(work: Work) -> dict[str, str]:
     """Write sizes.csv."""
+    config = current(QualityConfig)
     scene = four_objects(work)
-    held, rows = course(scene, SIZE), []
-    for limit in FEWER:
+    held, rows = course(scene, config.size), []
+    for limit in config.fewer:
         found, seconds = fused(held, scene, "blocks", most=limit)
         rows.append({"at most": limit} | found | {"seconds": seconds})
         write_csv(work.out / "sizes.csv", rows)
@@ -53,9 +64,10 @@ def sizes(work: Work) -> dict[str, str]:
 
 def closeup(work: Work) -> dict[str, str]:
     """Write closeup.csv; the figures of the table."""
+    config = current(QualityConfig)
     scene, box = with_a_tiny_one(work)
-    held, whole, rows = course(scene, SIZE, box), course(scene, SIZE), []
-    for kind in KINDS:
+    held, whole, rows = course(scene, config.size, box), course(scene, config.size), []
+    for kind in current(FusedConfig).kinds:
         found, _ = fused(held, scene, kind)
         found["psnr of the whole"] = whole.quality(bundle_of(scene, kind))["psnr"]
         rows.append({"kind": kind, "units tall": TINY} | found)
@@ -68,8 +80,10 @@ def bundle_of(scene: Path, kind: str) -> Path:
     return scene.with_name(f"{scene.stem}_{kind}.rfpack")
 
 
-def fused(held, scene: Path, kind: str, *words: str, most: int = MOST_BYTES) -> tuple[dict, float]:
-    """Fuse a scene to a kind of at most so many bytes, and hold it to views: the row, and seconds."""
+def fused(held, scene: Path, kind: str, *words: str, most: int | None = None) -> tuple[dict, float]:
+    """Fuse a scene to a kind of at most so many bytes (default: FusedConfig's), and hold it to views: the
+    row, and seconds."""
+    most = most or current(FusedConfig).most_bytes
     tell(f"{scene.stem}: {kind} {' '.join(words)}")
     path = bundle_of(scene, kind)
     line = ("--kind", kind, "--max-size", str(SIZES.get(kind, most)), *words)

@@ -1,14 +1,22 @@
 """The smallest bundle at a PSNR: on the chart, and as `fuse --target-psnr` finds it."""
 
 import shutil
+from dataclasses import dataclass
 
 from benchmarks.paper.sources import four_objects
 from benchmarks.paper.work import Work, course, fusedrf, tell, write_csv
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.report import readable_size
 
 WANTED = 40.0  # dB
 BUDGET = 600
-SIZE = 400
+
+
+@dataclass(frozen=True)
+class SmallestConfig:
+    """How the smallest bundle is looked for."""
+
+    size: int = 400
 
 
 def smallest(work: Work) -> dict[str, str]:
@@ -22,7 +30,7 @@ def smallest(work: Work) -> dict[str, str]:
     tell("smallest: the search")
     words = ("-o", "target.rfpack", "--target-psnr", f"{WANTED:g}")
     found = fusedrf(scene.parent, "fuse", scene.name, *words)
-    held = course(scene, SIZE).quality(scene.with_name("target.rfpack"))
+    held = course(scene, current(SmallestConfig).size).quality(scene.with_name("target.rfpack"))
     row = {"by": "search", "flags": " ".join(words[2:]), "psnr": held["psnr"], "covered": held["covered"]}
     rows = [row | {"bytes": found["bytes"], "seconds": found["total_seconds"]}]
     if not enough:

@@ -14,11 +14,18 @@ from fusedrf_cli.bridge.charting import Benchmark
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.main import cli
 
-MOST_BYTES = 25_000_000
-"""The paper's size of a fused field."""
+
+@dataclass(frozen=True)
+class FusedConfig:
+    """The fused fields that are measured."""
+
+    most_bytes: int = 25_000_000
+    """The paper's size of a fused field."""
+    kinds: tuple[str, ...] = ("blocks", "sparse", "vm")
+
+
 SIZES = {"sparse": 6_000_000}
 """Bytes of a kind of which less is taken: bricks of the paper's size take minutes to fill."""
-KINDS = ("blocks", "sparse", "vm")
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,13 @@ from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.making import Kept
 from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
-from fusedrf_cli.bridge.sizes import BESIDES
+from fusedrf_cli.bridge.sizes import HeaderConfig
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.instances import distinct_fields
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.requests import FuseRequest
 
 
@@ -47,7 +48,8 @@ class FusedBundle:
         self.framing = None if framing is None else tuple(float(number) for number in framing)
         self.cameras = cameras
         try:
-            self.overhead = BESIDES + len(dump_scene(self.scene(self.skeleton, {"nodes": self.nodes})))
+            skeleton = self.scene(self.skeleton, {"nodes": self.nodes})
+            self.overhead = current(HeaderConfig).besides + len(dump_scene(skeleton))
         except FormatError as error:
             raise error.within(self.request.output) from error
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from formats.bundle import PART
 from formats.graph import belongs, placement_of, with_field, without
-from formats.scene import WHITE, Leaf, Node
+from formats.nodes import WHITE, Leaf, Node
 from fusedrf_cli.bridge.distilled import holders_in, inside
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit
 from fusedrf_cli.bridge.mending import LEARNT, Frame, Teacher, hole_of, learnt_from, learnt_surfaces, up_of

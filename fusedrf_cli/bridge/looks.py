@@ -168,8 +168,8 @@ def looks(
 
 
 def views_of_place(scene: LoadedScene, composed: ComposedField) -> tuple[Camera, ...]:
-    """Small cameras in the frame of a scene: those of the photos of its place, and more from between them; none
-    where the scene keeps no cameras of a place."""
+    """Small cameras in the frame of a scene: those of the photos of its place, and more from between them;
+    none where the scene keeps no cameras of a place."""
     config = current(LookConfig)
     rig = rig_of(scene)
     if rig is None or not rig.surroundings or composed.occupancy.space is not unbounded:

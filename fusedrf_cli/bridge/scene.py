@@ -12,19 +12,10 @@ import numpy as np
 from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_nodes
+from formats.nodes import Leaf, check_affine
 from formats.records import FieldRecord, as_stored, reading_size
-from formats.scene import (
-    Leaf,
-    Node,
-    SceneGraph,
-    check_affine,
-    dump_scene,
-    expand_scene,
-    inline_scenes,
-    make_node,
-    parse_scene,
-    resolve_source,
-)
+from formats.scene import Node, SceneGraph, dump_scene, make_node, parse_scene
+from formats.sources import expand_scene, inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf

@@ -12,7 +12,8 @@ from formats.bundle import OpenBundle, is_bundle, sha256_of
 from formats.embedding import in_place_of
 from formats.graph import belongs, placement_of, with_leaves, with_nodes
 from formats.history import check_history, distilled, sources
-from formats.scene import WHITE, Leaf, Node, SceneGraph
+from formats.nodes import WHITE, Leaf, Node
+from formats.scene import SceneGraph
 from fusedrf_cli.bridge.memory import Memory
 from fusedrf_cli.bridge.scene import FoundField, LoadedScene, load_found, load_scene
 from fusedrf_cli.errors import InvalidInput, UsageProblem

@@ -308,9 +308,8 @@ def fit_settings(
     if request.max_size or not extent.unbounded:
         longest = fitting_longest(kind, extent.box, settings, room, request.precision)
     else:  # however its numbers are stored
-        longest = fitting_longest(
-            kind, extent.box, settings, current(Presets).largest_unbounded, kind.faithful
-        )
+        most = current(Presets).largest_unbounded
+        longest = fitting_longest(kind, extent.box, settings, most, kind.faithful)
     plan = kind.untrained(extent.box, longest, settings.way)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)

@@ -3,11 +3,12 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("add")
-@click.argument("fused", type=options.INPUT)
-@click.argument("source", metavar="OBJECT", type=options.INPUT)
+@click.argument("fused", type=InputType())
+@click.argument("source", metavar="OBJECT", type=InputType())
 @options.writing("The bundle to write, OUT.rfpack.")
 @click.option("--name", required=True, help="The object's name in the scene.")
 @options.placement

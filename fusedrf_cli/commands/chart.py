@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType, KindsType, PositiveType, SizeType
 from fusedrf_cli.requests import ChartRequest
 
 
@@ -12,11 +13,11 @@ def shown(report: dict) -> dict:
 
 
 @click.command("chart")
-@click.argument("scene", type=options.INPUT)
+@click.argument("scene", type=InputType())
 @options.writing("The folder for chart.png, chart.svg and chart.csv.")
 @click.option(
     "--budget",
-    type=options.POSITIVE,
+    type=PositiveType(),
     metavar="S",
     default=ChartRequest.budget,
     show_default=True,
@@ -24,14 +25,14 @@ def shown(report: dict) -> dict:
 )
 @click.option(
     "--kinds",
-    type=options.KindsType(),
+    type=KindsType(),
     default=",".join(ChartRequest.kinds),
     show_default=True,
     help="Kinds to try, separated by commas.",
 )
 @click.option(
     "--least-psnr",
-    type=options.POSITIVE,
+    type=PositiveType(),
     metavar="DB",
     default=ChartRequest.least_psnr,
     show_default=True,
@@ -39,7 +40,7 @@ def shown(report: dict) -> dict:
 )
 @click.option(
     "--size",
-    type=options.SIZE,
+    type=SizeType(),
     default=ChartRequest.size,
     help="Size of the pictures compared; default: 400x400.",
 )

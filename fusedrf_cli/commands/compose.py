@@ -4,6 +4,7 @@ import click
 
 from fusedrf_cli import options, verbs
 from fusedrf_cli.errors import UsageProblem
+from fusedrf_cli.option_types import CropType, InputType, ShareType, TintType
 from fusedrf_cli.requests import ComposeRequest
 
 
@@ -40,12 +41,12 @@ def _placed_options(command):
         ("--name",): {"help": "The node's name; default: the file's stem."},
         ("--background-node",): {"is_flag": True, "help": "This input is the background."},
         ("--crop",): {
-            "type": options.CROP,
+            "type": CropType(),
             "help": "Show what lies in a box, xmin,ymin,zmin,xmax,ymax,zmax, or in a sphere, x,y,z,r, of its "
             "own world.",
         },
-        ("--opacity",): {"type": options.SHARE, "help": "Its density times this, above 0 and at most 1."},
-        ("--tint",): {"type": options.TINT, "help": "Its colours times red, green and blue from 0 to 1."},
+        ("--opacity",): {"type": ShareType(), "help": "Its density times this, above 0 and at most 1."},
+        ("--tint",): {"type": TintType(), "help": "Its colours times red, green and blue from 0 to 1."},
         ("--hidden",): {"is_flag": True, "help": "Leave it out, but keep its place in the scene."},
     }
     for names, words in reversed(flags.items()):
@@ -54,7 +55,7 @@ def _placed_options(command):
 
 
 @click.command("compose")
-@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=options.INPUT)
+@click.argument("inputs", metavar="INPUT...", nargs=-1, required=True, type=InputType())
 @_placed_options
 @options.writing("The scene to write, scene.json, or - for stdout.")
 @click.option(

@@ -3,14 +3,13 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType, KindType
 
 
 @click.command("convert")
-@click.argument("field", type=options.INPUT)
+@click.argument("field", type=InputType())
 @options.writing("The field to write, OUT.rfpack.")
-@click.option(
-    "--kind", type=options.KindType(), required=True, help="Kind of field to make; see `fusedrf kinds`."
-)
+@click.option("--kind", type=KindType(), required=True, help="Kind of field to make; see `fusedrf kinds`.")
 @options.max_size
 @options.smallest
 @options.time_budget

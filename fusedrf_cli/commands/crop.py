@@ -3,12 +3,13 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import CropType, InputType
 
 
 @click.command("crop")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @click.argument("name")
-@click.argument("shape", type=options.CROP, required=False)
+@click.argument("shape", type=CropType(), required=False)
 @options.writing("The bundle to write, OUT.rfpack.")
 @options.keep_history
 @options.memory

@@ -3,10 +3,11 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("delete")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @options.writing("The bundle to write, OUT.rfpack.")
 @options.mending

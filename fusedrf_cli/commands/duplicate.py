@@ -3,10 +3,11 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("duplicate")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @click.argument("name")
 @click.argument("new_name", metavar="NEW")
 @options.writing("The bundle to write, OUT.rfpack.")

@@ -3,12 +3,13 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 from fusedrf_cli.requests import EvaluateRequest
 
 
 @click.command("eval")
-@click.argument("bundle", type=options.SCENE)
-@click.option("--against", type=options.INPUT, required=True, help="A capture, or a scene to compare with.")
+@click.argument("bundle", type=InputType(stdin=True))
+@click.option("--against", type=InputType(), required=True, help="A capture, or a scene to compare with.")
 @click.option(
     "--split",
     type=click.Choice(["test", "train", "all"]),

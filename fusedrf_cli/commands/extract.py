@@ -3,28 +3,29 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import BoxType, InputType, PointType, SphereType
 
 
 @click.command("extract")
-@click.argument("field", type=options.INPUT)
+@click.argument("field", type=InputType())
 @options.writing("The object to write, OUT.rfpack.")
 @click.option(
     "--masks",
-    type=options.INPUT,
+    type=InputType(),
     help="A folder of masks, black where the object is not, each named as the view that it masks.",
 )
-@click.option("--cameras", type=options.INPUT, help="The views of --masks and --points: a transforms.json.")
+@click.option("--cameras", type=InputType(), help="The views of --masks and --points: a transforms.json.")
 @click.option(
     "--points",
     multiple=True,
-    type=options.POINT,
+    type=PointType(),
     help="A pixel of a view that shows the object, or, with ,out after it, that does not. Repeat it.",
 )
 @click.option(
-    "--box", "boxes", multiple=True, type=options.AABB, help="It lies in this box. Repeat it: in one of them."
+    "--box", "boxes", multiple=True, type=BoxType(), help="It lies in this box. Repeat it: in one of them."
 )
-@click.option("--sphere", "spheres", multiple=True, type=options.SPHERE, help="It lies in this sphere.")
-@click.option("--mesh", type=options.INPUT, help="It lies in this closed mesh.")
+@click.option("--sphere", "spheres", multiple=True, type=SphereType(), help="It lies in this sphere.")
+@click.option("--mesh", type=InputType(), help="It lies in this closed mesh.")
 @click.option("--name", help="The part of a fused field that goes by this name.")
 @click.option("--invert", is_flag=True, help="Write the field without the object.")
 @click.option(

@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import FolderType, InputType, KindType
 from fusedrf_cli.requests import FuseRequest
 
 
@@ -12,11 +13,11 @@ def brief(report: dict) -> dict:
 
 
 @click.command("fuse")
-@click.argument("scene", type=options.SCENE)
+@click.argument("scene", type=InputType(stdin=True))
 @options.writing("The fused field to write, OUT.rfpack.")
 @click.option(
     "--kind",
-    type=options.KindType("auto"),
+    type=KindType("auto"),
     default=FuseRequest.kind,
     show_default=True,
     help="Kind of field, or way of fusing; auto: what suits the scene best.",
@@ -32,7 +33,7 @@ def brief(report: dict) -> dict:
 @click.option(
     "--sources",
     metavar="DIR",
-    type=options.FOLDER,
+    type=FolderType(),
     help="Where the sources of a fused bundle are looked for, by checksum, if not where its history says.",
 )
 @options.memory

@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 def _brief(report: dict) -> dict:
@@ -15,7 +16,7 @@ def _brief(report: dict) -> dict:
 
 
 @click.command("history")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @options.reporting(brief=_brief)
 def command(**words):
     """List what was done to a fused field.

@@ -3,6 +3,7 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 MOST_ROWS = 8
 """Of a table about a capture, for people."""
@@ -77,7 +78,7 @@ def _scalars(event: dict) -> dict:
 
 
 @click.command("info")
-@click.argument("scene", type=options.SCENE)
+@click.argument("scene", type=InputType(stdin=True))
 @options.reporting(brief=_brief)
 def command(**words):
     """List what a bundle or scene holds, or what `train` would read.

@@ -3,10 +3,11 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("pose")
-@click.argument("photos", type=options.INPUT)
+@click.argument("photos", type=InputType())
 @options.writing("The folder to write, CAPTURE.")
 @options.threads
 @options.reporting

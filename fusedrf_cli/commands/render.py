@@ -3,58 +3,59 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import ColourType, DirectionType, InputType, PositiveType, UpType, VectorType
 from fusedrf_cli.requests import RenderRequest
 
 
 @click.command("render")
-@click.argument("scene", type=options.SCENE)
+@click.argument("scene", type=InputType(stdin=True))
 @options.writing("A .png (one view), a folder (one PNG per view), or a .gif or .mp4 (a film).")
-@click.option("--cameras", type=options.INPUT, help="Views of a transforms.json.")
-@click.option("--path", type=options.INPUT, help="Views of a nerfstudio camera_path.json.")
+@click.option("--cameras", type=InputType(), help="Views of a transforms.json.")
+@click.option("--path", type=InputType(), help="Views of a nerfstudio camera_path.json.")
 @click.option(
     "--views",
     type=click.Choice(["capture", "heldout"]),
     help="All views of the photos that the scene was learnt from, or those that were held out.",
 )
 @click.option("--orbit", type=click.IntRange(1), metavar="N", help="N views around the scene.")
-@click.option("--look-at", type=options.VECTOR, help="Look at this point of the world.")
+@click.option("--look-at", type=VectorType(), help="Look at this point of the world.")
 @click.option(
     "--from",
     "direction",
-    type=options.DIRECTION,
+    type=DirectionType(),
     help="Look from this side: degrees from +x about the upward axis, and above the horizon.",
 )
 @click.option(
     "--zoom",
-    type=options.POSITIVE,
+    type=PositiveType(),
     default=RenderRequest.zoom,
     show_default=True,
     help="2: from half as far away.",
 )
 @click.option(
     "--up",
-    type=options.UP,
+    type=UpType(),
     default="auto",
     show_default=True,
     help="Which way of the world is up; auto: as photos were held, or +z.",
 )
 @click.option(
-    "--near", type=options.POSITIVE, metavar="D", help="Leave out what is nearer to the camera than D."
+    "--near", type=PositiveType(), metavar="D", help="Leave out what is nearer to the camera than D."
 )
 @click.option(
-    "--far", type=options.POSITIVE, metavar="D", help="Leave out what is farther from the camera than D."
+    "--far", type=PositiveType(), metavar="D", help="Leave out what is farther from the camera than D."
 )
 @options.size
 @click.option(
     "--background",
-    type=options.COLOUR,
+    type=ColourType(),
     default="white",
     show_default=True,
     help="white, black, transparent or #rrggbb.",
 )
 @click.option("--depth", is_flag=True, help="Write 16-bit depth pictures as well.")
 @click.option(
-    "--fps", type=options.POSITIVE, default=RenderRequest.fps, show_default=True, help="Frames per second."
+    "--fps", type=PositiveType(), default=RenderRequest.fps, show_default=True, help="Frames per second."
 )
 @click.option(
     "--naive",

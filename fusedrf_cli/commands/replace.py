@@ -3,12 +3,13 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("replace")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @click.argument("name")
-@click.argument("source", metavar="WITH", type=options.INPUT)
+@click.argument("source", metavar="WITH", type=InputType())
 @options.writing("The bundle to write, OUT.rfpack.")
 @options.keep_history
 @options.memory

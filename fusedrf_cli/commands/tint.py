@@ -3,14 +3,15 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType, ShareType, TintType
 
 
 @click.command("tint")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @click.argument("name")
-@click.argument("colour", metavar="[R,G,B]", type=options.TINT, required=False)
+@click.argument("colour", metavar="[R,G,B]", type=TintType(), required=False)
 @options.writing("The bundle to write, OUT.rfpack.")
-@click.option("--opacity", type=options.SHARE, help="Its density times this, above 0 and at most 1.")
+@click.option("--opacity", type=ShareType(), help="Its density times this, above 0 and at most 1.")
 @options.keep_history
 @options.memory
 @options.reporting

@@ -3,15 +3,14 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import BoxType, DownscaleType, InputType, KindType, PositiveType, VectorType
 from fusedrf_cli.requests import TrainRequest
 
 
 @click.command("train")
-@click.argument("source", type=options.INPUT)
+@click.argument("source", type=InputType())
 @options.writing("The field to write, FIELD.rfpack.")
-@click.option(
-    "--kind", type=options.KindType(), default=TrainRequest.kind, show_default=True, help="Kind of field."
-)
+@click.option("--kind", type=KindType(), default=TrainRequest.kind, show_default=True, help="Kind of field.")
 @options.ranks
 @options.sh_degree
 @options.max_size
@@ -39,19 +38,19 @@ from fusedrf_cli.requests import TrainRequest
 @click.option("--holdout", type=click.IntRange(2), metavar="N", help="Keep every N-th photo to measure with.")
 @click.option(
     "--downscale",
-    type=options.DOWNSCALE,
+    type=DownscaleType(),
     default="auto",
     show_default=True,
     help="Make a side of photos N times smaller; auto: to at most 1080 pixels.",
 )
-@click.option("--aabb", type=options.AABB, help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
+@click.option("--aabb", type=BoxType(), help="Box to learn, xmin,ymin,zmin,xmax,ymax,zmax.")
 @click.option(
     "--unbounded/--bounded",
     default=None,
     help="Learn all of space, as photos of a place show it, or a box; default: as the photos need.",
 )
-@click.option("--centre", type=options.VECTOR, help="Middle of what is learnt finest.")
-@click.option("--radius", type=options.POSITIVE, help="Half the side of what is learnt finest.")
+@click.option("--centre", type=VectorType(), help="Middle of what is learnt finest.")
+@click.option("--radius", type=PositiveType(), help="Half the side of what is learnt finest.")
 @click.option(
     "--masks",
     type=click.Choice(["ignore", "alpha"]),

@@ -3,10 +3,11 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("undo")
-@click.argument("fused", type=options.INPUT)
+@click.argument("fused", type=InputType())
 @options.writing("The field to write, OUT.rfpack.")
 @options.reporting
 def command(**words):

@@ -3,10 +3,11 @@
 import click
 
 from fusedrf_cli import options, verbs
+from fusedrf_cli.option_types import InputType
 
 
 @click.command("validate")
-@click.argument("scenes", metavar="SCENE...", nargs=-1, required=True, type=options.SCENE)
+@click.argument("scenes", metavar="SCENE...", nargs=-1, required=True, type=InputType(stdin=True))
 @options.allow_outside
 @options.reporting
 def command(**words):

@@ -19,7 +19,7 @@ from fusedrf_cli.commands.fuse import command as fuse_command
 from fusedrf_cli.engine.kinds import instances, registry
 from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor, shrinking
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
-from fusedrf_cli.options import BYTES
+from fusedrf_cli.option_types import BytesType
 from fusedrf_cli.progress import NullProgress
 from fusedrf_cli.requests import ChartRequest
 from fusedrf_cli.signals import interrupt
@@ -255,7 +255,7 @@ def test_a_distilled_ladder_goes_on_past_what_does_not_fit():
 def test_sizes_are_rounded_down_to_what_the_flag_reads_back(size):
     floor = readable_floor(size)
     assert 0.9 * size < floor <= size or size < 10
-    assert BYTES.parse(in_words(floor)) == floor
+    assert BytesType().parse(in_words(floor)) == floor
 
 
 @pytest.mark.parametrize("kind", registry.names())

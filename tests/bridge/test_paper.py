@@ -10,22 +10,28 @@ import pytest
 
 from benchmarks.paper import capacity, figures, quality, smallest, sources, table, times
 from benchmarks.paper.__main__ import EXPERIMENTS
-from benchmarks.paper.work import Work, fusedrf
+from benchmarks.paper.capacity import CapacityConfig
+from benchmarks.paper.quality import QualityConfig
+from benchmarks.paper.smallest import SmallestConfig
+from benchmarks.paper.times import TimesConfig
+from benchmarks.paper.work import FusedConfig, Work, fusedrf
 from tests.bridge.conftest import write_scene_of
 
-SMALL_VM = {"KINDS": ("blocks", "vm"), "MOST_BYTES": 300_000}
+SMALL = (
+    FusedConfig(kinds=("blocks", "vm"), most_bytes=300_000),
+    QualityConfig(size=24, seeds=2),
+    SmallestConfig(size=24),
+    TimesConfig(compared=24, size=24, fusing=(1,), training=(1,), views=4, wanted=5.0),
+)
+BLOCKS = FusedConfig(kinds=("blocks",))
 
 
 @pytest.fixture
-def work(folder, tmp_path, monkeypatch) -> Work:
+def work(folder, tmp_path, monkeypatch, in_force) -> Work:
     """The shop's scene in place of all others, and tiny pictures."""
     for module in (quality, times, smallest):
         monkeypatch.setattr(module, "four_objects", lambda work: folder / "scene.json")
-    for module, name in ((quality, "SIZE"), (smallest, "SIZE"), (times, "COMPARED"), (times, "SIZE")):
-        monkeypatch.setattr(module, name, 24)
-    for module in (quality, times):
-        for name, value in SMALL_VM.items():
-            monkeypatch.setattr(module, name, value)
+    in_force(*SMALL)
     (tmp_path / "out").mkdir()
     return Work(folder, tmp_path / "out", None)
 
@@ -36,9 +42,8 @@ def rows_of(work: Work, name: str) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_kinds_and_seeds(work, monkeypatch):
-    monkeypatch.setattr(quality, "KINDS", ("blocks",))
-    monkeypatch.setattr(quality, "SEEDS", 2)
+def test_kinds_and_seeds(work, in_force):
+    in_force(BLOCKS)
     seen = quality.kinds(work) | quality.seeds(work)
     plain, finished = rows_of(work, "kinds")
     assert (plain["rgb"], finished["rgb"]) == ("False", "True")
@@ -46,10 +51,10 @@ def test_kinds_and_seeds(work, monkeypatch):
     assert [row["seed"] for row in rows_of(work, "seeds")] == ["0", "1"]
 
 
-def test_a_close_up_frames_the_object_alone(work, folder, monkeypatch):
+def test_a_close_up_frames_the_object_alone(work, folder, monkeypatch, in_force):
     box = np.array([-0.8, -0.3, -0.3, -0.2, 0.3, 0.3])  # of red
     monkeypatch.setattr(quality, "with_a_tiny_one", lambda work: (folder / "scene.json", box))
-    monkeypatch.setattr(quality, "KINDS", ("blocks",))
+    in_force(BLOCKS)
     quality.closeup(work)
     (row,) = rows_of(work, "closeup")
     assert float(row["psnr"]) > 30 and row["psnr"] != row["psnr of the whole"]
@@ -65,9 +70,7 @@ def test_the_chart_of_times_names_every_way(tmp_path):
 
 
 @pytest.mark.slow
-def test_times(work, monkeypatch):
-    for name, value in {"FUSING": (1,), "TRAINING": (1,), "VIEWS": 4, "WANTED": 5.0}.items():
-        monkeypatch.setattr(times, name, value)
+def test_times(work):
     seen = times.times(work)
     rows = rows_of(work, "times")
     assert [row["way"] for row in rows] == ["blocks", "background", "scratch", "retraining"]
@@ -76,17 +79,14 @@ def test_times(work, monkeypatch):
 
 
 @pytest.mark.slow
-def test_capacity(work, folder, monkeypatch):
+def test_capacity(work, folder, monkeypatch, in_force):
     def places(work, count):
         write_scene_of(folder, *("floor", "red", "blue")[: count + 1], file=f"things_{count:02d}.json")
         return folder / f"things_{count:02d}.json"
 
     monkeypatch.setattr(capacity, "things_on_ground", places)
     limits = {"25MB": 25_000_000, "150kB": 150_000}
-    for name, value in {"COUNTS": (1, 2), "LIMITS": limits, "MEASURED_AT": 2}.items():
-        monkeypatch.setattr(capacity, name, value)
-    monkeypatch.setattr(capacity, "COMPARED", 24)
-    monkeypatch.setattr(capacity, "FRAME", 24)
+    in_force(CapacityConfig((1, 2), compared=24, frame=24, measured_at=2, limits=tuple(limits.items())))
     seen = capacity.capacity(work)
     rows = rows_of(work, "capacity")
     assert [(row["n"], row["limit"]) for row in rows] == [(n, s) for n in "12" for s in limits]
@@ -131,8 +131,8 @@ def test_the_table_keeps_what_other_parts_saw(work):
     assert "| blocks 0.1 dB |" in page
 
 
-def test_seconds_to_a_psnr_lie_between_its_points(monkeypatch):
-    monkeypatch.setattr(times, "WANTED", 35.0)
+def test_seconds_to_a_psnr_lie_between_its_points(in_force):
+    in_force(TimesConfig(wanted=35.0))
     rows = [{"way": "a", "seconds": s, "psnr": q} for s, q in ((40, 40.0), (10, 30.0), (2, 20.0))]
     assert times.seconds_to(rows, "a") == pytest.approx(20)  # half way, in logarithms
     assert times.seconds_to(rows[1:], "a") is None and times.seconds_to(rows[:1], "a") == 40

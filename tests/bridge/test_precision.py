@@ -1,6 +1,7 @@
 """Every command that writes numbers, in 8 and 4 bits, on the shop's tiny scenes."""
 
 import shutil
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,12 +9,12 @@ import pytest
 from formats.archive import read_archive
 from formats.bundle import read_bundle, read_headers
 from formats.records import PRECISIONS
-from fusedrf_cli import options
 from fusedrf_cli.bridge.scene import load_scene, stored, write_field
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.vm import KIND
 from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.requests import Precision
 from tests.bridge.conftest import done, part
 
 VM = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
@@ -50,7 +51,7 @@ def stored_arrays(path) -> dict[str, bytes]:
 
 
 def test_the_command_line_offers_what_the_format_has():
-    assert set(options.PRECISION.choices) == set(PRECISIONS)
+    assert set(get_args(Precision)) == set(PRECISIONS)
 
 
 def test_a_fused_field_is_stored_as_asked_within_the_size(folder, picture):

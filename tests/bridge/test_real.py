@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import placed, real
+from benchmarks.real import RealConfig
 from formats.images import read_image_header, write_png
 from tests.formats.test_captures import looking_at
 
@@ -30,11 +31,10 @@ def data(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_page(data, shop, tmp_path, monkeypatch):
+def test_the_page(data, shop, tmp_path, monkeypatch, in_force):
     shutil.copytree(shop / "photos", data / "made")
     out = tmp_path / "real"
-    monkeypatch.setattr(real, "OTHERS", (1.0, 2.0))
-    monkeypatch.setattr(real, "FRAME_WIDTH", 24)
+    in_force(RealConfig(others=(1.0, 2.0), frame_width=24))
     monkeypatch.setattr(sys, "argv", ["real", str(data), "--out", str(out), "--share", "0.5"])
     real.main()
     with (out / "real.csv").open(newline="") as file:

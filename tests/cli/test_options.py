@@ -10,8 +10,19 @@ from hypothesis import strategies as st
 
 from formats.errors import FormatWarning
 from formats.scene import make_node
-from fusedrf_cli import options
 from fusedrf_cli.errors import QualityNotReached, UsageProblem
+from fusedrf_cli.option_types import (
+    AffineType,
+    BoxType,
+    BytesType,
+    ColourType,
+    DirectionType,
+    DownscaleType,
+    PositiveType,
+    ScaleType,
+    SizeType,
+    VectorType,
+)
 from fusedrf_cli.placement import node_words, quaternion
 
 IDENTITY = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
@@ -21,24 +32,24 @@ SPELLED = "1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1"
 @pytest.mark.parametrize(
     "kind, text, value",
     [
-        (options.POSITIVE, "0.5", 0.5),
-        (options.SIZE, "800x600", (800, 600)),
-        (options.SIZE, "1X1", (1, 1)),
-        (options.BYTES, "25MB", 25_000_000),
-        (options.BYTES, "1.5kib", 1536),
-        (options.BYTES, "300", 300),
-        (options.VECTOR, "1,-2.5,3e2", (1.0, -2.5, 300.0)),
-        (options.DIRECTION, "-90,30", (-90.0, 30.0)),
-        (options.SCALE, "2", (2.0, 2.0, 2.0)),
-        (options.SCALE, "1,-1,1", (1.0, -1.0, 1.0)),
-        (options.AABB, "-1,-1,-1,1,1,2", (-1.0, -1.0, -1.0, 1.0, 1.0, 2.0)),
-        (options.DOWNSCALE, "auto", None),
-        (options.DOWNSCALE, "4", 4),
-        (options.COLOUR, "white", (1.0, 1.0, 1.0)),
-        (options.COLOUR, "#ff0033", (1.0, 0.0, 0.2)),
-        (options.COLOUR, "transparent", None),
-        (options.AFFINE, SPELLED, IDENTITY),
-        (options.AFFINE, str([list(row) for row in IDENTITY]), IDENTITY),
+        (PositiveType(), "0.5", 0.5),
+        (SizeType(), "800x600", (800, 600)),
+        (SizeType(), "1X1", (1, 1)),
+        (BytesType(), "25MB", 25_000_000),
+        (BytesType(), "1.5kib", 1536),
+        (BytesType(), "300", 300),
+        (VectorType(), "1,-2.5,3e2", (1.0, -2.5, 300.0)),
+        (DirectionType(), "-90,30", (-90.0, 30.0)),
+        (ScaleType(), "2", (2.0, 2.0, 2.0)),
+        (ScaleType(), "1,-1,1", (1.0, -1.0, 1.0)),
+        (BoxType(), "-1,-1,-1,1,1,2", (-1.0, -1.0, -1.0, 1.0, 1.0, 2.0)),
+        (DownscaleType(), "auto", None),
+        (DownscaleType(), "4", 4),
+        (ColourType(), "white", (1.0, 1.0, 1.0)),
+        (ColourType(), "#ff0033", (1.0, 0.0, 0.2)),
+        (ColourType(), "transparent", None),
+        (AffineType(), SPELLED, IDENTITY),
+        (AffineType(), str([list(row) for row in IDENTITY]), IDENTITY),
     ],
 )
 def test_a_type_reads_what_it_should(kind, text, value):
@@ -48,16 +59,16 @@ def test_a_type_reads_what_it_should(kind, text, value):
 @pytest.mark.parametrize(
     "kind, texts",
     [
-        (options.POSITIVE, ["0", "-1", "nan", "inf", "1,2", "", "x"]),
-        (options.SIZE, ["800", "0x1", "1x99999", "-1x2", "1.5x2", "1x2x3", ""]),
-        (options.BYTES, ["0", "-1", "1XB", "MB", "1ib", "nan", "9" * 400, ""]),
-        (options.VECTOR, ["1,2", "1,2,3,4", "1,2,nan", "1,2,inf", "1,2,1e999", "a,b,c", ""]),
-        (options.DIRECTION, ["1", "1,2,3", "0,91", "0,-90.1", "nan,0", ""]),
-        (options.SCALE, ["0", "1,0,1", "1,2", "nan", ""]),
-        (options.AABB, ["0,0,0,1,1", "0,0,0,0,1,1", "1,1,1,0,0,0", "0,0,0,1,1,inf"]),
-        (options.DOWNSCALE, ["0", "65", "-2", "1.5", "half", ""]),
-        (options.COLOUR, ["#fff", "#gggggg", "red", "", "#ff00331"]),
-        (options.AFFINE, ["1,2,3", SPELLED + ",0", SPELLED[:-1] + "2", SPELLED.replace("1", "nan", 1), ""]),
+        (PositiveType(), ["0", "-1", "nan", "inf", "1,2", "", "x"]),
+        (SizeType(), ["800", "0x1", "1x99999", "-1x2", "1.5x2", "1x2x3", ""]),
+        (BytesType(), ["0", "-1", "1XB", "MB", "1ib", "nan", "9" * 400, ""]),
+        (VectorType(), ["1,2", "1,2,3,4", "1,2,nan", "1,2,inf", "1,2,1e999", "a,b,c", ""]),
+        (DirectionType(), ["1", "1,2,3", "0,91", "0,-90.1", "nan,0", ""]),
+        (ScaleType(), ["0", "1,0,1", "1,2", "nan", ""]),
+        (BoxType(), ["0,0,0,1,1", "0,0,0,0,1,1", "1,1,1,0,0,0", "0,0,0,1,1,inf"]),
+        (DownscaleType(), ["0", "65", "-2", "1.5", "half", ""]),
+        (ColourType(), ["#fff", "#gggggg", "red", "", "#ff00331"]),
+        (AffineType(), ["1,2,3", SPELLED + ",0", SPELLED[:-1] + "2", SPELLED.replace("1", "nan", 1), ""]),
     ],
 )
 def test_a_type_refuses_what_it_should_not_read(kind, texts):
@@ -70,7 +81,7 @@ def test_a_type_refuses_what_it_should_not_read(kind, texts):
 def test_an_affine_may_lie_in_a_file(tmp_path, text):
     path = tmp_path / "matrix"
     path.write_text(text)
-    assert options.AFFINE(str(path)) == IDENTITY
+    assert AffineType()(str(path)) == IDENTITY
 
 
 def test_an_affine_may_come_by_pipe(run, bridge):

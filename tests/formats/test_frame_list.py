@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from formats import cameras, points
 from formats.cameras import JSON_TOKEN, read_document
 from formats.captures import read_cameras, read_capture
 from formats.colmap import read_model
@@ -27,6 +26,7 @@ from formats.errors import (
 from formats.names import distinct_names, is_name
 from formats.photos import natural
 from formats.points import read_ply_points
+from formats.transforms import read_splits, sparse_points
 from tests.formats.test_captures import POINT, looking_at, photo, project
 from tests.formats.test_readers import (
     NAMES,
@@ -194,11 +194,10 @@ def test_comments_are_looked_for_in_one_pass(text):
     assert end == len(text) and time.process_time() - started < 20  # quadratic: minutes
 
 
-def test_too_many_values(tmp_path, monkeypatch):
-    monkeypatch.setattr(cameras, "MAX_VALUES", 10)
+def test_too_many_values(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps({"frames": list(range(12))}))
     with pytest.raises(LimitExceeded, match="more than 10 values"):
-        read_document(tmp_path / "a.json")
+        read_document(tmp_path / "a.json", 10)
 
 
 # --- numbers ------------------------------------------------------------------------------------------------
@@ -337,10 +336,9 @@ def many_points(folder: Path, coding: str, count: int) -> dict:
 
 @pytest.mark.parametrize("coding", ["binary", "text"])
 @pytest.mark.parametrize("count, step", [(10, 1), (11, 2), (20, 2), (95, 10)])
-def test_points_beyond_a_limit_are_thinned(tmp_path, monkeypatch, coding, count, step):
-    monkeypatch.setattr(points, "MAX_POINTS", 10)
+def test_points_beyond_a_limit_are_thinned(tmp_path, coding, count, step):
     many_points(tmp_path, coding, count)
-    model = read_model(tmp_path)
+    model = read_model(tmp_path, most_points=10)
     assert model.points.positions[:, 0].tolist() == list(range(0, count, step))
     assert (model.notes == ()) == (step == 1) and (step == 1 or f"one in {step} is read" in model.notes[0])
     seen = model.images[1].view.seen
@@ -349,14 +347,16 @@ def test_points_beyond_a_limit_are_thinned(tmp_path, monkeypatch, coding, count,
 
 
 @pytest.mark.parametrize("coding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_points_of_a_cloud_are_thinned(tmp_path, monkeypatch, coding):
+def test_points_of_a_cloud_are_thinned(tmp_path, coding):
     cloud(tmp_path / "p.ply", coding, points=[(float(i), 0.0, 0.0) for i in range(25)])
-    monkeypatch.setattr(points, "MAX_POINTS", 10)
-    found = read_ply_points(tmp_path / "p.ply")
+    found = read_ply_points(tmp_path / "p.ply", 10)
     assert found.positions[:, 0].tolist() == [0, 3, 6, 9, 12, 15, 18, 21, 24] and found.thinned == 3
-    read = read_capture(capture(tmp_path, more=lambda i: {"sparse_points": [i, 6]}, ply_file_path="p.ply"))
-    assert "one in 3 is read, 9 in all" in said(read)
-    assert [view.seen.tolist() for view in read.train[:4]] == [[0, 2], [2], [2], [1, 2]]
+    capture(tmp_path, more=lambda i: {"sparse_points": [i, 6]}, ply_file_path="p.ply")
+    file = tmp_path / "transforms.json"
+    document, train, _ = read_splits(file, tmp_path, None)
+    sparse = sparse_points(file, document, train.views, 10)
+    assert "one in 3 is read, 9 in all" in said(sparse)
+    assert [view.seen.tolist() for view in sparse.told(file, train.views)[:4]] == [[0, 2], [2], [2], [1, 2]]
 
 
 def test_points_are_gathered_block_by_block(tmp_path, monkeypatch):

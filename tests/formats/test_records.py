@@ -9,7 +9,7 @@ import safetensors.numpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from formats import errors, records
+from formats import errors
 from formats.records import MAX_HEADER, FieldRecord, decode_field, decode_header, encode_field
 
 CONTENT = {"kind": "dense", "metadata": {}, "version": 1}
@@ -222,12 +222,11 @@ def test_a_coded_field_without_a_fault_is_taken():
     assert list(record.arrays) == ["a"]
 
 
-def test_what_all_arrays_decode_to_is_bounded(monkeypatch):
+def test_what_all_arrays_decode_to_is_bounded():
     """P14: a scale alone may stand for 64 numbers."""
     assert decode_header(coded(entry()), "here").decoded_size == 24
-    monkeypatch.setattr(records, "MAX_DECODED_BYTES", 23)
     with pytest.raises(errors.LimitExceeded, match="here: decodes to 24 bytes, but at most 23 are read"):
-        decode_header(coded(entry()), "here")
+        decode_header(coded(entry()), "here", 23)
 
 
 def test_as_many_arrays_are_read_whether_they_are_coded_or_not():

@@ -19,15 +19,14 @@ from formats.scene import (
     MAX_NODES,
     SceneGraph,
     dump_scene,
-    expand_scene,
     is_scene,
     make_node,
     parse_scene,
     read_scene,
-    resolve_source,
     scene_schema,
     write_scene,
 )
+from formats.sources import expand_scene, resolve_source
 
 MEMBER = "fields/0123456789abcdef.safetensors"
 number = st.floats(-100, 100, allow_nan=False)

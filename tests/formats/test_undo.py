@@ -21,10 +21,10 @@ def write(path, value: int, *entries) -> bytes:
     return path.read_bytes()
 
 
-def edited(path, value: int, *entries, onto=None) -> tuple[bytes, tuple]:
+def edited(path, value: int, *entries, onto=None, **how) -> tuple[bytes, tuple]:
     """The bundle after an edit that keeps what was; its bytes and its history."""
     onto = onto or path
-    entry = {"event": "moved", "names": [], "nodes": [], "before": keep(path, onto)}
+    entry = {"event": "moved", "names": [], "nodes": [], "before": keep(path, onto, **how)}
     return write(onto, value, *entries, entry), (*entries, entry)
 
 
@@ -71,14 +71,13 @@ def test_where_nothing_can_be_linked_bytes_are_copied(tmp_path, monkeypatch):
     assert path.read_bytes() == was
 
 
-def test_the_oldest_go(tmp_path, monkeypatch):
-    monkeypatch.setattr(undoing, "KEPT", 3)
+def test_the_oldest_go(tmp_path):
     path = tmp_path / "one.rfpack"
     write(path, 0)
     entries = ()
     for value in range(1, 7):
         os.utime(path, (value, value))
-        _, entries = edited(path, value, *entries)
+        _, entries = edited(path, value, *entries, most=3)
     assert len(list(past_of(path).iterdir())) == 3 and history(path)["undoable"] == 3
 
 
@@ -112,9 +111,8 @@ def test_odd_histories_are_listed(tmp_path, entry):
     assert history(path)["history"][0]["objects"] == []
 
 
-def test_what_others_put_there_stays_and_what_was_just_kept_too(tmp_path, monkeypatch):
+def test_what_others_put_there_stays_and_what_was_just_kept_too(tmp_path):
     """Files beside it that are newer, a user's own bundle, and one that only looks like ours."""
-    monkeypatch.setattr(undoing, "KEPT", 2)
     path, folder = tmp_path / "one.rfpack", tmp_path / "one.rfpack.history"
     folder.mkdir()
     for i in range(4):
@@ -128,24 +126,23 @@ def test_what_others_put_there_stays_and_what_was_just_kept_too(tmp_path, monkey
     os.utime(path, (0, 0))
     entries = ()
     for value in range(1, 6):
-        _, entries = edited(path, value, *entries)
+        _, entries = edited(path, value, *entries, most=2)
         os.utime(path, (0, 0))
         assert history(path)["undoable"] == min(value, 2)
     assert all(place.read_bytes() == data for place, data in mine.items())
     assert len(list(folder.iterdir())) == len(mine) + 2
 
 
-def test_what_another_bundle_left_goes_first(tmp_path, monkeypatch):
+def test_what_another_bundle_left_goes_first(tmp_path):
     """Of an output that was replaced by something else: its own edits stay, however old their files."""
-    monkeypatch.setattr(undoing, "KEPT", 2)
     path = tmp_path / "one.rfpack"
     write(path, 50)
-    edited(path, 51)
+    edited(path, 51, most=2)
     entries = ()
     write(path, 0)
     for value in (1, 2):
         os.utime(path, (0, 0))
-        _, entries = edited(path, value, *entries)
+        _, entries = edited(path, value, *entries, most=2)
     assert history(path)["undoable"] == 2 and len(list(past_of(path).iterdir())) == 2
 
 

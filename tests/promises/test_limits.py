@@ -14,7 +14,8 @@ from formats.bundle import member_name
 from formats.names import MAX_NAME_BYTES
 from formats.records import MAX_HEADER
 from formats.rig import MAX_CAMERAS
-from formats.scene import SceneGraph, dump_scene, expand_scene, make_node, parse_scene, write_scene
+from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, write_scene
+from formats.sources import expand_scene
 from tests.formats.test_records import HOSTILE as BAD_FIELDS
 from tests.formats.test_scene import REFUSED as BAD_SCENES
 from tests.formats.test_scene import nested, scene_json
@@ -209,14 +210,12 @@ def test_a_graph_that_is_no_bounded_tree_is_refused_at_once(tmp_path, name):
     assert time.process_time() - began < 10
 
 
-def test_without_a_count_a_graph_unfolds(tmp_path, monkeypatch):
+def test_without_a_count_a_graph_unfolds(tmp_path):
     """P13 with its defence removed: nine small files make 766 nodes."""
     path = doubling(tmp_path, 8)
     (tmp_path / "8.json").write_bytes(scene_json({"name": "leaf"}))
-    monkeypatch.setattr(scene, "MAX_NODES", 400)
     with pytest.raises(errors.LimitExceeded, match="unfold"):
-        expand_scene(path)
-    monkeypatch.setattr(scene, "MAX_NODES", 10**9)
+        expand_scene(path, most=400)
     assert sum(1 for _ in expand_scene(path).walk()) == 2 * (2**8 - 1) + 2**8
 
 

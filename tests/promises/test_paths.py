@@ -10,7 +10,8 @@ import pytest
 
 from formats.errors import BadSchema
 from formats.history import check_history
-from formats.scene import SceneGraph, dump_scene, make_node, resolve_source
+from formats.scene import SceneGraph, dump_scene, make_node
+from formats.sources import resolve_source
 from tests.formats.test_scene import OUTSIDE
 from tests.promises.packs import GOLDEN, write_generation
 

@@ -18,7 +18,7 @@ from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
 from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
-from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels import specialise
 from fusedrf_cli.engine.kernels.instances import FARTHEST, Instances
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
@@ -542,9 +542,9 @@ def test_compiled_loops_answer_render_and_learn_as_interpreted_ones(space):
 @pytest.mark.slow
 @every
 @pytest.mark.parametrize("rule", ["max", "add"])
-def test_a_hash_grid_and_a_ball_show_what_the_naive_composition_shows(space, rule, monkeypatch):
+def test_a_hash_grid_and_a_ball_show_what_the_naive_composition_shows(space, rule, in_force):
     """A field in the space and a `vm` field in a box, turned and stretched, by the composite and naively."""
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composed.OCCUPANCY_CELLS", 24)
+    in_force(OccupancyConfig(scene_cells=24))
     field = hashed_in(space, torch.float32)
     ball = exported(Gaussian(20.0, tint=Tint.of(0.1, 0.2, 0.9)), "vm", (25, 25, 25))
     spot = (0.2, 0.1, -2.0) if "ndc" in space.__name__ else (0.3, 0.1, 0.2)
