@@ -21,7 +21,7 @@ from fusedrf_cli.engine.kernels.segments import (
 )
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-NEAR_AT_ONCE = 1 << 24  # numbers of instances that rays may meet: room for 128 MB of them
+NEAR_AT_ONCE = 1 << 22  # numbers of instances that rays may meet: in each of four arrays of 32 MB
 
 
 @cache
@@ -41,13 +41,15 @@ def ray_kernels(spaces: tuple[ModuleType, ...] = ()) -> SimpleNamespace:
     return SimpleNamespace(**{t.__name__: kernel_of(t, names, tag) for t in templates})
 
 
-def near_thread(rays, instances, chosen, near, begins, segments):
+def near_thread(rays, instances, chosen, near, begins, few, few_begin, segments):
     """`next_segments`, with room for the instances near a ray for each of some threads, which share the rays
     out."""
-    thread, threads = cuda.grid(1), near.shape[0]
-    if thread < threads:
-        for i in range(thread, chosen.shape[0], threads):
-            segment_task(rays, instances, chosen, i, i + 1, near[thread], begins[thread], segments)
+    t, threads = cuda.grid(1), near.shape[0]
+    if t < threads:
+        for i in range(t, chosen.shape[0], threads):
+            segment_task(
+                rays, instances, chosen, i, i + 1, near[t], begins[t], few[t], few_begin[t], segments
+            )  # fmt: skip
 
 
 def merge_thread(shared, start, early_stop, groups, traces, segment_end, out):
@@ -82,8 +84,8 @@ def next_segments(
     """See segments.py."""
     count = len(instances.step)
     threads = max(1, min(len(chosen), NEAR_AT_ONCE // count))
-    near, begins = (cuda.device_array((threads, count), kind) for kind in (np.int64, np.float64))
-    launch(ray_kernels(spaces).near_thread, threads, (rays, instances, chosen, near, begins), (found,))
+    room = [cuda.device_array((threads, count), kind) for kind in (np.int64, np.float64) * 2]
+    launch(ray_kernels(spaces).near_thread, threads, (rays, instances, chosen, *room), (found,))
 
 
 def merge_samples(

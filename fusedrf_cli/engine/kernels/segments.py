@@ -17,10 +17,11 @@ from fusedrf_cli.engine.kernels.specialise import body as inlined
 from fusedrf_cli.engine.kernels.specialise import loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-TILE = 256  # rays, which lie close together in pictures
+TILE, FEW = 256, 16  # rays, which lie close together in pictures
 PER_TASK = 1024
 GAP = 4.0  # steps: occupied cells that are no farther apart belong together
 ROUNDING = 1e-6  # of angles, in radians, and of distances, by which rays may come nearer than is reckoned
+TIED = 1e-12  # of a distance, by which is looked farther for what begins where another does
 DONE, SHARED = -1, -2  # of a ray's segment: there is none; several instances meet in it
 
 
@@ -131,6 +132,19 @@ def instances_near(rays, instances, chosen, low, high, near, begins):
 
 
 @body
+def fewer_near(rays, instances, chosen, low, high, near, begins, count, few, few_begin):
+    """Those of instances near[:count] that rays chosen[low:high], some of those that they are near to, may
+    meet, in the same order, into few (B,) and few_begin (B,): how many."""
+    bundle, left = bundle_of(rays, chosen, low, high), 0
+    for c in range(count):
+        unbounded = begins[c] <= -FARTHEST
+        if unbounded or bundle_reaches(bundle, instances.spheres[near[c]]) < FARTHEST:
+            few[left], few_begin[left] = near[c], begins[c]
+            left += 1
+    return left
+
+
+@body
 def sort_by(keys, values, low, high):
     """Order keys[low:high], and values with them, by Shell's method with Ciura's gaps."""
     for gap in (701, 301, 132, 57, 23, 10, 4, 1):
@@ -168,12 +182,14 @@ def occupied_from(rays, instances, b, r, begin, end):
 def first_two(rays, instances, r, near, begins, low, high, begin, two):
     """Those two of instances near[low:high], and of `two`, whose occupied cells come first on ray r from
     `begin` on: (where the first begins, where the second does, the first, the second, a step of the first).
-    Of two that begin at one place the one of the lower number comes first, whatever order they are in."""
+    Of those that begin at one place, as all do in which the ray is already, the ones of the lowest numbers
+    come first, whatever order they are in."""
     for c in range(low, high):
-        if begins[c] > two[1]:
+        end = two[1] + TIED * abs(two[1])
+        if begins[c] > end:
             break
         b = near[c]
-        at, step = occupied_from(rays, instances, b, r, begin, two[1])
+        at, step = occupied_from(rays, instances, b, r, begin, end)
         if at < two[0] or (at == two[0] and b < two[2]):
             two = at, two[0], b, two[2], step
         elif at < two[1] or (at == two[1] and b < two[3]):
@@ -209,29 +225,38 @@ def note_meeting(rays, instances, r, near, begins, count, begin, end, segments):
     segments.n_meeting[r] = found
 
 
+@body
+def segment_of(rays, instances, r, near, begins, n_unbounded, count, segments):
+    """Enter the next segment of ray r, which may meet instances near[:count], n_unbounded of them without
+    end."""
+    begin, far = segments.end[r], rays.reach[r, 1]
+    two = far, far, DONE, DONE, 0.0
+    two = first_two(rays, instances, r, near, begins, n_unbounded, count, begin, two)
+    segments.alone_from[r], segments.alone_to[r] = begin, begin
+    if n_unbounded == 1 and (two[2] == DONE or two[0] - begin > GAP * two[4]):
+        begin = two[0]
+        segments.alone_to[r] = begin
+    if begin < far:
+        two = first_two(rays, instances, r, near, begins, 0, n_unbounded, begin, two)
+    segments.begin[r] = max(begin, two[0] - two[4])  # what was walked over need not be walked over again
+    segments.instance[r] = two[2]
+    if two[2] != DONE:
+        if two[3] == DONE or two[1] - two[0] > GAP * two[4]:
+            segments.end[r] = two[1]
+        else:
+            segments.instance[r], segments.end[r] = SHARED, end_of_meeting(rays, instances, r, two, far)
+            note_meeting(rays, instances, r, near, begins, count, begin, segments.end[r], segments)
+
+
 @task
-def segment_task(rays, instances, chosen, low, high, near, begins, segments):
-    """`next_segments` of rays chosen[low:high]; near (B,) and begins (B,) are room."""
+def segment_task(rays, instances, chosen, low, high, near, begins, few, few_begin, segments):
+    """`next_segments` of rays chosen[low:high]; near, begins, few and few_begin (B,) are room."""
     n_unbounded, count = instances_near(rays, instances, chosen, low, high, near, begins)
-    for i in range(low, high):
-        r = chosen[i]
-        begin, far = segments.end[r], rays.reach[r, 1]
-        two = far, far, DONE, DONE, 0.0
-        two = first_two(rays, instances, r, near, begins, n_unbounded, count, begin, two)
-        segments.alone_from[r], segments.alone_to[r] = begin, begin
-        if n_unbounded == 1 and (two[2] == DONE or two[0] - begin > GAP * two[4]):
-            begin = two[0]
-            segments.alone_to[r] = begin
-        if begin < far:
-            two = first_two(rays, instances, r, near, begins, 0, n_unbounded, begin, two)
-        segments.begin[r] = max(begin, two[0] - two[4])  # what was walked over need not be walked over again
-        segments.instance[r] = two[2]
-        if two[2] != DONE:
-            if two[3] == DONE or two[1] - two[0] > GAP * two[4]:
-                segments.end[r] = two[1]
-            else:
-                segments.instance[r], segments.end[r] = SHARED, end_of_meeting(rays, instances, r, two, far)
-                note_meeting(rays, instances, r, near, begins, count, begin, segments.end[r], segments)
+    for start in range(low, high, FEW):
+        stop = min(high, start + FEW)
+        left = fewer_near(rays, instances, chosen, start, stop, near, begins, count, few, few_begin)
+        for i in range(start, stop):
+            segment_of(rays, instances, chosen[i], few, few_begin, n_unbounded, left, segments)
 
 
 def next_segments(rays, instances, spaces, chosen, segments):
@@ -250,8 +275,10 @@ def segments_loop(rays, instances, chosen, threads, segments):
         part = turn % each_has * threads + turn // each_has
         low, high = part * TILE, min(n, (part + 1) * TILE)
         if low < high:
-            near, begins = np.empty(instances.step.shape[0], np.int64), np.empty(instances.step.shape[0])
-            segment_task(rays, instances, chosen, low, high, near, begins, segments)
+            count = instances.step.shape[0]
+            near, few = np.empty(count, np.int64), np.empty(count, np.int64)
+            begins, few_begin = np.empty(count), np.empty(count)
+            segment_task(rays, instances, chosen, low, high, near, begins, few, few_begin, segments)
 
 
 # -- other spaces than bounded and unbounded ones ------------------------------------------------------------
@@ -281,7 +308,7 @@ def segments_loop_in(spaces: tuple[ModuleType, ...]):
     loops = [loops_for(None, (), space) for space in spaces]
     tag = "_".join(each.tag for each in loops)
     names = globals() | {"next_in_space": next_in_any([one.names["next_change"] for one in loops], tag, task)}
-    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting):
+    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting, segment_of):
         name = function.py_func.__name__
         names[name] = inlined(rebound(function.py_func, names, tag))
     names["segment_task"] = task(rebound(segment_task.py_func, names, tag))

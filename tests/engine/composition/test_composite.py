@@ -259,8 +259,25 @@ def test_segments_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
     scene, _ = scenes("unbounded and vm", "in one another", "max")
     rays_o, rays_d = same_rays(scene, *some_rays(2000))
     wanted = render_rays(scene, rays_o, rays_d)
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composite.get_num_threads", lambda: threads)
+    monkeypatch.setattr("fusedrf_cli.engine.kernels.segments.get_num_threads", lambda: threads)
     assert np.array_equal(render_rays(scene, rays_o, rays_d), wanted)
+
+
+def test_rays_through_a_crowd_do_not_depend_on_their_company():
+    """Which instances are looked for, and in what order, goes by rays that lie side by side."""
+    rng, field = np.random.default_rng(4), blob("vm")
+    spots = [affine(0.3 * turn(rng.uniform(0, 360)), rng.uniform(-1.5, 1.5, 3)) for _ in range(40)]
+    placed = [Placed(f"n{i}", field, spot) for i, spot in enumerate([*spots, spots[7]])]
+    scene = Composite([Placed("around", surroundings(), np.eye(4)), *placed])
+    rays_o, rays_d = same_rays(scene, *some_rays(600))
+    together, order = render_rays(scene, rays_o, rays_d), rng.permutation(600)
+    assert np.array_equal(render_rays(scene, rays_o[order], rays_d[order]), together[order])
+    assert np.array_equal(render_rays(scene, rays_o[:1], rays_d[:1]), together[:1])
+    crowd, naive = Composite(placed), ComposedField(placed)
+    rays = same_rays(crowd, *some_rays(200))
+    truth = naively(naive, *rays, sampling_step(crowd) / 8)
+    found = render_rays(crowd, *rays, step=sampling_step(crowd) / 4, early_stop=1e-4)
+    assert truth[:, 3].max() > 0.5 and np.sqrt(np.mean((found - truth)[:, :4] ** 2)) < 1e-2
 
 
 def test_copies_that_are_posed_otherwise_lie_there():
