@@ -19,7 +19,6 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu, reference
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
 from fusedrf_cli.engine.rendering.cameras import framing_camera
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from fusedrf_cli.engine.spaces import bounded
@@ -61,13 +60,12 @@ def alternate(row: Row) -> tuple[float, float]:
 def shell_field(generator: torch.Generator) -> VMField:
     """A VM tensor of random numbers that is dense in a shell of cells: like a surface, most of it is
     empty."""
-    field = VMField.create(BOX, (TEXELS,) * 3, VMShape(), generator)
+    field = VMField.create(VMShape(), BOX, (TEXELS,) * 3, generator)
     grid = OccupancyGrid.full(BOX, CELLS)
     centres = BOX[:3] + (np.indices(grid.occupied.shape).reshape(3, -1).T + 0.5) * grid.cell
     radius = np.linalg.norm(centres, axis=1).reshape(grid.occupied.shape)
-    tensor = field.with_occupancy(OccupancyGrid(BOX, abs(radius - 0.7) < 0.04)).tensors[0]
-    object.__setattr__(tensor, "shift", 0.0)
-    return VMField(field.shape, (tensor,), field.blocks, field.params, tensor.occupancy)
+    field.shift = 0.0
+    return field.with_occupancy(OccupancyGrid(BOX, abs(radius - 0.7) < 0.04))
 
 
 def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> Row:
@@ -83,16 +81,17 @@ def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> 
         field.query(points, dirs, with_colour)
         field.query_backward(*back)
 
-    sections = {name: view.clone().requires_grad_() for name, view in field.sections(0).items()}
-    unit, ways, tensor = ((points + 1) / 2).float(), dirs.float(), field.tensors[0]
+    params, unit = field.params.clone().requires_grad_(), ((points + 1) / 2).float()
+    density = field.slots["density"]
 
     def theirs():
         if with_colour:
-            sigma, rgb = vm_query(sections, unit, ways, tensor.scale, tensor.shift)
+            sigma, rgb = field.reference(params, points, dirs)
             (sigma.sum() + rgb.sum()).backward()
         else:
-            feature = vm_density_feature(sections, unit)
-            reference.density(feature, tensor.scale, tensor.shift).sum().backward()
+            sections = field.with_params(params).slot_sections()["density"]
+            features = density.module.reference(field, sections, unit, None, **density.options)
+            reference.density(features.sum(1), field.scale, field.shift).sum().backward()
 
     what = "query forward and backward, density" + with_colour * " and colour"
     return Row(what, "point", POINTS, ours, theirs, POINTS)
@@ -136,9 +135,7 @@ def train_row(field: VMField, rays_o: np.ndarray, rays_d: np.ndarray) -> Row:
         field.train_rays(batch, mine.grads, np.zeros((mine.parts, 3)))
         mine.step(0.0)
 
-    copy = VMField(
-        field.shape, field.tensors, field.blocks, field.params.clone().requires_grad_(), field.occupancy
-    )
+    copy = field.with_params(field.params.clone().requires_grad_())
     other = torch.optim.Adam([copy.params], 0.0)
     few = RAYS // 8
     tensors = torch.from_numpy(rays_o[:few]), torch.from_numpy(rays_d[:few])
@@ -166,13 +163,12 @@ def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, ray
         point_step(field, batch, STEP, mine)
         mine.step(0.0)
 
-    sections = {name: view.clone().requires_grad_() for name, view in field.sections(0).items()}
-    other, tensor = torch.optim.Adam(sections.values(), 0.0), field.tensors[0]
+    params = field.params.clone().requires_grad_()
+    other = torch.optim.Adam([params], 0.0)
 
     def theirs():
         other.zero_grad()
-        unit, ways = ((points[chosen] + 1) / 2).float(), dirs[chosen].float()
-        sigma, rgb = vm_query(sections, unit, ways, tensor.scale, tensor.shift)
+        sigma, rgb = field.reference(params, points[chosen], dirs[chosen])
         depth = torch.log1p(10 * STEP * sigma) - torch.log1p(10 * STEP * asked[0][chosen])
         ((depth**2).mean() + 2 * ((rgb - 0.5) ** 2).mean()).backward()
         other.step()
@@ -203,7 +199,7 @@ def line(row: Row) -> str:
 def main() -> None:
     """Measure and print the table."""
     generator = torch.Generator().manual_seed(0)
-    full = VMField.create(BOX, (TEXELS,) * 3, VMShape(), generator)
+    full = VMField.create(VMShape(), BOX, (TEXELS,) * 3, generator)
     shell = shell_field(generator)
     rays = rays_through(generator)
     print(f"{TEXELS} texels per axis, ranks 16 and 24, SH degree 2; {torch.get_num_threads()} threads\n")

@@ -13,18 +13,17 @@ from formats.embedding import Embedding
 from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_leaves
 from formats.records import FieldRecord
-from formats.scene import Leaf, Node, SceneGraph, dump_scene
+from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.making import Kept
 from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
-from fusedrf_cli.bridge.sizes import HeaderConfig
+from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.instances import distinct_fields
-from fusedrf_cli.engine.settings import current
 from fusedrf_cli.requests import FuseRequest
 
 
@@ -48,8 +47,7 @@ class FusedBundle:
         self.framing = None if framing is None else tuple(float(number) for number in framing)
         self.cameras = cameras
         try:
-            skeleton = self.scene(self.skeleton, {"nodes": self.nodes})
-            self.overhead = current(HeaderConfig).besides + len(dump_scene(skeleton))
+            self.overhead = graph_bytes(self.scene(self.skeleton, {"nodes": self.nodes}))
         except FormatError as error:
             raise error.within(self.request.output) from error
 

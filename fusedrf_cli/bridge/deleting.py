@@ -23,7 +23,8 @@ from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing, placement, seen_box
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.splitting import CUT
+from fusedrf_cli.engine.kinds.splitting import SplittingConfig
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import DeleteRequest
 
@@ -240,4 +241,4 @@ def meet(one: np.ndarray, other: np.ndarray) -> bool:
 
 def side_of(one: Placed) -> float:
     """The side in the world of the cells in which a field is cropped."""
-    return max(one.voxel_size, extent(one) / CUT)
+    return max(one.voxel_size, extent(one) / current(SplittingConfig).cut)

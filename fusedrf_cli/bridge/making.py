@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.bridge.background import Background
 from fusedrf_cli.bridge.budget import Budget
-from fusedrf_cli.bridge.choose import FINALISTS, Tried
+from fusedrf_cli.bridge.choose import SearchConfig, Tried
 from fusedrf_cli.bridge.looks import looks_of, views_of_place
 from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable, take_up
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
@@ -257,10 +257,11 @@ class Maker:
 
     def tries_to_come(self) -> int:
         """How many tries the seconds that are left have to do for, about."""
+        search = current(SearchConfig)
         config = current(MakingConfig)
         if self.request.target_psnr is not None:
             return max(2, config.tries - self.finished_tries)  # how many a search takes is not known
-        return max(1, (FINALISTS if self.student.compares else 1) - self.finished_tries)
+        return max(1, (search.finalists if self.student.compares else 1) - self.finished_tries)
 
     def finetuned(self, scene: ComposedField, seconds: float | None) -> ComposedField:
         """A scene of smaller fields, each of which learnt from rays of its own source."""

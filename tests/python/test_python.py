@@ -151,10 +151,8 @@ def test_what_a_bundle_keeps_stays_in_it(folder):
     red = load_scene("red.rfpack").fields[0]
     field = open_scene("blue.rfpack").fields["blue"]
     kept = {red.member: folder / "red.rfpack"}
-    history = ({"event": "fused"},)
-    write_field(
-        "kept.rfpack", field, "blue", precision="float16", overwrite=False, history=history, kept=kept
-    )
+    about = SceneGraph((), history=({"event": "fused"},))
+    write_field("kept.rfpack", field, "blue", precision="float16", overwrite=False, about=about, kept=kept)
     open_scene("kept.rfpack").save("again.rfpack")
     assert Path("again.rfpack").read_bytes() == Path("kept.rfpack").read_bytes()
 

@@ -103,7 +103,7 @@ class Composite(ComposedField):
     def posed(self, poses: Mapping[str, np.ndarray]) -> "Composite":
         """See ComposedField."""
         other = super().posed(poses)
-        for name in ("groups", "leaves", "instances", "placed_instances", "spaces", "sampling_step"):
+        for name in ("groups", "parts", "instances", "placed_instances", "spaces", "sampling_step"):
             other.__dict__.pop(name, None)
         return other
 
@@ -116,7 +116,7 @@ class Composite(ComposedField):
         return groups
 
     @cached_property
-    def leaves(self) -> list[Placed]:
+    def parts(self) -> list[Placed]:
         """The instances, in this frame."""
         return [leaf for members, _ in self.groups for leaf in members]
 
@@ -128,7 +128,7 @@ class Composite(ComposedField):
     @cached_property
     def fields(self) -> list[ComputedField]:
         """The field of each instance."""
-        return [opened(p.field) for p in self.leaves]
+        return [opened(p.field) for p in self.parts]
 
     @cached_property
     def field_of(self) -> np.ndarray:
@@ -143,7 +143,7 @@ class Composite(ComposedField):
         skip = {b: grids[b].skip.ravel() for b in np.unique(self.field_of)}
         first = dict(zip(skip, np.cumsum([0, *map(len, skip.values())]), strict=False))
         return Instances(
-            np.stack([p.world_to_object[:3] for p in self.leaves]),
+            np.stack([p.world_to_object[:3] for p in self.parts]),
             *(
                 np.stack(rows)
                 for rows in zip(*((g.aabb[:3], g.aabb[3:], g.cell) for g in grids), strict=True)
@@ -152,21 +152,21 @@ class Composite(ComposedField):
             np.array([first[b] for b in self.field_of], np.int64),
             np.concatenate(list(skip.values())),
             np.array([sampling_step(field) for field in self.fields]),
-            np.stack([sphere_around(p, f) for p, f in zip(self.leaves, self.fields, strict=True)]),
-            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.leaves], np.int64),
-            np.array([(p.opacity, *p.tint) for p in self.leaves]),
+            np.stack([sphere_around(p, f) for p, f in zip(self.parts, self.fields, strict=True)]),
+            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.parts], np.int64),
+            np.array([(p.opacity, *p.tint) for p in self.parts]),
         )
 
     @cached_property
     def spaces(self) -> tuple[ModuleType, ...]:
         """Those without end that instances lie in, by name."""
-        found = {p.space for p in self.leaves if p.unbounded}
+        found = {p.space for p in self.parts if p.unbounded}
         return tuple(sorted(found, key=lambda space: space.__name__))
 
     @cached_property
     def sampling_step(self) -> float:
         """The finest at which an instance is sampled, in this frame; see base.py."""
-        pairs = zip(self.fields, self.leaves, strict=True)
+        pairs = zip(self.fields, self.parts, strict=True)
         return min(sampling_step(field) * squeezed(p.object_to_world) for field, p in pairs)
 
     # -- points ----------------------------------------------------------------------------------------------

@@ -52,9 +52,6 @@ class Recipe:
     schedule: type[Schedule] = Schedule
 
 
-DEFAULT_RECIPE = Recipe()
-
-
 @dataclass
 class DistillReport:
     """What a distillation did."""
@@ -102,7 +99,7 @@ class DistillRun:
         sampler: RaySampler,
         config: DistilConfig,
         rgb: bool = True,
-        recipe: Recipe = DEFAULT_RECIPE,
+        recipe: Recipe = Recipe(),
         judge: Callable[[StoredField], float] | None = None,
     ):
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge

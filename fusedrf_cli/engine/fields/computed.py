@@ -39,9 +39,8 @@ the runs of its rows, or None."""
 
 Reads = Callable[[str], np.ndarray]
 """A stored array by its name."""
-PER_CELL = 3
-"""Bytes of a cell of an occupancy grid: whether it is occupied, how far it is from one that is, and that once
-more for fields of several blocks."""
+PER_CELL = 2
+"""Bytes of a cell of an occupancy grid: whether it is occupied, and how far it is from one that is."""
 PER_CELL_MADE = 12
 """More while those distances are found."""
 
@@ -277,16 +276,14 @@ class ComputedField:
         """An item of work for each i < count, which fills `out`; see Loops.each."""
         self.loops.each(item, self.arrays, self.grid, asked, count, out, per_task)
 
-    def peaks(
-        self, lo: np.ndarray, cell: np.ndarray, cells: np.ndarray, offsets: np.ndarray, frame: int = 0
-    ) -> np.ndarray:
-        """(N,) largest σ of one of the field's frames, as if unstretched, over offsets (K, 3) in each of
-        `cells` (N, 3) int64 of a grid with corner lo (3,) and cells of size cell (3,)."""
+    def peaks(self, lo: np.ndarray, cell: np.ndarray, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """(N,) largest σ over offsets (K, 3) in each of `cells` (N, 3) int64 of a grid with corner lo (3,)
+        and cells of size cell (3,)."""
         out = np.zeros(len(cells), self.real)
         for start in range(0, len(cells), CELLS_AT_ONCE):  # between which an interrupt is heard
             part = slice(start, start + CELLS_AT_ONCE)
             own = np.ascontiguousarray(cells[part], np.int64)
-            asked = Cells(exact(lo), exact(cell), own, exact(offsets), frame)
+            asked = Cells(exact(lo), exact(cell), own, exact(offsets))
             self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(own), out[part])
         return out
 

@@ -161,8 +161,7 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
     trans, pending, enough = 1.0 - out[r, 3], 0.0, COLOUR_FROM
-    current, begun = -1, entered(o, d, slots.reach[r, 0] * length)
-    started(field, step, scratch)
+    ready, begun = False, entered(o, d, slots.reach[r, 0] * length)
     for _ in range(PIECES):
         if trans <= slots.early_stop:
             break
@@ -185,9 +184,9 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
                 depth += weight * distance(warp, u)
                 pending += weight
                 if pending > enough:
-                    if frame_of(place) != current:
-                        current = frame_of(place)
-                        begin(field, current, d, scratch)
+                    if not ready:
+                        begin(field, d, scratch)
+                        ready = True
                     c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
                     red += pending * c_r
                     green += pending * c_g
@@ -209,7 +208,6 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
     step, far, thick = slots.step, slots.reach[r, 1] * length, slots.shown[slots.instance[s], 0]
     trans, count, complete = 1.0 - slots.rendered[r, 3], 0, FARTHEST
     begun = entered(o, d, slots.reach[r, 0] * length)
-    started(field, step, scratch)
     for _ in range(PIECES):
         if trans <= slots.early_stop or count == MAX_TRACED:
             break
@@ -221,7 +219,6 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
             u = u0 + 0.5 * between(index, many) * step
             p = position_at(origin, way, u)
-            standing(field, many, scratch)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0 and sigma > 0.0:
                 depth = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
@@ -247,15 +244,15 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
     shown = slots.shown[slots.instance[s]]
     red, green, blue = 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
-    pending, enough, current = 0.0, COLOUR_FROM, -1
+    pending, enough, ready = 0.0, COLOUR_FROM, False
     for q in range(out.count[s]):
         pending += out.weight[s, q]
         if pending > enough:
             p = point(along(o, d, out.middle[s, q] * length))
             place = again(field, out.cell[s, q], p)
-            if frame_of(place) != current:
-                current = frame_of(place)
-                begin(field, current, d, scratch)
+            if not ready:
+                begin(field, d, scratch)
+                ready = True
             c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
             red += pending * c_r
             green += pending * c_g
@@ -311,7 +308,7 @@ def colour_at(field, grid, query, i, scratch, memory, out):
         share = sigma * times / out.sigma[j]
     else:
         place = again(field, out.cell[j], p)
-    begin(field, frame_of(place), d, scratch)
+    begin(field, d, scratch)
     c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
     out.rgb[j, 0] += share * shown[1] * c_r
     out.rgb[j, 1] += share * shown[2] * c_g

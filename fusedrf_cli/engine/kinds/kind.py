@@ -37,6 +37,8 @@ class Kind:
     """Whether a field of it can begin from photos."""
     takes: frozenset[str] = frozenset()
     """Which of Way's words it heeds, besides the precision: "ranks", "sh_degree"."""
+    reduces: frozenset[str] = frozenset()
+    """Which of them `reduction` heeds."""
     hashes = False
     """Whether its fields may have a hashed detail (`Way.hashed`)."""
     takes_over = False
@@ -147,10 +149,6 @@ class Kind:
         return {self.name: [by_sizes()]}
 
     # -- cutting ---------------------------------------------------------------------------------------------
-
-    def without(self, field: StoredField, names: set[str]) -> StoredField | None:
-        """A field without the parts that go by those names; None where nothing is left."""
-        return field
 
     def cut_out(self, field: StoredField, selection: Selection) -> StoredField | None:
         """A selected object as a field in the frame of the field, with the numbers that it has there; None

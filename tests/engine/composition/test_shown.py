@@ -77,7 +77,7 @@ def test_groups_hand_theirs_on():
     inner.placed.append(Placed("b", blob("sparse"), affine(1.0, (0.2, 0, 0))))
     outer = [Placed("g", inner, affine(2.0, (0, 1, 0)), 0.5, (0.5, 1.0, 0.5)), Placed("c", blob("vm"), AT)]
     scene, naive = Composite(outer), ComposedField(outer)
-    assert [(p.opacity, p.tint) for p in scene.leaves][:2] == [(0.25, (0.25, 1, 0.5)), (0.5, (0.5, 1, 0.5))]
+    assert [(p.opacity, p.tint) for p in scene.parts][:2] == [(0.25, (0.25, 1, 0.5)), (0.5, (0.5, 1, 0.5))]
     points, dirs = asked(naive.aabb)
     torch.testing.assert_close(
         scene.query(points, dirs)[0], naive.query(points, dirs)[0], rtol=1e-5, atol=1e-6
