@@ -13,11 +13,11 @@ from formats.embedding import Embedding
 from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_leaves
 from formats.records import FieldRecord
-from formats.scene import WHITE, Leaf, Node, SceneGraph
+from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.making import Kept
-from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes
+from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
 from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
@@ -99,9 +99,8 @@ class FusedBundle:
             own = add(writer, stays.field, background.precision)
         name = free_name(source.placed.name, {LEARNT})
         leaf = next(leaf for leaf, f in self.leaves if f is source)
-        words = {} if leaf.opacity == 1 else {"opacity": leaf.opacity}
-        words |= {} if leaf.tint == WHITE else {"tint": list(leaf.tint)}
-        node = Node(name, own, None, placement_of(leaf.object_to_world), True, showing=words)
+        at = placement_of(leaf.object_to_world)
+        node = Node(name, own, None, at, True, showing=showing_of(stays))
         place = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
         return SceneGraph((node, Node(LEARNT, member, None, place)))
 
