@@ -72,6 +72,11 @@ class FieldSet:
         """These fields and others."""
         return FieldSet(self.path, self._views | dict(views), self.headers, self.instances)
 
+    @property
+    def copied(self) -> int:
+        """Bytes of fields that lie in memory, not in the file alone: those of a version that is unfolded."""
+        return sum(len(data) for data in self._views.values() if isinstance(data, bytes))
+
     def data(self, member: str) -> bytes | memoryview:
         """A field's bytes. Raises MissingMember."""
         if member not in self.headers:

@@ -8,7 +8,7 @@ World axes and units stay as the file has them: nothing is recentred, turned or 
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,17 +17,15 @@ import numpy as np
 from formats import colmap, llff, opensfm, polycam
 from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
+from formats.capture_of import capture_of
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
 from formats.foreign import is_json, not_a_capture, other_cameras
-from formats.frame import default_box, scene_frame, shown_box
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
-from formats.masks import with_masks_beside
 from formats.matching import PHOTO_FOLDERS, gone, match_photos
 from formats.meshes import is_mesh, mesh_capture
 from formats.photos import (
     Folder,
-    alike_turned,
     chosen_copy,
     copies,
     folders,
@@ -42,9 +40,7 @@ from formats.photos import (
     on_photo,
     pictures,
 )
-from formats.points import Points
 from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
-from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
 from formats.transforms import (
     BLENDER_FILE,
     Part,
@@ -53,8 +49,7 @@ from formats.transforms import (
     sparse_points,
     stated_aabb,
 )
-from formats.upright import upward_doubt
-from formats.views import LEAST_VIEWS, Capture, View, hold_out
+from formats.views import Capture, View, hold_out
 
 LEVELS, MAX_FOLDERS = 3, 500
 """How deep captures are looked for below a folder without poses, and in how many folders of one depth."""
@@ -228,14 +223,16 @@ def _read_blender(
             notes = (f"{error}; none are held out by it",)
     parts = [*parts, Part()] if train else [Part(), *parts]
     stated = stated_aabb(first, read_document(first))
-    return _capture(path, "blender", *parts[:2], stated=stated, notes=notes)
+    return capture_of(path, "blender", *parts[:2], stated=stated, notes=notes)
 
 
 def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:
     document, train, test = read_splits(path, base or path.parent, downscale)
     sparse = sparse_points(path, document, train.views + test.views)
     train, test = (replace(part, views=sparse.told(path, part.views)) for part in (train, test))
-    return _capture(path, "transforms", train, test, stated_aabb(path, document), sparse.points, sparse.notes)
+    return capture_of(
+        path, "transforms", train, test, stated_aabb(path, document), sparse.points, sparse.notes
+    )
 
 
 def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
@@ -263,7 +260,7 @@ def _read_model(
     part = _read_listed(
         model.folder, base, images, lambda image, size: (image.where, image.view), downscale, homes
     )
-    return _capture(path, kind, part, Part(), None, model.points, tuple(notes))
+    return capture_of(path, kind, part, Part(), None, model.points, tuple(notes))
 
 
 def _read_listed(
@@ -340,7 +337,7 @@ def _read_llff(path: Path, downscale: int | None) -> Capture:
     empty = tuple(photo.name for photo in photos if not photo.stat().st_size)
     notes = (order, *(f"{path}: {note}" for note in gone(empty)), *broken, *repair_notes(path, views))
     part = Part(tuple(views), empty, notes)
-    return _capture(path, "llff", part, Part(), None)
+    return capture_of(path, "llff", part, Part(), None)
 
 
 def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
@@ -357,7 +354,7 @@ def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None
     photos, poses = polycam.FOLDERS[0]
     lost = images.name != photos and (images.parent / poses).is_dir()
     uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
-    return _capture(path, "polycam", part, Part(), None, notes=tuple(uncorrected))
+    return capture_of(path, "polycam", part, Part(), None, notes=tuple(uncorrected))
 
 
 def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Capture:
@@ -376,94 +373,13 @@ def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Cap
         for part in names
     ]
     notes += [f"{path}: {unused}"] if unused else []
-    return _capture(path, "pose files", *parts, read_box(files), notes=tuple(notes))
+    return capture_of(path, "pose files", *parts, read_box(files), notes=tuple(notes))
 
 
 def _read_opensfm(path: Path, file: Path, downscale: int | None) -> Capture:
     model = opensfm.read_model(file)
     base = file.parent if has_pictures(file.parent) or path == file.parent else file.parent.parent
     return _read_model(path, "opensfm", model, base, ("images", ""), downscale, model.notes)
-
-
-# --- what they share ----------------------------------------------------------------------------------------
-
-
-def _capture(
-    path: Path,
-    kind: str,
-    train: Part,
-    test: Part,
-    stated: np.ndarray | None,
-    points: Points | None = None,
-    notes: tuple[str, ...] = (),
-) -> Capture:
-    views, missing = train.views + test.views, train.missing + test.missing
-    if not views:
-        raise NoViews(
-            f"{path}: no view is left, {len(missing)} of {len(missing)} listed frames have no photo on disk; "
-            "put the photos where the file_path entries say"
-        )
-    views, sideways = alike_turned(views)
-    views, beside = with_masks_beside(views, path if path.is_dir() else path.parent)
-    masked = by_masks(views)
-    first_test = _left(views, masked.views, len(train.views))
-    seen = by_alpha(masked.views)
-    first_test = _left(masked.views, seen.views, first_test)
-    poses = np.array([view.camera_to_world for view in seen.views])
-    frame, box, opaque = None, stated, not seen.outlines
-    said = [sideways, *masked.notes, *seen.notes]
-    if opaque:
-        seen = by_ground(seen.views)
-        said += seen.notes
-    if not seen.outlines:
-        frame, box = _surroundings(seen.views, poses, points)
-    elif not opaque or box is None:
-        box = outline_box(seen, AMISS_ON_WHITE if opaque else AMISS)
-    cut_out = outline_box(masked) if masked.outlines else None
-    if frame is not None and len(seen.views) >= LEAST_VIEWS:
-        said.append(upward_doubt(poses))
-    notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in said if note))
-    notes = (*notes, *_off_centre(path, seen.views), *_smaller(path, seen.views))
-    notes = tuple(dict.fromkeys(map(printable, notes)))  # they have names from the file
-    parts = seen.views[:first_test], seen.views[first_test:]
-    return Capture(path, kind, *parts, box, opaque, cut_out, missing, points, frame, notes)
-
-
-def _left(before: tuple[View, ...], after: tuple[View, ...], first: int) -> int:
-    """How many of the first views are there still."""
-    return first if len(after) == len(before) else sum(view in after for view in before[:first])
-
-
-def _off_centre(path: Path, views: tuple[View, ...]) -> Iterator[str]:
-    """A sentence about photos beside which their cameras look, as where their size was changed alone."""
-    off = [v for v in views if not (0 <= v.cx <= v.width and 0 <= v.cy <= v.height)]
-    if off:
-        one = off[0]
-        yield (
-            f"{path}: the centres of {len(off)} of {len(views)} photos lie outside of them, such as "
-            f"{one.cx:g}, {one.cy:g} of {one.name}, which is {one.width}x{one.height}; check that cx, cy, "
-            "fl_x and fl_y are for photos of w and h"
-        )
-
-
-def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:
-    """A sentence about photos that are made smaller on reading."""
-    most = max(views, key=lambda view: view.reduction)
-    if most.reduction > 1:
-        yield (
-            f"{path}: photos are made {most.reduction} times smaller, to {most.width}x{most.height}; "
-            "--downscale 1 takes them whole"
-        )
-
-
-def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | None) -> tuple:
-    """The frame of photos that show a subject and all around it, and a box large enough for that."""
-    depths = [math.sqrt(view.near * view.far) for view in views if view.near and view.far]
-    frame = scene_frame(poses, float(np.median(depths)) if depths else None)
-    if frame.layout != "forward-facing":
-        return frame, default_box(frame, poses, None if points is None else points.positions)
-    seen = [(view, view.near or 0.5 * frame.distance, view.far or 4 * frame.distance) for view in views]
-    return frame, shown_box(np.concatenate([view.corners(d) for view, *ends in seen for d in ends]))
 
 
 # --- writing ------------------------------------------------------------------------------------------------

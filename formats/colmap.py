@@ -4,20 +4,19 @@ Binary files are little endian; images hold world-to-camera as a quaternion (w, 
 with x right, y down, z forward. Files `rigs` and `frames` of newer versions are not needed.
 """
 
-import math
 import os
-import re
 import struct
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from formats.cameras import MOST_PIXELS, checked_focal, checked_size
+from formats.colmap_points import Listed, binary_points, text_points
+from formats.colmap_text import check_count, number, numbered_lines, pose_number
 from formats.errors import (
     BadIntrinsics,
     BadModel,
@@ -28,19 +27,16 @@ from formats.errors import (
 )
 from formats.frame import depth_range
 from formats.frame_list import once, read_sound
-from formats.inputs import decoded, open_input, read_input
+from formats.inputs import open_input, read_input
 from formats.matching import stem_key
 from formats.photos import folders
-from formats.points import MAX_POINTS, Points, points_notes, stride
+from formats.points import MAX_POINTS, Points, points_notes
 from formats.rotations import matrices
 from formats.views import FARTHEST, View
 
 MAX_CAMERAS_BYTES = 64 * 2**20
 MAX_BYTES = 2**31
 MAX_NAME = 4096
-MOST_ERROR = 1.5
-"""Pixels of the photos that were compared. A point that lies farther, on average, from where photos show it
-says nothing of them."""
 MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
@@ -81,7 +77,6 @@ PHOTOS_IN = ("images", "input")
 NO_POINT = 2**64 - 1
 SMALLEST_IMAGE = 73
 """Bytes of an image without a name or observations."""
-LINE_ENDS = re.compile(r"\r\n?|\n")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,26 +100,6 @@ class Model:
     points: Points | None
     notes: tuple[str, ...] = ()
     """What of the model is not used, and why."""
-
-
-@dataclass(frozen=True, eq=False)
-class Listed:
-    """The points of a model as its files name them."""
-
-    ids: np.ndarray
-    """(N,) uint64, rising."""
-    points: Points
-    errors: np.ndarray
-    """(N,) float64, pixels."""
-
-    def found(self, seen: np.ndarray) -> np.ndarray:
-        """(M,) int64, rising: where the points of some ids are among these, without those that are not."""
-        at = np.minimum(np.searchsorted(self.ids, seen), max(len(self.ids) - 1, 0))
-        return np.unique(at[self.ids[at] == seen]) if len(self.ids) else np.empty(0, np.int64)
-
-    def sure(self, found: np.ndarray) -> np.ndarray:
-        """Those of `found` that lie where photos show them."""
-        return found[self.errors[found] <= MOST_ERROR]
 
 
 def model_folder(path: Path) -> Path | None:
@@ -230,7 +205,7 @@ def read_points(folder: Path, most: int = MAX_POINTS) -> tuple[Points | None, di
 def _points(folder: Path, most: int) -> Listed | None:
     if not _has(folder, "points3D"):
         return None
-    parsers = {"bin": partial(_binary_points, most), "txt": partial(_text_points, most)}
+    parsers = {"bin": partial(binary_points, most), "txt": partial(text_points, most)}
     return _read(folder, "points3D", parsers, MAX_BYTES)
 
 
@@ -300,7 +275,7 @@ def _known(where: str, model: str) -> str:
 
 def _binary_cameras(path: Path, data: bytes) -> dict[int, View]:
     (count,) = struct.unpack_from("<Q", data)
-    _check_count(path, count, len(data), 24)
+    check_count(path, count, len(data), 24)
     cameras, at = {}, 8
     for _ in range(count):
         camera, number, width, height = struct.unpack_from("<IiQQ", data, at)
@@ -316,15 +291,15 @@ def _binary_cameras(path: Path, data: bytes) -> dict[int, View]:
 
 def _text_cameras(path: Path, data: bytes) -> dict[int, View]:
     cameras = {}
-    for line, text in _lines(path, data):
+    for line, text in numbered_lines(path, data):
         words = text.split()
         if not words:
             continue
         if len(words) < 5:
             raise BadModel(f"{path}: line {line}: expected an id, a model, width, height and its parameters")
-        camera, width, height = (_number(path, line, words[i], int) for i in (0, 2, 3))
+        camera, width, height = (number(path, line, words[i], int) for i in (0, 2, 3))
         where = f"{path}: camera {camera}"
-        numbers = [_number(path, line, word, float) for word in words[4:]]
+        numbers = [number(path, line, word, float) for word in words[4:]]
         cameras[camera] = _camera(where, _known(where, words[1].upper()), width, height, numbers)
     return cameras
 
@@ -335,7 +310,7 @@ def _text_cameras(path: Path, data: bytes) -> dict[int, View]:
 def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
     """(where, name, quaternion, translation, camera, ids of the points it saw) of each image."""
     (count,) = struct.unpack_from("<Q", data)
-    _check_count(path, count, len(data), SMALLEST_IMAGE)
+    check_count(path, count, len(data), SMALLEST_IMAGE)
     at, found = 8, []
     for _ in range(count):
         image, *numbers, camera = struct.unpack_from("<I7dI", data, at)
@@ -357,7 +332,7 @@ def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
 def _text_images(path: Path, data: bytes) -> list[tuple]:
     """As `_binary_images`; the second line of an image holds x, y and point of each observation. It may be
     empty, or be missing where the poses were not found by COLMAP."""
-    found, lines = [], deque(_lines(path, data))
+    found, lines = [], deque(numbered_lines(path, data))
     while lines:
         line, text = lines.popleft()
         if not text:
@@ -365,8 +340,8 @@ def _text_images(path: Path, data: bytes) -> list[tuple]:
         words = text.split(None, 9)
         if len(words) < 10:
             raise BadModel(f"{path}: line {line}: expected an id, a pose, a camera and a name")
-        image, camera = (_number(path, line, words[i], int) for i in (0, 8))
-        numbers = [_pose_number(path, line, word) for word in words[1:8]]
+        image, camera = (number(path, line, words[i], int) for i in (0, 8))
+        numbers = [pose_number(path, line, word) for word in words[1:8]]
         name = words[9]
         seen = np.empty(0, np.int64)
         if lines and not _is_image(lines[0][1]):
@@ -401,97 +376,3 @@ def _is_image(text: str) -> bool:
     except ValueError:
         return True
     return len(rest) % 3 != 0
-
-
-# --- points -------------------------------------------------------------------------------------------------
-
-
-HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
-"""A point before its track, each entry of which has 8 bytes."""
-BLOCK = 1 << 16
-
-
-def _binary_points(most: int, path: Path, data: bytes) -> Listed:
-    (count,) = struct.unpack_from("<Q", data)
-    _check_count(path, count, len(data), HEAD.itemsize)
-    step, at, track = stride(count, most), 8, struct.Struct("<Q").unpack_from
-    heads, kept = np.empty(-(-count // step), HEAD), []
-    for i in range(count):
-        (length,) = track(data, at + 43)
-        if length > (len(data) - at - HEAD.itemsize) // 8:
-            (point,) = track(data, at)
-            raise BadModel(f"{path}: the file is truncated in point {point}; copy or export it again")
-        if i % step == 0:
-            kept.append(at)
-        if len(kept) == BLOCK or kept and i == count - 1:
-            _gather(data, kept, heads[: i // step + 1])
-            kept = []
-        at += HEAD.itemsize + 8 * length
-    return _sorted_points(heads["id"], heads["xyz"], heads["rgb"], heads["error"], step)
-
-
-def _gather(data: bytes, starts: list[int], heads: np.ndarray) -> None:
-    """Fill the last of `heads` from the bytes that begin at `starts`."""
-    rows = np.array(starts)[:, None] + np.arange(HEAD.itemsize)
-    heads[len(heads) - len(starts) :] = np.frombuffer(data, np.uint8)[rows].view(HEAD)[:, 0]
-
-
-def _text_points(most: int, path: Path, data: bytes) -> Listed:
-    step, rows, ids = stride(data.count(b"\n"), most), [], []
-    numbered = (item for item in _lines(path, data) if item[1])
-    for line, text in islice(numbered, 0, None, step):
-        words = text.split(None, 8)
-        if len(words) < 7:
-            raise BadModel(f"{path}: line {line}: expected an id, a position and a colour")
-        ids.append(_number(path, line, words[0], int) % 2**64)
-        position = [_number(path, line, word, float) for word in words[1:4]]
-        colour = [_number(path, line, word, int) for word in words[4:7]]
-        error = _number(path, line, words[7], float) if len(words) > 7 else 0.0
-        rows.append((*position, *colour, error))
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    return _sorted_points(np.array(ids, np.uint64), table[:, :3], table[:, 3:6], table[:, 6], step)
-
-
-def _sorted_points(
-    ids: np.ndarray, positions: np.ndarray, colours: np.ndarray, errors: np.ndarray, step: int
-) -> Listed:
-    """(N,), (N, 3), (N, 3) and (N,) numbers of every `step`-th point of a file."""
-    order = np.argsort(ids)
-    order = order[(np.abs(positions[order]) < 1e30).all(1)]
-    colours = np.clip(colours[order], 0, 255).astype(np.uint8)
-    points = Points(positions[order], colours, step, len(ids) - len(order))
-    return Listed(ids[order], points, errors[order])
-
-
-# --- parsing ------------------------------------------------------------------------------------------------
-
-
-def _check_count(path: Path, count: int, length: int, smallest: int) -> None:
-    if count > length // smallest:
-        raise BadModel(f"{path}: {count:,} records do not fit into {length:,} bytes; copy or export it again")
-
-
-def _lines(path: Path, data: bytes) -> Iterator[tuple[int, str]]:
-    """Number and text of each line that is not a comment."""
-    for i, line in enumerate(LINE_ENDS.split(decoded(data, "replace")), 1):
-        text = line.strip()
-        if not text.startswith("#"):
-            yield i, text
-
-
-def _pose_number(path: Path, line: int, word: str) -> float:
-    """A number of a pose, which may be NaN: its image alone is then of no use."""
-    return math.nan if word.lower().lstrip("+-") in ("nan", "inf") else _number(path, line, word, float)
-
-
-def _number(path: Path, line: int, word: str, kind: type):
-    try:
-        value = float(word) if len(word) < 40 else math.nan
-        value = int(word) if kind is int and word.lstrip("+-").isdecimal() and len(word) < 40 else value
-    except ValueError:
-        value = math.nan
-    if not abs(value) < 1e30 or kind is int and value != int(value):
-        points = "; write decimals with a point" if "," in word else ""
-        what = "a whole number" if kind is int else "a number"
-        raise BadModel(f"{path}: line {line}: found {word[:40]!r}, expected {what}{points}")
-    return kind(value)

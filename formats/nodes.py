@@ -135,21 +135,17 @@ def make_node(
     *,
     source: str | None = None,
     field: str | None = None,
-    translation=None,
-    rotation=None,
-    scale=None,
-    matrix=None,
     background: bool = False,
     children: tuple[Node, ...] = (),
     showing: dict | None = None,
+    **placement,
 ) -> Node:
-    """A node by translation (3,), rotation (4,) quaternion xyzw and scale (3,), or by matrix (4, 4); showing
-    are its SHOWING_KEYS.
+    """A node, placed by translation (3,), rotation (4,) quaternion xyzw and scale (3,), or by matrix (4, 4);
+    showing are its SHOWING_KEYS.
 
     Raises BadName, BadSchema, NotFinite, SingularTransform, LimitExceeded.
     """
-    words = zip(PLACEMENT_KEYS, (translation, rotation, scale, matrix), strict=True)
-    placement = {key: np.asarray(value).tolist() for key, value in words if value is not None}
+    placement = {key: np.asarray(value).tolist() for key, value in placement.items() if value is not None}
     return Node(name, field, source, placement, background, tuple(children), {}, showing or {})
 
 

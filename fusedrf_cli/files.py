@@ -21,8 +21,8 @@ from formats.scene import (
 from formats.sources import inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.errors import InvalidInput
+from fusedrf_cli.request_parts import STDIO
 from fusedrf_cli.requests import (
-    STDIO,
     ComposeRequest,
     HistoryRequest,
     InfoRequest,

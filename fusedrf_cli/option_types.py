@@ -13,7 +13,7 @@ from click.shell_completion import CompletionItem
 
 from formats.errors import MissingFile
 from fusedrf_cli.errors import UsageProblem
-from fusedrf_cli.requests import STDIO
+from fusedrf_cli.request_parts import STDIO
 
 _SEPARATORS = re.compile(r"[\s,\[\]]+")
 _BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?", re.IGNORECASE)

@@ -1,5 +1,5 @@
 """SIGINT and SIGTERM: raised in the main thread as `Interrupted`; and where that thread does not come to its
-end, since a compiled loop or a library has it, the process is ended within PATIENCE seconds all the same."""
+end, since a compiled loop or a library has it, the process is ended within seconds all the same."""
 
 import contextlib
 import os
@@ -8,15 +8,24 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 from formats.atomic import remove_unfinished
 from formats.errors import printable
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import Interrupted
 
-PATIENCE = 2.5
-"""Seconds that a process may take to end by itself."""
-ECHO = 0.3
-"""Seconds in which a second signal is the same one: `timeout` sends to a process and then to its group."""
+
+@dataclass(frozen=True)
+class SignalConfig:
+    """How long a process may take to end."""
+
+    patience: float = 2.5
+    """Seconds that it may take by itself."""
+    echo: float = 0.3
+    """Seconds in which a second signal is the same one: `timeout` sends to a process and then to its
+    group."""
+
 
 _obeying = False
 _raised: int | None = None
@@ -44,7 +53,7 @@ def obey() -> None:
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    threading.Thread(target=_watch, args=(reader,), daemon=True).start()
+    threading.Thread(target=_watch, args=(reader, current(SignalConfig)), daemon=True).start()
 
 
 def interrupt(number: int, frame: object) -> None:
@@ -93,16 +102,16 @@ def said() -> None:
     _said = True
 
 
-def _watch(reader: int) -> None:
+def _watch(reader: int, config: SignalConfig) -> None:
     """Wait for a signal, and then for the process's end, a second signal or the end of patience."""
     number = _next(reader, None)
     first = time.monotonic()
     while True:
-        left = max(first + PATIENCE, _calm + 1) - time.monotonic()
+        left = max(first + config.patience, _calm + 1) - time.monotonic()
         if _next(reader, max(left, 0.1)) is None:
             if left <= 0 and not _saving:
                 break
-        elif time.monotonic() - first > ECHO:
+        elif time.monotonic() - first > config.echo:
             break
     _end(number)
 

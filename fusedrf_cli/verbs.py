@@ -1,5 +1,6 @@
 """The verbs of fusedrf. Each takes what its request says (requests.py), in order or by keyword, checks it and
 its outputs before any work, writes its output whole or not at all, and returns its report, a JSON-able dict.
+`progress` is told of what goes on; `settings` are in force meanwhile (engine/settings.py).
 
 Nothing slow is imported until a verb needs it.
 """
@@ -9,15 +10,17 @@ import functools
 import importlib
 import inspect
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import msgspec
 
 from fusedrf_cli import requests
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.progress import NullProgress
-from fusedrf_cli.requests import EARLIER, STDIO, EditRequest, Writing
+from fusedrf_cli.request_parts import EARLIER, STDIO
+from fusedrf_cli.requests import EditRequest, Writing
 
 __all__ = [
     *("pose", "train", "compose", "fuse", "convert", "add", "delete", "move", "duplicate", "rename"),
@@ -31,17 +34,23 @@ def verb(name: str, request: type, does: str = "", module: str = "bridge") -> Ca
     name."""
     signature = inspect.signature(request)
 
-    def run(*words: Any, progress: NullProgress | None = None, **options: Any) -> dict:
+    def run(
+        *words: Any, progress: NullProgress | None = None, settings: Sequence = (), **options: Any
+    ) -> dict:
         options = {EARLIER.get(name, name): value for name, value in options.items()}
         asked = checked(request, signature.bind(*words, **options).arguments)
         progress = progress or NullProgress()
-        with held_outputs(asked, progress) if isinstance(asked, Writing) else contextlib.nullcontext():
+        held = held_outputs(asked, progress) if isinstance(asked, Writing) else contextlib.nullcontext()
+        with held, using(*settings):
             work = getattr(importlib.import_module(f"fusedrf_cli.{module}"), does or name)
             report = work(asked, progress)
         return report and {**report, "warnings": report.get("warnings", progress.warnings)}
 
-    how = inspect.Parameter("progress", inspect.Parameter.KEYWORD_ONLY, default=None)
-    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), how])
+    how = {"progress": None, "settings": ()}
+    how = [
+        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=value) for word, value in how.items()
+    ]
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *how])
     run.__name__ = run.__qualname__ = name
     run.__doc__ = request.__doc__
     return run

@@ -5,8 +5,6 @@ from collections.abc import Iterator
 
 from fusedrf_cli.engine.kernels import working_time
 
-LEAST = 1e-3  # seconds, less of which are not worth a beginning
-
 
 class Budget:
     """The seconds that one command may learn; the time of compiling kernels does not count."""
@@ -22,7 +20,8 @@ class Budget:
     @property
     def over(self) -> bool:
         """Whether there is no time left to learn in."""
-        return self.seconds is not None and self.seconds - self.spent < LEAST
+        least = 1e-3  # seconds, less of which are not worth a beginning
+        return self.seconds is not None and self.seconds - self.spent < least
 
     @contextlib.contextmanager
     def learning(self) -> Iterator[None]:

@@ -13,18 +13,17 @@ from formats.embedding import Embedding
 from formats.errors import FormatError
 from formats.graph import free_name, placement_of, with_leaves
 from formats.records import FieldRecord
-from formats.scene import Leaf, Node, SceneGraph, dump_scene
+from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.making import Kept
-from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes
-from fusedrf_cli.bridge.sizes import HeaderConfig
+from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
+from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds.instances import distinct_fields
-from fusedrf_cli.engine.settings import current
 from fusedrf_cli.requests import FuseRequest
 
 
@@ -39,7 +38,7 @@ class FusedBundle:
         self.kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
         self.nodes = history_nodes(loaded, request.output, self.kept)
         self.composed = loaded.composed()
-        self.graph = SceneGraph(()) if learnt else named_graph(request, everything, loaded)
+        self.graph = named_graph(request, everything, loaded)
         self.framing: tuple[float, ...] | None = None
         self.cameras: dict | None = None
 
@@ -48,8 +47,7 @@ class FusedBundle:
         self.framing = None if framing is None else tuple(float(number) for number in framing)
         self.cameras = cameras
         try:
-            skeleton = self.scene(self.skeleton, {"nodes": self.nodes})
-            self.overhead = current(HeaderConfig).besides + len(dump_scene(skeleton))
+            self.overhead = graph_bytes(self.scene(self.skeleton, {"nodes": self.nodes}))
         except FormatError as error:
             raise error.within(self.request.output) from error
 
@@ -100,7 +98,9 @@ class FusedBundle:
         else:
             own = add(writer, stays.field, background.precision)
         name = free_name(source.placed.name, {LEARNT})
-        node = Node(name, own, None, placement_of(source.placed.object_to_world), True)
+        leaf = next(leaf for leaf, f in self.leaves if f is source)
+        at = placement_of(leaf.object_to_world)
+        node = Node(name, own, None, at, True, showing=showing_of(stays))
         place = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
         return SceneGraph((node, Node(LEARNT, member, None, place)))
 

@@ -10,15 +10,28 @@ from dataclasses import dataclass
 from functools import cache
 
 from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.report import readable_size
 
-DB_PER_E_FOLD = 8.0  # that PSNR gains about when the bytes grow by e: only the next guess rests on it
-CLOSE = 1.08  # between the smallest size that reaches the target and the largest that does not
-MOST_GROWTH = 3.0  # from one size that is tried to the next
-OVERSHOOT = 0.1  # dB aimed above a target, so that the next try is likely to reach it
-NEIGHBOUR = 1.3  # ratio of bytes at which the next larger and smaller choice is looked at
-TRIES = 8  # sizes of one way
-FINALISTS = 3  # ways that are finished where a size is given; the others are judged as they are
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How sizes and ways are searched for the best."""
+
+    db_per_e_fold: float = 8.0
+    """dB that PSNR gains about when the bytes grow by e: only the next guess rests on it."""
+    close: float = 1.08
+    """Between the smallest size that reaches the target and the largest that does not."""
+    most_growth: float = 3.0
+    """From one size that is tried to the next."""
+    overshoot: float = 0.1
+    """dB aimed above a target, so that the next try is likely to reach it."""
+    neighbour: float = 1.3
+    """Ratio of bytes at which the next larger and smaller choice is looked at."""
+    tries: int = 8
+    """Sizes of one way."""
+    finalists: int = 3
+    """Ways that are finished where a size is given; the others are judged as they are."""
 
 
 def flags(kind: str, way: Way, limit: int) -> str:
@@ -102,7 +115,7 @@ class Choosing:
         """The highest PSNR under a size, None where nothing fits."""
         plain = [t for way in ways if (t := self.make(way, limit, False)) is not None]
         plain.sort(key=lambda t: -t.psnr)
-        made = (self.make(t.way, limit, True) for t in plain[:FINALISTS])
+        made = (self.make(t.way, limit, True) for t in plain[: current(SearchConfig).finalists])
         return max((t for t in made if t is not None), key=lambda t: t.psnr, default=None)
 
     def smallest_reaching(
@@ -116,7 +129,7 @@ class Choosing:
         for group in ways:
             best = None
             for way in group:
-                most = limit if best is None else int(best.bytes / CLOSE)
+                most = limit if best is None else int(best.bytes / current(SearchConfig).close)
                 top = self.make(way, most, False)
                 if top is None or top.psnr + gain < target:
                     continue
@@ -130,9 +143,10 @@ class Choosing:
         """The smallest size of one way that reaches the target. `contested`: another way reaches it at `most`
         already, so that this one has to show at once that it does too.
         """
+        config = current(SearchConfig)
         size = most if contested else max(top // 4, 1)
         low, high = None, None
-        for _ in range(TRIES):
+        for _ in range(config.tries):
             found = self.make(way, size, True)
             if found is not None and found.psnr >= target:
                 high = found
@@ -141,38 +155,40 @@ class Choosing:
             else:
                 low = max(low or 0, size)
             if found is None:  # not even the coarsest fits
-                size = min(most, int(size * MOST_GROWTH))
+                size = min(most, int(size * config.most_growth))
                 continue
-            if high is not None and low is not None and high.limit <= CLOSE * low:
+            if high is not None and low is not None and high.limit <= config.close * low:
                 break
             size = self._next_size(found, target, low, high, most)
         return high
 
     def _next_size(self, found: Tried, target: float, low: int | None, high: Tried | None, most: int) -> int:
         """By the slope that PSNR usually has, between what is too small and what is enough."""
-        step = math.exp((target + OVERSHOOT - found.psnr) / DB_PER_E_FOLD)
+        config = current(SearchConfig)
+        step = math.exp((target + config.overshoot - found.psnr) / config.db_per_e_fold)
         start = min(found.limit, found.bytes) if found.whole else found.limit
-        size = start * min(max(step, 1 / MOST_GROWTH), MOST_GROWTH)
+        size = start * min(max(step, 1 / config.most_growth), config.most_growth)
         if low is not None and high is not None:
-            size = min(max(size, low * CLOSE**0.5), min(high.limit, high.bytes) / CLOSE**0.5)
+            size = min(max(size, low * config.close**0.5), min(high.limit, high.bytes) / config.close**0.5)
         elif high is not None:
-            size = min(size, min(high.limit, high.bytes) / CLOSE**0.5)
+            size = min(size, min(high.limit, high.bytes) / config.close**0.5)
         elif low is not None:
-            size = max(size, low * CLOSE)
+            size = max(size, low * config.close)
         return min(most, max(1, round(size)))
 
     def neighbours(self, chosen: Tried) -> dict[str, dict]:
         """The next larger choice that shows more and the next smaller one, with what they give."""
+        config = current(SearchConfig)
         found = {}
         for name, side in (("smaller", -1), ("larger", 1)):
             near = [
                 t
                 for t in self.tried
-                if CLOSE**0.5 < (t.bytes / chosen.bytes) ** side < NEIGHBOUR * CLOSE
+                if config.close**0.5 < (t.bytes / chosen.bytes) ** side < config.neighbour * config.close
                 and (t.psnr - chosen.psnr) * side > 0
             ]
             if not near and not (chosen.whole and side > 0):
-                made = self.make(chosen.way, round(chosen.bytes * NEIGHBOUR**side), True)
+                made = self.make(chosen.way, round(chosen.bytes * config.neighbour**side), True)
                 near = [made] if made is not None and made.bytes != chosen.bytes else []
             if near:
                 best = max(near, key=lambda t: (t.psnr - chosen.psnr) / abs(math.log(t.bytes / chosen.bytes)))

@@ -25,14 +25,23 @@ from fusedrf_cli.engine.selection.voting import shown_by
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput
 
-COPIES = 3.0
-"""Of the largest field in memory, while it is taken apart."""
-CELLS_BYTES = 400e6
-"""Of cells and votes."""
-VEILED = 0.2
-"""Of how much cameras see of a cell without the object: it was hidden where they saw less before."""
-LAYERS, FEW_REVEALED = 4, 1e-4
-"""How often what was hidden is taken away, at most, and the share of cells from which it is."""
+
+@dataclass(frozen=True)
+class CuttingConfig:
+    """How what a cut hides is found, and what that takes."""
+
+    copies: float = 3.0
+    """Copies of the largest field in memory, while it is taken apart."""
+    cells_bytes: float = 400e6
+    """Of cells and votes."""
+    veiled: float = 0.2
+    """Of how much cameras see of a cell without the object: it was hidden where they saw less before."""
+    layers: int = 4
+    """How often what was hidden is taken away, at most."""
+    few_revealed: float = 1e-4
+    """Share of cells from which it is."""
+
+
 Fields = Mapping[str, StoredField]
 """What is there of the fields of visible nodes, by their names: those of the bundle, and parts of them."""
 
@@ -52,18 +61,21 @@ class Whole:
     @classmethod
     def read(cls, path: str, memory: Memory) -> "Whole":
         """The bundle at a path, with all its fields in memory."""
+        config = current(CuttingConfig)
         draft = Draft(path, memory)
         loaded = draft.before
         lone = loaded.lone()
         field, origin = lone or ((scene := as_composite(loaded.composed())), scene.origin)
         memory.expect(
-            sources(loaded.sizes, copies=COPIES) | ownership(field.aabb) | {"its cells": CELLS_BYTES},
+            sources(loaded.sizes, copies=config.copies)
+            | ownership(field.aabb)
+            | {"its cells": config.cells_bytes},
             advice="take an object out of a smaller field",
         )
         loaded.shelf.resize(sum(loaded.sizes))
         whole = cls(draft, loaded, field, origin)
         for leaf, placed in whole.nodes:
-            own = placed.field if leaf.whole else make_field(draft.bundle.field(leaf.field), path)
+            own = make_field(draft.bundle.field(leaf.field), path) if leaf.crops else placed.field
             whole.raw[leaf.name] = opened(own)
         return whole
 
@@ -179,17 +191,18 @@ def cut_with_hidden(
     """As `cut`, and what is left is without what then shows where the object was to cameras that did not see
     it before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it
     lies more of it."""
+    config = current(CuttingConfig)
     found, rest = cut(whole, selection, True, touched)
     gone = selection.with_islands()  # of photos: what hangs in the air is an error
     if (gone.chosen != selection.chosen).any():
         rest = cut(whole, gone, True, touched)[1]
-    for _ in range(LAYERS):
+    for _ in range(config.layers):
         left = whole.composed(rest)
         if left is None:
             break
         now = shown_by(left, selection.lattice, cameras)
-        revealed = ~gone.chosen & (now > least) & (shown < VEILED * now)
-        if revealed.mean() < FEW_REVEALED:
+        revealed = ~gone.chosen & (now > least) & (shown < config.veiled * now)
+        if revealed.mean() < config.few_revealed:
             break
         gone = gone.joined(revealed)
         rest = cut(whole, gone, True, touched)[1]

@@ -7,11 +7,6 @@ from fusedrf_cli.bridge.extent import Extent
 from fusedrf_cli.engine.distillation.keypoints import Known
 from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
 
-LEAST_PHOTOS = 3
-"""A point that only two photos show may be two things that look alike."""
-PIXELS_OFF = 0.5
-"""How far a point lies from where photos show it, about."""
-
 
 def known_points(capture: Capture, extent: Extent) -> Known | None:
     """The sparse points that photos to learn from show, in the field's frame, where the capture says which
@@ -45,4 +40,5 @@ def certain(
     mean = np.stack([np.bincount(point, line, len(positions)) for line in lines.T], 1) / few[:, None]
     spread = np.sqrt(np.maximum(1 - (mean**2).sum(1), 0))
     pixel = np.median([1 / view.fl_x for view in views])
-    return (count >= LEAST_PHOTOS) & (PIXELS_OFF * pixel < DEPTH_TOLERANCE * spread * np.sqrt(few))
+    # A point lies half a pixel from where photos show it, about; one that only two show may be two things.
+    return (count >= 3) & (0.5 * pixel < DEPTH_TOLERANCE * spread * np.sqrt(few))

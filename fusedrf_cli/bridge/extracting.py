@@ -3,7 +3,7 @@ it."""
 
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.selecting import (
-    SEEN_SIDE,
+    SelectingConfig,
     Told,
     in_frame,
     nothing,
@@ -42,17 +42,25 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.selection.voting import shown_by, well_shown
 from fusedrf_cli.engine.selection.weights import cell_weights
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest, FuseRequest
 
 OBJECT = "object"
 """The node of an object that was not chosen by a name."""
-SEEN_FROM = 2e-3
-"""Weight of what was seen of an object."""
-SEEN = 0.1
-"""Of how much cameras see of a cell that they see well (`well_shown`): less is not seen, and what a field has
-there it has by chance."""
-UNSURE = 0.6
+
+
+@dataclass(frozen=True)
+class ExtractingConfig:
+    """From when what was seen of an object counts."""
+
+    seen_from: float = 2e-3
+    """Weight of what was seen of an object."""
+    seen: float = 0.1
+    """Of how much cameras see of a cell that they see well (`well_shown`): less is not seen, and what a field
+    has there it has by chance."""
+    unsure: float = 0.6
+    """How far those who chose agree, under which it is said that they do not."""
 
 
 def extract(request: ExtractRequest, progress) -> dict:
@@ -115,6 +123,8 @@ def parted(
 ) -> tuple[Fields, Fields, dict]:
     """The object's fields, those that are left, and what the report says of how it was chosen. InvalidInput
     where there is no such object."""
+    extracting = current(ExtractingConfig)
+    config = current(SelectingConfig)
     by_name = request.name is not None
     told = told_by_name(request, whole) if by_name else told_by(request, whole, rig, progress)
     if told is None:
@@ -122,11 +132,11 @@ def parted(
     selection = selected(whole.field, told)
     cameras = watching(whole)
     shown = shown_by(whole.field, selection.lattice, cameras)
-    well = SEEN * well_shown(selection, shown)
+    well = extracting.seen * well_shown(selection, shown)
     selection = selection.without(shown < well)
     if not selection.shows:
         raise InvalidInput(f"{request.field}: {nothing(request)}")
-    if selection.sure < UNSURE and told.is_guess:
+    if selection.sure < extracting.unsure and told.is_guess:
         progress.warn(
             f"what tells of the object agrees by {selection.sure:.0%} only; look at --preview, and "
             "give more masks or points"
@@ -144,7 +154,7 @@ def parted(
     object_shown = whole.composed(found)
     if object_shown is None:
         raise InvalidInput(f"{request.field}: {nothing(request)}")
-    share = seen_share([in_frame(small(view, SEEN_SIDE), whole) for view in some(rig)], object_shown)
+    share = seen_share([in_frame(small(view, config.seen_side), whole) for view in some(rig)], object_shown)
     return found, rest, {"sure": round(selection.sure, 3), "seen": share}
 
 
@@ -189,15 +199,17 @@ def some(rig: dict[str, View]) -> list[View]:
 def seen_share(own: list[Camera], found: RadianceField) -> float | None:
     """Of the object's cells that some view around it shows, the share that cameras of the frame show; None
     where there are none."""
+    extracting = current(ExtractingConfig)
+    config = current(SelectingConfig)
     if not own:
         return None
-    lens = framing_lens(SEEN_SIDE, SEEN_SIDE)
+    lens = framing_lens(config.seen_side, config.seen_side)
     around = [
         replace(framing(subject(found), lens, azimuth, elevation).camera(lens), name="")
         for elevation in (-0.6, 0.0, 0.6, 1.2)
         for azimuth in np.arange(6) * np.pi / 3
     ]
-    shown, all_round = (weighed(found, cameras) > SEEN_FROM for cameras in (own, around))
+    shown, all_round = (weighed(found, cameras) > extracting.seen_from for cameras in (own, around))
     total = int(all_round.sum())
     return round(float((shown & all_round).sum() / total), 3) if total else None
 

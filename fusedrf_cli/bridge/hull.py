@@ -33,11 +33,8 @@ class HullConfig:
     lies beside the object, and only photos tell of it in which it is in line with the object."""
 
 
-DEFAULT = HullConfig()
-
-
 def visual_hull(
-    views: Sequence[View], box: np.ndarray, finest: int | None = None, config: HullConfig = DEFAULT
+    views: Sequence[View], box: np.ndarray, finest: int | None = None, config: HullConfig = HullConfig()
 ) -> OccupancyGrid:
     """The smallest box, with cells in it, around those of a box (6,), in world units, that most of the views'
     masks (`amiss`) leave room for an object in; a view says nothing of cells outside its picture, and cells

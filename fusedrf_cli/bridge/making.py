@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.bridge.background import Background
 from fusedrf_cli.bridge.budget import Budget
-from fusedrf_cli.bridge.choose import FINALISTS, Tried
+from fusedrf_cli.bridge.choose import SearchConfig, Tried
 from fusedrf_cli.bridge.looks import looks_of, views_of_place
 from fusedrf_cli.bridge.running import Saved, checkpoint_mismatch, resumable, take_up
 from fusedrf_cli.bridge.scene import LoadedScene, background_of, stored
@@ -115,10 +115,10 @@ class Maker:
         self.views = current(MakingConfig).views if compares else lesson.views
         size = lesson.view_size, lesson.view_size
         seed = current(JudgingConfig).judged_seed, 3, request.seed
-        self.looks = looks_of(scene.loaded, scene.composed, self.views, size, seed)
         self.answered = as_composite if together else lambda scene: scene
         self.sources = {id(leaf.field) for leaf in scene.composed.leaves()}
         truth = self.teacher = self.answered(scene.composed)
+        self.looks = looks_of(scene.loaded, truth, self.views, size, seed)
         self.sampler = scene.sampler
         if student.scene is not scene.composed:
             self.teacher = self.answered(student.scene)
@@ -257,10 +257,11 @@ class Maker:
 
     def tries_to_come(self) -> int:
         """How many tries the seconds that are left have to do for, about."""
+        search = current(SearchConfig)
         config = current(MakingConfig)
         if self.request.target_psnr is not None:
             return max(2, config.tries - self.finished_tries)  # how many a search takes is not known
-        return max(1, (FINALISTS if self.student.compares else 1) - self.finished_tries)
+        return max(1, (search.finalists if self.student.compares else 1) - self.finished_tries)
 
     def finetuned(self, scene: ComposedField, seconds: float | None) -> ComposedField:
         """A scene of smaller fields, each of which learnt from rays of its own source."""
@@ -328,8 +329,8 @@ class Maker:
         field, start = self.student.begun(plan, before, background, generator)
         if wanted and start == NOTHING:
             self.progress.warn(
-                f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
-                "nothing"
+                f"'{background.name}' is of another kind, turned, stretched or tinted, so the student starts "
+                "from nothing"
             )
         taken_over = wanted and start != NOTHING and same_texels(field, background.field)
         return field, start, {"coarse_from": None, "rate": config.rate_in_place} if taken_over else {}

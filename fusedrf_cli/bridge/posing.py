@@ -37,8 +37,6 @@ WORLD = (
     "units are arbitrary"
 )
 """Of a capture whose poses were estimated."""
-NAMED = 12
-"""At most so many photos are named in a warning."""
 
 
 def pose(request: PoseRequest, progress) -> dict:
@@ -128,9 +126,10 @@ def _warn_of_unposed(source: str, unposed: Sequence[str], plain: Sequence[str], 
     """Say which photos did not find a pose, where some did not."""
     if not unposed:
         return
-    more = f" and {len(unposed) - NAMED} more" if len(unposed) > NAMED else ""
-    names = ", ".join(unposed[:NAMED]) + more
-    why = f"; {', '.join(plain[:NAMED])} are blurred or plain" if plain else ""
+    most = 12  # photos that are named
+    more = f" and {len(unposed) - most} more" if len(unposed) > most else ""
+    names = ", ".join(unposed[:most]) + more
+    why = f"; {', '.join(plain[:most])} are blurred or plain" if plain else ""
     progress.warn(
         f"{source}: {len(unposed)} of {count} photos found no pose and were left out: {names}{why}"
     )

@@ -1,6 +1,7 @@
 """Pictures of an object that was cut out: alone, what is left without it, and where it was."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +19,26 @@ from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import enclosing
 from fusedrf_cli.engine.rendering.cameras import Camera, framing, framing_lens
 from fusedrf_cli.engine.rendering.volume import RenderedImage, render_image
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.requests import ExtractRequest
 
-SHOWN = 400
-"""Pixels along the longer side of a preview."""
-PREVIEWS = 4
+
+@dataclass(frozen=True)
+class PreviewConfig:
+    """What previews show."""
+
+    shown: int = 400
+    """Pixels along the longer side of a preview."""
+    previews: int = 4
+    before: float = 1.05
+    """A pixel of the whole shows something before the object where its distance is so many times less."""
+    alike: float = 0.1
+    """And its colour differs by so much."""
+
+
 PREVIEW = re.compile(r".*_(object|marked|rest)\.png")
 """Names of previews."""
 MARKED = np.array([1.0, 0.2, 0.1])
-BEFORE, ALIKE = 1.05, 0.1
-"""A pixel of the whole shows something before the object where its distance is less by so much, and its
-colour another."""
 
 Shown = tuple[RadianceField, np.ndarray]
 """A field, and where its frame lies in the world: a position (3,), or a placement (4, 4)."""
@@ -52,7 +62,7 @@ def previews(
 ) -> list[str]:
     """Write pictures of a few views of the "object" in its box (6,), in the world, of the "rest", and of the
     "whole" with the object marked."""
-    views = [small(view, SHOWN) for view in shown_views(request, rig)]
+    views = [small(view, current(PreviewConfig).shown) for view in shown_views(request, rig)]
     cameras = [camera_of(view) for view in views] or [framed(box)]
     progress.phase("previews", len(cameras))
     files, folder = [], Path(request.preview)
@@ -69,17 +79,21 @@ def previews(
 
 def shown_views(request: ExtractRequest, rig: dict[str, View]) -> list[View]:
     """The views that were masked or pointed at, else some of all."""
+    config = current(PreviewConfig)
     stems = {path.stem for path in pictures(Path(request.masks))} if request.masks else set()
     stems |= {name for name, *_ in request.points}
     named = [view for name, view in rig.items() if name in stems] or list(rig.values())
     return (
-        [named[i] for i in np.unique(np.linspace(0, len(named) - 1, PREVIEWS).astype(int))] if named else []
+        [named[i] for i in np.unique(np.linspace(0, len(named) - 1, config.previews).astype(int))]
+        if named
+        else []
     )
 
 
 def framed(box: np.ndarray) -> Camera:
     """A view of where the object stands, for want of cameras."""
-    lens = framing_lens(SHOWN, SHOWN)
+    config = current(PreviewConfig)
+    lens = framing_lens(config.shown, config.shown)
     grown = enclosing([box + 0.5 * (box[3:] - box[:3]).max() * np.repeat([-1, 1], 3)])
     return framing(grown, lens).camera(lens)
 
@@ -88,13 +102,15 @@ def pictures_of(shown: dict[str, Shown | None], camera: Camera) -> dict[str, np.
     """(H, W, 3 or 4) uint8 of the object alone, over nothing; of the rest; and of the whole, in which the
     object is red."""
 
+    config = current(PreviewConfig)
+
     def shot(what: str) -> RenderedImage:
         field, origin = shown[what]
         return render_image(field, camera, origin=origin)
 
     whole, by_itself = shot("whole"), shot("object")
     marked, own = whole.over((1, 1, 1)), by_itself.over((1, 1, 1))
-    hidden = (by_itself.depth > whole.depth * BEFORE) & (np.abs(marked - own).mean(-1) > ALIKE)
+    hidden = (by_itself.depth > whole.depth * config.before) & (np.abs(marked - own).mean(-1) > config.alike)
     before = (by_itself.opacity > 0.5) & ~hidden
     marked[before] = 0.5 * marked[before] + 0.5 * MARKED
     found = {"object": to_pixels(by_itself, None), "marked": np.rint(255 * marked).astype(np.uint8)}

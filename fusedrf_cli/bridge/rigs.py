@@ -10,8 +10,6 @@ from fusedrf_cli.bridge.sizes import camera_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import placed_box
 
-MAX_CAMERA_BYTES = 2 << 20  # half of what a scene.json may have
-
 
 def cameras_of_capture(capture: Capture, cut_out: bool, progress) -> dict | None:
     """The cameras of a capture as scene.json has them; None of a mesh, and, with a warning, where they are
@@ -22,8 +20,8 @@ def cameras_of_capture(capture: Capture, cut_out: bool, progress) -> dict | None
     try:
         cameras = capture_rig(capture, capture.frame is not None and not cut_out).content()
         read_rig(cameras)
-        if camera_bytes(cameras) > MAX_CAMERA_BYTES:
-            raise LimitExceeded(f"they take more than {MAX_CAMERA_BYTES:,} bytes")
+        if camera_bytes(cameras) > (most := 2 << 20):  # half of what a scene.json may have
+            raise LimitExceeded(f"they take more than {most:,} bytes")
     except FormatError as error:
         progress.warn(f"{capture.path}: the bundle does not keep its cameras: {error}")
         return None

@@ -34,9 +34,6 @@ class RunningConfig:
     two minutes."""
 
 
-FIRST_USE = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
-
-
 def place_for(device: str) -> str:
     """Where to compute, "cpu" or "cuda", when "auto", "cpu" or "cuda" was asked for; ResourceProblem where
     there is no such place."""
@@ -66,7 +63,8 @@ def engine(device: str, threads: int | None, progress) -> Iterator[str]:
     torch.set_num_threads(count)
     kernels.set_threads(count)
     try:
-        with kernels.telling_of_compilation(lambda: progress.tell(FIRST_USE), progress.warn):
+        said = "first use: compiling kernels, which takes up to two minutes and is kept for later runs"
+        with kernels.telling_of_compilation(lambda: progress.tell(said), progress.warn):
             yield place
     except FloatingPointError as error:
         raise NumericFailure(
@@ -270,10 +268,6 @@ def take_up(run, saved: Saved, output: str) -> None:
         raise checkpoint_mismatch(output) from error
 
 
-MOST = 2**53
-"""Beyond any count of a state."""
-
-
 def check_alike(found: object, own: object, where: str) -> None:
     """Raise ValueError where a saved value is not of the kind that a run's `own` is: a word, a yes or no, a
     count, a number, a list, or an object that has all of its keys. What is not known yet in a run (None) may
@@ -285,7 +279,7 @@ def check_alike(found: object, own: object, where: str) -> None:
     elif isinstance(own, list | str | bool):
         alike = type(found) is type(own)
     elif type(found) is int:
-        alike = -MOST <= found <= MOST and not (isinstance(own, int) and found < 0)
+        alike = abs(found) <= 2**53 and not (isinstance(own, int) and found < 0)
     else:
         alike = type(found) is float and not isinstance(own, int) or own is None and found is None
     if not alike:

@@ -25,16 +25,21 @@ from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest
 
-LONGEST = 512
-"""Pixels along the longer side of a view, in which masks are looked at."""
-AROUND = 2
-"""Cells around an object that was found in a first look."""
-RADIUS = 3
-"""Pixels of LONGEST around a point that say what it does, beside masks."""
-SEEN_SIDE = 96
-"""Pixels a side of the views that tell what of an object was ever seen."""
-WATCHING = 48
-"""Cameras of a capture that tell what was seen, at most."""
+
+@dataclass(frozen=True)
+class SelectingConfig:
+    """How an object is looked at, and how finely."""
+
+    longest: int = 512
+    """Pixels along the longer side of a view, in which masks are looked at."""
+    around: int = 2
+    """Cells around an object that was found in a first look."""
+    radius: int = 3
+    """Pixels of `longest` around a point that say what it does, beside masks."""
+    seen_side: int = 96
+    """Pixels a side of the views that tell what of an object was ever seen."""
+    watching: int = 48
+    """Cameras of a capture that tell what was seen, at most."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +146,7 @@ def masked(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress
 
 
 def looked_at(view: View, path: Path, fused: Whole) -> Look:
-    """A mask and its view, at most LONGEST pixels a side. Raises BadMask where their shapes differ."""
+    """A mask and its view, at most `longest` pixels a side. Raises BadMask where their shapes differ."""
     mask = read_mask(path)
     high, wide = mask.shape
     if abs(wide * view.height - high * view.width) > 0.01 * wide * view.height:
@@ -149,7 +154,7 @@ def looked_at(view: View, path: Path, fused: Whole) -> Look:
             f"{path}: {wide}x{high} pixels, but the view '{view.name}' has {view.width}x{view.height}; paint "
             "masks on pictures of that size"
         )
-    smaller = small(view, LONGEST)
+    smaller = small(view, current(SelectingConfig).longest)
     rows = ((np.arange(smaller.height) + 0.5) * high / smaller.height).astype(int)
     columns = ((np.arange(smaller.width) + 0.5) * wide / smaller.width).astype(int)
     return Look(in_frame(smaller, fused), mask[np.ix_(rows, columns)])
@@ -170,6 +175,7 @@ def in_frame(view: View, fused: Whole) -> Camera:
 
 def pointed_at(point: tuple, request: ExtractRequest, fused: Whole, rig: dict[str, View]) -> Look:
     """The pixels around a point, which say whether they show the object."""
+    config = current(SelectingConfig)
     name, column, row, shows = point
     if name not in rig:
         names = ", ".join(list(rig)[:3])
@@ -182,10 +188,10 @@ def pointed_at(point: tuple, request: ExtractRequest, fused: Whole, rig: dict[st
             f"--points: {column:g},{row:g} lies outside of the view '{name}' of {view.width}x{view.height} "
             "pixels"
         )
-    smaller = small(view, LONGEST)
+    smaller = small(view, config.longest)
     x, y = column * smaller.width / view.width, row * smaller.height / view.height
     away = np.hypot(np.arange(smaller.width) + 0.5 - x, (np.arange(smaller.height) + 0.5 - y)[:, None])
-    near = away <= max(RADIUS, away.min() + 1e-9)
+    near = away <= max(config.radius, away.min() + 1e-9)
     return Look(in_frame(smaller, fused), near & shows, near)
 
 
@@ -205,9 +211,10 @@ def surface_at(field: RadianceField, look: Look, what: str) -> np.ndarray:
 def watching(fused: Whole) -> list[Camera]:
     """Cameras of the capture, in the field's frame, that tell what of it was ever seen; of a field that
     keeps none, none."""
+    config = current(SelectingConfig)
     views = [] if fused.scene.cameras is None else read_rig(fused.scene.cameras).views
-    chosen = np.unique(np.linspace(0, len(views) - 1, WATCHING).astype(int)) if views else []
-    return [in_frame(small(views[i], SEEN_SIDE), fused) for i in chosen]
+    chosen = np.unique(np.linspace(0, len(views) - 1, config.watching).astype(int)) if views else []
+    return [in_frame(small(views[i], config.seen_side), fused) for i in chosen]
 
 
 # -- choosing ------------------------------------------------------------------------------------------------
@@ -221,7 +228,7 @@ def selected(field: RadianceField, told: Told) -> Selection:
     if not found.shows:
         return found
     held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
-    fine = choice(Lattice.over(field, held.tight_aabb(AROUND), config.fine), told)
+    fine = choice(Lattice.over(field, held.tight_aabb(current(SelectingConfig).around), config.fine), told)
     return fine.without_foreign() if told.masks or told.touches else fine
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from formats.quantised import BLOCKS, code_bytes, is_coded
 from formats.records import BITS, BYTES_PER_NUMBER, FieldRecord, coded_bytes, encode_field
-from formats.scene import SceneGraph, dump_scene, make_node
+from formats.scene import SceneGraph, dump_scene
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.kinds.student import Contents, Section
 from fusedrf_cli.engine.settings import current
@@ -71,13 +71,9 @@ def kept_texels(used: np.ndarray) -> int:
     return int(sides[0] @ held @ sides[1])
 
 
-def graph_bytes(nodes: list[dict], cameras: dict | None = None, extras: dict | None = None) -> int:
-    """At most so many bytes for all of a fused bundle but its field; nodes are those of its history, extras
-    the scene's keys that this version does not know."""
-    node = make_node("fused", field=f"fields/{'0' * 16}.safetensors", translation=(math.pi,) * 3)
-    framing = (-math.pi,) * 3 + (math.pi,) * 3
-    history = ({"nodes": nodes},)
-    scene = SceneGraph((node,), history=history, framing=framing, cameras=cameras, extras=extras or {})
+def graph_bytes(scene: SceneGraph) -> int:
+    """At most so many bytes for all of a bundle but its fields, whose nodes and history are those of a
+    scene."""
     return current(HeaderConfig).besides + len(dump_scene(scene))
 
 

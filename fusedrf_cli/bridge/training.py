@@ -11,6 +11,7 @@ from formats.atomic import check_space
 from formats.captures import hold_out, is_mesh, load_photos
 from formats.meshes import mesh_capture
 from formats.photos import loading_bytes
+from formats.scene import SceneGraph
 from formats.views import Capture, check_parallax
 from fusedrf_cli.bridge.depths import known_points
 from fusedrf_cli.bridge.extent import Extent, check_flatness, extent_of
@@ -40,7 +41,7 @@ from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import LEAST_TEXELS, Plan, Section, Way
+from fusedrf_cli.engine.kinds.student import Plan, Section, StudentConfig, Way
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import REACH
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
@@ -120,7 +121,7 @@ def train(request: TrainRequest, progress) -> dict:
         suits = current(Presets).unbounded_precision if extent.unbounded else "float16"
         request = replace(request, precision=request.precision or suits)
         kept = cameras_of_capture(capture, cut_out, progress)
-        check_graph(request.output, Path(request.output).stem, extent.origin, None, kept)
+        check_graph(request.output, Path(request.output).stem, extent.origin, SceneGraph((), cameras=kept))
         settings = fit_settings(request, kind, capture, extent, place, camera_bytes(kept))
         plan = kind.untrained(extent.box, settings.longest, settings.way)
         check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
@@ -152,7 +153,7 @@ def train(request: TrainRequest, progress) -> dict:
                     precision=request.precision,
                     overwrite=request.overwrite,
                     origin=extent.origin,
-                    cameras=kept,
+                    about=SceneGraph((), cameras=kept),
                 ),
             )
             checkpoint_path(request.output).unlink(missing_ok=True)
@@ -393,7 +394,7 @@ def fitting_longest(
     longest = settings.longest
     while (
         max_size
-        and longest > LEAST_TEXELS
+        and longest > current(StudentConfig).least_texels
         and bytes_of(kind.untrained(box, longest, settings.way), precision) > max_size
     ):
         longest -= current(Presets).fewer_texels

@@ -19,7 +19,7 @@ def command(**words):
     """Put a copy of an object of a bundle beside it.
 
     The copy, NEW, is placed from where NAME stands as `fusedrf move` does, and shares its field: a copy
-    costs a few hundred bytes. The object has to be a node of its own, as in bundles of --kind blocks.
+    costs a few hundred bytes. Of one that was distilled into a field with others the source is placed.
 
     \b
     Example:

@@ -26,7 +26,7 @@ from fusedrf_cli.option_types import BoxType, InputType, PointType, SphereType
 )
 @click.option("--sphere", "spheres", multiple=True, type=SphereType(), help="It lies in this sphere.")
 @click.option("--mesh", type=InputType(), help="It lies in this closed mesh.")
-@click.option("--name", help="The part of a fused field that goes by this name.")
+@click.option("--name", help="The node, group or distilled object that goes by this name.")
 @click.option("--invert", is_flag=True, help="Write the field without the object.")
 @click.option(
     "--preview",

@@ -5,7 +5,6 @@ import click
 from fusedrf_cli import options, verbs
 from fusedrf_cli.option_types import InputType
 
-MOST_ROWS = 8
 """Of a table about a capture, for people."""
 
 
@@ -42,8 +41,8 @@ def _brief_overview(facts: dict) -> dict:
     """What is to be told of a capture or mesh: what there is none of is left out, and tables are cut."""
     brief = {key: part for key, part in facts.items() if part and (key, part) != ("made_smaller", 1)}
     for key, noun in (("left_out", "photo"), ("sizes", "size"), ("lenses", "lens")):
-        if (more := len(facts.get(key, [])) - MOST_ROWS) > 0:
-            brief[key] = [*facts[key][:MOST_ROWS], {noun: f"{more} more"}]
+        if (more := len(facts.get(key, [])) - 8) > 0:
+            brief[key] = [*facts[key][:8], {noun: f"{more} more"}]
     return brief
 
 

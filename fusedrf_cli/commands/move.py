@@ -18,8 +18,9 @@ def command(**words):
     """Move, turn or scale an object of a bundle.
 
     From where it stands: it is scaled and turned about the middle of its box, then moved by -t; or --matrix
-    is applied to it in the world. All fields keep their numbers, so that nothing is lost however often. The
-    object has to be a node of its own, as in bundles of --kind blocks.
+    is applied to it in the world. All fields keep their numbers, so that nothing is lost however often. Of
+    one that was distilled into a field with others the source is taken, and the region in that field is
+    emptied as `fusedrf delete` does it.
 
     \b
     Example:

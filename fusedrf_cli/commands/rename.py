@@ -17,7 +17,7 @@ from fusedrf_cli.option_types import InputType
 def command(**words):
     """Give an object of a bundle another name.
 
-    The object has to be a node of its own, as in bundles of --kind blocks.
+    One that was distilled into a field with others goes by the new name as well.
 
     \b
     Example:

@@ -5,6 +5,7 @@ are fields of such a dataclass; a verb's `settings`, or `using`, puts others in 
 """
 
 import contextlib
+import functools
 from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from types import MappingProxyType
@@ -17,7 +18,12 @@ _in_force: ContextVar[Mapping[type, Any]] = ContextVar("settings", default=Mappi
 
 def current(kind: type[Settings]) -> Settings:
     """The settings of a dataclass that are in force: its defaults where nothing else was said."""
-    return _in_force.get().get(kind) or kind()
+    return _in_force.get().get(kind) or _defaults(kind)
+
+
+@functools.cache
+def _defaults(kind: type[Settings]) -> Settings:
+    return kind()
 
 
 @contextlib.contextmanager

@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, VMMLPField, VMMLPShape, weight_shapes
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
 
@@ -55,16 +55,16 @@ def vm_field(
     dtype: torch.dtype = torch.float32,
     cells: int = CELLS,
 ) -> VMField:
-    """A one-block VM field over the box of the field's matter.
+    """A VM field over the box of the field's matter.
 
     Exact at the texels, and between them wherever the functions of `activation` and the tint are linear; hard
-    faces are those of the tensor's box.
+    faces are those of its box.
     """
     tint = field.tint or Tint()
     shape = shape or (BANDED if tint.bands.shape[1] else SHAPE)
     vm = bare_field(field, resolution, shape, dtype, cells)
     write_colour_products(vm, texels(vm))
-    basis = vm.sections(0)["colour_basis"]
+    basis = vm.basis
     level = np.concatenate(
         [
             np.asarray(tint.level)[:, None] / Y0,
@@ -91,7 +91,7 @@ def vm_mlp_field(
     vm = bare_field(field, resolution, shape, torch.float32, cells)
     write_colour_products(vm, texels(vm))
     features = 3 * shape.coefficients
-    vm.sections(0)["colour_basis"].view(features, -1)[:4, :4] = torch.eye(4)
+    vm.basis.view(features, -1)[:4, :4] = torch.eye(4)
     weights = {name: torch.zeros(size) for name, size in weight_shapes(features, 8).items()}
     first = np.concatenate([np.asarray(tint.level)[:, None], tint.slope], 1)
     into = weights["0.weight"]
@@ -103,19 +103,15 @@ def vm_mlp_field(
 
 
 def with_network(vm: VMField, weights: dict[str, torch.Tensor]) -> VMMLPField:
-    """A vm-mlp field of the factors and the basis of a vm field of one tensor, and of a network."""
-    (tensor,), shape = vm.tensors, VMMLPShape(
-        vm.shape.density_rank, vm.shape.colour_rank, vm.shape.sh_degree, len(weights["0.bias"])
-    )
-    occupancy = OccupancyGrid(tensor.occupancy.aabb, tensor.occupancy.occupied, tensor.space)
-    field = VMMLPField(
-        shape, tensor.aabb, tensor.resolution, tensor.scale, tensor.shift, occupancy=occupancy
-    )
+    """A vm-mlp field of the factors and the basis of a vm field, and of a network."""
+    ranks = vm.shape.density_rank, vm.shape.colour_rank
+    shape = VMMLPShape(*ranks, vm.shape.sh_degree, len(weights["0.bias"]))
+    field = VMMLPField(shape, vm.box, vm.resolution, vm.scale, vm.shift, occupancy=vm.occupancy)
     field.params = field.params.to(vm.params.dtype)
-    for name, view in vm.sections(0).items():
+    for name, view in vm.sections().items():
         if name != "colour_basis":
-            field.sections()[f"tensor_0.{name}"].copy_(view)
-    field.basis.copy_(vm.sections(0)["colour_basis"].flatten(0, 1))
+            field.sections()[name].copy_(view)
+    field.basis.copy_(vm.basis.flatten(0, 1))
     for name, view in field.weights.items():
         view.copy_(weights[name])
     return field
@@ -155,15 +151,10 @@ def bare_field(
         raise NotExportable(f"the density of {type(field).__name__} is no sum of products of axes")
     box = field.matter
     grid = OccupancyGrid(box, np.ones((cells,) * 3, bool))
-    vm = VMField(
-        shape,
-        (VMTensor(tuple(resolution), box, told.scale, SHIFT, grid.occupied),),
-        (Block(0, np.eye(4), ""),),
-        torch.zeros(shape.size(resolution), dtype=dtype),
-        grid,
-    )
+    params = torch.zeros(VMField.size_of(shape, resolution), dtype=dtype)
+    vm = VMField(shape, box, resolution, told.scale, SHIFT, params, grid)
     x, y, z = texels(vm)
-    sections = vm.sections(0)
+    sections = vm.sections()
     for i, (a, b, c) in enumerate(told.terms):
         sections["density_plane_0"][..., i] = torch.from_numpy(np.outer(a(x), b(y))).to(dtype)
         sections["density_line_0"][:, i] = torch.from_numpy(c(z)).to(dtype)
@@ -172,14 +163,13 @@ def bare_field(
 
 def texels(field: VMField) -> list[np.ndarray]:
     """Coordinates of the texels on each axis."""
-    (tensor,) = field.tensors
-    return [np.linspace(tensor.aabb[a], tensor.aabb[a + 3], tensor.resolution[a]) for a in range(3)]
+    return [np.linspace(field.box[a], field.box[a + 3], field.resolution[a]) for a in range(3)]
 
 
 def write_colour_products(field: VMField, axes: list[np.ndarray]) -> None:
     """Make the first four colour products 1, x, y and z."""
     x, y, z = axes
-    plane, line = field.sections(0)["colour_plane_0"], field.sections(0)["colour_line_0"]
+    plane, line = field.sections()["colour_plane_0"], field.sections()["colour_line_0"]
     for i, values in enumerate((np.outer(x**0, y**0), np.outer(x, y**0), np.outer(x**0, y))):
         plane[..., i] = torch.from_numpy(values).to(plane.dtype)
         line[:, i] = 1

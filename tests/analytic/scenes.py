@@ -11,7 +11,7 @@ import numpy as np
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, FramingConfig, look_at
 from tests.analytic.export import exported, vm_field
@@ -50,10 +50,11 @@ class Scene:
         """The engine's naive composition of the parts in a field kind."""
         return ComposedField(self.placed(kind, **options), rule)
 
-    def blocks(self, **options) -> tuple[VMField, np.ndarray]:
-        """The parts as one vm field of blocks, and the world position (3,) of its frame's origin."""
-        composed = self.composed("vm", **options)
-        return blocks_of(composed.placed), composed.origin
+    def composite(self, **options) -> tuple[ComposedField, np.ndarray]:
+        """The composition of the parts as vm fields that compiled loops answer, and the world position (3,)
+        of its frame's origin."""
+        composed = as_composite(self.composed("vm", **options))
+        return composed, composed.origin
 
     def under(self, matrix: np.ndarray) -> "Scene":
         """The whole scene placed once more by a (4, 4) affine."""
@@ -248,7 +249,7 @@ def s9_hostile(value: float) -> VMField:
     """A vm cube with one number in the middle of its density line replaced; which answers are allowed is a
     rule, not an integral."""
     field = vm_field(Box(5.0, 0.5, tint=RED))
-    field.sections(0)["density_line_0"][NODE, 0] = value
+    field.sections()["density_line_0"][NODE, 0] = value
     return field
 
 

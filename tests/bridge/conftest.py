@@ -30,8 +30,8 @@ from fusedrf_cli.engine.kinds import instances
 from fusedrf_cli.engine.kinds.asked import AskedStudent
 from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
 from fusedrf_cli.engine.kinds.student import DistilConfig, Student
-from fusedrf_cli.engine.kinds.vm import students
 from fusedrf_cli.engine.kinds.vm.field import VMField
+from fusedrf_cli.engine.kinds.vm.students import VMConfig
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.settings import using
@@ -106,7 +106,8 @@ TINY = (
     OccupancyConfig(scene_cells=48),
     LookConfig(whole=2, most_objects=0),
     MakingConfig(views=2),
-    MendingConfig(settings=TinySettings(), numbers=SHAPE.size((20, 20, 20))),
+    VMConfig(SHAPE),
+    MendingConfig(settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),
     Presets(DRAFT, DRAFT, DRAFT, DRAFT),
 )
 """Coarse grids, few steps, and few pictures to judge by."""
@@ -118,7 +119,6 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(part("making"), "DistilConfig", TinySettings)  # for students that are not taught
     for made in (SparseStudent, AskedStudent):
         patch.setattr(made, "lesson", replace(made.lesson, points_per_step=1 << 13, views=2, view_size=32))
-    patch.setattr(students, "SHAPE", SHAPE)
     patch.setattr(instances.InstancesStudent, "ranks", (None,))  # others would be compiled
     patch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
 

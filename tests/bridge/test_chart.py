@@ -16,8 +16,10 @@ import pytest
 from fusedrf_cli import plots
 from fusedrf_cli.bridge.ladders import flags_of, in_words
 from fusedrf_cli.commands.fuse import command as fuse_command
-from fusedrf_cli.engine.kinds import instances, registry
+from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.instances import InstancesConfig
 from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor, shrinking
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
 from fusedrf_cli.option_types import BytesType
 from fusedrf_cli.progress import NullProgress
@@ -33,10 +35,9 @@ def charted(shop, tmp_path_factory):
     """(folder, the report of a chart of blocks there, the bundles that were made for it)."""
     folder = shutil.copytree(shop, tmp_path_factory.mktemp("charted") / "shop")
     module, made = part("charting"), []
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("LADDER_PRECISIONS", "LADDER_FINISHED"):
-            patch.setattr(instances, name, ("float16",))
-        patch.setattr(instances, "LADDER_RANKS", (None,))
+    one = ("float16",)
+    ladder = InstancesConfig(ladder_precisions=one, ladder_finished=one, ladder_ranks=(None,))
+    with pytest.MonkeyPatch.context() as patch, using(ladder):
 
         def noted(*words):
             report = fuse(*words)

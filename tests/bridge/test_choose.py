@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from fusedrf_cli.bridge.choose import CLOSE, Choosing, Tried, flags
+from fusedrf_cli.bridge.choose import Choosing, SearchConfig, Tried, flags
 from fusedrf_cli.engine.kinds.student import Way
 
 INT4 = [Way("int4", (8, 16)), Way("int4", (8, 24)), Way("int4")]
@@ -39,7 +39,7 @@ def test_the_smallest_is_found_to_within_the_tolerance(target):
     chosen = search(law).smallest_reaching([INT4], target, 25_000_000, gain=3)
     exact = 1e6 * math.exp((target - 40.0) / 9)
     assert chosen.way == INT4[1] and chosen.psnr >= target
-    assert exact <= chosen.bytes <= 1.06 * CLOSE * exact
+    assert exact <= chosen.bytes <= 1.06 * SearchConfig.close * exact
     assert len([a for a in law.asked if a[2]]) <= 12
 
 

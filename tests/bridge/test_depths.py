@@ -7,7 +7,7 @@ import pytest
 
 from formats.points import Points
 from formats.views import Capture, View
-from fusedrf_cli.bridge.depths import PIXELS_OFF, certain, known_points
+from fusedrf_cli.bridge.depths import certain, known_points
 from fusedrf_cli.bridge.extent import Extent
 from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
 from tests.formats.test_captures import looking_at
@@ -24,12 +24,12 @@ def views(eyes: np.ndarray, seen=None) -> tuple[View, ...]:
 
 def off(eyes: np.ndarray, point: np.ndarray, rng) -> float:
     """By how much of its mean distance from the eyes, on average, a point is misplaced along a line of sight
-    where it is put nearest to all lines of sight (least squares), each off by PIXELS_OFF."""
+    where it is put nearest to all lines of sight (least squares), each off by half a pixel."""
     errors = []
     for _ in range(400):
         lines = point - eyes
         away = np.linalg.norm(lines, axis=1, keepdims=True)
-        lines = lines / away + rng.normal(size=lines.shape) * PIXELS_OFF / FOCAL
+        lines = lines / away + rng.normal(size=lines.shape) * 0.5 / FOCAL
         lines /= np.linalg.norm(lines, axis=1, keepdims=True)
         across = np.eye(3) - lines[:, :, None] * lines[:, None]
         found = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, eyes))

@@ -20,12 +20,11 @@ from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.sparse import KIND as SPARSE
 from fusedrf_cli.engine.kinds.student import (
-    NUMBERS_PER_SECOND,
-    TOLD_NUMBERS,
     DistilConfig,
     Made,
     MadeStudent,
     Student,
+    StudentConfig,
     StudentRequest,
     Way,
 )
@@ -204,12 +203,17 @@ def test_where_the_time_is_over_a_student_stays_as_it_was_made(monkeypatch):
 
 def test_a_student_of_more_numbers_is_told_more_up_to_twice_as_much():
     student = Student(VM, SCENE, StudentRequest(BundleSizes(), 10_000_000))
-    wanted = {1: 1, TOLD_NUMBERS: 1, TOLD_NUMBERS * 3 // 2: 1.5, TOLD_NUMBERS * 9: 2}
+    wanted = {
+        1: 1,
+        StudentConfig.told_numbers: 1,
+        StudentConfig.told_numbers * 3 // 2: 1.5,
+        StudentConfig.told_numbers * 9: 2,
+    }
     for numbers, times in wanted.items():
         found = student.lesson_of(numbers)
         assert (found.rays, found.steps) == (times * student.lesson.rays, times * student.lesson.steps)
         assert found.rgb_steps == student.lesson.rgb_steps
-    assert Restless(None).lesson_of(TOLD_NUMBERS * 9) is None
+    assert Restless(None).lesson_of(StudentConfig.told_numbers * 9) is None
 
 
 def test_bricks_learn_from_more_rays_the_more_numbers_they_hold():
@@ -233,5 +237,5 @@ def test_a_short_time_teaches_fewer_numbers_unless_a_quality_is_asked_for():
     def most(**words) -> int:
         return Student(VM, SCENE, StudentRequest(BundleSizes(), 10_000_000, **words)).largest().allowed
 
-    assert most(seconds=0.1) == int(0.1 * NUMBERS_PER_SECOND) + 1 < most()
+    assert most(seconds=0.1) == int(0.1 * StudentConfig.numbers_per_second) + 1 < most()
     assert most(seconds=1e6) == most() and most(seconds=0.1, target=40.0) == most(target=40.0)

@@ -29,7 +29,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.vm.field import VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm_mlp.field import untrained
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.errors import ResourceProblem
@@ -174,10 +174,10 @@ def boxed(path: Path, name: str, texels: int, full: bool, precision: str, cells:
 def placed(path: Path, name: str, texels: int, full: bool, precision: str, cells=1, blocks=1) -> Path:
     """A pack of one tensor, in one block or several."""
     shape = VMShape()
-    tensor = VMTensor((texels,) * 3, np.array(BOX), 1.0, occupied=np.full((cells,) * 3, full))
+    parts = VMField.parts_of(shape, (texels,) * 3)
     make = np.random.default_rng(0).standard_normal if full else np.zeros
-    arrays = {f"tensor_0.{n}": 0.1 * make(s).astype(np.float32) for n, s in tensor.sections(shape)}
-    arrays["tensor_0.occupancy"] = np.packbits(tensor.occupied)
+    arrays = {f"tensor_0.{part.name}": 0.1 * make(part.shape).astype(np.float32) for part in parts}
+    arrays["tensor_0.occupancy"] = np.packbits(np.full((cells,) * 3, full))
     if name == "vm-mlp":
         weights = untrained(3 * shape.coefficients, 64, torch.Generator().manual_seed(0))
         arrays |= {f"network.{key}": weight.numpy() for key, weight in weights.items()}
@@ -185,8 +185,9 @@ def placed(path: Path, name: str, texels: int, full: bool, precision: str, cells
     for i, move in enumerate(moves):
         move[0, 3] = 0.6 * i
     told = {"resolution": [texels] * 3, "aabb": BOX, "scale": 1.0, "shift": -8.0, "occupancy": [cells] * 3}
+    ranks = {"density_rank": shape.density_rank, "colour_rank": shape.colour_rank, "sh_degree": 2}
     named = [{"tensor": 0, "object_to_field": m.tolist(), "name": f"b{i}"} for i, m in enumerate(moves)]
-    metadata = {"aabb": BOX, "shape": asdict(shape), "tensors": [told], "blocks": named}
+    metadata = {"aabb": BOX, "shape": ranks, "tensors": [told], "blocks": named}
     single_field_bundle(FieldRecord(name, arrays, metadata), name, precision=precision).write(path)
     return path
 

@@ -9,8 +9,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from formats.bundle import read_bundle
 from formats.images import read_image, write_png
 from formats.scene import SceneGraph, make_node, write_scene
+from fusedrf_cli.bridge.background import Background, kept_background, turn_of
 from fusedrf_cli.bridge.fusing import place_bytes, source_bytes
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.sizes import BundleSizes
@@ -19,13 +21,11 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import Student, StudentRequest
-from fusedrf_cli.engine.kinds.vm.blocks import reshaped
+from fusedrf_cli.engine.kinds.student import StudentRequest
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.places import PlaceStudent, turn_of
-from fusedrf_cli.engine.kinds.vm.students import place_of
+from fusedrf_cli.engine.kinds.vm.trimming import reshaped
 from fusedrf_cli.engine.rendering.metrics import psnr
-from fusedrf_cli.engine.spaces import bounded, unbounded
+from fusedrf_cli.engine.spaces import unbounded
 from fusedrf_cli.engine.spaces.unbounded import WHOLE
 from fusedrf_cli.python import open_scene
 from tests.analytic.export import SHAPE, vm_field, way_of
@@ -43,13 +43,12 @@ def walls(seed: int = 0) -> VMField:
     kind, generator = registry.kind("vm"), torch.Generator().manual_seed(seed)
     way = replace(way_of(SHAPE), hashed=Hashed((1.0, 0.5), 256))
     field = kind.create(kind.plan_at(WHOLE, (17,) * 3, way), generator)
-    field.sections(0)["detail"].normal_(0, 0.1, generator=generator)
+    field.sections()["density_detail"].normal_(0, 0.1, generator=generator)
     middles = OccupancyGrid.full(WHOLE, 32, unbounded)
     there = (abs(middles.centres()).max(1) > 1.9).reshape(middles.occupied.shape)
     field = field.with_occupancy(middles.marked(there))
-    tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
-    numbers = field.params * torch.tensor(2.0)
-    return VMField(field.shape, (tensor,), field.blocks, numbers, field.occupancy)
+    field.shift = float(np.log(np.expm1(20 / field.scale)))
+    return field.with_params(field.params * torch.tensor(2.0))
 
 
 def fine_walls() -> VMField:
@@ -102,7 +101,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
 
     def taken(room: Placed, scene: ComposedField, numbers: int = 10**7):
         plan = kind.plan(scene.aabb, scene.voxel_size, way, numbers)
-        return place_of(room, plan, scene)
+        return kind.place_of(room, plan, scene)
 
     student = taken(scene.placed[0], scene)
     assert student.shape == SHAPE and torch.equal(student.params, room.params)
@@ -123,7 +122,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
     assert taken(part, ComposedField([part, replace(small, object_to_world=np.eye(4))])) is None
 
 
-def test_the_tensor_of_what_stands_in_a_place_is_turned_as_most_of_that_is():
+def test_what_stands_in_a_place_is_learnt_turned_as_most_of_it_is():
     """Mirrored and scaled as they may be; and it is put back where all stands."""
     turn = Rotation.from_euler("xyz", [0.5, -0.2, 0.3]).as_matrix()
     room, thing = walls(), random_vm(dtype=torch.float32, cells=4)
@@ -139,18 +138,14 @@ def test_the_tensor_of_what_stands_in_a_place_is_turned_as_most_of_that_is():
     assert np.array_equal(turn_of([askew[2]]), np.eye(4))
     even = [askew[0], askew[2]]
     assert np.array_equal(turn_of(even), turn_of(even[::-1]))
-    request = StudentRequest(BundleSizes(), 25_000_000)
     scene = ComposedField([Placed("room", room, np.eye(4)), *askew])
-    student = registry.kind("vm").student(scene, request)
-    box = student.scene.occupancy.aabb
-    plan = student.plan(student.ways()[0][0], 50_000)
-    field, _ = student.begun(plan, None, None, torch.Generator().manual_seed(0))
-    whole = student.whole(field)
-    lies = whole.blocks[0].object_to_field
+    beside = kept_background(registry.kind("vm"), scene, StudentRequest(BundleSizes(), 25_000_000))
+    background, learnt = beside.with_learnt(thing).placed
+    assert background.field is beside.placed.field and np.array_equal(background.object_to_world, np.eye(4))
+    lies = learnt.object_to_world
     assert np.abs(lies[:3, :3] - turn).max() < 1e-9
-    assert np.array_equal(whole.blocks[1].object_to_field, np.eye(4))
     middles = np.array([p.object_to_world @ [0.05, -0.1, 0.2, 1.0] for p in askew])  # of their boxes
-    own = middles @ np.linalg.inv(lies).T
+    own, box = middles @ np.linalg.inv(lies).T, beside.objects.aabb
     assert ((own[:, :3] > box[:3]) & (own[:, :3] < box[3:])).all()
 
 
@@ -174,7 +169,11 @@ def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, repor
     write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
     words = ("fuse", "two.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
     said = report(*words)
-    assert said["chosen"]["start"] == "'room' as it is" and len(said["chosen"]["resolution"]) == 2
+    assert said["chosen"]["start"] == "'room' as it is" and said["nodes"] == 2
+    (entry,) = read_bundle(folder / "one.rfpack").scene.history
+    assert entry["objects"] == ["room"] and [n["name"] for n in entry["nodes"]] == ["red", "blue"]
+    own = read_bundle(folder / "room.rfpack").fields.keys()
+    assert own < read_bundle(folder / "one.rfpack").fields.keys()  # the room's very bytes
     assert said["bytes"] <= 25_000_000 and said["psnr"]["stored"] > 30
     assert [d["name"] for d in said["objects"]] == ["room", "red", "blue"]
     assert said["objects"][0]["held_voxel"] == said["objects"][0]["own_voxel"]
@@ -186,36 +185,27 @@ def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, repor
     assert psnr(picture("none.rfpack"), picture("room.rfpack")) > 35
 
 
-@pytest.mark.slow
-def test_a_place_takes_the_dearest_precision_that_leaves_room():
-    """And is held beside the objects' tensor in no more bytes than were planned; where it leaves none, one
-    tensor over all of space stands for the scene."""
-    room, thing = reshaped(fine_walls(), VMShape(16, 16, 1)), random_vm(dtype=torch.float32, cells=4)
+def test_a_background_stays_where_it_leaves_room():
+    """With its own bytes, else in the dearest precision that does; beside a learnt field of any kind."""
+    room, thing = fine_walls(), random_vm(dtype=torch.float32, cells=4)
     small = Placed("thing", thing, LIES @ np.diag([0.3, 0.3, 0.3, 1]))
     scene, kind = ComposedField([Placed("room", room, LIES), small]), registry.kind("vm")
-    sizes = BundleSizes()
-    whole = {p: sizes.exactly(room, p) for p in ("float16", "int8", "int4")}
-    taken = []
-    for limit in (2 * whole["float16"], whole["float16"], 1.5 * whole["int4"]):
-        student = kind.student(scene, StudentRequest(sizes, int(limit), ranks=(16, 16), sh_degree=1))
-        (((way,),), (plan,)) = student.ways(), student.plans()
-        taken.append(way.precision)
-        learnt, start = student.begun(plan, None, None, torch.Generator().manual_seed(0))
-        field = student.whole(learnt)
-        assert start == "'room' as it is" and learnt.space is bounded and field.space is unbounded
-        assert student.bytes_of(field, way) <= student.bytes_of_plan(plan, way) <= limit
-        at = unit(np.random.default_rng(0).normal(size=(2000, 3)))
-        points, dirs = torch.from_numpy(at * np.array([720, 12, 12])), torch.from_numpy(at)
-        for found, wanted in zip(field.query(points, dirs), room.query(points, dirs), strict=True):
-            assert wanted.any()
-            torch.testing.assert_close(found, wanted, rtol=1e-6, atol=0)  # compiled for other sizes
-    assert taken == ["float16", "int8", "int4"]
-    for more in ({"limit": whole["int4"]}, {"from_scratch": True}, {"ranks": (8, 8)}, {"sh_degree": 0}):
-        request = StudentRequest(**({"sizes": sizes, "limit": 10**7} | more))
-        assert type(kind.student(scene, request)) is Student
-    assert type(kind.student(scene, StudentRequest(sizes, 10**7, sh_degree=2))) is PlaceStudent
-    summed = ComposedField(scene.placed, "add")
-    assert type(kind.student(summed, StudentRequest(sizes, 10**7))) is Student
+    trimmed, sizes = kind.trimmed(room), BundleSizes()
+    bytes_of = {p: sizes.exactly(trimmed, p) for p in ("float16", "int8", "int4")}
+
+    def kept(limit: float, kind=kind, scene=scene, **words) -> Background | None:
+        return kept_background(kind, scene, StudentRequest(**{"sizes": sizes, "limit": int(limit)} | words))
+
+    own = {"stored_bytes": {id(room): 7000}}
+    assert (kept(1e4 + 1, **own).precision, kept(1e4 + 1, **own).bytes) == (None, 7000)
+    assert kept(1e4 + 1, **own).placed.field is room
+    for precision, size in bytes_of.items():
+        assert kept(1.5 * size, stored_bytes={id(room): 10**9}).precision == precision
+    assert kept(1.5 * bytes_of["int4"], precision="float16") is None and kept(bytes_of["int4"]) is None
+    assert kept(10**9, from_scratch=True) is None and kept(10**9, scene=ComposedField([small])) is None
+    assert kept(10**9, scene=ComposedField(scene.placed, "add")) is None
+    for name in ("cp", "dense", "vm-mlp", "sparse", "blocks"):
+        assert (kept(10**9, kind=registry.kind(name)) is None) == (name in ("sparse", "blocks"))
 
 
 def test_bricks_of_a_place_hold_its_colours_from_all_sides():
@@ -380,13 +370,13 @@ def furnished() -> VMField:
     kind, generator = registry.kind("vm"), torch.Generator().manual_seed(3)
     way = replace(way_of(SHAPE), hashed=Hashed((1 / 16, 1 / 32), 1 << 15))
     field = kind.create(kind.plan_at(WHOLE, (49,) * 3, way), generator)
-    field.sections(0)["detail"].normal_(0, 0.5, generator=generator)
+    field.sections()["density_detail"].normal_(0, 0.5, generator=generator)
     grid = OccupancyGrid.full(WHOLE, 64, unbounded)
     at = grid.centres()
     there = (abs(at).max(1) > 1.9) | (np.linalg.norm(at - [0.3, 0, 0], axis=1) < 0.25)
     field = field.with_occupancy(grid.marked(there.reshape(grid.occupied.shape)))
-    tensor = replace(field.tensors[0], shift=float(np.log(np.expm1(20 / field.tensors[0].scale))))
-    return VMField(field.shape, (tensor,), field.blocks, 4 * field.params, field.occupancy)
+    field.shift = float(np.log(np.expm1(20 / field.scale)))
+    return field.with_params(4 * field.params)
 
 
 @pytest.fixture
@@ -402,7 +392,7 @@ def test_an_object_out_of_a_place_has_the_numbers_that_it_asks_alone(folder, rep
     """Those of the place to the bit, in a fraction of its bytes."""
     (room, _), (ball, _) = (load_scene(str(folder / n)).lone() for n in ("room.rfpack", "ball.rfpack"))
     assert cut["precision"] == "int8" and cut["bytes"] < 0.2 * (folder / "room.rfpack").stat().st_size
-    rows, own = (field.sections(0)["detail"] for field in (room, ball))
+    rows, own = (field.sections()["density_detail"] for field in (room, ball))
     asked = (own != 0).any(1)
     assert torch.equal(own[asked], rows[asked]) and 0.02 < asked.float().mean() < 0.5
     rng, grid = np.random.default_rng(0), ball.occupancy
@@ -435,7 +425,8 @@ def test_it_stays_small_where_it_is_put(folder, report, cut):
     assert (folder / "left_balls.rfpack").stat().st_size <= three
     said = report("extract", "three_balls.rfpack", "--name", "b", "-o", "b.rfpack")
     (ball, _), (b, _) = (load_scene(str(folder / n)).lone() for n in ("ball.rfpack", "b.rfpack"))
-    assert said["precision"] == "int8" and torch.equal(b.sections(0)["detail"], ball.sections(0)["detail"])
+    rows, own = (field.sections()["density_detail"] for field in (b, ball))
+    assert said["precision"] == "int8" and torch.equal(rows, own)
 
 
 def test_its_size_can_be_limited(folder, report, cut):

@@ -62,7 +62,7 @@ def keep(folder, name: str, rig: Rig | None, field: str = "red", **more) -> None
     cameras = rig and rig.content()
     write_field(
         str(folder / name), FIELDS[field], name.split(".")[0], precision="float32", overwrite=True,
-        cameras=cameras, **more,
+        about=SceneGraph((), cameras=cameras), **more,
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ CAUGHT = """
 import signal, sys, time, types
 from formats.atomic import atomic_writer
 from fusedrf_cli import signals
-signals.PATIENCE, signals.ECHO = {patience}, {echo}
+from fusedrf_cli.engine.settings import using
 def train(request, progress):
     with atomic_writer(request.output) as file:
         file.write(b"half")
@@ -24,7 +24,8 @@ def caught(seconds):
 import fusedrf_cli
 fusedrf_cli.bridge = sys.modules["fusedrf_cli.bridge"] = types.SimpleNamespace(train=train)
 from fusedrf_cli.main import main
-main()
+with using(signals.SignalConfig({patience}, {echo})):
+    main()
 """
 WORDS = ("train", "chair.rfpack", "-o", "out.rfpack")
 

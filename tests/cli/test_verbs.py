@@ -12,6 +12,8 @@ from formats.errors import OutputExists, ResourceError
 from formats.locks import output_lock
 from formats.scene import read_scene
 from fusedrf_cli import verbs
+from fusedrf_cli.engine.rendering.volume import RenderConfig
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.main import COMMANDS, cli
 
@@ -23,8 +25,17 @@ PLACED = {"translate", "rotate", "scale", "matrix", "name", "crop", "opacity", "
 
 
 def asked(name: str) -> dict[str, inspect.Parameter]:
-    """The parameters of a verb but for `progress`."""
-    return {k: p for k, p in inspect.signature(getattr(verbs, name)).parameters.items() if k != "progress"}
+    """The parameters of a verb but for `progress` and `settings`."""
+    words = inspect.signature(getattr(verbs, name)).parameters.items()
+    return {k: p for k, p in words if k not in ("progress", "settings")}
+
+
+def test_settings_are_in_force_while_a_verb_works(bridge, folder, monkeypatch):
+    found = []
+    monkeypatch.setattr(bridge, "render", lambda request, progress: found.append(current(RenderConfig)))
+    verbs.render("chair.rfpack", "a.png", settings=[RenderConfig(early_stop=0.5)])
+    verbs.render("chair.rfpack", "a.png")
+    assert found == [RenderConfig(early_stop=0.5), RenderConfig()]
 
 
 def test_every_command_has_a_verb():

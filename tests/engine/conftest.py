@@ -1,13 +1,15 @@
 """What every test of the engine reaches for: the analytic fields and rays of tests/analytic, and small random
 VM fields."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from tests.analytic.export import SHAPE as THIRTY_TWO  # float32's: few shapes, since each is compiled
 from tests.analytic.fields import BOX, AnalyticField, Ball, Gaussian, Slab, Slow, chord_of_box
 from tests.analytic.rays import DIRECTIONS_26, points_in, rays_at, unit
@@ -39,23 +41,22 @@ def random_vm(
     seed: int = 0,
     aabb=BOX,
     cells: int | None = None,
-    matrix=None,
     scale: float = 3.0,
     shift: float = -1.0,
     hashed: Hashed | None = None,
 ) -> VMField:
-    """A one-block VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so
-    many cells. Its shape, where none is given, is what loops of its type are compiled for."""
+    """A VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so many
+    cells. Its shape, where none is given, is what loops of its type are compiled for."""
     shape = shape or (SIXTY_FOUR if dtype == torch.float64 else THIRTY_TWO)
+    shape = replace(shape, hashed=hashed)
     generator = torch.Generator().manual_seed(seed)
     grid = OccupancyGrid.full(aabb, cells or 1)
     if cells is not None:
         grid = OccupancyGrid(grid.aabb, np.random.default_rng(seed).random(grid.occupied.shape) < 0.3)
-    occupied = None if cells is None else grid.occupied
-    tensor = VMTensor(resolution, grid.aabb, scale, shift, occupied, hashed=hashed)
-    params = torch.randn(tensor.size(shape), generator=generator, dtype=torch.float64) * 0.5
-    block = Block(0, np.eye(4) if matrix is None else matrix, "one")
-    return VMField(shape, (tensor,), (block,), params.to(dtype), grid)
+    params = torch.randn(VMField.size_of(shape, resolution), generator=generator, dtype=torch.float64) * 0.5
+    field = VMField(shape, grid.aabb, resolution, scale, shift, params.to(dtype), grid)
+    field.name = "one"
+    return field
 
 
 @pytest.fixture

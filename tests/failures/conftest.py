@@ -19,6 +19,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds import instances
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Student
+from fusedrf_cli.engine.kinds.vm.students import VMConfig
 from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings
 from tests.engine.kinds.cases import SLOW_TO_COMPILE
@@ -77,10 +78,9 @@ def row(request) -> Row:
 @pytest.fixture
 def quick(monkeypatch, in_force) -> None:
     """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
-    in_force(OccupancyConfig(scene_cells=48))
+    in_force(OccupancyConfig(scene_cells=48), VMConfig(SHAPE))
     monkeypatch.setattr(Student, "lesson", TinySettings())
     monkeypatch.setattr("fusedrf_cli.bridge.making.DistilConfig", TinySettings)  # for what is not taught
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.students.SHAPE", SHAPE)
     monkeypatch.setattr(instances.InstancesStudent, "ranks", (None,))  # others would be compiled
     monkeypatch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
     in_force(LookConfig(whole=2, most_objects=0))

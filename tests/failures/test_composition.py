@@ -16,6 +16,7 @@ from formats.scene import NODE_KEYS, SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
@@ -23,7 +24,6 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_rays
@@ -79,12 +79,12 @@ def test_b1_the_denser_wins_in_any_order(row, density):
     ]
     points, dirs = around(scene_of(*parts))
     alone = scene_of(parts[2]).composed("vm")
-    wanted = [answers(f, points, dirs) for f in (alone, blocks_of(alone.placed))]
+    wanted = [answers(f, points, dirs) for f in (alone, as_composite(alone))]
     assert np.count_nonzero(wanted[0][0]) > 100
     flips = 0
     for order in itertools.permutations(parts):
         composed = scene_of(*order).composed("vm")
-        for field, (sigma, rgb) in zip((composed, blocks_of(composed.placed)), wanted, strict=True):
+        for field, (sigma, rgb) in zip((composed, as_composite(composed)), wanted, strict=True):
             found = answers(field, points, dirs, composed.origin)
             flips += np.count_nonzero((found[1] != rgb).any(1) & (sigma > 0))
             flips += np.count_nonzero(np.abs(found[0] - sigma) > 2e-7 * sigma)
@@ -94,25 +94,25 @@ def test_b1_the_denser_wins_in_any_order(row, density):
 
 
 def test_b1_ties_go_to_the_lower_node(row):
-    """The rule of DESIGN, in the naive composition and in blocks alike."""
+    """The rule of DESIGN, in the naive composition and in the fast one alike."""
     wrong = 0
     for first, second in ((scenes.RED, scenes.BLUE), (scenes.BLUE, scenes.RED)):
         scene = scene_of((Box(50.0, 0.5, tint=first), np.eye(4)), (Box(50.0, 0.5, tint=second), np.eye(4)))
         points, dirs = around(scene)
-        for field in (scene.composed("vm"), scene.blocks()[0]):
+        for field in (scene.composed("vm"), as_composite(scene.composed("vm"))):
             sigma, rgb = answers(field, points, dirs)
             wrong += np.count_nonzero(np.abs(rgb - first(points, dirs)).max(1)[sigma > 0] > 1e-5)
     row.check("B1", "ties not won by the lower node", wrong, 0, at_most=True, scene="S4")
 
 
 @pytest.mark.parametrize("count", [4, pytest.param(30, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("way", ["composed", "blocks"])
+@pytest.mark.parametrize("way", ["composed", "composite"])
 def test_b2_coplanar_faces_do_not_flicker(row, way, count):
     """Two cubes in one place, densities within ±2 %: which wins is a function of the place alone, so that the
     frames of a camera that turns by 1e-5 rad each look the same."""
     scene = scenes.s4_twins(noise=0.02)
     composed = scene.composed("vm")
-    field = composed if way == "composed" else blocks_of(composed.placed)
+    field = composed if way == "composed" else as_composite(composed)
     frames = []
     for i in range(count):
         angle = 1e-5 * i
@@ -133,7 +133,7 @@ def test_b2_the_winner_is_that_of_the_rule(row):
     wanted = scene.answer(points, dirs, "max")[1]
     assert clear.sum() > 1000
     wrong = 0
-    for field in (scene.composed("vm"), scene.blocks()[0]):
+    for field in (scene.composed("vm"), as_composite(scene.composed("vm"))):
         rgb = answers(field, points, dirs, scene.composed().origin)[1]
         wrong += np.count_nonzero(np.abs(rgb - wanted)[clear & (sigmas.max(0) > 0)].max(1) > 1e-4)
     row.check("B2", "winners that are not the denser", wrong, 0, at_most=True, scene="S4")
@@ -145,11 +145,11 @@ ROD = scene_of(
 )
 
 
-@pytest.mark.parametrize("way", ["composed", "blocks"])
+@pytest.mark.parametrize("way", ["composed", "composite"])
 def test_b5_a_rod_through_a_box(row, way):
     """Every winner is that of the analytic union; the pixels along its outlines are reported apart."""
     composed = ROD.composed("vm")
-    field = composed if way == "composed" else blocks_of(composed.placed)
+    field = composed if way == "composed" else as_composite(composed)
     points, dirs = around(ROD, 20_000)
     faces = [
         np.abs(
@@ -199,7 +199,7 @@ def test_b3_media_through_each_other(row, kind, rule, depths):
         composed = scene.composed(kind, rule)
         ways = [composed]
         if rule == "max" and kind == "vm":
-            ways.append(blocks_of(composed.placed))
+            ways.append(as_composite(composed))
         depth = (max(a, b) if overlap and rule == "max" else a + b) / rays_d[:, 0]
         for field in ways:
             found = piecewise_pixels(field, composed.origin, scene, -5 * rays_d, rays_d)
@@ -208,7 +208,7 @@ def test_b3_media_through_each_other(row, kind, rule, depths):
     row.check("B3", f"{kind}, {rule}: opacity and colour off by", worst, 1e-4, at_most=True, scene="S1")
 
 
-@pytest.mark.parametrize("way", ["composed", "blocks"])
+@pytest.mark.parametrize("way", ["composed", "composite"])
 def test_b4_fog_around_solids(row, way):
     """The fog does not feel the solids outside their matter: bit for bit where a ray misses them."""
     room = scenes.s6_room()
@@ -216,7 +216,7 @@ def test_b4_fog_around_solids(row, way):
     pictures = {}
     for name, scene in (("with", inside), ("without", Scene(room.parts[:1]))):
         composed = scene.composed("vm")
-        field = composed if way == "composed" else blocks_of(composed.placed)
+        field = composed if way == "composed" else as_composite(composed)
         rays_o, rays_d = EYE.rays()
         pictures[name] = render_rays(field, rays_o - composed.origin, rays_d, step=0.05)
     boxes = [p.aabb for p in inside.placed("vm")[1:]]
@@ -231,7 +231,7 @@ def test_b4_fog_around_solids(row, way):
         figure = -10 * np.log10((changed**2).mean())
         row.check("B4", f"{way}: fog beside solids as it was", figure, 40, scene="S6", unit="dB")
     composed = room.composed("vm")
-    field = composed if way == "composed" else blocks_of(composed.placed)
+    field = composed if way == "composed" else as_composite(composed)
     found = piecewise_pixels(field, composed.origin, room, rays_o, rays_d)
     off = np.abs(found - room.pixels(rays_o, rays_d)).max()
     row.check("B4", f"{way}: room against slab algebra", off, 1e-4, at_most=True, scene="S6")
@@ -248,7 +248,7 @@ def test_b6_the_empty_lends_no_colour(row, kind, rule):
         unit(points_in(np.ones(6) * [-1, -1, -1, 1, 1, 1], 300)),
     )
     worst = 0.0
-    for field in [composed] + ([blocks_of(composed.placed)] if kind == "vm" and rule == "max" else []):
+    for field in [composed] + ([as_composite(composed)] if kind == "vm" and rule == "max" else []):
         worst = max(
             worst, np.abs(answers(field, points, dirs, composed.origin)[1] - scenes.RED(points, dirs)).max()
         )
@@ -330,7 +330,7 @@ def test_b9_hostile_numbers_are_refused_by_name_or_harmless(row, tmp_path, name)
     pictures = []
     for order in ((loaded, other), (other, loaded)):
         composed = ComposedField([Placed(f"n{i}", f, np.eye(4)) for i, f in enumerate(order)])
-        pictures += [photo(f, EYE) for f in (composed, blocks_of(composed.placed))]
+        pictures += [photo(f, EYE) for f in (composed, as_composite(composed))]
     assert all(np.isfinite(p).all() for p in pictures)
     row.check("B9", f"{name}: pictures finite", sum(np.isfinite(p).all() for p in pictures), 4, scene="S9")
 
@@ -403,7 +403,7 @@ def test_b11_a_hundred_copies_are_stored_once(row, tmp_path):
 
 @pytest.mark.parametrize("count", [6, pytest.param(24, marks=pytest.mark.slow)])
 def test_b12_order_changes_no_answer(row, kind, count):
-    """Six or all 24 orders of four overlapping objects, under max and add, and as blocks: bit for bit."""
+    """Orders of four overlapping objects, under max and add, and as a composite: bit for bit."""
     parts = [
         (f"p{i}", Box(d, 0.5, tint=t), affine(turn(17 * i), (0.25 * i, 0, 0)))
         for i, (d, t) in enumerate(zip((3.0, 5.0, 8.0, 2.0), scenes.HUES[:4], strict=True))
@@ -416,7 +416,7 @@ def test_b12_order_changes_no_answer(row, kind, count):
         found = {rule: ComposedField(placed, rule) for rule in ("max", "add")}
         origin = found["max"].origin
         if all(type(p.field) is VMField for p in placed):
-            found["blocks"] = blocks_of(found["max"].placed)
+            found["composite"] = as_composite(found["max"])
         for way, field in found.items():
             sigma, rgb = answers(field, points, dirs, origin)
             wanted = first.setdefault(way, (sigma, rgb))
@@ -538,7 +538,7 @@ def surface(field, origin=0.0) -> float:
 
 
 def test_b15_surfaces_stay_where_they_were(row, kind):
-    """Stored in half precision, resampled finer, coarser and off the lattice, placed as blocks and shrunk."""
+    """Stored in half precision, resampled finer, coarser and off the lattice, and made smaller."""
     ramp = Ramp()
     wanted = surface(ramp)
     field = exported(ramp, kind)
@@ -549,11 +549,9 @@ def test_b15_surfaces_stay_where_they_were(row, kind):
         for n in (11, 23, 46):
             conversions[f"{n} texels"] = field.resampled(field.aabb, (n, n, n))
     if type(field) is VMField:
-        limit = SHAPE.size((12, 12, 12))
-        conversions["shrunk"] = blocks_of(
-            [Placed("one", field, np.eye(4))],
-            lambda shape, tensors: shape.size(tensors[0].resolution) <= limit,
-        )
+        kind = registry.kind(field.kind)
+        voxel = float((field.box[3:] - field.box[:3]).max()) / 11
+        conversions["shrunk"] = kind.reduction(kind.outline(field), voxel, Way()).make(field)
     shifts = {name: abs(surface(f) - wanted) / ramp.voxel_size for name, f in conversions.items()}
     row.check("B15", f"{kind}: surface moved, voxels", max(shifts.values()), 0.05, at_most=True, scene="S3")
 

@@ -13,14 +13,12 @@ from formats.errors import FormatError
 from formats.scene import Node, SceneGraph, make_node, read_scene, write_scene
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.composition.detail import opacity_off
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.student import DistilConfig
 from fusedrf_cli.engine.kinds.vm import KIND as VM
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
-from fusedrf_cli.engine.kinds.vm.details import block_details
-from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.analytic import scenes
 from tests.analytic.export import SHAPE, exported, way_of
@@ -43,11 +41,11 @@ pytestmark = pytest.mark.usefixtures("quick")
 
 
 def ways(scene: Scene, kind: str) -> dict[str, tuple]:
-    """(field, origin) of the naive composition and, where the kind allows it, of the blocks."""
+    """(field, origin) of the naive composition and, where the kind allows it, of the fast one."""
     composed = scene.composed(kind)
     found = {"composed": (composed, composed.origin)}
-    if all(type(p.field) is VMField for p in composed.placed):
-        found["blocks"] = (blocks_of(composed.placed), composed.origin)
+    if (fast := as_composite(composed)) is not composed:
+        found["composite"] = (fast, composed.origin)
     return found
 
 
@@ -340,28 +338,16 @@ def test_a6_a_tiny_object_is_named_before_fusing(row, tmp_path):
 
 
 @pytest.mark.parametrize("size", [0.03, pytest.param(1e-3, marks=pytest.mark.slow)])
-def test_a6_blocks_hold_a_tiny_object_as_it_was(row, size):
+def test_a6_a_composition_holds_a_tiny_object_as_it_was(row, size):
     """Down to a thousandth of the table, seen from close by."""
     scene = marble_on_table(size)
     found = ways(scene, "vm")
-    across = {d.name: d for d in block_details(found["composed"][0].placed, found["blocks"][0])}
-    row.check(
-        "A6", f"voxels across a marble of {size:g}, blocks", across["marble"].voxels_across, 8, scene="S7"
-    )
-    assert across["marble"].lost == 0
     eye = camera_at(size * np.array([3.0, 2.0, 2.0]), (0, 0, size / 2), size=20)
     truth = scene.image(eye)
     assert truth.std() > 0.05
-    for name in ("composed", "blocks"):
+    for name in ("composed", "composite"):
         shown = psnr(photo(*pair(found[name], eye)), truth)
         row.check("A6", f"close-up of a marble of {size:g}, {name}", shown, 40, scene="S7", unit="dB")
-
-
-def test_a6_what_more_than_two_in_a_cell_hide_is_told(row):
-    """Field, table and marble of S7 meet in one cell of a grid over the field; who is lost is known."""
-    composed = scenes.s7_scales().composed("vm")
-    lost = {d.name: d.lost for d in block_details(composed.placed, blocks_of(composed.placed))}
-    row.check("A6", "share of an object lost among three and told", max(lost.values()), 0.01, scene="S7")
 
 
 def test_a6_every_object_gets_its_share_of_the_questions(row):
@@ -378,7 +364,7 @@ def test_a6_every_object_gets_its_share_of_the_questions(row):
     row.check("A6", "share of rays through the smallest of four", min(hits), 0.05, scene="S7")
 
 
-@pytest.mark.parametrize("kind_of_scene", ["composed", "blocks"])
+@pytest.mark.parametrize("kind_of_scene", ["composed", "composite"])
 def test_a7_a_scene_far_away_looks_the_same(row, kind_of_scene):
     """Scene and camera moved by 1e4 to 1e7 units along the diagonal."""
     scene = scene_of(*[(p.name, p.field, p.object_to_world) for p in scenes.s8_boxes(3, 30).parts])

@@ -105,7 +105,7 @@ def test_d1_hard_surfaces_at_every_step(row, peak):
         box = Box(peak * 63 / (2 * half.min()), half, tint=part.field.tint)
         parts.append(replace(part, field=box))
     scene = scenes.Scene(tuple(parts))
-    field, origin = scene.blocks(resolution=(64,) * 3)
+    field, origin = scene.composite(resolution=(64,) * 3)
     camera = scenes.camera_at((3.0, 2.0, 1.8), size=40)
     truth = scene.image(camera)
     for share, bar in ((STEP_PER_VOXEL, 40.0), (0.125, 50.0)):

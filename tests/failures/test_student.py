@@ -15,11 +15,10 @@ from formats.bundle import read_bundle, read_headers
 from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, without
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.main import cli
@@ -133,34 +132,6 @@ def test_c1_what_does_not_fit_the_memory_is_refused_with_the_number(row, folder)
     row.check("C1", "exit code beyond --memory, with the numbers", result.exit_code if named else 0, 5)
 
 
-# -- C2: chains of adds --------------------------------------------------------------------------------------
-
-
-def chained(count: int) -> tuple[float, float, bool]:
-    """PSNR against closed form of `count` adds one by one and of all fused at once, and whether the first
-    tensors are as they were."""
-    scene, _ = scenes.s10_chain(count)
-    placed = scene.placed("vm")
-    camera = scenes.camera_at((4.5, -4.0, 4.0), size=48)
-    field, first = blocks_of(placed[:1]), placed[0].field.params
-    for new in placed[1:]:
-        field = blocks_of([Placed("", field, np.eye(4)), new])
-    wanted = scene.image(camera)
-    step = 0.5 * max(p.voxel_size for p in placed)
-    one, all_ = (
-        psnr(render_image(f, camera, step=step).over(WHITE), wanted) for f in (field, blocks_of(placed))
-    )
-    return one, all_, torch.equal(field.params[: len(first)], first)
-
-
-@pytest.mark.parametrize("count", [4, pytest.param(32, marks=pytest.mark.slow)])
-def test_c2_a_chain_of_adds_is_as_good_as_fusing_all(row, count):
-    one, all_, kept = chained(count)
-    row.check("C2", f"PSNR of {count} objects fused at once", all_, 25.0, unit="dB")
-    row.check("C2", f"lost by {count} adds", all_ - one, 0.5, at_most=True, unit="dB")
-    row.check("C2", "the first tensor's bits are as they were", kept, 1)
-
-
 # -- C3, C4: deleting ----------------------------------------------------------------------------------------
 
 
@@ -230,9 +201,9 @@ def test_c4_a_parent_takes_its_subtree_along(row, folder):
 @pytest.mark.parametrize("width", [0.05, 0.25, 1.0])
 def test_c5_thin_things_are_not_missed(row, width, wires):
     """Of the pixels that a comb of plates or wires covers, w voxels thick and eight apart: seen from where
-    they are several pixels wide, the share that the blocks do not show."""
+    they are several pixels wide, the share that is not shown."""
     scene = scenes.s5_comb(width, count=2, wires=wires)
-    field, origin = scene.blocks(resolution=(8,) * 3)
+    field, origin = scene.composite(resolution=(8,) * 3)
     close = 0.8 * width * 0.05 * 48 / 6 + 0.26
     camera = scenes.camera_at(
         (0.2, 0.2 if wires else 0.0, close), (0.2, 0.2 if wires else 0.0, 0.0), 48, up=(0, 1, 0)
@@ -248,14 +219,14 @@ def test_c5_thin_things_are_not_missed(row, width, wires):
 
 @pytest.mark.parametrize("tau", [0.01, 0.1, 0.7])
 def test_c6_fog_keeps_its_opacity(row, folder, tau):
-    """A slab of fog, composed and fused to blocks, at the angles of a picture: 0.5 % of opacity."""
+    """A slab of fog, composed by either way, at the angles of a picture: 0.5 % of opacity."""
     fog = Box(tau, 0.5, tint=scenes.GREY)
     scene = scenes.scene_of((fog, np.eye(4)), (CUBE, affine(1.0, (0, 2.0, 0))))
     rays = np.tile([[-3.0, 0.02, 0.01]], (7, 1)), np.array([[1.0, a / 40, a / 60] for a in range(-3, 4)])
     rays = rays[0], rays[1] / np.linalg.norm(rays[1], axis=1, keepdims=True)
     wanted = scene.pixels(*rays)[:, 3]
-    for name, field in (("composed", scene.composed("vm", resolution=(64,) * 3)), ("blocks", None)):
-        field, origin = (field, field.origin) if field is not None else scene.blocks(resolution=(64,) * 3)
+    for name, field in (("composed", scene.composed("vm", resolution=(64,) * 3)), ("composite", None)):
+        field, origin = (field, field.origin) if field is not None else scene.composite(resolution=(64,) * 3)
         found = render_rays(field, rays[0] - origin, rays[1])[:, 3]
         error = abs(found - wanted).max()
         row.check("C6", f"τ = {tau:g}, {name}: error of the opacity", error, 0.005, at_most=True)
@@ -265,11 +236,10 @@ def test_c7_a_white_edge_is_white(row, folder):
     """A near-white cloud on black, resampled to a quarter of its voxels: pixels show their opacity's
     worth of white."""
     white = Tint.of(0.98, 0.98, 0.98)
-    field = blocks_of(
-        [Placed("white", vm_field(Gaussian(60.0, tint=white), (33,) * 3, SHAPE), affine(turn(30)))],
-        lambda shape, tensors: shape.size(tensors[0].resolution) <= SHAPE.size((9, 9, 9)),
-    )
-    assert max(field.tensors[0].resolution) <= 9
+    field = vm_field(Gaussian(60.0, tint=white), (33,) * 3, SHAPE)
+    voxel = float((field.box[3:] - field.box[:3]).max()) / 8
+    field = VM.reduction(VM.outline(field), voxel, Way()).make(field)
+    assert max(field.resolution) <= 9
     picture = render_image(field, scenes.camera_at((2.5, 1.0, 1.5), size=48))
     edge = (picture.opacity > 0.02) & (picture.opacity < 0.98)
     off = abs(picture.rgb - 0.98 * picture.opacity[..., None]).max(-1)
@@ -297,14 +267,14 @@ def test_c7_a_distilled_edge_is_white(row):
 
 
 def test_c8_turned_boxes_are_as_good_as_upright_ones(row):
-    """Blocks have each object's own axes: what turning by up to 45 degrees loses, at a step so short that
+    """Every object has its own axes: what turning by up to 45 degrees loses, at a step so short that
     it is the representation that is judged, and the worst at the default one."""
     eyes = ((3.0, 2.0, 1.8), (-2.0, 2.5, 1.0), (1.5, -3.0, -1.0))
     cameras = [scenes.camera_at(eye, size=64) for eye in eyes]
     figures = {0.5: [], 0.125: []}
     for degrees in (0, 15, 30, 45):
         scene = scenes.s8_boxes(4, degrees)
-        field, origin = scene.blocks(resolution=(64,) * 3)
+        field, origin = scene.composite(resolution=(64,) * 3)
         truth = np.stack([scene.image(c) for c in cameras])
         for share, found in figures.items():
             step = share * field.voxel_size
@@ -370,14 +340,3 @@ def test_c11_what_is_cut_out_does_not_show_through(row, folder):
     floor = 1.5 + z.ravel() + 0.5  # distance to the floor's upper face
     ghosts = ((depth < floor - 0.25) & (found[:, 3] > 0.02)).mean()
     row.check("C11", "rays that meet something where the object was", ghosts, 0.0, at_most=True)
-
-
-def test_c11_a_field_without_its_only_matter_there_is_air(row):
-    """Blocks: the cells of a dropped block answer 0."""
-    field = blocks_of([Placed(n, vm_field(b), m) for n, (b, m) in PARTS.items()])
-    less = without(field, {"red"})
-    x = PARTS["red"][1][:3, 3] + np.random.default_rng(0).uniform(-0.2, 0.2, (500, 3))
-    dirs = torch.tensor([[1.0, 0, 0]], dtype=torch.float64).expand(500, 3)
-    before, after = (f.query(torch.from_numpy(x), dirs)[0] for f in (field, less))
-    assert before.min() > 1
-    row.check("C11", "σ where a block was dropped", after.max(), 0.0, at_most=True)

@@ -67,7 +67,7 @@ def scaled(camera: Camera, scale: float) -> Camera:
 
 def nothing(field) -> OccupancyGrid:
     """What a search for matter finds where there is none."""
-    return OccupancyGrid(field.tensors[0].aabb, np.zeros((8, 8, 8), bool))
+    return OccupancyGrid(field.box, np.zeros((8, 8, 8), bool))
 
 
 def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypatch):
@@ -75,7 +75,7 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
     find, boxes = module.occupancy_of, []
 
     def blind_twice(field, *box):
-        boxes.append(field.tensors[0].aabb)
+        boxes.append(field.box)
         return nothing(field) if len(boxes) <= 2 else find(field, *box)
 
     monkeypatch.setattr(module, "occupancy_of", blind_twice)
@@ -138,8 +138,8 @@ def test_t1_pictures_of_nothing(row, images):
 def test_t2_an_untrained_box_is_as_clear_at_any_size(row, extent):
     """Opacity along the diagonal, of what the softplus' shift alone gives."""
     box = np.array([0.0, 0, 0, *extent])
-    tensor = VMField.create(box, (4, 4, 4), THIRTY_TWO, torch.Generator().manual_seed(0)).tensors[0]
-    sigma = tensor.scale * np.log1p(np.exp(tensor.shift))
+    field = VMField.create(THIRTY_TWO, box, (4, 4, 4), torch.Generator().manual_seed(0))
+    sigma = field.scale * np.log1p(np.exp(field.shift))
     opacity = 1 - np.exp(-sigma * np.linalg.norm(extent))
     row.check("T2", "opacity of an untrained box", opacity, 0.03)
     row.check("T2", "opacity of an untrained box", opacity, 0.08, at_most=True)
@@ -246,7 +246,7 @@ def test_t9_poisoned_numbers_are_recovered_from(row, images, unseen_psnr, value)
     def poisoning(share):
         if run.steps == 50:
             for what in ("density", "colour"):
-                run.field.sections(0)[f"{what}_plane_0"][8:12] = value
+                run.field.sections()[f"{what}_plane_0"][8:12] = value
         step(share)
 
     run.step = poisoning
@@ -288,8 +288,8 @@ def test_t13_the_rate_may_be_a_third_or_thrice(row, images, unseen_psnr):
 def test_t14_no_start_is_dead(row, opaque, empty):
     """A field of one texel, whose two ends start as the opposite of what they should be: an optical depth per
     step of 500 and more in empty space, and softplus(-100) in a solid."""
-    field = VMField.create(BOX, (2, 2, 2), THIRTY_TWO, torch.Generator().manual_seed(0))
-    sections, shift = field.sections(0), field.tensors[0].shift
+    field = VMField.create(THIRTY_TWO, BOX, (2, 2, 2), torch.Generator().manual_seed(0))
+    sections, shift = field.sections(), field.shift
     sections["density_plane_2"][..., 0] = 4.0
     sections["density_line_2"][:, 0] = (torch.tensor([empty, opaque]) - shift) / 4
     solid, step = np.arange(2000) < 1000, 0.25

@@ -63,16 +63,41 @@ def decoded(bits: int, shape: tuple, scales: np.ndarray, codes: np.ndarray, runs
     return scale * number / np.float32(127 if bits == 8 else 7)
 
 
-def contracted(x: np.ndarray, space: str) -> tuple[np.ndarray, np.ndarray]:
-    """2.3: coordinates (N, 3) of points, and rho (N,)."""
-    if space == "bounded":
+def contracted(x: np.ndarray, d: np.ndarray, space: str | dict) -> tuple[np.ndarray, np.ndarray]:
+    """2.3: coordinates (N, 3) of points, and rho (N,) along d (N, 3)."""
+    constants = dict(space) if isinstance(space, dict) else {"name": space}
+    name = constants.pop("name")
+    if name == "bounded":
         return x, np.ones(len(x))
+    if name == "ndc":
+        scales = np.array([constants.get("scale_x", 1.0), constants.get("scale_y", 1.0)])
+
+        def coordinates(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([scales * x[:, :2], -x[:, 2:] - 2], 1) / -x[:, 2:]
+
+        return coordinates(x), moved(coordinates, x, d)
+    if name != "unbounded":
+        shell, order = constants.get("shell", 1.0), {"contracted_l2": 2, "contracted_linf": np.inf}[name]
+
+        def coordinates(x: np.ndarray) -> np.ndarray:
+            n = np.maximum(np.linalg.norm(x, order, 1, keepdims=True), 1)
+            return np.where(n > 1, (1 + shell - shell / n) * x / n, x)
+
+        per_y = constants.get("contracted_density", 0.0) == 1
+        return coordinates(x), moved(coordinates, x, d) if per_y else np.ones(len(x))
     n = np.abs(x).max(1)
     far, axis = n > 1, np.abs(x).argmax(1)
     y = np.where(far[:, None], x / np.maximum(n, 1)[:, None], x)
     rows = np.flatnonzero(far)
     y[rows, axis[rows]] = np.sign(x[rows, axis[rows]]) * (2 - 1 / n[rows])
     return y, np.where(far, 1 / np.maximum(n, 1) ** 2, 1)
+
+
+def moved(coordinates, x: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(N,) the length of the derivative of coordinates along d, by differences."""
+    step = 1e-5 * np.abs(x).max(1, keepdims=True)
+    change = coordinates(x + step * d) - coordinates(x - step * d)
+    return np.linalg.norm(change, axis=1) / (2 * step[:, 0])
 
 
 def harmonics(count: int, d: np.ndarray) -> np.ndarray:
@@ -148,7 +173,7 @@ def answer(field: tuple, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.n
 def of_grid(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
     """2.6: `cp`, `dense` and `dense-mlp`."""
     box, cells = np.array(told["aabb"]), told["cells"]
-    y, rho = contracted(x, cells.get("space", "bounded"))
+    y, rho = contracted(x, d, cells.get("space", "bounded"))
     unit = (y - box[:3]) / (box[3:] - box[:3])
     grid = cells_of(arrays, "occupancy", cells["counts"])
     here = occupied(grid, np.array(cells["aabb"]), y) & ((unit >= 0) & (unit <= 1)).all(1)
@@ -203,7 +228,8 @@ def of_tensors(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray
         own = {n.split(".", 1)[1]: a for n, a in arrays.items() if n.startswith(f"tensor_{t}.")}
         v = d @ inverse[:3, :3].T
         stretch = np.linalg.norm(v, axis=1)
-        y, rho = contracted(x @ inverse[:3, :3].T + inverse[:3, 3], tensor.get("space", "bounded"))
+        own_x, own_d = x @ inverse[:3, :3].T + inverse[:3, 3], v / stretch[:, None]
+        y, rho = contracted(own_x, own_d, tensor.get("space", "bounded"))
         box = np.array(tensor["aabb"])
         here = occupied(cells_of(own, "occupancy", tensor["occupancy"]), box, y)
         unit = np.clip((y - box[:3]) / (box[3:] - box[:3]), 0, 1)
@@ -350,7 +376,7 @@ def between(numbers: dict, low: tuple, side: int, at: np.ndarray) -> np.ndarray:
 
 def of_bricks(told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
     """2.6: `sparse`."""
-    y, rho = contracted(x, told.get("space", "bounded"))
+    y, rho = contracted(x, d, told.get("space", "bounded"))
     units = (y - np.array(told["aabb"])[:3]) / np.array(told["top"]) * 512
     bricks = Bricks(told, arrays)
     count = (told["sh_degree"] + 1) ** 2

@@ -181,3 +181,11 @@ def test_a_writer_writes_nodes(tmp_path):
     old, new = written(tmp_path, record, precision="int8"), OpenBundle(tmp_path / "new.rfpack")
     assert new.headers.keys() == read_bundle(tmp_path / "new.rfpack").fields.keys() == old.headers.keys()
     assert new.scene.nodes == old.scene.nodes and not new.instances
+
+
+def test_what_is_copied_to_be_read_is_told(tmp_path):
+    """Fields that are unfolded lie in memory, beside the file that is mapped."""
+    bundle = written(tmp_path, record_of([block("cup", 0), block("pole", 1)]))
+    assert bundle.copied == sum(header.size for header in bundle.headers.values()) > 0
+    bundle = written(tmp_path, record_of([block("fused", 0)], count=1))
+    assert bundle.copied == 0

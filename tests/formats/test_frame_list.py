@@ -13,6 +13,7 @@ from PIL import Image
 from formats.cameras import JSON_TOKEN, read_document
 from formats.captures import read_cameras, read_capture
 from formats.colmap import read_model
+from formats.colmap_points import binary_points
 from formats.errors import (
     BadImage,
     BadIntrinsics,
@@ -25,7 +26,7 @@ from formats.errors import (
 )
 from formats.names import distinct_names, is_name
 from formats.photos import natural
-from formats.points import read_ply_points
+from formats.points import MAX_POINTS, read_ply_points
 from formats.transforms import read_splits, sparse_points
 from tests.formats.test_captures import POINT, looking_at, photo, project
 from tests.formats.test_readers import (
@@ -359,15 +360,12 @@ def test_points_of_a_cloud_are_thinned(tmp_path, coding):
     assert [view.seen.tolist() for view in sparse.told(file, train.views)[:4]] == [[0, 2], [2], [2], [1, 2]]
 
 
-def test_points_are_gathered_block_by_block(tmp_path, monkeypatch):
+def test_points_are_gathered_block_by_block(tmp_path):
     """A track of any length lies between them."""
     data = struct.pack("<Q", 7)
     for i in range(7):
         data += struct.pack("<Q3d3BdQ", 70 - i, i, 2 * i, 3 * i, i, i, i, 0.25 * i, i) + bytes(8 * i)
-    binary_model(tmp_path)
-    (tmp_path / "points3D.bin").write_bytes(data)
-    monkeypatch.setattr("formats.colmap.BLOCK", 3)
-    found = read_model(tmp_path).points
+    found = binary_points(MAX_POINTS, tmp_path, data, block=3).points
     assert found.positions.tolist() == [[i, 2 * i, 3 * i] for i in reversed(range(7))]
     assert found.colours[:, 0].tolist() == [6, 5, 4, 3, 2, 1, 0]
 

@@ -11,10 +11,12 @@ from formats.bundle import BundleWriter, single_field_bundle
 from formats.records import FieldRecord, decode_field, encode_field
 from formats.scene import SceneGraph, make_node
 from fusedrf_cli.bridge.scene import make_field
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.spaces import contracted_l2, contracted_linf, ndc, space_of, unbounded
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import open_scene
 from tests.engine.conftest import points_in, unit
-from tests.engine.kinds.cases import KINDS, coarse_ownership  # noqa: F401  (a fixture)
+from tests.engine.kinds.cases import KINDS  # noqa: F401  (a fixture)
 from tests.formats import spec_reader
 
 COUNT = 200
@@ -44,6 +46,34 @@ def test_a_reader_written_from_the_specification_answers_as_the_engine(name, pre
     np.testing.assert_allclose(found, sigma.numpy(), rtol=1e-4, atol=1e-6)
     seen = found > 0
     np.testing.assert_allclose(colours[seen], rgb.numpy()[seen], atol=1e-5)
+
+
+SPACES = {
+    "unbounded": unbounded,
+    "L2": contracted_l2,
+    "Linf": contracted_linf,
+    "L2 of DVGO": space_of(contracted_l2, shell=0.2, contracted_density=1.0),
+    "Linf of DVGO": space_of(contracted_linf, shell=0.2, contracted_density=1.0),
+    "NDC": ndc,
+    "NDC of a camera": space_of(ndc, scale_x=2.1, scale_y=2.8),
+}
+
+
+@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+def test_the_words_of_spaces(space, tmp_path):
+    made = KINDS["dense"]().resampled(space.WHOLE, (6, 6, 6))
+    made = made.with_occupancy(OccupancyGrid.full(space.WHOLE, 4, space))
+    single_field_bundle(FieldRecord(made.kind, *made.state()), "node").write(tmp_path / "a.rfpack")
+    _, fields = spec_reader.open_bundle(tmp_path / "a.rfpack")
+    points = space.placed(torch.from_numpy(points_in(0.9 * space.WHOLE, COUNT)))
+    dirs = unit(np.random.default_rng(5).normal(size=(COUNT, 3)))
+    field = make_field(decode_field(encode_field(FieldRecord(made.kind, *made.state())), "here"), "here")
+    assert field.space is space
+    sigma, rgb = field.answers(field.params.double(), points, torch.from_numpy(dirs))
+    found, colours = spec_reader.answer(next(iter(fields.values())), points.numpy(), dirs)
+    assert (sigma > 0).sum() > COUNT // 20
+    np.testing.assert_allclose(found, sigma.numpy(), rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(colours[found > 0], rgb.numpy()[found > 0], atol=1e-4)
 
 
 def test_the_worked_field_of_the_specification(tmp_path):

@@ -13,7 +13,7 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.errors import InvalidInput
 from tests.engine.conftest import points_in, rays_at, unit
-from tests.engine.kinds.cases import KINDS, SLOW_TO_COMPILE, coarse_ownership  # noqa: F401  (a fixture)
+from tests.engine.kinds.cases import KINDS, SLOW_TO_COMPILE  # noqa: F401  (a fixture)
 
 # a tensor that is placed in a frame whose grid was not made from it does not come back with the same grid
 FIELDS = {name: make for name, make in KINDS.items() if "placed" not in name}

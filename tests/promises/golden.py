@@ -250,15 +250,16 @@ def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
 
     generator = torch.Generator().manual_seed(seed)
     detail = Hashed((1.0, 0.5), 256) if hashed else None
-    made = VMField.create(WHOLE, (resolution,) * 3, shape or THIRTY_TWO, generator, hashed=detail)
+    made = VMField.create(
+        replace(shape or THIRTY_TWO, hashed=detail), WHOLE, (resolution,) * 3, generator
+    )
     if hashed:
-        made.sections(0)["detail"].normal_(0, 0.3, generator=generator)
+        made.sections()["density_detail"].normal_(0, 0.3, generator=generator)
     grid = OccupancyGrid.full(WHOLE, 16, unbounded)
     there = (abs(grid.centres()).max(1) > 1.6).reshape(grid.occupied.shape)
     made = made.with_occupancy(grid.marked(there))
-    shift = float(np.log(np.expm1(0.8 / made.tensors[0].scale)))
-    thick = replace(made.tensors[0], shift=shift)
-    return VMField(made.shape, (thick,), made.blocks, 4 * made.params, made.occupancy)
+    made.shift = float(np.log(np.expm1(0.8 / made.scale)))
+    return made.with_params(4 * made.params)
 
 
 def furnished():
@@ -271,15 +272,15 @@ def furnished():
     from tests.engine.conftest import THIRTY_TWO
 
     generator = torch.Generator().manual_seed(3)
-    made = VMField.create(WHOLE, (25,) * 3, THIRTY_TWO, generator, hashed=Hashed((1 / 8, 1 / 16), 1 << 12))
-    made.sections(0)["detail"].normal_(0, 0.5, generator=generator)
+    shape = replace(THIRTY_TWO, hashed=Hashed((1 / 8, 1 / 16), 1 << 12))
+    made = VMField.create(shape, WHOLE, (25,) * 3, generator)
+    made.sections()["density_detail"].normal_(0, 0.5, generator=generator)
     grid = OccupancyGrid.full(WHOLE, 32, unbounded)
     at = grid.centres()
     there = (abs(at).max(1) > 1.9) | (np.linalg.norm(at - [0.3, 0, 0], axis=1) < 0.3)
     made = made.with_occupancy(grid.marked(there.reshape(grid.occupied.shape)))
-    shift = float(np.log(np.expm1(20 / made.tensors[0].scale)))
-    thick = replace(made.tensors[0], shift=shift)
-    return VMField(made.shape, (thick,), made.blocks, 4 * made.params, made.occupancy)
+    made.shift = float(np.log(np.expm1(20 / made.scale)))
+    return made.with_params(4 * made.params)
 
 
 LIES = np.array(
@@ -489,7 +490,7 @@ def small_sources(folder: Path) -> None:
         field = FIELDS[name]
         write(
             folder / f"{name}.rfpack",
-            field.resampled(field.tensors[0].aabb, (6, 6, 6)).with_occupancy(field.occupancy),
+            field.resampled(field.box, (6, 6, 6)).with_occupancy(field.occupancy),
         )
 
 

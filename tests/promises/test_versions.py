@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +15,9 @@ from formats.errors import FormatWarning, NewerVersion
 from formats.images import read_image
 from formats.rig import read_rig
 from formats.scene import dump_scene
-from fusedrf_cli.bridge.rendering import renderable, to_pixels
+from fusedrf_cli.bridge.rendering import reference, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, placement
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.main import cli
@@ -35,15 +32,12 @@ FINE = 0.003  # a step so small that pictures show what a pack holds, not how it
 
 def rendered(path) -> np.ndarray:
     """(48, 48, 3) uint8 of a pack, as pair.png was made."""
-    field, origin = renderable(load_scene(str(path)), reference=True)
-    if isinstance(field, ComposedField):
-        field = blocks_of(field.placed)
-    field = copy(field)._afresh("arrays", "grid")
-    field.occupancy = replace(field.occupancy, stride=None, unit=FINE)
+    field, origin = reference(load_scene(str(path)))
     camera = orbit(field.occupancy.tight_aabb(0), 1, 48, 48)[0]
     linear, pose = placement(origin)[:3, :3], camera.camera_to_world.copy()
     pose[:3, 3] = linear @ pose[:3, 3] + placement(origin)[:3, 3]
-    return to_pixels(render_image(field, replace(camera, camera_to_world=pose), origin=origin), WHITE)
+    camera = replace(camera, camera_to_world=pose)
+    return to_pixels(render_image(field, camera, origin=origin, step=FINE), WHITE)
 
 
 def decibels(one: np.ndarray, other: np.ndarray) -> float:
@@ -97,12 +91,13 @@ def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
     """P1 with its defence removed: a reader that changed its mind about a number misses the picture."""
     from fusedrf_cli.engine.kinds.vm import field as vm
 
-    real = vm.stored_tensor
-    monkeypatch.setattr(
-        vm,
-        "stored_tensor",
-        lambda i, stored, *rest: real(i, {**stored, "scale": 1.1 * stored["scale"]}, *rest),
-    )
+    real = vm.box_metadata
+
+    def misread(*words) -> dict:
+        told = real(*words)
+        return told | {"scale": 1.1 * told["scale"]}
+
+    monkeypatch.setattr(vm, "box_metadata", misread)
     assert decibels(rendered(GOLDEN / "pair.rfpack"), read_image(GOLDEN / "pair.png")[..., :3]) < 50
 
 

@@ -1,4 +1,5 @@
-"""Decoders: what turns features into density (of slot `sigma`) or into colour (of slot `rgb`); one file each.
+"""Decoders: what turns features into density (of slot `sigma`) or into the logits of a colour (of slot
+`rgb`), which a sigmoid makes a colour of; one file each.
 
 For the loops, compiled, beside what encodings have (engine/encodings):
     of sigma   forward(field, cell, scratch) -> (σ per length of the coordinates, `pre`)
@@ -7,15 +8,15 @@ For the loops, compiled, beside what encodings have (engine/encodings):
                                once per ray before the first colour and after the last backward: fold the unit
                                direction d; send its gradient back, and leave 0 what has gathered it; may be
                                left out
-               forward(field, cell, d, scratch, memory, at) -> (r, g, b) in [0, 1]
+               forward(field, cell, d, scratch, memory, at) -> three logits
                                leaves KEPT numbers in memory[at:]
-               backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad)
+               backward(field, cell, d, d_logits, scratch, memory, at, grad)
 They call what they read `features_forward`, `features_backward`, `features_summed`, ...
 
 For Python: Arrays, sizes (with KEPT, for rgb, and what kernels/loops.py lets a kind say: LEARN_FROM,
 SHADING_COST), sections and arrays as encodings have them, and
     of sigma   reference(field, sections, features, **options) -> ((N,) σ, what is handed on, or None)
-    of rgb     reference(field, sections, features, dirs, **options) -> (N, 3)
+    of rgb     reference(field, sections, features, dirs, **options) -> (N, 3) logits
     bound(field, sections, features, **options)
                                of the density before activation, or of a logit, the largest magnitude that is
                                reached from features of at most these magnitudes (WIDTH,); of sigma with what

@@ -50,5 +50,4 @@ def forward(field, cell, scratch):
 def backward(field, cell, pre, d_sigma, scratch, grad):
     """See decoders."""
     scratch[AT] = d_sigma * field.activation[0] * activated_slope(pre + field.activation[1])
-    if scratch[AT] != 0:
-        features_summed_backward(field, cell, scratch, AT, scratch, grad)
+    features_summed_backward(field, cell, scratch, AT, scratch, grad)

@@ -1,9 +1,7 @@
-"""Colour that is the same from all sides: rgb_c = sigmoid(features_c) of the first three features (DVGO, Sun
+"""Colour that is the same from all sides: the logits are the first three features (DVGO, Sun
 et al., CVPR 2022)."""
 
 import torch
-
-from fusedrf_cli.engine.kernels.parts import sigmoid
 
 
 def sizes(width: int) -> dict[str, int]:
@@ -13,7 +11,7 @@ def sizes(width: int) -> dict[str, int]:
 
 def reference(field, sections: dict, features: torch.Tensor, dirs: torch.Tensor, width: int) -> torch.Tensor:
     """See decoders."""
-    return features[:, :3].sigmoid()
+    return features[:, :3]
 
 
 def bound(field, sections: dict, features: torch.Tensor, width: int) -> float:
@@ -27,13 +25,13 @@ def bound(field, sections: dict, features: torch.Tensor, width: int) -> float:
 def forward(field, cell, d, scratch, memory, at):
     """See decoders."""
     features_forward(field, cell, scratch, memory, at)
-    return float(sigmoid(memory[at])), float(sigmoid(memory[at + 1])), float(sigmoid(memory[at + 2]))
+    return memory[at], memory[at + 1], memory[at + 2]
 
 
-def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
     for r in range(WIDTH):
         scratch[AT + r] = 0
     for c in range(3):
-        scratch[AT + c] = field.params.dtype.type(d_rgb[c] * rgb[c] * (1 - rgb[c]))
+        scratch[AT + c] = field.params.dtype.type(d_logits[c])
     features_backward(field, cell, scratch, AT, scratch, grad)

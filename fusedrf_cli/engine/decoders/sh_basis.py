@@ -1,5 +1,5 @@
 """Colour by spherical harmonics of features, as TensoRF's SH shading of a learnt basis:
-rgb_c = sigmoid(Σ_r features_r Σ_k Y_k(d) B[c, k, r]). SH is linear: a ray folds its direction into B once."""
+logit_c = Σ_r features_r Σ_k Y_k(d) B[c, k, r]. SH is linear: a ray folds its direction into B once."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import torch
 
 from fusedrf_cli.engine.fields.box import Part, largest
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import add_scaled, dot, mixed_8, scatter, sh_basis, sigmoid
+from fusedrf_cli.engine.kernels.parts import add_scaled, dot, mixed_8, scatter, sh_basis
 
 
 class Arrays(NamedTuple):
@@ -38,7 +38,7 @@ def reference(
 ) -> torch.Tensor:
     """See decoders."""
     harmonics = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
-    return torch.einsum("nk,ckr,nr->nc", harmonics, sections["basis"], features).sigmoid()
+    return torch.einsum("nk,ckr,nr->nc", harmonics, sections["basis"], features)
 
 
 def bound(field, sections: dict, features: torch.Tensor, width: int, coefficients: int) -> float:
@@ -81,18 +81,16 @@ def forward(field, cell, d, scratch, memory, at):
     r = dot(WIDTH, scratch, np.uint64(AT), memory, f)
     g = dot(WIDTH, scratch, np.uint64(AT + WIDTH), memory, f)
     b = dot(WIDTH, scratch, np.uint64(AT + 2 * WIDTH), memory, f)
-    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
+    return r, g, b
 
 
-def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
     d_features = np.uint64(AT + 6 * WIDTH)
     for r in range(np.uint64(WIDTH)):
         scratch[d_features + r] = 0
     for c in range(3):
-        value = rgb[0] if c == 0 else (rgb[1] if c == 1 else rgb[2])
-        d_value = d_rgb[0] if c == 0 else (d_rgb[1] if c == 1 else d_rgb[2])
-        d_logit = scratch.dtype.type(d_value * value * (1 - value))
+        d_logit = scratch.dtype.type(d_logits[0] if c == 0 else (d_logits[1] if c == 1 else d_logits[2]))
         row = np.uint64(AT) + np.uint64(c * WIDTH)
         add_scaled(WIDTH, scratch, d_features, d_logit, scratch, row)
         add_scaled(WIDTH, scratch, row + np.uint64(3 * WIDTH), d_logit, memory, np.uint64(at))

@@ -1,6 +1,6 @@
 """Colour by a network of one hidden layer from features and spherical harmonics of the direction (DVGO, Sun
 et al., CVPR 2022; Instant-NGP, Müller et al. 2022, sec. 5.4): with x = [features, Y(d)],
-h = max(0, W x + b) and rgb = sigmoid(V h + c)."""
+h = max(0, W x + b) and logits V h + c."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ import torch
 
 from fusedrf_cli.engine.fields.box import Part
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import dense, dense_backward, rectify, sh_basis, sigmoid
+from fusedrf_cli.engine.kernels.parts import dense, dense_backward, rectify, sh_basis
 
 OUTPUTS = 8  # three colours, filled up to a run
 HARMONICS = 16
@@ -55,7 +55,7 @@ def reference(
     """See decoders."""
     x = torch.cat([features, torch_reference.sh_basis(HARMONICS, dirs).to(features.dtype)], 1)
     h = (x @ sections["hidden.weight"] + sections["hidden.bias"]).relu()
-    return (h @ sections["out.weight"] + sections["out.bias"])[:, :3].sigmoid()
+    return (h @ sections["out.weight"] + sections["out.bias"])[:, :3]
 
 
 def bound(field, sections: dict, features: torch.Tensor, width: int, hidden: int) -> float:
@@ -85,18 +85,17 @@ def forward(field, cell, d, scratch, memory, at):
     dense(INPUTS, HIDDEN, field.params, np.uint64(field.hidden), memory, x, memory, h)
     rectify(HIDDEN, memory, h)
     dense(HIDDEN, OUTPUTS, field.params, np.uint64(field.out), memory, h, memory, out)
-    r, g, b = memory[out], memory[out + np.uint64(1)], memory[out + np.uint64(2)]
-    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
+    return memory[out], memory[out + np.uint64(1)], memory[out + np.uint64(2)]
 
 
-def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
     x, h, real = np.uint64(at), np.uint64(at + INPUTS), field.params.dtype.type
     d_out, d_h, d_x = np.uint64(AT + D_OUT), np.uint64(AT + D_HIDDEN), np.uint64(AT + D_INPUT)
     for r in range(OUTPUTS):
         scratch[AT + D_OUT + r] = 0
     for c in range(3):
-        scratch[AT + D_OUT + c] = real(d_rgb[c] * rgb[c] * (1 - rgb[c]))
+        scratch[AT + D_OUT + c] = real(d_logits[c])
     params, hidden, out = field.params, np.uint64(field.hidden), np.uint64(field.out)
     dense_backward(HIDDEN, OUTPUTS, params, out, memory, h, True, scratch, d_out, scratch, d_h, grad)
     dense_backward(INPUTS, HIDDEN, params, hidden, memory, x, False, scratch, d_h, scratch, d_x, grad)

@@ -1,6 +1,6 @@
 """Colour by TensoRF's network (Chen et al., ECCV 2022, MLP_Fea): with a matrix B (ROWS, WIDTH) and
 x = [B features, d], its input is [x, sin x, sin 2x, cos x, cos 2x] (INPUTS numbers); two rectified layers of
-HIDDEN outputs and one of three, behind a sigmoid, follow.
+HIDDEN outputs and one of three logits follow.
 
 The inputs lie in blocks as wide as x, where TensoRF interleaves frequencies and keeps features and direction
 apart: an importer permutes the columns of the first layer."""
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import Part
-from fusedrf_cli.engine.kernels.parts import add_scaled, dense, dense_backward, dot, rectify, scatter, sigmoid
+from fusedrf_cli.engine.kernels.parts import add_scaled, dense, dense_backward, dot, rectify, scatter
 
 OUTPUTS = 8  # of the last layer: three colours, filled up to a run
 LAYERS = 3
@@ -71,7 +71,7 @@ def reference(
     x = torch.cat([x, x.sin(), (2 * x).sin(), x.cos(), (2 * x).cos()], 1)
     for i in range(LAYERS):
         x = x @ sections[f"layer_{i}"][:-1] + sections[f"layer_{i}"][-1]
-        x = x.relu() if i < LAYERS - 1 else x[:, :3].sigmoid()
+        x = x.relu() if i < LAYERS - 1 else x[:, :3]
     return x
 
 
@@ -108,8 +108,7 @@ def forward(field, cell, d, scratch, memory, at):
     dense(HIDDEN, HIDDEN, params, np.uint64(field.layers[1]), memory, first, memory, second)
     rectify(HIDDEN, memory, second)
     dense(HIDDEN, OUTPUTS, params, np.uint64(field.layers[2]), memory, second, memory, last)
-    r, g, b = memory[last], memory[last + np.uint64(1)], memory[last + np.uint64(2)]
-    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
+    return memory[last], memory[last + np.uint64(1)], memory[last + np.uint64(2)]
 
 
 def encode(memory, x):
@@ -123,7 +122,7 @@ def encode(memory, x):
         memory[x + np.uint64(4) * count + j] = 1 - 2 * sin * sin
 
 
-def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, d, d_logits, scratch, memory, at, grad):
     """See decoders."""
     base, x, params = np.uint64(at), np.uint64(at + INPUT), field.params
     first, second = base + np.uint64(FIRST), base + np.uint64(SECOND)
@@ -131,9 +130,8 @@ def backward(field, cell, d, rgb, d_rgb, scratch, memory, at, grad):
     d_first, d_input = np.uint64(AT + D_FIRST), np.uint64(AT + D_INPUT)
     for r in range(np.uint64(OUTPUTS)):
         scratch[d_last + r] = 0
-    scratch[d_last] = d_rgb[0] * rgb[0] * (1 - rgb[0])
-    scratch[d_last + np.uint64(1)] = d_rgb[1] * rgb[1] * (1 - rgb[1])
-    scratch[d_last + np.uint64(2)] = d_rgb[2] * rgb[2] * (1 - rgb[2])
+    for c in range(3):
+        scratch[d_last + np.uint64(c)] = d_logits[c]
     layer = np.uint64(field.layers[2])
     dense_backward(
         HIDDEN, OUTPUTS, params, layer, memory, second, True, scratch, d_last, scratch, d_second, grad

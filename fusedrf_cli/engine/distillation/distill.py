@@ -44,15 +44,12 @@ from fusedrf_cli.engine.settings import current
 
 @dataclass(frozen=True)
 class Recipe:
-    """The parts of the method, of which benchmarks/ablation.py replaces one at a time."""
+    """The parts of the method."""
 
     chance: Chance = matter_first
     density_loss: DensityLoss = log_depth
     visibility: Visibility = mostly_seen
     schedule: type[Schedule] = Schedule
-
-
-DEFAULT_RECIPE = Recipe()
 
 
 @dataclass
@@ -102,7 +99,7 @@ class DistillRun:
         sampler: RaySampler,
         config: DistilConfig,
         rgb: bool = True,
-        recipe: Recipe = DEFAULT_RECIPE,
+        recipe: Recipe = Recipe(),
         judge: Callable[[StoredField], float] | None = None,
     ):
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge

@@ -57,15 +57,14 @@ class ExposureConfig:
     """Of a photo that maps do not explain, against one that they do."""
 
 
-DEFAULT = ExposureConfig()
-
-
-def rays_of_each(photos: int, config: ExposureConfig = DEFAULT) -> int:
+def rays_of_each(photos: int, config: ExposureConfig = ExposureConfig()) -> int:
     """How many rays of each photo maps are found from."""
     return int(np.clip(config.rays // photos, *config.rays_of_each))
 
 
-def matched(photos: torch.Tensor, poses: Poses, config: ExposureConfig = DEFAULT) -> np.ndarray | None:
+def matched(
+    photos: torch.Tensor, poses: Poses, config: ExposureConfig = ExposureConfig()
+) -> np.ndarray | None:
     """Maps of photos by many people, of which m colours each are known, (n, m, 3) in [0, 1] and not finite
     where they do not count: those by which mean and deviation of all are alike. None where photos that were
     taken side by side are alike as they are."""
@@ -85,7 +84,7 @@ def matched(photos: torch.Tensor, poses: Poses, config: ExposureConfig = DEFAULT
     return weighed(maps, maps[:, 0], config)
 
 
-def side_by_side(poses: Poses, config: ExposureConfig = DEFAULT) -> tuple[np.ndarray, np.ndarray]:
+def side_by_side(poses: Poses, config: ExposureConfig = ExposureConfig()) -> tuple[np.ndarray, np.ndarray]:
     """(m,) and (m,) photos, and of each the one that was taken nearest to it, looking the same way; without
     those that have none beside them."""
     place = poses.position - poses.position.mean(0)
@@ -107,7 +106,7 @@ def measured(
     photos: torch.Tensor,
     near: float,
     before: np.ndarray | None,
-    config: ExposureConfig = DEFAULT,
+    config: ExposureConfig = ExposureConfig(),
 ) -> np.ndarray | None:
     """Maps of photos by what a field shows, in the least squares; None where none were known `before` and the
     photos do not surely differ.
@@ -125,7 +124,7 @@ def measured(
     return fitted(shown, truth, before, config)
 
 
-def differ(shown: torch.Tensor, truth: torch.Tensor, config: ExposureConfig = DEFAULT) -> bool:
+def differ(shown: torch.Tensor, truth: torch.Tensor, config: ExposureConfig = ExposureConfig()) -> bool:
     """Whether photos (n, m, 3), nan where they do not count, are surely brighter and darker, one than the
     other, than the colours that a field shows for them: by their gains of least squares, of which `sure`
     standard errors do not count (the positive part of James and Stein's estimate)."""
@@ -146,7 +145,7 @@ def fitted(
     shown: torch.Tensor,
     truth: torch.Tensor,
     before: np.ndarray | None = None,
-    config: ExposureConfig = DEFAULT,
+    config: ExposureConfig = ExposureConfig(),
 ) -> np.ndarray:
     """Maps of photos (n, m, 3), nan where they do not count, that show `shown`, from those `before` on.
 
@@ -190,7 +189,7 @@ def gauged(gain: np.ndarray, offset: np.ndarray, like: np.ndarray) -> np.ndarray
     return np.stack([gain, offset + gain * (like[:, 1] - offset).mean(0) / gain.mean(0)], 1)
 
 
-def weighed(maps: np.ndarray, missed: np.ndarray, config: ExposureConfig = DEFAULT) -> np.ndarray:
+def weighed(maps: np.ndarray, missed: np.ndarray, config: ExposureConfig = ExposureConfig()) -> np.ndarray:
     """Maps (n, 2, 3) with weights, of photos that are off by root mean squares (n, 3): an error counts as the
     colour of the field that it is due to, and less in a photo that is off by more of that than the median."""
     off = missed / maps[:, 0]

@@ -31,7 +31,7 @@ from fusedrf_cli.engine.fields.computed import AS_IT_IS, NONE_KNOWN, Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import LEAST_TEXELS
+from fusedrf_cli.engine.kinds.student import StudentConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.settings import current
 
@@ -101,7 +101,7 @@ class FitRun:
         pictures are known to show."""
         generator = torch.Generator().manual_seed(config.seed)
         pool = RayPool(cameras, images, generator)
-        coarse = max(LEAST_TEXELS, round(config.longest * config.stages[0][1]))
+        coarse = max(current(StudentConfig).least_texels, round(config.longest * config.stages[0][1]))
         kind = registry.kind(config.kind)
         field = kind.create(kind.untrained(aabb, coarse, config.way), generator, name).to(config.device)
         if limits is not None:

@@ -25,9 +25,6 @@ class DepthConfig:
     """Of that loss; with twice that the cup shows 0.2 dB less."""
 
 
-DEFAULT = DepthConfig()
-
-
 class Known(NamedTuple):
     """Which points pictures are known to show."""
 
@@ -46,7 +43,7 @@ class KeyPoints:
         known: Known,
         ignored: np.ndarray | None,
         generator: torch.Generator,
-        config: DepthConfig = DEFAULT,
+        config: DepthConfig = DepthConfig(),
     ):
         """ignored (P,) bool: pixels, counted picture after picture, that must not be drawn."""
         self.config = config

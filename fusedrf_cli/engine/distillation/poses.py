@@ -42,9 +42,6 @@ class PoseConfig:
     """Probes by which a pose changes in one round at most."""
 
 
-DEFAULT = PoseConfig()
-
-
 class Poses(NamedTuple):
     """Of n photos, in the field's frame."""
 
@@ -66,7 +63,7 @@ def refined(
     photos: torch.Tensor,
     near: float,
     probe: np.ndarray,
-    config: PoseConfig = DEFAULT,
+    config: PoseConfig = PoseConfig(),
 ) -> np.ndarray:
     """(n, 6) float64: by which angles about the frame's axes (3, radians) each of n photos' cameras is to be
     turned, and by how much moved (3), so that the field shows their colours better: one damped step of Gauss
@@ -115,7 +112,7 @@ def refined(
 
 
 def step_of(
-    slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray, config: PoseConfig = DEFAULT
+    slopes: np.ndarray, missed: np.ndarray, fair: np.ndarray, config: PoseConfig = PoseConfig()
 ) -> np.ndarray:
     """(n, 6) of n photos, in probes: by how much all six parameters change, damped, drawn towards none by as
     much as noise alone would change, and held to `largest`.

@@ -5,8 +5,6 @@ from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
 from fusedrf_cli.engine.settings import current
 
-LOST_DEPTH = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
-
 
 def starts_coarse(student: StoredField, coarse_from: int | None) -> bool:
     """Whether a student is on one grid large enough, in texels, to have half its resolution first."""
@@ -27,6 +25,7 @@ def resampled_like(student: StoredField, other: StoredField) -> StoredField:
 def pruned(student: StoredField) -> OccupancyGrid:
     """The student's occupancy without the cells in which it turned out to hold nothing."""
     grid, depth = student.occupancy, depths_across(student, PROBES)
-    occupied = depth > harmless_depth(depth, current(MatterConfig).empty_below, LOST_DEPTH)
+    lost = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
+    occupied = depth > harmless_depth(depth, current(MatterConfig).empty_below, lost)
     kept = grid.marked(occupied).dilated().occupied & grid.occupied
     return grid.marked(kept)

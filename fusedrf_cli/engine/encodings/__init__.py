@@ -16,6 +16,20 @@ unit cube of the box, three float64:
                                left out
 Points may lie a rounding outside the cube; no index may. A multiple of 8 features lets them use vectors.
 
+The density's encoding may also have
+    steps_at(field, cell, unit, k)
+                               for how many steps of a ray its sample k stands, 0 where there is nothing; left
+                               out: 1 in the box
+    advance(field, cell, many, steps, k, p, way, u, u0, step), known(field, grid, p)
+                               as kernels/loops.py has them
+    located(field, cell, scratch)
+                               the cell with what the last `summed` or `forward` has found out of it
+    keep(cell), again(field, held, unit)
+                               an int from which `again` makes the cell once more, where `locate` does not
+    logits(field, cell, scratch), logits_backward(field, cell, d_logits, scratch)
+                               what it adds to the three logits of the colour, and what they send back, which
+                               waits in scratch for the way back of the density
+
 For Python, with `options` what a field's shape says of the encoding:
     sizes(**options)           constants: WIDTH, ROOM (numbers of scratch, if any, which lie from AT on), and
                                its own
@@ -24,9 +38,12 @@ For Python, with `options` what a field's shape says of the encoding:
     Arrays, arrays(field, starts, **options)
                                what the functions read beside `field.params`, if anything: a NamedTuple, and
                                that of a field where its sections begin at starts in `params`
-    reference(sections, unit, read, **options)
+    reference(field, sections, unit, read, **options)
                                (N, WIDTH) features of its sections at unit (N, 3), in plain torch; `read` is
                                what the slot that it reads hands on (kernels/assembled.py), or None
     bound(sections, read, **options)
-                               (WIDTH,) float64 the largest magnitude that each feature can reach
+                               (WIDTH,) float64 the largest magnitude that each feature can reach; of fields
+                               over a box
+    logits_reference(field, sections, unit, **options), logits_bound(sections, **options)
+                               the same of `logits`: (N, 3), and one magnitude
 """

@@ -11,7 +11,7 @@ def sizes(count: int) -> dict[str, int]:
     return {"COUNT": count, "NUMBERS": 3 + 6 * count, "WIDTH": -(-(3 + 6 * count) // 8) * 8}
 
 
-def reference(sections: dict, unit: torch.Tensor, read: None, count: int) -> torch.Tensor:
+def reference(field, sections: dict, unit: torch.Tensor, read: None, count: int) -> torch.Tensor:
     """See encodings."""
     x = 2 * unit - 1
     waves = [wave(2.0**level * x) for level in range(count) for wave in (torch.sin, torch.cos)]

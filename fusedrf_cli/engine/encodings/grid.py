@@ -38,7 +38,7 @@ def arrays(field, starts: np.ndarray, numbers: int) -> Arrays:
 
 
 def reference(
-    sections: dict[str, torch.Tensor], unit: torch.Tensor, read: None, numbers: int
+    field, sections: dict[str, torch.Tensor], unit: torch.Tensor, read: None, numbers: int
 ) -> torch.Tensor:
     """See encodings."""
     return torch_reference.trilinear(sections[""].view(*sections[""].shape[:3], -1), unit)

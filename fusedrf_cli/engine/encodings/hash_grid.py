@@ -57,8 +57,8 @@ def arrays(
 
 
 def reference(
-    sections: dict, unit: torch.Tensor, read: None, levels: int, features: int, log2_rows: int, base: int,
-    growth: float,
+    field, sections: dict, unit: torch.Tensor, read: None, levels: int, features: int, log2_rows: int,
+    base: int, growth: float,
 ) -> torch.Tensor:  # fmt: skip
     """See encodings."""
     per_level, first, table = [], 0, sections["rows"]

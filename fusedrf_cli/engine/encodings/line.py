@@ -24,8 +24,8 @@ def sizes(rank: int) -> dict[str, int]:
 
 
 def sections(resolution: tuple[int, int, int], rank: int) -> list[Part]:
-    """See encodings."""
-    return [Part(f"line_{axis}", (resolution[axis], rank), (axis,)) for axis in range(3)]
+    """See encodings; drawn as TensoRF's lines."""
+    return [Part(f"line_{axis}", (resolution[axis], rank), (axis,), spread=0.2) for axis in range(3)]
 
 
 def arrays(field, starts: np.ndarray, rank: int) -> Arrays:
@@ -33,7 +33,9 @@ def arrays(field, starts: np.ndarray, rank: int) -> Arrays:
     return Arrays(starts, field.corners[0])
 
 
-def reference(sections: dict[str, torch.Tensor], unit: torch.Tensor, read: None, rank: int) -> torch.Tensor:
+def reference(
+    field, sections: dict[str, torch.Tensor], unit: torch.Tensor, read: None, rank: int
+) -> torch.Tensor:
     """See encodings."""
     x, y, z = (torch_reference.linear(sections[f"line_{axis}"], unit[:, axis]) for axis in range(3))
     return x * y * z

@@ -11,6 +11,7 @@ from fusedrf_cli.engine.kernels import reference as torch_reference
 from fusedrf_cli.engine.kernels.parts import bilinear, linear, scatter, store_8, texel
 from fusedrf_cli.engine.kernels.prefetch import prefetch_plane
 
+SPREAD = 0.1  # TensoRF's, of an untrained field's numbers
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
 
 
@@ -28,9 +29,9 @@ def sizes(rank: int) -> dict[str, int]:
 
 def sections(resolution: tuple[int, int, int], rank: int) -> list[Part]:
     """See encodings."""
-    n = resolution
-    planes = [Part(f"plane_{m}", (n[a], n[b], rank), (a, b)) for m, (a, b, _) in enumerate(MODES)]
-    return [*planes, *(Part(f"line_{m}", (n[c], rank), (c,)) for m, (_, _, c) in enumerate(MODES))]
+    n, drawn = resolution, {"spread": SPREAD}
+    planes = [Part(f"plane_{m}", (n[a], n[b], rank), (a, b), **drawn) for m, (a, b, _) in enumerate(MODES)]
+    return [*planes, *(Part(f"line_{m}", (n[c], rank), (c,), **drawn) for m, (_, _, c) in enumerate(MODES))]
 
 
 def arrays(field, starts: np.ndarray, rank: int) -> Arrays:
@@ -38,7 +39,9 @@ def arrays(field, starts: np.ndarray, rank: int) -> Arrays:
     return Arrays(starts, field.corners[0])
 
 
-def reference(sections: dict[str, torch.Tensor], unit: torch.Tensor, read: None, rank: int) -> torch.Tensor:
+def reference(
+    field, sections: dict[str, torch.Tensor], unit: torch.Tensor, read: None, rank: int
+) -> torch.Tensor:
     """See encodings."""
     products = []
     for m, (a, b, c) in enumerate(MODES):

@@ -9,7 +9,7 @@ def sizes(outputs: int) -> dict[str, int]:
     return {"WIDTH": outputs}
 
 
-def reference(sections: dict, unit: torch.Tensor, read: torch.Tensor, outputs: int) -> torch.Tensor:
+def reference(field, sections: dict, unit: torch.Tensor, read: torch.Tensor, outputs: int) -> torch.Tensor:
     """See encodings."""
     return read
 

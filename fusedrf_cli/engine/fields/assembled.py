@@ -1,5 +1,5 @@
-"""A field over one box that is assembled of an encoding for its density, one for its colour, and a decoder of
-each (kernels/assembled.py says how their functions become one namespace)."""
+"""Fields that are assembled of an encoding for their density, one for their colour, and a decoder of each
+(kernels/assembled.py says how their functions become one namespace)."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,8 +9,11 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import BoxField, Part
+from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.kernels.reference import cell_at, exact
+
+MAX_RANK = 1024  # of a stored field
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Slot:
         """Its constants."""
         return self.module.sizes(**self.options)
 
-    def arrays(self, field: "AssembledField", starts: np.ndarray) -> tuple:
+    def arrays(self, field: "Assembled", starts: np.ndarray) -> tuple:
         """Its arrays, of a field where its numbers begin at starts in `params`."""
         return self.module.arrays(field, starts, **self.options) if hasattr(self.module, "arrays") else ()
 
@@ -52,8 +55,92 @@ class Slot:
         ]
 
 
-class AssembledField(BoxField):
+@dataclass(frozen=True)
+class RankedShape:
+    """Components of a decomposed field whose colours are spherical harmonics."""
+
+    density_rank: int = 16
+    """Components, per mode, of the density."""
+    colour_rank: int = 24
+    """Components, per mode, of the colour features."""
+    sh_degree: int = 2
+
+    def __post_init__(self):
+        """Refuse what the kernels were not written for: runs of eight components, four SH bands."""
+        for name in ("density_rank", "colour_rank"):
+            rank = getattr(self, name)
+            if type(rank) is not int or not 8 <= rank <= MAX_RANK or rank % 8:
+                raise ValueError(f"'{name}' should be a multiple of 8 up to {MAX_RANK}, found {rank}")
+        if self.sh_degree not in range(4):
+            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
+
+    @property
+    def coefficients(self) -> int:
+        """SH coefficients per channel."""
+        return (self.sh_degree + 1) ** 2
+
+
+class Assembled(ComputedField):
     """A field of four slots: `density` and `colour`, encodings, and `sigma` and `rgb`, which decode them.
+
+    Over a box its numbers and all else follow from the slots (AssembledField); a kind over anything else
+    defines the methods below.
+    """
+
+    slots: dict[str, Slot]
+    """What fills the slots, by name, in the order of `kernels.assembled.READS`."""
+
+    @property
+    def cube(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower corner (3,) and sides (3,) of the cube that encodings count in."""
+        raise NotImplementedError
+
+    def slot_starts(self) -> dict[str, np.ndarray]:
+        """Where in `params` the numbers of each slot begin."""
+        raise NotImplementedError
+
+    def slot_sections(self) -> dict[str, dict]:
+        """What the references of each slot take for its numbers."""
+        raise NotImplementedError
+
+    def located(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Points (N, 3) float64 of the space's coordinates as the encodings' references take them (N, 3), and
+        whether the field is there (N,)."""
+        raise NotImplementedError
+
+    @property
+    def bodies(self) -> ModuleType:
+        """See ComputedField."""
+        return assemble(**{name: slot.module for name, slot in self.slots.items()})
+
+    def kernel_arrays(self, params: object) -> tuple:
+        """See ComputedField."""
+        values, starts = [params, *self.cube], self.slot_starts()
+        for name, slot in self.slots.items():
+            values += slot.arrays(self, starts[name])
+        return self.bodies.Arrays(*values)
+
+    def reference(
+        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See ComputedField: the references of the slots, one after the other."""
+        bare = self.with_params(params)
+        own = bare.slot_sections()
+        unit, held = bare.located(exact(points, params.device))
+        density, colour, sigma, rgb = self.slots.values()
+        features = density.module.reference(self, own["density"], unit, None, **density.options)
+        values, outputs = sigma.module.reference(self, own["sigma"], features, **sigma.options)
+        values = torch.where(held, values, 0)
+        features = colour.module.reference(self, own["colour"], unit, outputs, **colour.options)
+        dirs = exact(dirs, params.device)
+        logits = rgb.module.reference(self, own["rgb"], features, dirs, **rgb.options)
+        if hasattr(density.module, "logits_reference"):
+            logits = logits + density.module.logits_reference(self, own["density"], unit, **density.options)
+        return values, torch.where((values > 0)[:, None], logits.sigmoid(), 0)
+
+
+class AssembledField(Assembled, BoxField):
+    """Such a field over one box.
 
     A kind sets `kind` and `shape_type`, and defines `slots_of`; the rest follows from the slots' modules.
     """
@@ -65,36 +152,31 @@ class AssembledField(BoxField):
 
     @cached_property
     def slots(self) -> dict[str, Slot]:
-        """What fills its slots."""
+        """See Assembled."""
         return self.slots_of(self.shape)
-
-    @property
-    def bodies(self) -> ModuleType:
-        """See ComputedField."""
-        return assemble(**{name: slot.module for name, slot in self.slots.items()})
 
     @classmethod
     def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[Part]:
         """See BoxField: those of each slot in turn."""
         return [part for slot in cls.slots_of(shape).values() for part in slot.parts(resolution)]
 
-    def kernel_arrays(self, params: object) -> tuple:
-        """See ComputedField."""
-        _, lo, side = self.corners
-        values, first = [params, lo, side], 0
-        for slot in self.slots.values():
-            last = first + len(slot.parts(self.resolution))
-            values += slot.arrays(self, self.starts[first:last])
-            first = last
-        return self.bodies.Arrays(*values)
-
     def planes(self, numbers: torch.Tensor) -> list[torch.Tensor]:
         """See ComputedField."""
         sections = self.with_params(numbers).sections()
         return [sections[part.name] for part in self.parts if len(part.axes) == 2]
 
+    @property
+    def cube(self) -> tuple[np.ndarray, np.ndarray]:
+        """See Assembled: the box."""
+        return self.corners[1:]
+
+    def slot_starts(self) -> dict[str, np.ndarray]:
+        """See Assembled."""
+        counts = [len(slot.parts(self.resolution)) for slot in self.slots.values()]
+        return dict(zip(self.slots, np.split(self.starts[:-1], np.cumsum(counts)), strict=False))
+
     def slot_sections(self) -> dict[str, dict[str, torch.Tensor]]:
-        """Views of the numbers of each slot, by the names that its module gives them."""
+        """See Assembled: views of the numbers of each slot, by the names that its module gives them."""
         sections = self.sections()
         return {
             name: {
@@ -104,21 +186,11 @@ class AssembledField(BoxField):
             for name, slot in self.slots.items()
         }
 
-    def reference(
-        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """See ComputedField: the references of the slots, one after the other."""
-        kind, own = params.dtype, self.with_params(params).slot_sections()
-        points, dirs = exact(points, params.device), exact(dirs, params.device)
-        box = exact(self.box, params.device)
-        unit = ((points - box[:3]) / (box[3:] - box[:3])).to(kind)
-        density, colour, sigma, rgb = self.slots.values()
-        features = density.module.reference(own["density"], unit, None, **density.options)
-        values, outputs = sigma.module.reference(self, own["sigma"], features, **sigma.options)
-        values = torch.where(cell_at(self.occupancy, points)[1], values, 0)
-        features = colour.module.reference(own["colour"], unit, outputs, **colour.options)
-        colours = rgb.module.reference(self, own["rgb"], features, dirs, **rgb.options)
-        return values, torch.where((values > 0)[:, None], colours, 0)
+    def located(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """See Assembled: in the unit cube of the box, where a cell is occupied."""
+        box = exact(self.box, points.device)
+        unit = ((points - box[:3]) / (box[3:] - box[:3])).to(self.params.dtype)
+        return unit, cell_at(self.occupancy, points)[1]
 
     def check_answers(self) -> None:
         """See BoxField."""
@@ -128,4 +200,7 @@ class AssembledField(BoxField):
         largest, outputs = sigma.module.bound(self, own["sigma"], features, **sigma.options)
         self.check_density(largest)
         features = colour.module.bound(own["colour"], outputs, **colour.options)
-        self.check_logit(rgb.module.bound(self, own["rgb"], features, **rgb.options))
+        logit = rgb.module.bound(self, own["rgb"], features, **rgb.options)
+        if hasattr(density.module, "logits_bound"):
+            logit += density.module.logits_bound(own["density"], **density.options)
+        self.check_logit(logit)

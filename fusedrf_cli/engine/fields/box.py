@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,12 +22,9 @@ from fusedrf_cli.engine.fields.computed import (
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
-PAGE = 2 << 20  # bytes, of a large one: a vertex that is used may be alone in its
-PER_VERTEX_FOUND = 7  # bytes of a vertex, or of a cell, while the used ones are found
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
-ON_TEXEL = 1e-9  # spacings from one, within which a place is that of the texel
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
 
@@ -42,16 +39,23 @@ class Part:
     axes: tuple[int, ...] = ()
     """Axes of the box (0 x, 1 y, 2 z) that its leading dimensions run along, texel by texel."""
     rate: float = 1.0
-    """What it learns at, relative to the optimiser's rate."""
+    """What it learns at, relative to the optimiser's rate; at 0 it does not."""
     spread: float = 0.0
     """Standard deviation of an untrained field's numbers."""
     columns: int | None = None
     """Of a row of numbers, how many are stored; the others fill it up to whole runs and are 0. None: all."""
+    fades: bool = False
+    """See Group."""
 
     @property
     def on_vertices(self) -> bool:
         """Whether it has a number, or a row of them, for each vertex of the grid."""
         return self.axes == (0, 1, 2)
+
+
+def aligned(part: Part) -> int:
+    """Floats of a part, up to whole cache lines."""
+    return -(-math.prod(part.shape) // LINE) * LINE
 
 
 class BoxField(ComputedField):
@@ -65,6 +69,8 @@ class BoxField(ComputedField):
     """
 
     shape_type: type
+    name = ""
+    """Of the object that it is, where its kind's files say so."""
 
     def __init__(
         self,
@@ -115,7 +121,7 @@ class BoxField(ComputedField):
         if self.params.device.type != "cpu":
             return self.to("cpu").resampled(box, resolution).to(self.params.device)
         new = type(self)(self.shape, box, resolution, self.scale, self.shift, occupancy=self.occupancy)
-        new.params = new.params.to(self.params.dtype)
+        new.params, new.name = new.params.to(self.params.dtype), self.name
         at = [unit_texels(new.box, self.box, axis, new.resolution[axis]) for axis in range(3)]
         for part, old, target in zip(
             self.parts, self.sections().values(), new.sections().values(), strict=True
@@ -135,13 +141,17 @@ class BoxField(ComputedField):
     @cached_property
     def starts(self) -> np.ndarray:
         """(parts + 1,) int64: where each part begins in `params`, on a cache line, and the end."""
-        counts = [-(-int(np.prod(part.shape)) // LINE) * LINE for part in self.parts]
-        return np.cumsum([0, *counts], dtype=np.int64)
+        return np.cumsum([0, *map(aligned, self.parts)], dtype=np.int64)
 
     @property
     def size(self) -> int:
         """Floats of `params`."""
         return int(self.starts[-1])
+
+    @classmethod
+    def size_of(cls, shape: object, resolution: tuple[int, int, int]) -> int:
+        """Floats of the `params` of a field."""
+        return sum(map(aligned, cls.parts_of(shape, resolution)))
 
     def sections(self) -> dict[str, torch.Tensor]:
         """Views of the parts of `params` by name."""
@@ -191,11 +201,12 @@ class BoxField(ComputedField):
         for part, low, high, lines in zip(
             self.parts, self.starts, self.starts[1:], self.reached, strict=False
         ):
-            last = groups[-1] if groups else None
-            if last and last.lines is None and lines is None and last.rate == part.rate:
-                groups[-1] = Group(last.low, int(high), part.rate)
-            else:
-                groups.append(Group(int(low), int(high), part.rate, lines))
+            last, alike = groups[-1] if groups else None, (part.rate, part.fades)
+            whole = last is not None and last.lines is None and lines is None and last.high == low
+            if whole and (last.rate, last.fades) == alike:
+                groups[-1] = replace(last, high=int(high))
+            elif part.rate:
+                groups.append(Group(int(low), int(high), part.rate, lines, part.fades))
         return groups
 
     # -- storing -----------------------------------------------------------------------------------------
@@ -203,7 +214,7 @@ class BoxField(ComputedField):
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and metadata for a bundle: the parts, and occupancy as packed bits."""
         arrays = {
-            part.name: self.pack(part, view.detach().cpu()).numpy()
+            self.stored_name(part.name): self.pack(part, view.detach().cpu()).numpy()
             for part, view in zip(self.parts, self.sections().values(), strict=True)
         }
         arrays |= packed_bits("occupancy", self.occupancy.occupied)
@@ -221,9 +232,17 @@ class BoxField(ComputedField):
         }
         return arrays, metadata
 
-    def stored_shape(self, part: Part) -> tuple[int, ...]:
-        """Shape under which a part is stored; of vertices, the used ones in order."""
-        shape = (int(np.count_nonzero(self.used)), *part.shape[3:]) if part.on_vertices else part.shape
+    @classmethod
+    def stored_name(cls, name: str) -> str:
+        """The name in files of the array of a part."""
+        return name
+
+    def stored_shape(self, part: Part, used: int | None = None) -> tuple[int, ...]:
+        """Shape under which a part is stored; of vertices, the used ones in order. used: how many these are,
+        where that is known."""
+        if part.on_vertices and used is None:
+            used = int(np.count_nonzero(self.used))
+        shape = (used, *part.shape[3:]) if part.on_vertices else part.shape
         return shape if part.columns is None else (*shape[:-1], part.columns)
 
     def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
@@ -245,14 +264,16 @@ class BoxField(ComputedField):
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs."""
         parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
-        numbers = sum(-(-math.prod(part.shape) // LINE) * LINE for part in parts)
+        numbers = sum(map(aligned, parts))
         counts, texels = metadata["cells"]["counts"], metadata["resolution"]
         made, unwritten = PER_CELL_MADE * math.prod(counts), 0
         for part in parts:
             if part.on_vertices:  # used_vertices axis by axis, and the used ones' places
                 halves, used = [math.prod([*texels[:n], *counts[n:]]) for n in range(4)], shapes[part.name][0]
-                made = max(made, PER_VERTEX_FOUND * max(halves), math.prod(texels) + 8 * used)
-                unwritten += max(0, 4 * math.prod(part.shape) - used * PAGE)
+                # 7 bytes of a vertex, or of a cell, while the used ones are found; of these each may be
+                # alone in a large page.
+                made = max(made, 7 * max(halves), math.prod(texels) + 8 * used)
+                unwritten += max(0, 4 * math.prod(part.shape) - used * (2 << 20))
         return FieldNeeds(4 * numbers + PER_CELL * math.prod(counts), made, unwritten)
 
     @classmethod
@@ -268,19 +289,20 @@ class BoxField(ComputedField):
         cells = metadata["cells"]
         grid = OccupancyGrid(
             checked_box(cells["aabb"], "cells"),
-            unpack_bits(arrays, "occupancy", counts),
+            unpack_bits(arrays, cls.stored_name("occupancy"), counts),
             space_named(cells.get("space", "bounded")),
         )
         bare = cls(shape, checked_box(box, "aabb"), resolution, scale, shift, torch.zeros(0), grid)
         check_samples(grid.space.most_samples(grid.aabb, sampling_step(bare)), "the field")
         for part in bare.parts:  # before `params` takes memory
-            found, expected = arrays.get(part.name), bare.stored_shape(part)
+            name, expected = cls.stored_name(part.name), bare.stored_shape(part)
+            found = arrays.get(name)
             if found is None or found.shape != expected:
                 have = "nothing" if found is None else list(found.shape)
-                raise ValueError(f"array '{part.name}' should have shape {list(expected)}, found {have}")
+                raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
         field = cls(shape, bare.box, resolution, scale, shift, occupancy=grid)
         for part, view in zip(field.parts, field.sections().values(), strict=True):
-            stored = torch.from_numpy(np.ascontiguousarray(arrays[part.name], np.float32))
+            stored = torch.from_numpy(np.ascontiguousarray(arrays[cls.stored_name(part.name)], np.float32))
             field.unpack(part, stored, view)
         field.check_answers()
         return field
@@ -356,7 +378,7 @@ def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> tor
     n = values.shape[axis]
     position = unit * (n - 1)
     whole = position.round()
-    position = torch.where((position - whole).abs() < ON_TEXEL, whole, position)
+    position = torch.where((position - whole).abs() < 1e-9, whole, position)
     lower = position.floor().clamp(0, n - 2).long()
     fraction = (position - lower).to(values.dtype)
     inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)

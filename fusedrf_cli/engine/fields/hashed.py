@@ -5,19 +5,19 @@ A place of photos has surfaces everywhere, and products of planes and lines over
 and stones apart; vertices that are found by a hash cost memory only where some surface uses them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 RUN = 4  # rows that lie side by side along z, so that neighbours share a cache line
-WIDTH = 4  # numbers of a row: density, then red, green and blue
+ROW = 4  # numbers of a row: density, then red, green and blue
 EMPTY_FROM = -6.0  # density before activation, shift included, under which none is asked for
+STEPS = 2.0  # of its finest spacing from one sample of a picture to the next
 MAX_LEVELS, MAX_ROWS = 8, 1 << 24
 MAX_VERTEX = 1 << 20  # along an axis: past it, float32 would not tell where between two a point is
 TOGETHER = 64  # rows that files code by one scale
-PER_BLOCK = TOGETHER // RUN // 8 + 1 + 2 * WIDTH  # bytes of those: which are held, how many, and scales
-WORTH = 0.75  # of the bytes of all rows: up to which a file has those alone that are not 0
+PER_BLOCK = TOGETHER // RUN // 8 + 1 + 2 * ROW  # bytes of those: which are held, how many, and scales
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,11 @@ class Hashed:
     """Of the vertices of each level."""
     rows: int
     """Of each level, a power of two; vertices share them."""
+    learns_from: int = field(default=100, compare=False)
+    """Texels along a field's longest axis from which it learns; before, it would learn what is coarse."""
+    rate: float = field(default=0.5, compare=False)
+    """It learns at, relative to the factors; at 1 smooth things come out grainy: a cup after 100 s SSIM 0.77,
+    with 0.5 0.79."""
 
     def __post_init__(self):
         """Refuse what the kernels were not written for."""
@@ -40,7 +45,12 @@ class Hashed:
     @property
     def shape(self) -> tuple[int, int]:
         """Of the array of all rows, level after level."""
-        return len(self.spacings) * self.rows, WIDTH
+        return len(self.spacings) * self.rows, ROW
+
+    @property
+    def picture_step(self) -> float:
+        """At which pictures sample it."""
+        return STEPS * min(self.spacings)
 
 
 @dataclass(frozen=True)
@@ -53,12 +63,13 @@ class Held:
 
     @classmethod
     def of(cls, detail: np.ndarray) -> "Held | None":
-        """Of a detail (R, WIDTH) the runs with a number other than 0; None where a file is to hold all."""
+        """Of a detail (R, ROW) the runs with a number other than 0; None where a file is to hold all."""
         if len(detail) % TOGETHER:
             return None
-        held = cls(detail.reshape(-1, RUN * WIDTH).any(1))
-        bytes_held = held.count * WIDTH + len(held.masks) * PER_BLOCK
-        return held if bytes_held <= WORTH * WIDTH * len(detail) else None
+        held = cls(detail.reshape(-1, RUN * ROW).any(1))
+        bytes_held = held.count * ROW + len(held.masks) * PER_BLOCK
+        # A file has those alone that are not 0 up to three quarters of the bytes of all rows.
+        return held if bytes_held <= 0.75 * ROW * len(detail) else None
 
     @property
     def rows(self) -> np.ndarray:

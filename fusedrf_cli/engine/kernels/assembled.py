@@ -16,15 +16,17 @@ from functools import cache
 from types import FunctionType, ModuleType
 from typing import NamedTuple
 
-from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kernels.parts import LINE, sigmoid
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
 HOOKS = (
-    "locate", "forward", "backward", "summed", "summed_backward", "prefetch_at", "ray_setup", "ray_backward"
+    "locate", "steps_at", "located", "known", "keep", "again", "advance", "forward", "backward", "summed",
+    "summed_backward", "logits", "logits_backward", "prefetch_at", "ray_setup", "ray_backward",
 )  # fmt: skip
 """What the loops below and other slots call; the rest of a module is reached from there."""
-BASE = "params", "lo", "side"  # fields of every assembly's Arrays: numbers (P,), corner (3,) and sides (3,)
+BASE = "params", "lo", "side"
+"""Fields of every assembly's Arrays: numbers (P,); corner (3,) and sides (3,) of the cube of `unit`."""
 OF_LOOPS = "KEPT", "LEARN_FROM", "SHADING_COST", "COLOUR_FROM"  # constants that loops.py reads
 NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
 EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
@@ -34,25 +36,28 @@ EDGE = 1e-9  # share of a box by which rounding may put a point on its face outs
 
 
 def unit_of(field, p):
-    """The coordinates of a point in the unit cube of the field's box, and whether it lies inside."""
-    u, v = (p[0] - field.lo[0]) / field.side[0], (p[1] - field.lo[1]) / field.side[1]
-    w = (p[2] - field.lo[2]) / field.side[2]
-    return (u, v, w), min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE
+    """The coordinates of a point in the unit cube of the field's box."""
+    return (
+        (p[0] - field.lo[0]) / field.side[0],
+        (p[1] - field.lo[1]) / field.side[1],
+        (p[2] - field.lo[2]) / field.side[2],
+    )
 
 
 def density(field, grid, k, p, d, scratch):
     """See loops.py; a place is (unit coordinates, what the density's encoding located there)."""
-    unit, inside = unit_of(field, p)
+    unit = unit_of(field, p)
     cell = density_locate(field, unit)
-    if not inside:
+    steps = density_steps_at(field, cell, unit, k)
+    if steps == 0:
         return 0.0, 0.0, 0, (unit, cell)
     sigma, pre = sigma_forward(field, cell, scratch)
-    return sigma, pre, 1, (unit, cell)
+    return sigma, pre, steps, (unit, density_located(field, cell, scratch))
 
 
 def again(field, held, p):
     """See loops.py."""
-    unit = unit_of(field, p)[0]
+    unit = unit_of(field, p)
     return unit, density_locate(field, unit)
 
 
@@ -66,31 +71,74 @@ def own_cell(field, place):
     return colour_locate(field, place[0])
 
 
-def begin(field, frame, d, scratch):
+def begin(field, d, scratch):
     """See loops.py."""
     rgb_ray_setup(field, d, scratch)
 
 
-def end(field, frame, d, scratch, grad):
+def end(field, d, scratch, grad):
     """See loops.py."""
     rgb_ray_backward(field, d, scratch, grad)
 
 
+def plain_logits(field, place, r, g, b, scratch):
+    """The logits of a colour, to which the density's encoding adds none."""
+    return r, g, b
+
+
+def shifted_logits(field, place, r, g, b, scratch):
+    """The same, where it does."""
+    red, green, blue = density_logits(field, place[1], scratch)
+    return r + red, g + green, b + blue
+
+
 def colour(field, place, p, d, scratch, memory, at):
     """See loops.py."""
-    return rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+    r, g, b = rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
+    r, g, b = shown_logits(field, place, r, g, b, scratch)
+    return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
 def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py; colour first, since it may send back to what sigma hands on."""
     if shaded:
-        rgb_backward(field, colour_cell(field, place), d, rgb, d_rgb, scratch, memory, at, grad)
+        d_red, d_green = d_rgb[0] * rgb[0] * (1 - rgb[0]), d_rgb[1] * rgb[1] * (1 - rgb[1])
+        d_logits = d_red, d_green, d_rgb[2] * rgb[2] * (1 - rgb[2])
+        rgb_backward(field, colour_cell(field, place), d, d_logits, scratch, memory, at, grad)
+        density_logits_backward(field, place[1], d_logits, scratch)
     sigma_backward(field, place[1], pre, d_sigma, scratch, grad)
+
+
+TEMPLATES = unit_of, density, again, begin, end, colour, backward
+
+
+# -- where an encoding has the hook that they call; else the loops' own serve --------------------------------
+
+
+def held_keep(place):
+    """See loops.py."""
+    return density_keep(place[1])
+
+
+def held_again(field, held, p):
+    """See loops.py."""
+    unit = unit_of(field, p)
+    return unit, density_again(field, held, unit)
+
+
+def own_advance(field, grid, place, many, steps, k, p, way, u, u0, step):
+    """See loops.py."""
+    return density_advance(field, place[1], many, steps, k, p, way, u, u0, step)
+
+
+def own_known(field, grid, p):
+    """See loops.py."""
+    return density_known(field, grid, p)
 
 
 def ahead_density(field, array, held, p):
     """See loops.py."""
-    density_prefetch_at(field, array, density_locate(field, unit_of(field, p)[0]))
+    density_prefetch_at(field, array, again(field, held, p)[1])
 
 
 def ahead_colour(field, array, held, p):
@@ -98,7 +146,13 @@ def ahead_colour(field, array, held, p):
     colour_prefetch_at(field, array, colour_cell(field, again(field, held, p)))
 
 
-TEMPLATES = unit_of, density, again, begin, end, colour, backward, ahead_density, ahead_colour
+OPTIONAL = {
+    "keep": (held_keep, "density_keep"), "again": (held_again, "density_again"),
+    "advance": (own_advance, "density_advance"), "known": (own_known, "density_known"),
+    "ahead_density": (ahead_density, "density_prefetch_at"),
+    "ahead_colour": (ahead_colour, "colour_prefetch_at"),
+}  # fmt: skip
+"""By name, and the hook that each calls."""
 
 
 # -- what a module may leave out -----------------------------------------------------------------------------
@@ -113,8 +167,19 @@ def locate(field, unit):
     return unit
 
 
-def prefetch_at(field, array, cell):
-    """Nothing: what is read is near at hand."""
+def steps_at(field, cell, unit, k):
+    """Every sample in the box stands for one step."""
+    u, v, w = unit
+    return 1 if min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE else 0
+
+
+def located(field, cell, scratch):
+    """The cell, of which no more is known now."""
+    return cell
+
+
+def logits_backward(field, cell, d_logits, scratch):
+    """Nothing was added to a colour's logits."""
 
 
 def ray_setup(field, d, scratch):
@@ -125,7 +190,7 @@ def ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-DEFAULTS = {f.__name__: f for f in (locate, prefetch_at, ray_setup, ray_backward)}
+DEFAULTS = {f.__name__: f for f in (locate, steps_at, located, logits_backward, ray_setup, ray_backward)}
 
 
 # -- one namespace of four slots -----------------------------------------------------------------------------
@@ -138,14 +203,17 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
     assembly = ModuleType(f"{__name__}.{label}.bodies")
-    names = vars(assembly) | {"EDGE": EDGE}
-    names |= {template.__name__: renamed(template, template.__name__, assembly, {}) for template in TEMPLATES}
-    shared = colour is density or getattr(colour, "locate", locate) is None
-    names["colour_cell"] = renamed(shared_cell if shared else own_cell, "colour_cell", assembly, {})
+    names = vars(assembly) | {"sigmoid": sigmoid}
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
             if names.setdefault(name, value) is not value:
                 raise ValueError(f"'{name}' of '{module.__name__}' has two meanings")
+    templates = {template.__name__: template for template in TEMPLATES}
+    templates |= {name: template for name, (template, hook) in OPTIONAL.items() if hook in names}
+    shared = colour is density or getattr(colour, "locate", locate) is None
+    templates["colour_cell"] = shared_cell if shared else own_cell
+    templates["shown_logits"] = shifted_logits if hasattr(density, "logits") else plain_logits
+    names |= {name: renamed(template, name, assembly, {}) for name, template in templates.items()}
     functions = {name: value for name, value in names.items() if isinstance(value, FunctionType)}
     vars(assembly).update(names, Arrays=arrays_type(slots), functions=functions, sizes=constants)
     return assembly
@@ -158,6 +226,7 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
         raise ValueError(f"'{module.__name__}' may not call its arrays {sorted(fields & NOT_PREFIXED)}")
     hooks = {name: getattr(module, name, DEFAULTS.get(name)) for name in HOOKS}
     pending = {name: hook for name, hook in hooks.items() if hook is not None}
+    known_as = dict(pending)
     while pending:
         name, function = pending.popitem()
         new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
@@ -170,8 +239,11 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
                 new[used] = f"{READS[slot]}_{needed}"
             elif isinstance(value, FunctionType) or used.isupper() or used in fields:
                 new[used] = f"{slot}_{used}"
-                if isinstance(value, FunctionType) and new[used] not in names:
-                    pending[used] = value
+                if isinstance(value, FunctionType):
+                    if known_as.setdefault(used, value) is not value:
+                        raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
+                    if new[used] not in names:
+                        pending[used] = value
                 elif used.isupper() and used in known:
                     names[new[used]] = value
             elif used in known and names.setdefault(used, value) is not value:  # numpy, kernels/parts.py
@@ -196,8 +268,8 @@ def arrays_of(module: ModuleType) -> type:
 
 
 def arrays_type(slots: dict[str, ModuleType]) -> type:
-    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
-    that is kept by its types must find it (kernels/tinting.py)."""
+    """The type of the arrays of an assembly: one for each, found in this module by its name, without
+    which another process would take it for another type and compile all loops over it again."""
     name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
     if name not in globals():
         prefixed = [

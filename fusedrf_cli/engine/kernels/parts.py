@@ -282,6 +282,19 @@ def scatter_8(out, o, weight, values, v):
 
 
 @body
+def scatter_4(out, o, weight, values, v):
+    """`scatter_8` of four numbers."""
+    e0 = out[o] + weight * values[v]
+    e1 = out[o + np.uint64(1)] + weight * values[v + np.uint64(1)]
+    e2 = out[o + np.uint64(2)] + weight * values[v + np.uint64(2)]
+    e3 = out[o + np.uint64(3)] + weight * values[v + np.uint64(3)]
+    out[o] = e0
+    out[o + np.uint64(1)] = e1
+    out[o + np.uint64(2)] = e2
+    out[o + np.uint64(3)] = e3
+
+
+@body
 def scatter(count, out, o, weight, values, v):
     """`add_scaled` to a place where others may be adding too."""
     literally(count)

@@ -13,10 +13,9 @@ from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.streamed import opened
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.asking import (
-    LEAST,
-    MOST,
-    OCTANTS,
+    AskingConfig,
     colours,
     density,
     density_features,
@@ -26,15 +25,30 @@ from fusedrf_cli.engine.kinds.asking import (
 )
 from fusedrf_cli.engine.kinds.boxes import GridStudent
 from fusedrf_cli.engine.kinds.student import DistilConfig, Made, MadeStudent, Needs, Plan, TooSmall, Way
+from fusedrf_cli.engine.settings import current
 
-SMOOTHED = 0.7  # voxels: standard deviation of the opacity whose slope says where a surface faces
-DEEPEST = -40.0  # density feature of nothing at all, where a field is copied
-INSIDE = 1e-7  # of a box's sides: on its very faces a field may answer that it ends there
-SHOWN_RAYS, SHOWN_SEED = 1 << 19, 5
-SHOWN_FROM = 1e-3  # weight on a ray from which a cell shows
+
+@dataclass(frozen=True)
+class AskedConfig:
+    """How what is asked becomes a field."""
+
+    smoothed: float = 0.7
+    """Voxels: standard deviation of the opacity whose slope says where a surface faces."""
+    deepest: float = -40.0
+    """Density feature of nothing at all, where a field is copied."""
+    inside: float = 1e-7
+    """Of a box's sides: on its very faces a field may answer that it ends there."""
+    shown_rays: int = 1 << 19
+    shown_seed: int = 5
+    shown_from: float = 1e-3
+    """Weight on a ray from which a cell shows."""
+    per_vertex: float = 500.0
+    """Bytes, at most: corners, places, what is asked at eight points of a voxel, and matrices."""
+    slope: float = 0.2
+    """Of opacity per voxel from which a vertex is seen from one side."""
+
+
 FLOAT = 4.0  # bytes
-PER_VERTEX = 500.0  # bytes, at most: corners, places, what is asked at eight points of a voxel, and matrices
-SLOPE = 0.2  # of opacity per voxel from which a vertex is seen from one side
 
 
 @dataclass(frozen=True)
@@ -69,12 +83,13 @@ class GridVertices:
     def facing(self, sigma: np.ndarray) -> np.ndarray:
         """(V, 3) unit directions along which surfaces at vertices with σ (V,) are seen; 0 where there is no
         one side."""
+        config = current(AskedConfig)
         opacity = np.zeros(self.resolution, np.float32)
         opacity.ravel()[self.index] = -np.expm1(-sigma * self.finest_voxel)
-        slopes = np.gradient(gaussian_filter(opacity, SMOOTHED))
+        slopes = np.gradient(gaussian_filter(opacity, config.smoothed))
         found = np.stack([slope.ravel()[self.index] for slope in slopes], 1).astype(np.float64)
         length = np.linalg.norm(found, axis=1, keepdims=True)
-        return np.where(length > SLOPE, found / np.maximum(length, 1e-12), 0)
+        return np.where(length > config.slope, found / np.maximum(length, 1e-12), 0)
 
 
 class Lattice(NamedTuple):
@@ -94,10 +109,10 @@ def lattice_of(scene: ComposedField) -> Lattice | None:
     """The lattice of a scene of one field that is neither turned nor stretched; None where there is none."""
     placed = scene.placed[0]
     matrix = placed.object_to_world
-    if len(scene.placed) > 1 or not np.array_equal(matrix[:3, :3], np.eye(3)):
+    if len(scene.placed) > 1 or not placed.as_it_is or not np.array_equal(matrix[:3, :3], np.eye(3)):
         return None
     field = opened(placed.field)
-    if getattr(field, "resolution", None) is None or field.tints is not None:
+    if getattr(field, "resolution", None) is None:
         return None
     origin = matrix[:3, 3]
     everywhere = field.with_occupancy(OccupancyGrid.full(field.aabb))
@@ -107,9 +122,9 @@ def lattice_of(scene: ComposedField) -> Lattice | None:
 class AskedStudent(MadeStudent, GridStudent):
     """A field whose vertices can be given densities and colours: its class has
 
-        fill_vertices(index, features, colours)
-                            set vertices (V,), counted z first, to density features (V,), σ = scale
-                            softplus(f), and harmonics of their colours' logits (V, 3 coefficients)
+    fill_vertices(index, features, colours)
+                        set vertices (V,), counted z first, to density features (V,), σ = scale
+                        softplus(f), and harmonics of their colours' logits (V, 3 coefficients)
     """
 
     lesson = DistilConfig(rays=400_000, steps=0, rgb_steps=1000, rgb_rate=0.0006)
@@ -153,13 +168,14 @@ class AskedStudent(MadeStudent, GridStudent):
     def copied(self, plan: Plan, lattice: "Lattice") -> BoxField:
         """A field with the vertices of the scene's only one and what that says at them: between them it says
         the same as far as both interpolate alike."""
+        config = current(AskedConfig)
         field = self.kind.create(plan, torch.Generator(), "fused").with_occupancy(self.cells)
         vertices = GridVertices.of(field)
-        margin = INSIDE * (lattice.aabb[3:] - lattice.aabb[:3])
+        margin = config.inside * (lattice.aabb[3:] - lattice.aabb[:3])
         places = np.clip(vertices.places, lattice.aabb[:3] + margin, lattice.aabb[3:] - margin)
         places -= lattice.origin
         sigma = density(lattice.field, places)
-        features = np.clip(inverse_softplus(sigma / field.scale), DEEPEST, MOST)
+        features = np.clip(inverse_softplus(sigma / field.scale), config.deepest, current(AskingConfig).most)
         rows = colours(lattice.field, places, vertices.facing(sigma), field.shape.sh_degree)
         field.fill_vertices(vertices.index, features, rows.reshape(len(sigma), -1))
         return field
@@ -172,13 +188,15 @@ class AskedStudent(MadeStudent, GridStudent):
 
     def shown(self, field: BoxField, vertices: GridVertices, sigma: np.ndarray) -> OccupancyGrid:
         """The field's cells of which some ray shows anything, when its vertices have σ (V,)."""
-        features = np.clip(inverse_softplus(sigma / field.scale), LEAST, MOST)
+        asked = current(AskedConfig)
+        config = current(AskingConfig)
+        features = np.clip(inverse_softplus(sigma / field.scale), config.least, config.most)
         field.fill_vertices(vertices.index, features, np.zeros((len(sigma), field.shape.numbers), np.float32))
-        generator = torch.Generator().manual_seed(SHOWN_SEED)
-        rays_o, rays_d = RaySampler([self.scene.occupancy.subject]).draw(SHOWN_RAYS, generator)
+        generator = torch.Generator().manual_seed(asked.shown_seed)
+        rays_o, rays_d = RaySampler([self.scene.occupancy.subject]).draw(asked.shown_rays, generator)
         jitter = torch.rand(len(rays_o), generator=generator, dtype=torch.float64).numpy()
         weights = field.weights_in_cells(rays_o, rays_d, jitter, 0.0, sampling_step(field))
-        found = self.scene.occupancy.marked(weights > SHOWN_FROM)
+        found = self.scene.occupancy.marked(weights > asked.shown_from)
         return found if found.occupied.any() else self.scene.occupancy
 
     def smallest(self) -> int:
@@ -187,10 +205,14 @@ class AskedStudent(MadeStudent, GridStudent):
 
     def needs(self) -> Needs:
         """Vertices while they are asked, and the whole grid, of which one copy is what it started as."""
+        config = current(AskedConfig)
         plan, lattice = self.largest(), lattice_of(self.scene)
         vertices = sum(section.shape[0] for section in plan.sections[:1])
         held = plan.numbers
         if lattice is not None:
             held = max(held, self.kind.numbers(plan.way, lattice.resolution))
-        making = {"vertices while they are asked": PER_VERTEX * vertices, "what it starts as": FLOAT * held}
+        making = {
+            "vertices while they are asked": config.per_vertex * vertices,
+            "what it starts as": FLOAT * held,
+        }
         return Needs(held, making=making, points=0)

@@ -2,6 +2,7 @@
 learned."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Protocol
 
@@ -12,20 +13,37 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kernels.reference import sh_basis
+from fusedrf_cli.engine.kernels.reference import OCTANTS, sh_basis
+from fusedrf_cli.engine.settings import current
 
-OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
-"""(8, 3) the corners of a voxel, z first."""
-LEAST, MOST = -12.0, 60.0  # of the density feature
-REACH, HALF, FIT_STEPS = 5.0, 0.6, 6  # measured: 32.4 dB by asking at vertices, 35.0 dB with these
-COLOURED = 1e-2  # opacity of what a vertex stands for, from which its colour is asked and not its neighbours'
-DIRECTIONS = 32  # along which colours are asked
-ONE_SIDED = 0.4  # length of the mean direction a vertex is seen along, from which only that side is asked
-LOOKS = 9  # places along a look through the voxels before and behind a vertex
-RIDGE = 1e-3  # keeps harmonics small where no direction tells of them
-LOGITS = 8.0  # colours are told apart up to sigmoid(8)
-DILATIONS = 3
-AT_ONCE = 1 << 18  # points
+
+@dataclass(frozen=True)
+class AskingConfig:
+    """How a field is asked at the vertices of voxels."""
+
+    least: float = -12.0
+    """Of the density feature."""
+    most: float = 60.0
+    reach: float = 5.0
+    """Of features in a voxel that a surface runs through, on either side of the one at which light falls to
+    `half`. Measured: 32.4 dB by asking at vertices, 35.0 dB with these three."""
+    half: float = 0.6
+    fit_steps: int = 6
+    coloured: float = 1e-2
+    """Opacity of what a vertex stands for, from which its colour is asked and not its neighbours'."""
+    directions: int = 32
+    """Along which colours are asked."""
+    one_sided: float = 0.4
+    """Length of the mean direction a vertex is seen along, from which only that side is asked."""
+    looks: int = 9
+    """Places along a look through the voxels before and behind a vertex."""
+    ridge: float = 1e-3
+    """Keeps harmonics small where no direction tells of them."""
+    logits: float = 8.0
+    """Colours are told apart up to sigmoid(8)."""
+    dilations: int = 3
+    at_once: int = 1 << 18
+    """Points."""
 
 
 class Vertices(Protocol):
@@ -53,16 +71,11 @@ def density(source, places: np.ndarray, space: ModuleType | None = None) -> np.n
     stretched = any(p.condition > 1 + 1e-6 for p in parts)
     found = np.zeros(len(places))
     axes = np.eye(3)[: 3 if stretched else 1]
-    for part in pieces(len(places), AT_ONCE):
+    for part in pieces(len(places), current(AskingConfig).at_once):
         points = space.placed(torch.from_numpy(places[part]))
         for axis in axes:
             dirs = torch.from_numpy(np.broadcast_to(axis, points.shape).copy())
-            if isinstance(source, Placed):
-                x, d, stretch = source.to_object(points, dirs)
-                sigma = source.field.query(x, d, False)[0].double() * stretch
-            else:
-                sigma = source.query(points, dirs, False)[0].double()
-            found[part] += sigma.numpy() / len(axes)
+            found[part] += source.query(points, dirs, False)[0].double().numpy() / len(axes)
     return found / space.rates(torch.from_numpy(places)).numpy()
 
 
@@ -76,11 +89,12 @@ def seen_colours(
     What lies under a surface was never seen, and what lies before it is nothing: a vertex takes its colour
     from where a look along its facing ends.
     """
+    config = current(AskingConfig)
     places, opacity = look(teacher, lattice, sigma, facing)
     found = np.zeros((len(sigma), 3, (degree + 1) ** 2), np.float32)
-    asked = np.flatnonzero(opacity > COLOURED)
+    asked = np.flatnonzero(opacity > config.coloured)
     found[asked] = colours(teacher, places[asked], facing[asked], degree)
-    return found, np.where(opacity > COLOURED, opacity, 0)
+    return found, np.where(opacity > config.coloured, opacity, 0)
 
 
 def look(
@@ -89,12 +103,13 @@ def look(
     """What is seen from a voxel before a vertex to a voxel behind, along its facing: where most of that is
     (V, 3), and the opacity (V,) of it all. A vertex that is seen from all sides, or never, is all that it
     sees."""
+    config = current(AskingConfig)
     size, places = lattice.finest_voxel, lattice.places.copy()
     opacity = -np.expm1(-sigma * size)
     length = np.linalg.norm(facing, axis=1)
-    which = np.flatnonzero(length > ONE_SIDED)
+    which = np.flatnonzero(length > config.one_sided)
     along = facing[which] / length[which, None] * size[which, None]
-    spots = np.linspace(-1, 1, LOOKS)
+    spots = np.linspace(-1, 1, config.looks)
     trans, heaviest, end = np.ones(len(which)), np.zeros(len(which)), np.zeros(len(which))
     for spot in spots:
         depth = density(teacher, lattice.places[which] + spot * along) * size[which] * (spots[1] - spots[0])
@@ -113,10 +128,11 @@ def density_features(
     the squares of their differences at eight points of every active voxel; sigma (V,) is what the teacher
     says at the vertices.
 
-    In a voxel that a surface runs through, features are told apart up to REACH on either side of the one at
+    In a voxel that a surface runs through, features are told apart up to `reach` on either side of the one at
     which it is half opaque: so the surface comes to lie where it is, between vertices of which one knows only
     that there is much and the other that there is nothing.
     """
+    config = current(AskingConfig)
     corners = lattice.corners
     first = lattice.places[corners[:, 0]]
     extent = lattice.places[corners[:, 7]] - first
@@ -124,9 +140,9 @@ def density_features(
     weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
     answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
     half, own = (half_opaque(scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
-    wanted = np.clip(inverse_softplus(answers / scale), LEAST, half + REACH)
-    wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - REACH), wanted)
-    found = np.clip(inverse_softplus(sigma / scale), own - REACH, own + REACH)
+    wanted = np.clip(inverse_softplus(answers / scale), config.least, half + config.reach)
+    wanted = np.where(wanted.max(1, keepdims=True) > half, np.maximum(wanted, half - config.reach), wanted)
+    found = np.clip(inverse_softplus(sigma / scale), own - config.reach, own + config.reach)
     scatter = sparse.csr_matrix(
         (np.ones(corners.size), (corners.ravel(), np.arange(corners.size))), (len(found), corners.size)
     )
@@ -139,14 +155,14 @@ def density_features(
     diagonal = scatter @ np.tile((weights**2).sum(0), len(corners))
     inverse = sparse.diags(1 / np.maximum(diagonal, 1e-12))
     exact = {"rtol": 0.0, "atol": np.finfo(float).tiny}  # until there is no more to be gained
-    found, _ = cg(normal, adjoint(wanted), found, **exact, maxiter=FIT_STEPS, M=inverse)
-    most = np.clip(inverse_softplus(sigma / scale), None, MOST)
-    return np.where(found > own + 0.9 * REACH, np.maximum(found, most), found)
+    found, _ = cg(normal, adjoint(wanted), found, **exact, maxiter=config.fit_steps, M=inverse)
+    most = np.clip(inverse_softplus(sigma / scale), None, config.most)
+    return np.where(found > own + 0.9 * config.reach, np.maximum(found, most), found)
 
 
 def half_opaque(scale: float, side: np.ndarray) -> np.ndarray:
-    """The feature at which light falls to HALF on its way through a voxel of a side."""
-    return inverse_softplus(-np.log(HALF) / (scale * side))
+    """The feature at which light falls to `half` on its way through a voxel of a side."""
+    return inverse_softplus(-np.log(current(AskingConfig).half) / (scale * side))
 
 
 def inverse_softplus(y: np.ndarray) -> np.ndarray:
@@ -161,25 +177,26 @@ def colours(teacher: RadianceField, places: np.ndarray, facing: np.ndarray, degr
     as `around` has it).
 
     What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
-    is exact, however the teacher is turned, but for what ONE_SIDED leaves.
+    is exact, however the teacher is turned, but for what `one_sided` leaves.
     """
-    dirs, space = even_directions(DIRECTIONS), teacher.occupancy.space
+    config = current(AskingConfig)
+    dirs, space = even_directions(config.directions), teacher.occupancy.space
     basis = sh_basis((degree + 1) ** 2, torch.from_numpy(dirs)).numpy()
     found = np.empty((len(places), 3, len(basis[0])), np.float32)
-    one_sided = np.linalg.norm(facing, axis=1) > ONE_SIDED
+    one_sided = np.linalg.norm(facing, axis=1) > config.one_sided
     side = np.where(one_sided, (facing @ dirs.T).argmax(1), len(dirs))
     for group in np.unique(side):
         counts = np.ones(len(dirs)) if group == len(dirs) else np.maximum(dirs @ dirs[group], 0)
         asked = np.flatnonzero(counts > 0.1)
         weighted = basis[asked] * counts[asked, None]
-        ridge = RIDGE * np.diag([0.0] + [1.0] * (len(basis[0]) - 1))
+        ridge = config.ridge * np.diag([0.0] + [1.0] * (len(basis[0]) - 1))
         solve = np.linalg.solve(weighted.T @ basis[asked] + ridge, weighted.T)
         own = np.flatnonzero(side == group)
-        for part in pieces(len(own), AT_ONCE // len(asked)):
+        for part in pieces(len(own), config.at_once // len(asked)):
             points = space.placed(torch.from_numpy(np.repeat(places[own[part]], len(asked), 0)))
             along = np.tile(dirs[asked], (len(points) // len(asked), 1))
             rgb = teacher.query(points, torch.from_numpy(along))[1].double().numpy()
-            edge = 1 / (1 + np.exp(LOGITS))
+            edge = 1 / (1 + np.exp(config.logits))
             rgb = np.clip(rgb, edge, 1 - edge)
             logits = np.log(rgb / (1 - rgb)).reshape(-1, len(asked), 3)
             found[own[part]] = np.einsum("kd,ndc->nck", solve, logits)
@@ -199,7 +216,7 @@ def dilated(lattice: Vertices, values: np.ndarray, weight: np.ndarray) -> tuple[
     (V,) then."""
     touches = touching(lattice)
     values, weight = values.astype(np.float32).copy(), weight.astype(np.float32)
-    for _ in range(DILATIONS):
+    for _ in range(current(AskingConfig).dilations):
         gathered = touches.T @ (touches @ np.concatenate([values * weight[:, None], weight[:, None]], 1))
         new = (weight == 0) & (gathered[:, -1] > 0)
         values[new] = gathered[new, :-1] / gathered[new, -1:]

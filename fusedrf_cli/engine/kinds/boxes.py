@@ -1,7 +1,7 @@
 """Kinds whose fields lie over one box, on texels along its axes (engine/fields/box.py)."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -20,9 +20,17 @@ from fusedrf_cli.engine.kinds.student import (
     Way,
     finest_within,
 )
+from fusedrf_cli.engine.settings import current
 
-COUNTED = 3  # times the used vertices are counted to find how many fit
-MOST_HELD = 60_000_000  # numbers in memory: with what learning adds, some 1.5 GB
+
+@dataclass(frozen=True)
+class BoxesConfig:
+    """How large a field on one grid gets."""
+
+    counted: int = 3
+    """Times the used vertices are counted to find how many fit."""
+    most_held: int = 60_000_000
+    """Numbers in memory: with what learning adds, some 1.5 GB."""
 
 
 class BoxKind(Kind):
@@ -31,14 +39,24 @@ class BoxKind(Kind):
 
     field: type[BoxField]
 
+    @property
+    def reduces(self) -> frozenset[str]:
+        """See Kind; ranks are of too different a use from kind to kind to have one bound."""
+        return self.takes & {"sh_degree"}
+
+    @property
+    def usual(self) -> object:
+        """The field's shape where nothing is asked."""
+        return self.field.shape_type()
+
     def shape(self, way: Way) -> object:
-        """The field's shape for a way; what the way leaves open is the shape's own default."""
+        """The field's shape for a way; what the way leaves open is as usual."""
         asked = {"sh_degree": way.sh_degree}
         if way.ranks is not None:
             asked |= dict(zip(("density_rank", "colour_rank"), way.ranks, strict=True))
         known = {field.name for field in fields(self.field.shape_type)}
         heeded = {name: value for name, value in asked.items() if name in known and value is not None}
-        return replace(self.field.shape_type(), **heeded)
+        return replace(self.usual, **heeded)
 
     def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """See Kind."""
@@ -46,8 +64,8 @@ class BoxKind(Kind):
         return [Section(part.name, (*part.shape[:-1], part.columns or part.shape[-1])) for part in parts]
 
     def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
-        """See Kind; with what fills rows up."""
-        return sum(int(np.prod(part.shape)) for part in self.field.parts_of(self.shape(way), resolution))
+        """See Kind; with what fills rows and cache lines up."""
+        return self.field.size_of(self.shape(way), resolution)
 
     def student(self, scene: ComposedField, request: StudentRequest) -> Student:
         """See Kind."""
@@ -56,21 +74,44 @@ class BoxKind(Kind):
         return (GridStudent if on_vertices else Student)(self, scene, request)
 
     def reduction(self, outline: BoxField, voxel: float, way: Way) -> Reduction:
-        """See Kind: fewer texels."""
+        """See Kind: fewer texels, and SH bands where the kind has them."""
         box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
-        same, none = resolution == outline.resolution, outline.params
-        unit = outline.scale, outline.shift
-        bare = type(outline)(outline.shape, box, resolution, *unit, none, outline.occupancy)
-        sections = [Section(part.name, bare.stored_shape(part)) for part in bare.parts]
+        same, shape, unit = resolution == outline.resolution, outline.shape, (outline.scale, outline.shift)
+        if way.sh_degree is not None and "sh_degree" in self.reduces:
+            shape = replace(shape, sh_degree=min(shape.sh_degree, way.sh_degree))
+        bare = type(outline)(shape, box, resolution, *unit, outline.params, outline.occupancy)
+        on_vertices = any(part.on_vertices for part in bare.parts)
+        used = int(np.count_nonzero(bare.used)) if on_vertices else 0
+        sections = [Section(part.name, bare.stored_shape(part, used)) for part in bare.parts]
 
         def make(field: BoxField) -> BoxField:
-            return field if same else field.resampled(box, resolution)
+            small = field if same else field.resampled(box, resolution)
+            return small if shape == field.shape else self.with_bands(small, shape)
 
-        return Reduction(Contents(sections, outline.occupancy.occupied.size), make, same)
+        lossless = same and shape == outline.shape
+        return Reduction(Contents(sections, outline.occupancy.occupied.size), make, lossless)
+
+    def with_bands(self, field: BoxField, shape: object) -> BoxField:
+        """A field with the first of its SH bands, as many as another shape has: a colour basis (3, bands,
+        rank) has them apart, rows of vertices side by side for each channel."""
+        unit = field.scale, field.shift
+        small = type(field)(shape, field.box, field.resolution, *unit, occupancy=field.occupancy)
+        own, fewer = field.shape.coefficients, shape.coefficients
+        for old, new in zip(field.sections().values(), small.sections().values(), strict=True):
+            if old.shape == new.shape:
+                new.copy_(old)
+            elif old.dim() == 3:
+                new.copy_(old[:, :fewer])
+            else:
+                rows = old[..., : 3 * own].unflatten(-1, (3, own))[..., :fewer]
+                new[..., : 3 * fewer] = rows.flatten(-2)
+        return small
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> BoxField:
         """See Kind."""
-        return self.field.create(self.shape(plan.way), plan.box, plan.resolution, generator)
+        field = self.field.create(self.shape(plan.way), plan.box, plan.resolution, generator)
+        field.name = name
+        return field
 
 
 class GridStudent(Student):
@@ -87,14 +128,15 @@ class GridStudent(Student):
 
     def plan(self, way: Way, numbers: int) -> Plan:
         """See Student; `numbers` counts what is stored."""
+        config = current(BoxesConfig)
         box, kind, cells = self.scene.aabb, self.kind, self.cells
         share = min(1.0, float(cells.occupied.mean()))
 
         def wanted(resolution: tuple[int, int, int]) -> float:
             stored = share * sum(np.prod(section.shape) for section in kind.sections(way, resolution))
-            return max(stored, kind.numbers(way, resolution) * numbers / MOST_HELD)
+            return max(stored, kind.numbers(way, resolution) * numbers / config.most_held)
 
-        for _ in range(COUNTED):  # coarser grids have more vertices just beyond the cells
+        for _ in range(config.counted):  # coarser grids have more vertices just beyond the cells
             resolution = finest_within(box, self.finer * self.scene.voxel_size, wanted, numbers)
             used = np.count_nonzero(used_vertices(cells, box, resolution))
             share = used / np.prod(resolution)

@@ -3,6 +3,7 @@ where that fits, else with coarser texels, fewer components or SH bands. What th
 again from rays of its source."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
@@ -15,17 +16,37 @@ from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung, shrinking
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.student import Made, MadeStudent, Needs, StudentRequest, Suits, Way
+from fusedrf_cli.engine.kinds.student import (
+    Made,
+    MadeStudent,
+    Needs,
+    StudentRequest,
+    Suits,
+    TooSmall,
+    Way,
+)
+from fusedrf_cli.engine.settings import current
 
-# Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md).
-RANKS = ((8, 16), (8, 24), None)
+
+@dataclass(frozen=True)
+class InstancesConfig:
+    """How sources are made smaller, and which ways a chart tries."""
+
+    ranks: tuple[tuple[int, int] | None, ...] = ((8, 16), (8, 24), None)
+    """Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md)."""
+    copies: float = 8.5
+    """Of a source while it is made smaller: sections in float64 before and after, most of them."""
+    finer: float = 1 / 8
+    """Of the finest voxel: with a stretched instance a common voxel may lie under it."""
+    tolerance: float = 1 + 1e-4
+    """To which a common voxel is found."""
+    ladder_ranks: tuple[tuple[int, int] | None, ...] = (None, (8, 24), (8, 16))
+    ladder_precisions: tuple[str, ...] = ("int8", "float16", "int4")
+    ladder_finished: tuple[str, ...] = ("int8", "int4")
+    """What was finished at 16 bits is surpassed by twice the numbers at 8."""
+
+
 FLOAT = 4
-COPIES = 8.5  # of a source while it is made smaller: sections in float64 before and after, most of them
-FINER = 1 / 8  # of the finest voxel: with a stretched instance a common voxel may lie under it
-TOLERANCE = 1 + 1e-4  # to which a common voxel is found
-LADDER_RANKS = (None, (8, 24), (8, 16))
-LADDER_PRECISIONS = ("int8", "float16", "int4")
-LADDER_FINISHED = ("int8", "int4")  # what was finished at 16 bits is surpassed by twice the numbers at 8
 
 
 class InstancesKind(Kind):
@@ -60,8 +81,9 @@ class InstancesKind(Kind):
 
     def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
         """What is only made smaller, and what is finished."""
-        plain = [Rung(p, r, rgb=False) for r, p in product(LADDER_RANKS, LADDER_PRECISIONS)]
-        finished = [Rung(p, r) for r, p in product(LADDER_RANKS, LADDER_FINISHED)]
+        config = current(InstancesConfig)
+        plain = [Rung(p, r, rgb=False) for r, p in product(config.ladder_ranks, config.ladder_precisions)]
+        finished = [Rung(p, r) for r, p in product(config.ladder_ranks, config.ladder_finished)]
         groups = {self.name: plain, f"{self.name}, finished": finished}
         return {name: [shrinking(rung, least_psnr) for rung in rungs] for name, rungs in groups.items()}
 
@@ -71,7 +93,7 @@ class InstancesStudent(MadeStudent):
 
     lesson = None
     gain = 5.0  # dB, the most that was seen
-    ranks: Sequence[tuple[int, int] | None] = RANKS
+    ranks: Sequence[tuple[int, int] | None] = InstancesConfig.ranks
     """That are compared where none are asked for."""
 
     def __init__(self, kind: InstancesKind, scene: ComposedField, request: StudentRequest):
@@ -88,7 +110,7 @@ class InstancesStudent(MadeStudent):
         """By precision, and ranks, where any of the fields has such."""
         request = self.request
         precisions = (request.precision,) if request.precision else self.kind.precisions
-        ranked = any("ranks" in kind.takes for kind in self.kinds)
+        ranked = any("ranks" in kind.reduces for kind in self.kinds)
         ranks = (request.ranks,) if request.ranks or not ranked else self.ranks
         return [[Way(p, r, request.sh_degree) for r in ranks] for p in precisions]
 
@@ -116,7 +138,10 @@ class InstancesStudent(MadeStudent):
                 return field
             return reductions[i].make(opened(field).to("cpu"))
 
-        return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+        try:
+            return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+        except TooSmall:
+            return None
 
     def fits_as_it_is(self, limit: int) -> bool:
         """Whether the fields with their own bytes are no larger than a limit."""
@@ -172,6 +197,8 @@ class InstancesStudent(MadeStudent):
         """The fields at their own resolution, or at that of the finest common voxel, in the scene's frame, at
         which they fit in so many bytes, as far as that goes; and how many they take."""
 
+        config = current(InstancesConfig)
+
         def at_voxel(voxel: float) -> tuple[list[Reduction], int]:
             found = [
                 kind.reduction(outline, voxel / stretch, way)
@@ -182,11 +209,11 @@ class InstancesStudent(MadeStudent):
         best = at_voxel(0.0)
         if best[1] <= limit:
             return best
-        fine = FINER * min(p.voxel_size for own in self.placed for p in own)
+        fine = config.finer * min(p.voxel_size for own in self.placed for p in own)
         pairs = zip(self.outlines, self.stretches, strict=True)
         coarse = max(float((o.aabb[3:] - o.aabb[:3]).max()) * stretch for o, stretch in pairs)
         best = at_voxel(coarse)
-        while coarse > TOLERANCE * fine and best[1] <= limit:
+        while coarse > config.tolerance * fine and best[1] <= limit:
             middle = (fine * coarse) ** 0.5
             found = at_voxel(middle)
             if found[1] <= limit:
@@ -215,7 +242,7 @@ class InstancesStudent(MadeStudent):
         request, per_number = self.request, self.request.sizes.per_number
         own = sum(request.source_bytes) // FLOAT
         cheapest = request.precision or self.kind.precisions[0]
-        return Needs(min(own, int(request.limit / per_number(cheapest))), COPIES)
+        return Needs(min(own, int(request.limit / per_number(cheapest))), current(InstancesConfig).copies)
 
 
 def distinct_fields(scene: ComposedField) -> list[StoredField]:

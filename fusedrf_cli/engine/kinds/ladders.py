@@ -5,10 +5,19 @@ import math
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 
-SHRINK = 1.5  # a rung's bytes over the next one's
-SMALLEST = 50_000  # bytes, below which a bundle is mostly headers
-SIZES = (25_000_000, 12_000_000, 6_000_000)
-SECONDS = (5.0, 15.0, 45.0, None)
+from fusedrf_cli.engine.settings import current
+
+
+@dataclass(frozen=True)
+class LadderConfig:
+    """Which sizes and times a chart tries."""
+
+    shrink: float = 1.5
+    """A rung's bytes over the next one's."""
+    smallest: int = 50_000
+    """Bytes, below which a bundle is mostly headers."""
+    sizes: tuple[int, ...] = (25_000_000, 12_000_000, 6_000_000)
+    seconds: tuple[float | None, ...] = (5.0, 15.0, 45.0, None)
 
 
 @dataclass(frozen=True)
@@ -30,15 +39,17 @@ Ladder = Generator[Rung, tuple[int, float] | None, None]
 
 def shrinking(rung: Rung, least_psnr: float) -> Ladder:
     """The rung as it is, then with ever fewer bytes until the PSNR falls below least_psnr."""
+    config = current(LadderConfig)
     found, size = (yield rung), math.inf
-    while found is not None and found[1] >= least_psnr and min(size, found[0]) > SMALLEST:
-        size = readable_floor(min(size, found[0]) / SHRINK)
+    while found is not None and found[1] >= least_psnr and min(size, found[0]) > config.smallest:
+        size = readable_floor(min(size, found[0]) / config.shrink)
         found = yield replace(rung, max_size=size)
 
 
 def by_sizes() -> Ladder:
     """Few sizes; the seconds decide last, since that takes longest."""
-    for seconds, size, finetune in itertools.product(SECONDS, SIZES, (False, True)):
+    config = current(LadderConfig)
+    for seconds, size, finetune in itertools.product(config.seconds, config.sizes, (False, True)):
         yield Rung(max_size=size, finetune=finetune, time_budget=seconds)
 
 

@@ -2,7 +2,7 @@
 that together they show what it showed."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -13,12 +13,20 @@ from fusedrf_cli.engine.selection.cells import Selection
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-FINEST = 320
-"""Cells along an axis of the grid of a field from which an object is gone, at most, or as many as it had."""
-CUT = 256
-"""Cells along the longest side of an object's grid, at most."""
-TOGETHER = 8
-"""Texels along an axis of a plane that files code by one scale."""
+
+@dataclass(frozen=True)
+class SplittingConfig:
+    """How finely an object is cut out."""
+
+    finest: int = 320
+    """Cells along an axis of the grid of a field from which an object is gone, at most, or as many as it
+    had."""
+    cut: int = 256
+    """Cells along the longest side of an object's grid, at most."""
+    together: int = 8
+    """Texels along an axis of a plane that files code by one scale."""
+
+
 OWN, OTHER = 1, 2
 """Of what is in a cell of a selection."""
 CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -30,9 +38,10 @@ KeepsCells = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def refined(grid: OccupancyGrid, voxel: float) -> OccupancyGrid:
     """The same cells, each made of several that are no smaller than about a voxel."""
+    config = current(SplittingConfig)
     finer = grid.occupied
     for axis, (cell, count) in enumerate(zip(grid.cell, grid.occupied.shape, strict=True)):
-        finer = np.repeat(finer, max(1, min(FINEST // count, int(np.ceil(cell / voxel)))), axis)
+        finer = np.repeat(finer, max(1, min(config.finest // count, int(np.ceil(cell / voxel)))), axis)
     return grid.marked(finer)
 
 
@@ -93,9 +102,9 @@ def emptied(grid: OccupancyGrid, index: np.ndarray, matter: Matter) -> np.ndarra
 def with_object(
     grid: OccupancyGrid, box: np.ndarray, narrowest: float, inside: KeepsCells
 ) -> OccupancyGrid | None:
-    """Cells over a box (6,), no wider than `narrowest` where that takes at most CUT of them, that are
+    """Cells over a box (6,), no wider than `narrowest` where that takes at most `cut` of them, that are
     occupied in a grid and that `inside` keeps; None where there is none."""
-    longest = int(np.clip(np.ceil((box[3:] - box[:3]).max() / narrowest), 1, CUT))
+    longest = int(np.clip(np.ceil((box[3:] - box[:3]).max() / narrowest), 1, current(SplittingConfig).cut))
     cells = OccupancyGrid.full(box, longest, grid.space)
     middles = cells.centres()
     own = grid.contains(middles)
@@ -166,12 +175,12 @@ def on_texels(
     wanted: np.ndarray, box: np.ndarray, resolution: tuple[int, int, int]
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
     """The smallest box (6,) around another whose faces lie on texels of a field over `box` (6,), the lower
-    ones on those of TOGETHER, and how many of them it has per axis: on it resampling takes over the very
+    ones on those of `together`, and how many of them it has per axis: on it resampling takes over the very
     numbers, and what files code together stays so."""
     count = np.asarray(resolution) - 1
     spacing = (box[3:] - box[:3]) / count
     first = np.clip(np.floor((wanted[:3] - box[:3]) / spacing + 1e-6), 0, count - 1).astype(int)
-    first -= first % TOGETHER
+    first -= first % current(SplittingConfig).together
     last = np.clip(np.ceil((wanted[3:] - box[:3]) / spacing - 1e-6), first + 1, count).astype(int)
     faces = np.concatenate([box[:3] + first * spacing, box[:3] + last * spacing])
     return faces, tuple(int(n) for n in last - first + 1)

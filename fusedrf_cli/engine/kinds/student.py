@@ -17,19 +17,35 @@ from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.hashed import Hashed
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 
 if TYPE_CHECKING:
     from fusedrf_cli.engine.kinds.kind import Kind
 
-LEAST_TEXELS = 16  # along the longest axis: no student is coarser
-GROWTH = 2  # of the numbers, from one size to the next
-SMALLEST = 32  # times fewer numbers than the limit allows: where growing begins
+
+@dataclass(frozen=True)
+class StudentConfig:
+    """How large a student is, and how much it is told."""
+
+    least_texels: int = 16
+    """Along the longest axis: no student is coarser."""
+    growth: int = 2
+    """Of the numbers, from one size to the next."""
+    smallest: int = 32
+    """Times fewer numbers than the limit allows: where growing begins."""
+    shrink: float = 0.98
+    """Steps in which a size is looked for that fits."""
+    told_numbers: int = 12_000_000
+    """Of a student, for which a lesson's rays do."""
+    numbers_per_second: int = 1_000_000
+    """Four objects after 5, 15, 45 s: best with 6, 12, 25 of 3, 6, 12, 25 million."""
+    rays_per_second: int = 40_000
+    """That are asked for each second of learning."""
+    most_told: float = 2.0
+    """Four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all."""
+
+
 NOTHING = "nothing"  # what a student starts from that takes over no numbers
-SHRINK = 0.98  # steps in which a size is looked for that fits
-TOLD_NUMBERS = 12_000_000  # of a student, for which a lesson's rays do
-NUMBERS_PER_SECOND = 1_000_000  # four objects after 5, 15, 45 s: best with 6, 12, 25 of 3, 6, 12, 25 million
-RAYS_PER_SECOND = 40_000  # that are asked for each second of learning
-MOST_TOLD = 2.0  # four objects in 24 million: 36.4 dB by one lesson, 36.9 by twice the steps, 38.1 by all
 
 
 @dataclass(frozen=True)
@@ -236,9 +252,9 @@ def finest_within(
     box: np.ndarray, finest: float, numbers: Callable[[tuple[int, int, int]], int], most: int
 ) -> tuple[int, int, int]:
     """Texels per axis over a box (6,): voxels no finer than `finest`, and no more numbers than `most`, as far
-    as LEAST_TEXELS allow."""
+    as `least_texels` allow."""
     longest = int(np.ceil((box[3:] - box[:3]).max() / finest)) + 1
-    while longest > LEAST_TEXELS and numbers(texels(box, longest)) > most:
+    while longest > current(StudentConfig).least_texels and numbers(texels(box, longest)) > most:
         longest -= max(1, longest // 100)
     return texels(box, longest)
 
@@ -261,14 +277,15 @@ class Student:
 
     def lesson_of(self, numbers: int, seconds: float | None = None) -> DistilConfig | None:
         """How a student of so many numbers learns, in so many seconds where they are given: the more numbers
-        there are, the more it is told, up to MOST_TOLD times, but no more than there is time to learn
+        there are, the more it is told, up to `most_told` times, but no more than there is time to learn
         from."""
+        config = current(StudentConfig)
         if not self.learnt or self.lesson is None:
             return self.lesson and replace(self.lesson, time_budget=seconds)
-        more = min(max(1.0, numbers / TOLD_NUMBERS), MOST_TOLD)
+        more = min(max(1.0, numbers / config.told_numbers), config.most_told)
         rays, steps = round(more * self.lesson.rays), round(more * self.lesson.steps)
         if seconds is not None:
-            rays = min(rays, int(RAYS_PER_SECOND * seconds) + 1)
+            rays = min(rays, int(config.rays_per_second * seconds) + 1)
         return replace(self.lesson, rays=rays, steps=steps, time_budget=seconds)
 
     def unchanged(self) -> "Made | None":
@@ -286,12 +303,13 @@ class Student:
 
     def plans(self) -> Iterator[Plan]:
         """What to make, one after the other, until one shows enough; without a target the largest alone."""
+        config = current(StudentConfig)
         largest, before = self.largest(), None
         if self.request.target is None:
             yield largest
             return
-        for k in range(SMALLEST.bit_length() - 1, -1, -1):
-            numbers = largest.allowed // GROWTH**k
+        for k in range(config.smallest.bit_length() - 1, -1, -1):
+            numbers = largest.allowed // config.growth**k
             plan = self.plan(largest.way, numbers)
             made_of = plan.way, plan.resolution
             if made_of != before and (plan.numbers <= numbers or k == 0):
@@ -306,7 +324,7 @@ class Student:
         around = any(p.unbounded for p in self.scene.placed)
         if request.seconds is None or request.target is not None or around:
             return plan
-        taught = int(NUMBERS_PER_SECOND * request.seconds) + 1
+        taught = int(current(StudentConfig).numbers_per_second * request.seconds) + 1
         return plan if plan.allowed <= taught else self.plan(plan.way, taught)
 
     def largest_of(self, way: Way, limit: int) -> Plan:
@@ -320,7 +338,7 @@ class Student:
         )
         numbers = max(1, int((limit - bare) / sizes.per_number(way.precision)))
         while self.bytes_of_plan(plan := self.plan(way, numbers), way) > limit:  # small planes are not coded
-            numbers = int(SHRINK * numbers)
+            numbers = int(current(StudentConfig).shrink * numbers)
         return plan
 
     def plan(self, way: Way, numbers: int) -> Plan:
@@ -342,7 +360,7 @@ class Student:
         scene = self.scene
         if before is not None:
             return self.kind.grown(before, plan).with_occupancy(scene.occupancy), "a smaller student"
-        if background is not None:
+        if background is not None and background.as_it_is:
             taken = self.kind.taken_over(background, plan, scene, generator)
             if taken is not None:
                 return taken, f"the weights of '{background.name}'"

@@ -4,7 +4,8 @@ What every space has, as scalar functions that the loops of kernels/loops.py are
 into PIECES, on each of which samples lie evenly in u. Where pieces are straight lines in the space's
 coordinates, u is length along them. Where they are not (curved.py), a length of u is at most as long in the
 coordinates, origin and direction of a piece are whatever its `position_at` reads, u begins at 0, and the
-space has a `next_sample` and a `next_change` of its own in place of those of the loops.
+space has a `next_sample` and a `next_change` of its own in place of those of the loops. A kind with an
+`advance` of its own follows straight lines, and cannot lie in such a space.
 """
 
 import numpy as np

@@ -14,6 +14,7 @@ import torch
 
 from fusedrf_cli.engine.kernels.parts import along
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
+    CURVED,
     clearance,
     contracted_by,
     density_rates_by,

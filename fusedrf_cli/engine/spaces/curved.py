@@ -14,6 +14,8 @@ import torch
 
 from fusedrf_cli.engine.kernels.parts import FACE_TOLERANCE, along, cell_of
 
+CURVED = True
+
 
 def position_at(origin, way, u):
     """See bounded.py."""

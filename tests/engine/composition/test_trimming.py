@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.kinds.vm.field import MODES, VMField, VMShape
+from fusedrf_cli.engine.encodings.plane_line import MODES
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.trimming import (
+    common_shape,
     fewer_components,
     leading,
     read_texels,
+    reshaped,
     truncated,
     without_unread,
 )
-from tests.engine.conftest import SIXTY_FOUR, THIRTY_TWO, random_vm, unit
+from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
 
 
 def sparse_vm(seed: int, resolution=(21, 34, 9)):
@@ -43,19 +46,19 @@ def test_unread_texels_change_no_answer(seed):
 
 def test_a_texel_is_read_if_and_only_if_a_point_of_an_occupied_cell_weighs_it():
     field = sparse_vm(5)
-    tensor = field.tensors[0]
-    cells = np.argwhere(tensor.occupied)
-    ends = (cells / tensor.occupied.shape, (cells + 1) / tensor.occupied.shape)  # unit cube
+    occupied = field.occupancy.occupied
+    cells = np.argwhere(occupied)
+    ends = (cells / occupied.shape, (cells + 1) / occupied.shape)  # unit cube
     for mode, (a, b, _) in enumerate(MODES):
-        wanted = np.zeros((tensor.resolution[a], tensor.resolution[b]), bool)
+        wanted = np.zeros((field.resolution[a], field.resolution[b]), bool)
         for low, high in zip(*ends, strict=True):
             touched = []
             for axis in (a, b):
-                n = tensor.resolution[axis]
+                n = field.resolution[axis]
                 at = np.arange(n) / (n - 1)
                 touched.append((at > low[axis] - 1 / (n - 1) + 1e-9) & (at < high[axis] + 1 / (n - 1) - 1e-9))
             wanted |= np.outer(*touched)
-        assert np.array_equal(read_texels(tensor, mode), wanted) and not wanted.all()
+        assert np.array_equal(read_texels(field, mode), wanted) and not wanted.all()
 
 
 def test_density_loses_what_eckart_and_young_say():
@@ -100,16 +103,33 @@ def test_colour_keeps_more_energy_than_any_prefix():
 def test_a_truncated_field_keeps_its_box_and_drops_bands():
     field = random_vm(VMShape(16, 24, 2), resolution=(6, 7, 8))
     small = truncated(field, VMShape(8, 16, 1))
-    assert small.shape == VMShape(8, 16, 1) and small.tensors == field.tensors
+    assert small.shape == VMShape(8, 16, 1) and small.resolution == field.resolution
     assert truncated(field, VMShape(24, 24, 3)) is field
-    flat = truncated(field, VMShape(16, 24, 0)).sections(0)
-    assert torch.equal(flat["colour_basis"], field.sections(0)["colour_basis"][:, :1])
-    assert torch.equal(flat["colour_plane_1"], field.sections(0)["colour_plane_1"])
+    flat = truncated(field, VMShape(16, 24, 0)).sections()
+    assert torch.equal(flat["colour_basis"], field.sections()["colour_basis"][:, :1])
+    assert torch.equal(flat["colour_plane_1"], field.sections()["colour_plane_1"])
 
 
 def test_ranks_that_are_there_already_stay():
     field = random_vm(SIXTY_FOUR)
     assert truncated(field, VMShape(8, 16, 3)) is field
+
+
+def test_more_components_change_no_answer():
+    """Of a narrow field and its widened copy; the narrow one by its reference, whose loops nothing else
+    compiles."""
+    narrow = random_vm(VMShape(8, 8, 0), dtype=torch.float64)
+    wide = reshaped(narrow, SIXTY_FOUR)
+    points, dirs = torch.from_numpy(points_in(BOX, 500)), torch.from_numpy(unit(points_in(BOX, 500, 4)))
+    for found, wanted in zip(
+        wide.query(points, dirs), narrow.answers(narrow.params, points, dirs), strict=True
+    ):
+        torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
+    assert wide.shape == SIXTY_FOUR and reshaped(wide, SIXTY_FOUR) is wide
+
+
+def test_common_shape_holds_all():
+    assert common_shape([VMShape(8, 24, 0), VMShape(16, 8, 2)]) == VMShape(16, 24, 2)
 
 
 class Elsewhere(torch.Tensor):

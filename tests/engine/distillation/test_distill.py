@@ -3,6 +3,7 @@
 import contextlib
 import json
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +20,7 @@ from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, texels
 from fusedrf_cli.engine.kinds.student import DistilConfig, finest_within
 from fusedrf_cli.engine.kinds.vm import KIND as VM
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import way_of
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
@@ -29,7 +30,8 @@ SAMPLER = RaySampler([TEACHER.occupancy.tight_aabb(0)])
 SETTINGS = DistilConfig(
     rays=4000, steps=60, points_per_step=1 << 13, rgb_steps=30, rgb_samples=1 << 13, views=2, view_size=32
 )
-NUMBERS = THIRTY_TWO.size(texels(BOX, 32))
+numbers = partial(VMField.size_of, THIRTY_TWO)
+NUMBERS = numbers(texels(BOX, 32))
 WAY = way_of(THIRTY_TWO)
 
 
@@ -60,7 +62,7 @@ def test_a_ball_is_learnt():
         lambda s, f: told.append(s),
     )
     assert before < 15 and judge(student) > 22
-    assert max(student.tensors[0].resolution) == 32 and student.blocks[0].name == "ball"
+    assert max(student.resolution) == 32 and student.name == "ball"
     assert report.psnr_before_rgb > 20 and set(report.seconds) == {"teachers", "points", "pictures"}
     assert [t for t in told if isinstance(t, str)] == ["asking the teachers", "points", "pictures"]
     assert 0.02 < student.occupancy.occupied.mean() < TEACHER.occupancy.occupied.mean() + 1e-9
@@ -192,26 +194,11 @@ def test_pictures_alone_go_on_from_the_student_that_is_there():
     assert torch.equal(student.params, start) and report.psnr_before_rgb == report.psnr_after_rgb > 20
 
 
-def test_several_blocks_are_finished_on_pictures():
-    """Two placed tensors learn together; their cells stay as they are."""
-    one, two = (random_vm(THIRTY_TWO, (16, 16, 16), torch.float32, seed=s, cells=8) for s in (1, 2))
-    matrices = np.eye(4), affine(turn(30), (0.5, 0, 0))
-    placed = [Placed(n, f, m) for n, f, m in zip("ab", (one, two), matrices, strict=True)]
-    student, teacher = blocks_of(placed), blocks_of(placed)
-    student.params.mul_(0.9)
-    settings = replace(SETTINGS, steps=0, rgb_steps=40)
-    run = DistillRun(teacher, student, RaySampler([teacher.occupancy.tight_aabb(0)]), settings)
-    cells = student.occupancy.occupied
-    finished, report = run.finish()
-    assert report.psnr_after_rgb > report.psnr_before_rgb + 1 and report.rgb_kept
-    assert len(finished.blocks) == 2 and np.array_equal(finished.occupancy.occupied, cells)
-
-
 def test_half_the_resolution_first_ends_at_all_of_it(monkeypatch):
     """What comes out has the resolution that was asked, and is no worse."""
     straight, told = taught(SETTINGS, rgb=False)
     student, report = taught(replace(SETTINGS, coarse_from=16), rgb=False)
-    assert student.tensors[0].resolution == straight.tensors[0].resolution
+    assert student.resolution == straight.resolution
     assert student.params.shape == straight.params.shape
     assert report.psnr_before_rgb > told.psnr_before_rgb - 0.5
 
@@ -251,7 +238,7 @@ def test_a_student_starts_as_the_upright_background(scale):
 def replace_voxels(field):
     """The smooth field of a few texels, on more of them."""
     coarse = random_vm(THIRTY_TWO, (4, 4, 4), field.params.dtype)
-    return coarse.resampled(BOX, field.tensors[0].resolution)
+    return coarse.resampled(BOX, field.resolution)
 
 
 @pytest.mark.parametrize("linear", [turn(20), np.diag([1.0, 1, 2]), -1.0])
@@ -265,10 +252,10 @@ def test_a_turned_background_cannot_be_taken_over(linear):
 
 
 def test_resolution_is_the_teachers_or_what_fits():
-    assert finest_within(BOX, 0.1, THIRTY_TWO.size, 10**9) == texels(BOX, 23)
-    tight = THIRTY_TWO.size(texels(BOX, 40))
-    found = finest_within(BOX, 1e-3, THIRTY_TWO.size, tight)
-    assert 0.9 * tight < THIRTY_TWO.size(found) <= tight
+    assert finest_within(BOX, 0.1, numbers, 10**9) == texels(BOX, 23)
+    tight = numbers(texels(BOX, 40))
+    found = finest_within(BOX, 1e-3, numbers, tight)
+    assert 0.9 * tight < numbers(found) <= tight
 
 
 def test_pruned_drops_empty_cells_only():

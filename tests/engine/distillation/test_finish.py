@@ -5,29 +5,19 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.rendering.volume import render_rays
-from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, random_vm
 
 
 @pytest.fixture
-def pair(in_force):
-    """Two blocks over two tensors, and the same at less than half their resolution."""
-    in_force(OccupancyConfig(scene_cells=32))
-    one, two = (
-        random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32, seed=s).resampled(BOX, (20, 21, 22))
-        for s in (1, 2)
-    )
-    placed = [Placed("a", one, affine(turn(20))), Placed("b", two, affine(0.5, (2.5, 0, 0)))]
-    whole = blocks_of(placed)
-    few = blocks_of(placed, lambda shape, tensors: max(t.resolution[0] for t in tensors) < 5)
+def pair():
+    """A field, and the same at less than half its resolution."""
+    smooth = random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32, seed=1)
+    whole, few = smooth.resampled(BOX, (20, 21, 22)), smooth.resampled(BOX, (4, 4, 5))
     few.params += 0.3 * torch.randn(few.params.shape, generator=torch.Generator().manual_seed(3))
     return whole, few
 

@@ -46,7 +46,7 @@ def test_a_ball_is_learnt(capture):
     white = white[..., :3] * white[..., 3:] + 1 - white[..., 3:]
     seen = np.stack([render_image(field, camera).over((1, 1, 1)) for camera in unseen])
     assert psnr(seen, white) > 24
-    assert field.blocks[0].name == "ball" and max(field.tensors[0].resolution) == 32
+    assert field.name == "ball" and max(field.resolution) == 32
     assert np.prod(field.aabb[3:] - field.aabb[:3]) < 0.8 * np.prod(BOX[3:] - BOX[:3])
     assert 0.02 < field.occupancy.occupied.mean() < 0.9
     shares, quality = zip(*told, strict=True)
@@ -138,13 +138,12 @@ def test_steps_take_more_samples_at_full_resolution_of_a_box(capture, unbounded,
     assert steered() == pytest.approx(factor * coarse, rel=0.01)
 
 
-def test_a_detail_fades_where_photos_say_little_of_it(capture, monkeypatch):
+def test_a_detail_fades_where_photos_say_little_of_it(capture):
     """By the square of its numbers for each pixel, up to a most; a field without one by nothing, ever."""
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.DETAIL_FROM", 2)
     cameras, images = capture
 
     def faded(count: int, rows: int) -> float:
-        way = replace(SETTINGS.way, hashed=Hashed((0.1,), rows) if rows else None)
+        way = replace(SETTINGS.way, hashed=Hashed((0.1,), rows, learns_from=2) if rows else None)
         settings = replace(SETTINGS, way=way, unbounded=True)
         return FitRun.start(cameras[:count], images[:count], BOX, settings).faded
 

@@ -33,7 +33,7 @@ def test_a_bad_gradient_of_the_basis_is_no_step(parts, value):
     """1e30 is finite, but its square in the second moment would not be."""
     field, optimiser, guard = parts
     guard.keep()
-    optimiser.grads[1, int(field.layout[0, 12]) + 5] = value
+    optimiser.grads[1, int(field.starts[12]) + 5] = value
     assert not guard.accepts(FINE, optimiser)
 
 
@@ -52,7 +52,7 @@ def test_a_poisoned_factor_shows_in_the_basis():
     from tests.engine.conftest import BOX, rays_at
 
     field = random_vm(THIRTY_TWO, dtype=torch.float32)
-    field.sections(0)["colour_line_1"][:, 3] = float("inf")
+    field.sections()["colour_line_1"][:, 3] = float("inf")
     optimiser = Adam(field, 2)
     rays = rays_at(BOX, 64)
     zeros = np.zeros((64, 4), np.float32)

@@ -73,7 +73,7 @@ def test_the_colour_of_a_turned_teacher_is_learnt_without_loss(degrees):
 def probe(shape: VMShape, seed: int) -> VMField:
     """A dense box of one colour function of the direction all over."""
     field = random_vm(shape, (2, 2, 2), torch.float32, seed=seed)
-    for name, section in field.sections(0).items():
+    for name, section in field.sections().items():
         if name == "colour_basis":
             section.normal_(0, 0.15, generator=torch.Generator().manual_seed(seed))
         else:

@@ -13,8 +13,8 @@ from tests.engine.conftest import BOX, THIRTY_TWO, rays_at
 
 def ball(cells: int = 24):
     """A ball of matter in a box of 49 texels an axis, under a grid that is occupied around it."""
-    field = VMField.create(BOX, (49,) * 3, THIRTY_TWO, torch.Generator().manual_seed(0))
-    sections = field.sections(0)
+    field = VMField.create(THIRTY_TWO, BOX, (49,) * 3, torch.Generator().manual_seed(0))
+    sections = field.sections()
     for name in sections:
         if name.startswith("density"):
             sections[name].zero_()
@@ -31,9 +31,9 @@ def fog(depth: float):
     """Fog of an optical depth across each of 32 x 32 x 32 cells, all occupied."""
     field = ball().with_occupancy(OccupancyGrid.full(BOX, 32))
     sigma = depth / field.occupancy.cell.min()
-    sections, (tensor,) = field.sections(0), field.tensors
+    sections = field.sections()
     sections["density_plane_0"].zero_()
-    sections["density_plane_0"][..., 0] = float(np.log(np.expm1(sigma / tensor.scale))) - tensor.shift
+    sections["density_plane_0"][..., 0] = float(np.log(np.expm1(sigma / field.scale))) - field.shift
     return field
 
 
@@ -71,7 +71,7 @@ def test_thick_haze_goes_where_rays_should_not_show_it_and_stays_where_they_shou
     """Fog of 0.03 across each cell, three times what counts as empty, beside matter a hundred times as
     dense: as what a student failed to learn, and as what its teacher shows."""
     field, dense = fog(3 * MatterConfig.empty_below), fog(300 * MatterConfig.empty_below)
-    plane, solid = (f.sections(0)["density_plane_0"] for f in (field, dense))
+    plane, solid = (f.sections()["density_plane_0"] for f in (field, dense))
     plane[: len(plane) // 2] = solid[: len(plane) // 2]
     rays, grid = rays_at(BOX, 3000, 7), field.occupancy
     matter = grid.marked(deepest(field, np.argwhere(grid.occupied)).reshape(grid.occupied.shape) > 1)

@@ -40,8 +40,8 @@ def test_planes_are_those_of_the_field():
     field = untrained("vm")
     changed = field.params.clone()
     field.planes(changed)[1][3, 4, 5] += 1
-    name = [name for name in field.sections(0) if "_plane_" in name][1]
-    assert field.with_params(changed).sections(0)[name][3, 4, 5] - field.sections(0)[name][3, 4, 5] == 1
+    name = [name for name in field.sections() if "_plane_" in name][1]
+    assert field.with_params(changed).sections()[name][3, 4, 5] - field.sections()[name][3, 4, 5] == 1
     assert (changed != field.params).sum() == 1
 
 

@@ -11,7 +11,7 @@ from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.streamed import StreamedField
 
 from ..conftest import Gaussian, points_in, random_vm, unit
-from ..kinds.cases import KINDS, coarse_ownership  # noqa: F401  (a fixture)
+from ..kinds.cases import KINDS  # noqa: F401  (a fixture)
 
 
 @pytest.fixture(params=KINDS)

@@ -9,21 +9,34 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.decoders import density_sum, rgb, sh, sh_basis, sh_mlp, tensorf_mlp, trunk
-from fusedrf_cli.engine.encodings import frequencies, grid, hash_grid, line, plane_line, trunk_features
+from fusedrf_cli.engine.encodings import (
+    frequencies,
+    grid,
+    hash_grid,
+    hash_runs,
+    line,
+    plane_line,
+    plane_line_hash,
+    trunk_features,
+)
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.kernels import instances, loops, parts, specialise
-from fusedrf_cli.engine.kernels.assembled import READS, TEMPLATES, assemble
+from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.kernels import instances, light, loops, parts, specialise
+from fusedrf_cli.engine.kernels.assembled import OPTIONAL, READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 from ..conftest import BOX, points_in
 from .interpreted import assert_answers, assert_gradients, interpreted, samples
 
+RUNS = Hashed((0.31, 0.07), 64)
 HASHED = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
 DENSITIES = {
     "line": (line, {"rank": 8}),
     "plane_line": (plane_line, {"rank": 8}),
     "grid": (grid, {"numbers": 1}),
     "hash_grid": (hash_grid, HASHED),
+    "hash_runs": (hash_runs, {"hashed": RUNS}),
+    "plane_line_hash": (plane_line_hash, {"rank": 8, "hashed": RUNS}),
     "frequencies": (frequencies, {"count": 2}),
 }
 FEATURES = DENSITIES | {"plane_line": (plane_line, {"rank": 16}), "grid": (grid, {"numbers": 13})}
@@ -73,7 +86,10 @@ class Product(AssembledField):
 
 
 PRODUCTS = [Recipe(e, e, "density_sum", c) for e in ("line", "plane_line", "grid") for c in COLOURS]
+PRODUCTS += [Recipe("plane_line_hash", "plane_line", "density_sum", c) for c in COLOURS]
 PRODUCTS += [
+    Recipe("plane_line_hash", "grid", "exp", "sh"),
+    Recipe("hash_runs", "hash_runs", "trunk", "rgb"),
     Recipe("line", "grid", "exp", "sh_basis"),
     Recipe("grid", "line", "relu", "sh"),
     Recipe("hash_grid", "of 16", "trunk", "sh_mlp"),
@@ -84,8 +100,9 @@ PRODUCTS += [
 
 
 def product(recipe: Recipe) -> Product:
-    """A field of random numbers in float64."""
-    bare = Product(recipe, BOX, (5, 8, 7), 3.0, 0.3)
+    """A field of random numbers in float64; rows of a hash grid are asked at about half of its points."""
+    scale, shift = (300.0, -6.0) if recipe.density == "plane_line_hash" else (3.0, 0.3)
+    bare = Product(recipe, BOX, (5, 8, 7), scale, shift)
     generator = torch.Generator().manual_seed(0)
     return bare.with_params(0.5 * torch.randn(len(bare.params), generator=generator, dtype=torch.float64))
 
@@ -151,6 +168,25 @@ def test_what_is_prefetched_lies_in_the_numbers(field):
         names["ahead_colour"](field.arrays, field.arrays.params, 0, tuple(p))
 
 
+def test_a_place_is_made_again_of_what_is_kept_of_it():
+    """Whether rows of a hash grid were asked is known of a point alone when its density was; the colour comes
+    out right whatever was asked in between."""
+    field = product(Recipe("plane_line_hash", "plane_line", "density_sum", "sh_basis"))
+    names, (points, dirs) = interpreted(field), samples(field, 30)
+    d, scratch, memory = tuple(dirs[0]), np.zeros(names["SCRATCH"]), np.empty(names["KEPT"])
+    along = torch.from_numpy(dirs[:1]).expand(30, 3)
+    expected = field.reference(field.params, torch.from_numpy(points), along)[1].numpy()
+    kept = [
+        names["keep"](names["density"](field.arrays, field.grid, 0, tuple(p), d, scratch)[3]) for p in points
+    ]
+    assert 5 < sum(kept) < 25
+    names["begin"](field.arrays, d, scratch)
+    for p, held, colour in zip(points, kept, expected, strict=True):
+        place = names["again"](field.arrays, held, tuple(p))
+        shown = names["colour"](field.arrays, place, tuple(p), d, scratch, memory, 0)
+        np.testing.assert_allclose(shown, colour, atol=1e-10)
+
+
 def test_one_assembly_and_one_type_of_arrays_for_the_same_parts(field):
     slots = [slot.module for slot in field.slots.values()]
     assert assemble(*slots) is assemble(*slots) and type(field.arrays) is assemble(*slots).Arrays
@@ -162,8 +198,10 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     space or of kernels/parts.py would be called in its place. Hooks of loops.py are there to be hidden."""
     bodies = vars(field.bodies)
     own = {name for name in {*bodies, *field.bodies.sizes(field)} if not name.startswith("__")}
-    hooks, settings = {template.__name__ for template in TEMPLATES}, {"LEARN_FROM", "SHADING_COST"}
-    for module, allowed in ((loops, hooks | settings), (space, settings), (parts, set()), (instances, set())):
+    hooks = {template.__name__ for template in TEMPLATES} | set(OPTIONAL)
+    settings = {"LEARN_FROM", "SHADING_COST"}
+    for module in (loops, space, parts, instances, light):
+        allowed = {loops: hooks | settings, space: settings}.get(module, set())
         others = {name for name in own & set(vars(module)) if bodies.get(name) is not vars(module)[name]}
         assert others <= allowed
 
@@ -171,7 +209,7 @@ def test_no_two_parts_of_a_namespace_define_one_name(field, space):
 def test_names_get_the_prefix_of_their_slot(field):
     names, functions = specialise.namespace(field.bodies, bounded)
     for slot in READS:
-        assert f"{slot}_forward" in names
+        assert {f"{slot}_forward", f"{slot}_summed"} & set(names)
     assert "sigma_activation" in functions["sigma_forward"].__code__.co_names
     for name, function in functions.items():
         assert not [used for used in function.__code__.co_names if used.startswith("features_")], name

@@ -12,9 +12,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, plain, reference
 from fusedrf_cli.engine.kernels.loops import Answers, Points
 from fusedrf_cli.engine.kernels.parts import CLIPPED, LINE
-from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
-from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kinds.vm.reference import vm_density_feature, vm_query
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.rendering.volume import reach_of
 from fusedrf_cli.engine.spaces import bounded
 from tests.engine.conftest import (
@@ -30,14 +28,6 @@ from tests.engine.conftest import (
 )
 
 MARCH = cpu.loops_for(None, (), bounded).march
-TURN = np.array([[0.0, -1.0, 0.0, 0.2], [1.0, 0.0, 0.0, -0.1], [0.0, 0.0, 1.0, 0.3], [0, 0, 0, 1]])
-MIRROR = np.diag([-1.0, 0.8, 1.3, 1.0])
-SHEAR = np.array([[1.0, 0.8, 0.0, 0.0], [0.0, 0.5, 0.2, 0.1], [0.1, 0.0, 2.0, 0.0], [0, 0, 0, 1]])
-
-
-def with_params(field: VMField, params: torch.Tensor) -> VMField:
-    """The same field over other numbers."""
-    return VMField(field.shape, field.tensors, field.blocks, params, field.occupancy, field.owners)
 
 
 def query(field: VMField, points: np.ndarray, dirs: np.ndarray, **options) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +57,7 @@ def test_query_is_the_reference(shape, dtype, error, resolution):
     points = points_in(BOX, 500, margin=0.1)
     dirs = unit(np.random.default_rng(1).normal(size=(500, 3)))
     sigma, rgb = query(field, points, dirs)
-    sigma_wanted, rgb_wanted = expected(with_params(field, field.params.double()), points, dirs)
+    sigma_wanted, rgb_wanted = expected(field.with_params(field.params.double()), points, dirs)
     assert 0.1 < (sigma_wanted > 0).mean() < 0.5
     np.testing.assert_allclose(sigma, sigma_wanted, rtol=0, atol=error * sigma_wanted.max())
     np.testing.assert_allclose(rgb, rgb_wanted, rtol=0, atol=error * 3)
@@ -111,153 +101,27 @@ def test_box_is_half_open():
 def test_query_on_texels_reads_them():
     """At a texel the feature is the plain sum over ranks and modes, without interpolation."""
     field = random_vm(resolution=(4, 3, 5))
-    s, tensor = field.sections(0), field.tensors[0]
+    s, voxel = field.sections(), (BOX[3:] - BOX[:3]) / (np.array(field.resolution) - 1)
     index = np.array([(1, 1, 2), (0, 0, 0), (2, 1, 3)])
-    points = BOX[:3] + index * tensor.voxel_size + 1e-13
+    points = BOX[:3] + index * voxel + 1e-13
     sigma, _ = query(field, points, DIRECTIONS_26[:3].copy(), with_colour=False)
     for (i, j, k), found in zip(index, sigma, strict=True):
         feature = (s["density_plane_0"][i, j] * s["density_line_0"][k]).sum()
         feature += (s["density_plane_1"][i, k] * s["density_line_1"][j]).sum()
         feature += (s["density_plane_2"][j, k] * s["density_line_2"][i]).sum()
-        assert found == pytest.approx(
-            tensor.scale * np.log1p(np.exp(float(feature) + tensor.shift)), rel=1e-9
-        )
+        assert found == pytest.approx(field.scale * np.log1p(np.exp(float(feature) + field.shift)), rel=1e-9)
 
 
 def test_extreme_densities_are_finite():
     field = random_vm(scale=1.0, shift=0.0)
     for factor in (30.0, -30.0):
-        sections = field.sections(0)
+        sections = field.sections()
         for name, view in sections.items():
             view.fill_(1.0 if "line" in name else factor)
         sigma, rgb = query(field, points_in(BOX, 50), unit(points_in(BOX, 50)))
         assert np.isfinite(sigma).all() and np.isfinite(rgb).all()
         wanted = 3 * 8 * factor if factor > 0 else 0.0
         np.testing.assert_allclose(sigma, wanted, rtol=1e-12, atol=1e-300)
-
-
-@pytest.mark.parametrize("matrix", [TURN, MIRROR, SHEAR])
-def test_placed_block(matrix):
-    """σ is |A d| times the object's and the direction turns with it; the optical depth of a ray is the
-    object's own."""
-    field = random_vm(matrix=matrix)
-    corners = np.stack(np.meshgrid(*zip(BOX[:3], BOX[3:], strict=True)), -1).reshape(-1, 3)
-    corners = corners @ matrix[:3, :3].T + matrix[:3, 3]
-    box = np.concatenate([corners.min(0), corners.max(0)])
-    placed = VMField(field.shape, field.tensors, field.blocks, field.params, OccupancyGrid.full(box))
-    points, dirs = points_in(box, 300), unit(np.random.default_rng(2).normal(size=(300, 3)))
-    for found, wanted in zip(query(placed, points, dirs), expected(placed, points, dirs), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
-    inverse = np.linalg.inv(matrix)
-    own = random_vm()
-    x, v = points @ inverse[:3, :3].T + inverse[:3, 3], dirs @ inverse[:3, :3].T
-    sigma, rgb = query(own, x, unit(v))
-    np.testing.assert_allclose(
-        query(placed, points, dirs)[0], sigma * np.linalg.norm(v, axis=1), rtol=1e-9, atol=1e-12
-    )
-    np.testing.assert_allclose(query(placed, points, dirs)[1], rgb, rtol=1e-9, atol=1e-12)
-
-
-# -- several blocks ------------------------------------------------------------------------------------------
-
-
-def two_blocks(second: np.ndarray, same: bool = False) -> VMField:
-    """Two tensors (or one used twice) in one field; every cell asks both, the lower first."""
-    one, two = random_vm(), random_vm(resolution=(6, 3, 4), seed=5, scale=2.0)
-    matrices = (TURN, TURN) if same else (TURN, second)
-    tensors = one.tensors if same else one.tensors + two.tensors
-    params = one.params if same else torch.cat([one.params, two.params])
-    blocks = (Block(0, matrices[0], "a"), Block(0 if same else 1, matrices[1], "b"))
-    box = np.array([-2.5, -2.0, -1.5, 2.0, 2.0, 3.0])
-    cells = (4, 5, 6)
-    owners = np.zeros(cells, np.uint8), np.ones(cells, np.uint8)
-    return VMField(one.shape, tensors, blocks, params, OccupancyGrid(box, np.ones(cells, bool)), owners)
-
-
-def by_the_max_rule(field: VMField, x: np.ndarray, d: np.ndarray) -> tuple[float, np.ndarray, int]:
-    """σ, rgb and block at one point, block after block: the densest wins, ties go to the lower."""
-    best, colour, winner = 0.0, np.zeros(3), 0
-    for b, block in enumerate(field.blocks):
-        tensor = field.tensors[block.tensor]
-        inverse = np.linalg.inv(block.object_to_field)
-        v = inverse[:3, :3] @ d
-        at = (inverse[:3, :3] @ x + inverse[:3, 3] - tensor.aabb[:3]) / (tensor.aabb[3:] - tensor.aabb[:3])
-        sigma, rgb = vm_query(
-            field.sections(block.tensor),
-            torch.from_numpy(at[None]),
-            torch.from_numpy(v[None] / np.linalg.norm(v)),
-            tensor.scale,
-            tensor.shift,
-        )
-        sigma = float(sigma[0]) * np.linalg.norm(v)
-        if sigma > best:
-            best, colour, winner = sigma, rgb[0].numpy(), b
-    return best, colour, winner
-
-
-@pytest.mark.parametrize(
-    "second", [MIRROR, SHEAR, np.diag([0.3, 0.3, 0.3, 1.0])], ids=["mirror", "shear", "small"]
-)
-def test_densest_block_wins(second):
-    field = two_blocks(second)
-    points = np.concatenate([points_in(field.aabb, 100), points_in(0.3 * BOX, 50)])
-    dirs = unit(np.random.default_rng(3).normal(size=(150, 3)))
-    sigma, rgb = query(field, points, dirs)
-    slow = [by_the_max_rule(field, x, d) for x, d in zip(points, dirs, strict=True)]
-    winners = [w for s, _, w in slow if s > 0]
-    assert 0 < np.mean(winners) < 1
-    np.testing.assert_allclose(sigma, [s for s, _, _ in slow], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(rgb, [c for _, c, _ in slow], rtol=1e-9, atol=1e-12)
-
-
-def test_ties_go_to_the_lower_block():
-    """Two equal densities of different colours: the lower block's colour shows, whichever the grids name
-    first as `first`."""
-    field = two_blocks(TURN, same=True)
-    points, dirs = points_in(BOX, 100), unit(np.random.default_rng(4).normal(size=(100, 3)))
-    single = VMField(field.shape, field.tensors, field.blocks[:1], field.params, field.occupancy)
-    for found, wanted in zip(query(field, points, dirs), query(single, points, dirs), strict=True):
-        assert (found == wanted).all()
-    grads = backward(field, points, dirs, np.ones(100), np.zeros((100, 3)))
-    np.testing.assert_array_equal(grads, backward(single, points, dirs, np.ones(100), np.zeros((100, 3))))
-
-
-def test_only_owners_are_asked():
-    field = two_blocks(SHEAR)
-    first, second = (np.full(field.occupancy.occupied.shape, NO_BLOCK, np.uint8) for _ in range(2))
-    first[:2] = 1  # the first cells along x ask block 1 alone, the others nobody
-    alone = VMField(field.shape, field.tensors, field.blocks, field.params, field.occupancy, (first, second))
-    points, dirs = points_in(field.aabb, 300), unit(np.random.default_rng(5).normal(size=(300, 3)))
-    sigma, _ = query(alone, points, dirs)
-    asked = points[:, 0] < field.aabb[0] + 2 * field.occupancy.cell[0]
-    assert (sigma[~asked] == 0).all()
-    for i in np.flatnonzero(asked):
-        others = VMField(field.shape, field.tensors, field.blocks[1:], field.params, field.occupancy)
-        assert sigma[i] == pytest.approx(by_the_max_rule(others, points[i], dirs[i])[0], rel=1e-9)
-    grads = backward(
-        alone, points[~asked], dirs[~asked], np.ones((~asked).sum()), np.ones(((~asked).sum(), 3))
-    )
-    assert (grads == 0).all()
-    *_, grads, _ = train(alone, *rays_at(field.aabb, 20, away=5.0), step=0.2)
-    assert (grads[: field.layout[1, 0]] == 0).all()  # block 0 is asked nowhere
-    assert (grads[field.layout[1, 0] :] != 0).any()
-
-
-def test_a_block_is_silent_where_its_tensor_is_empty():
-    """Between several blocks a tensor's own occupancy counts: what it says in empty cells was never
-    learnt."""
-    field = two_blocks(SHEAR)
-    occupied = np.zeros((2, 2, 2), bool)
-    occupied[1] = True  # the upper half along the object's x
-    tensors = (VMTensor(**{**vars(field.tensors[0]), "occupied": occupied}), field.tensors[1])
-    half = VMField(field.shape, tensors, field.blocks, field.params, field.occupancy, field.owners)
-    nobody = np.full(field.occupancy.occupied.shape, NO_BLOCK, np.uint8)
-    half.owners = (half.owners[0], nobody)
-    whole = VMField(field.shape, field.tensors, field.blocks[:1], field.params, field.occupancy)
-    points, dirs = points_in(field.aabb, 200), unit(np.random.default_rng(6).normal(size=(200, 3)))
-    inverse = np.linalg.inv(TURN)
-    upper = (points @ inverse[:3, :3].T + inverse[:3, 3])[:, 0] > (BOX[0] + BOX[3]) / 2
-    assert (query(half, points, dirs)[0] == np.where(upper, query(whole, points, dirs)[0], 0)).all()
 
 
 # -- gradients -----------------------------------------------------------------------------------------------
@@ -287,29 +151,6 @@ def test_query_backward_of_no_and_one_point():
         points, dirs = points_in(BOX, count), DIRECTIONS_26[:count].copy()
         grads = backward(field, points, dirs, np.ones(count), np.ones((count, 3)))
         assert (grads != 0).any() == bool(count)
-
-
-def slopes_along(function, params: torch.Tensor, directions: np.ndarray, h: float = 1e-5) -> list[float]:
-    """Central differences of a scalar function of params along directions."""
-    return [
-        float(function(params + h * d) - function(params - h * d)) / (2 * h)
-        for d in torch.from_numpy(directions)
-    ]
-
-
-def test_query_backward_of_several_blocks_is_finite_differences():
-    field = two_blocks(SHEAR)
-    points, dirs = points_in(field.aabb, 60), unit(np.random.default_rng(8).normal(size=(60, 3)))
-    rng = np.random.default_rng(9)
-    d_sigma, d_rgb = rng.normal(size=60), rng.normal(size=(60, 3))
-
-    def total(params):
-        sigma, rgb = query(with_params(field, params), points, dirs)
-        return (sigma * d_sigma).sum() + (rgb * d_rgb).sum()
-
-    directions = rng.normal(size=(6, field.params.numel()))
-    wanted = slopes_along(total, field.params, directions)
-    np.testing.assert_allclose(directions @ backward(field, points, dirs, d_sigma, d_rgb), wanted, rtol=1e-5)
 
 
 def train(
@@ -349,7 +190,7 @@ def test_train_rays_is_autograd(early_stop, scale):
     rays_o, rays_d = rays_at(BOX, 30)
     target, background, jitter, grads, loss = train(field, rays_o, rays_d, 0.05, early_stop)
     params = field.params.clone().requires_grad_()
-    same = with_params(field, params)
+    same = field.with_params(params)
     total, colour, opacity = reference_loss(
         same, rays_o, rays_d, 0.05, target, background, jitter, early_stop
     )
@@ -370,7 +211,7 @@ def test_train_rays_of_photos_of_their_own_exposure_is_autograd():
     target, background, jitter, grads, loss = train(field, rays_o, rays_d, 0.05, exposure=exposure)
     params = field.params.clone().requires_grad_()
     out = reference.render_rays(
-        with_params(field, params), torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, 0.05, 0.0,
+        field.with_params(params), torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, 0.05, 0.0,
         torch.from_numpy(jitter), loops.COLOUR_FROM,
     )  # fmt: skip
     gain, offset, weight = torch.from_numpy(exposure).unbind(1)
@@ -416,25 +257,9 @@ def test_train_rays_of_float32_is_close_to_float64():
     target, background, jitter, grads, _ = train(field, rays_o, rays_d, 0.05)
     params = field.params.double().requires_grad_()
     target, background = target.astype(float), background.astype(float)
-    total, *_ = reference_loss(with_params(field, params), rays_o, rays_d, 0.05, target, background, jitter)
+    total, *_ = reference_loss(field.with_params(params), rays_o, rays_d, 0.05, target, background, jitter)
     total.backward()
     np.testing.assert_allclose(grads, params.grad.numpy(), rtol=0, atol=2e-5 * float(params.grad.abs().max()))
-
-
-def test_train_rays_of_several_blocks_is_finite_differences():
-    field = two_blocks(np.diag([0.7, 0.7, 0.7, 1.0]))
-    rays_o, rays_d = rays_at(np.array([-1.0, -1, -1, 1, 1, 1]), 12, away=4.0)
-    *_, grads, loss = train(field, rays_o, rays_d, 0.11)
-
-    def total(params):
-        *_, loss = train(with_params(field, params), rays_o, rays_d, 0.11)
-        return (loss[0] + 0.3 * loss[1]) / len(rays_o)
-
-    assert total(field.params) == pytest.approx((loss[0] + 0.3 * loss[1]) / 12)
-    directions = np.random.default_rng(1).normal(size=(5, field.params.numel()))
-    np.testing.assert_allclose(
-        directions @ grads, slopes_along(total, field.params, directions, 1e-6), rtol=1e-4
-    )
 
 
 def test_rays_that_meet_nothing_teach_nothing():
@@ -626,12 +451,8 @@ def test_peaks_are_the_largest_of_the_probes():
     grid = OccupancyGrid.full(BOX, 5)
     cells, offsets = np.argwhere(grid.occupied), np.array([[0.25, 0.25, 0.25], [0.75, 0.5, 0.1]])
     out = field.peaks(BOX[:3], grid.cell, cells, offsets)
-    tensor = field.tensors[0]
-    wanted = []
-    for offset in offsets:
-        at = torch.from_numpy((cells + offset) / grid.occupied.shape)
-        feature = vm_density_feature(field.sections(0), at)
-        wanted.append(reference.density(feature, tensor.scale, tensor.shift).numpy())
+    whole, dirs = field.with_occupancy(grid), np.tile([0.0, 0.0, 1.0], (len(cells), 1))
+    wanted = [expected(whole, BOX[:3] + (cells + offset) * grid.cell, dirs)[0] for offset in offsets]
     np.testing.assert_allclose(out, np.max(wanted, 0), rtol=1e-6)
 
 

@@ -23,7 +23,7 @@ def test_cache_is_the_users_and_named_for_what_is_inlined(tmp_path, monkeypatch)
     read, engine = Path.read_bytes, Path(kernels.__file__).parent.parent
     changed = [
         *("kernels/parts.py", "kernels/loops.py", "kernels/prefetch.py", "spaces/bounded.py"),
-        *("encodings/line.py", "decoders/sh_basis.py", "kinds/vm/bodies.py", "kinds/sparse/bodies.py"),
+        *("encodings/line.py", "decoders/sh_basis.py", "encodings/plane_line.py", "encodings/bricks.py"),
     ]
     folders = {folder}
     for name in changed:

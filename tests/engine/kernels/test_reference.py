@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.kernels import reference
-from fusedrf_cli.engine.kinds.vm.reference import vm_query
-from tests.engine.conftest import DIRECTIONS_26, SIXTY_FOUR, random_vm, unit
+from tests.engine.conftest import DIRECTIONS_26, random_vm
 
 
 def test_line_and_plane_between_texels():
@@ -63,21 +62,6 @@ def test_compositing_is_the_product_of_transparencies():
             assert float(weights[ray, k]) == pytest.approx(trans * alpha, rel=1e-9)
             trans *= 1 - alpha
     torch.testing.assert_close(weights.sum(1), 1 - torch.exp(-0.1 * sigma.sum(1)), rtol=1e-12, atol=0)
-
-
-def test_query_is_differentiable():
-    field = random_vm(SIXTY_FOUR, (2, 3, 2))
-    at, dirs = (
-        torch.rand(3, 3, dtype=torch.float64),
-        torch.from_numpy(unit(np.random.default_rng(0).normal(size=(3, 3)))),
-    )
-    names, values = zip(*field.sections(0).items(), strict=True)
-
-    def query(*values):
-        return vm_query(dict(zip(names, values, strict=True)), at, dirs, 3.0, -1.0)
-
-    leaves = tuple(v.clone().requires_grad_() for v in values)
-    assert torch.autograd.gradcheck(query, leaves, fast_mode=True)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

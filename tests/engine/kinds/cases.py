@@ -4,20 +4,16 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import pytest
 import torch
 
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.hashed import Hashed
-from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.boxes import BoxKind
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, untrained
 from tests.analytic.export import with_network
-from tests.analytic.rays import affine, turn
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm
 from .sparse_cases import random_sparse
@@ -26,24 +22,11 @@ SLOW_TO_COMPILE = {"cp", "dense-mlp", "vm-mlp"}
 """Kinds whose loops the quick tests do not wait for, where they try every kind."""
 
 
-def random_blocks():
-    """Three overlapping, turned and stretched tensors in one field."""
-    spots = affine(turn(30)), affine((0.7, -1.2, 0.9), (0.4, 0, 0)), affine(0.8, (-0.3, 0.2, 0))
-    fields = [random_vm(SIXTY_FOUR, seed=seed, cells=5) for seed in range(3)]
-    return blocks_of([Placed(f"n{i}", f, m) for i, (f, m) in enumerate(zip(fields, spots, strict=True))])
-
-
 def random_detail(**kwargs):
-    """A tensor with a hashed detail that about half of its points ask for; 64 rows for thousands of
+    """A field with a hash grid that about half of its points ask for; 64 rows for thousands of
     vertices."""
-    hashed = Hashed((0.31, 0.07), 64)
+    hashed = Hashed((0.31, 0.07), 64, learns_from=2)
     return random_vm(cells=4, hashed=hashed, scale=300.0, shift=-6.0, **kwargs)
-
-
-def random_detailed_blocks():
-    """Two tensors that overlap, of which one has a detail."""
-    rough, plain = random_detail(), random_vm(cells=4)
-    return blocks_of([Placed("rough", rough, affine(turn(30))), Placed("plain", plain, np.eye(4))])
 
 
 def random_vm_mlp(dtype=torch.float64, seed=0, cells=None, width=8) -> VMMLPField:
@@ -73,18 +56,9 @@ def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
 BOXED = [name for name in registry.names() if isinstance(registry.kind(name), BoxKind)]
 KINDS = {
     "vm": lambda: random_vm(cells=4),
-    "vm placed": lambda: random_vm(cells=4, matrix=affine(turn(25) @ np.diag([1, -0.8, 1.1]), (0.1, 0, 0))),
     "vm, detail": random_detail,
-    "blocks": random_blocks,
-    "blocks, detail": random_detailed_blocks,
     "vm-mlp": lambda: random_vm_mlp(cells=4),
     "sparse": lambda: random_sparse(0, depth=0),
     "sparse, levels and bands": lambda: random_sparse(2, depth=2),
     **{name: partial(random_boxed, name) for name in BOXED},
 }
-
-
-@pytest.fixture(autouse=True)
-def coarse_ownership(in_force):
-    """A grid that is made in no time."""
-    in_force(OccupancyConfig(scene_cells=24))

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, children, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 

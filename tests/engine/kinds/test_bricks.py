@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     BrickTree,

@@ -13,22 +13,26 @@ from formats.errors import FormatError
 from formats.records import FieldRecord, decode_field, encode_field
 from fusedrf_cli.bridge.scene import stored
 from fusedrf_cli.bridge.sizes import BundleSizes
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.encodings import plane_line
+from fusedrf_cli.engine.encodings.hash_runs import hashed_row
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Hashed
+from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, STEPS, Hashed
 from fusedrf_cli.engine.kinds import registry, splitting
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of, reshaped, tensor_field, without
-from fusedrf_cli.engine.kinds.vm.field import DETAIL_STEP, VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.reference import hashed_row, vm_density_feature
-from fusedrf_cli.engine.kinds.vm.students import contents_of
-from fusedrf_cli.engine.kinds.vm.trimming import asked_rows, truncated, without_unasked
+from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.trimming import (
+    asked_rows,
+    reshaped,
+    truncated,
+    without_detail,
+    without_unasked,
+)
 from fusedrf_cli.engine.selection.cells import Lattice, Selection
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
-from tests.analytic.rays import affine
 
-from ..conftest import BOX, THIRTY_TWO, points_in, random_vm, unit
-from .cases import coarse_ownership, random_detail  # noqa: F401  (a fixture)
+from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
+from .cases import random_detail
 
 
 def asked(field, count=300, reference=False):
@@ -59,11 +63,11 @@ def test_rows_are_those_of_the_rule(rows):
 def test_an_answer_by_the_rule_alone():
     """One level, a tensor that says the same everywhere: σ and colour from eight rows, in a slow loop."""
     field = random_vm(hashed=Hashed((0.25,), 16), scale=2.0, shift=1.0)
-    sections = field.sections(0)
+    sections = field.sections()
     for name, view in sections.items():
-        if name != "detail":
+        if name != DETAIL:
             view.zero_()
-    rows, (x, y, z) = sections["detail"].numpy(), (0.3, -0.55, 0.1)
+    rows, (x, y, z) = sections[DETAIL].numpy(), (0.3, -0.55, 0.1)
     total = np.zeros(4)
     for corner in product((0, 1), repeat=3):
         place = np.array([x, y, z]) / 0.25
@@ -84,63 +88,44 @@ def test_what_the_kernels_cannot_serve_is_refused(kwargs):
 def test_it_stays_where_texels_change():
     """Texels at which planes and lines are exact again: the old ones are among the new."""
     field = random_detail(resolution=(5, 8, 7))
-    same(field, field.resampled(field.tensors[0].aabb, (9, 15, 13)).with_occupancy(field.occupancy))
+    same(field, field.resampled(field.box, (9, 15, 13)).with_occupancy(field.occupancy))
     wider = VMShape(16, 24, 3)
     same(field, reshaped(field, wider), reference=True)
     same(field, truncated(reshaped(field, wider), field.shape))
 
 
 def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
-    """Whatever is done to the field, and of blocks too."""
+    """Whatever is done to the field."""
     coarse, fine = (random_vm(hashed=Hashed(spacings, 16)) for spacings in ((9.0,), (0.25, 0.01)))
     coarse, fine = (field.with_occupancy(field.occupancy) for field in (coarse, fine))
     assert sampling_step(coarse) == pytest.approx(STEP_PER_VOXEL * coarse.voxel_size)
     smaller = fine.resampled(fine.aabb, (9, 9, 9)).with_occupancy(fine.occupancy)
     stored = VMField.from_state(*fine.state())
     for field in (fine, smaller, stored, fine.resampled(fine.aabb, (9, 9, 9))):
-        assert sampling_step(field) == pytest.approx(DETAIL_STEP * 0.01)
-    many = replace(fine.tensors[0], resolution=(2001, 2001, 2001))
-    assert many.step == pytest.approx(STEP_PER_VOXEL * many.voxel_size.min())
-    blocks = blocks_of([Placed("a", fine, affine(2.0))])
-    assert sampling_step(blocks) == pytest.approx(2 * DETAIL_STEP * 0.01)
-    assert sampling_step(blocks.alone[0]) == pytest.approx(DETAIL_STEP * 0.01)
+        assert sampling_step(field) == pytest.approx(STEPS * 0.01)
 
 
-def test_blocks_keep_it_and_share_it():
-    rough, plain = random_detail(), random_vm(cells=4, seed=3)
-    nodes = [("a", rough, 0.0), ("b", plain, 3.0), ("c", rough, 6.0)]
-    field = blocks_of([Placed(name, f, affine(1.0, (x, 0, 0))) for name, f, x in nodes])
-    assert [t.hashed for t in field.tensors] == [rough.tensors[0].hashed, None]
-    same(tensor_field(field, 0), rough)
-    same(tensor_field(field, 1), plain)
-    left = without(field, {"b", "c"})
-    same(tensor_field(left, 0), rough)
+def test_what_is_left_without_it_answers_as_planes_and_lines_do():
+    field = random_vm(resolution=(9, 8, 7), hashed=Hashed((0.05,), 1 << 8), scale=300.0, shift=-6.0)
+    bare, there = without_detail(field), field.with_params(field.params.clone())
+    there.sections()[DETAIL].zero_()
+    assert bare.shape == SIXTY_FOUR and len(bare.params) == len(field.params) - (1 << 10)
+    same(there, bare, reference=True)
+    assert without_detail(bare) is bare
 
 
-def test_blocks_that_meet_show_the_detail_of_the_denser_one():
-    """Whichever of them was asked last: against the reference, at points where either wins."""
-    rough = random_detail()
-    field = blocks_of([Placed(str(x), rough, affine(1.0, (x, 0.1, 0))) for x in (0.0, 0.33)])
-    points = torch.from_numpy(points_in(field.aabb, 3000))
-    dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(3000, 3))))
-    found, wanted = field.query(points, dirs), field.answers(field.params, points, dirs)
-    one, two = (rough.query(points - torch.tensor([x, 0.1, 0]), dirs)[0] for x in (0.0, 0.33))
-    both = (one > 0) & (two > 0) & (found[0] > 0)
-    assert (both & (one > two)).sum() > 50 < (both & (one < two)).sum()
-    for one, other in zip(found, wanted, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
-
-
-def test_far_fewer_texels_leave_it_out():
-    """Under a limit that its rows alone pass; what is left answers as the tensor without them."""
-    hashed = Hashed((0.05,), 1 << 12)
-    field = random_vm(resolution=(20, 20, 20), hashed=hashed)
-    limit = 4 * hashed.rows
-    placed = [Placed("a", field, np.eye(4))]
-    small = blocks_of(placed, lambda shape, tensors: sum(t.size(shape) for t in tensors) < limit)
-    assert small.tensors[0].hashed is None and len(small.params) < limit
-    bare = tensor_field(field, 0, small.tensors[0])
-    same(small, bare.with_occupancy(small.occupancy))
+def test_a_reduction_says_what_a_file_will_hold_of_it():
+    """Of a field cut out of a place, whose rows are few; far fewer texels leave it out."""
+    cut, kind = without_unasked(sparse_detail(1 << 14, torch.float32)), registry.kind("vm")
+    outline = kind.outline(cut)
+    assert len(outline.params) == 0
+    for voxel, hashed in ((0.0, cut.shape.hashed), (0.6, None)):
+        reduction = kind.reduction(outline, voxel, Way())
+        made = reduction.make(cut)
+        assert made.shape.hashed == hashed
+        for precision in ("float16", "int8"):
+            found = len(encode_field(FieldRecord("vm", *made.state()), precision))
+            assert found <= BundleSizes().of(reduction.contents, precision) <= 1.3 * found + 8000
 
 
 def test_it_comes_back_from_a_file_that_older_readers_refuse():
@@ -148,7 +133,7 @@ def test_it_comes_back_from_a_file_that_older_readers_refuse():
     data = encode_field(FieldRecord("vm", *field.state()), "float32")
     back = decode_field(data, "somewhere")
     found = VMField.from_state(back.arrays, back.metadata)
-    assert found.tensors[0].hashed == field.tensors[0].hashed
+    assert found.shape == field.shape
     same(field, found)
     assert b'\\"version\\":3' in data
     plain = encode_field(FieldRecord("vm", *random_vm().state()), "float32")
@@ -180,32 +165,33 @@ def test_rows_that_no_cell_asks_change_no_answer():
     dirs = torch.from_numpy(unit(np.random.default_rng(0).normal(size=points.shape)))
     for found, wanted in zip(trimmed.query(points, dirs), field.query(points, dirs), strict=True):
         assert torch.equal(found, wanted)
-    left = (trimmed.sections(0)["detail"] != 0).any(1)
+    left = (trimmed.sections()[DETAIL] != 0).any(1)
     assert 0.02 < left.float().mean() < 0.7
 
 
 def test_rows_are_asked_if_and_only_if_a_point_with_matter_is_near():
     """By the rule, of points drawn: every row that one of them reads, and next to none besides."""
     field = sparse_detail(1 << 16)
-    tensor, found = field.tensors[0], asked_rows(field, 0)
+    hashed = field.shape.hashed
+    found = asked_rows(field, hashed)
     points = within_cells(field, 3000)
     low, high = torch.from_numpy(field.aabb).view(2, 3)
-    feature = vm_density_feature(field.sections(0), (points - low) / (high - low))
-    dense = feature + tensor.shift > EMPTY_FROM
+    factors, unit_points = field.slot_sections()["density"], (points - low) / (high - low)
+    dense = plane_line.reference(field, factors, unit_points, None, 8).sum(1) + field.shift > EMPTY_FROM
     assert 0.2 < dense.float().mean() < 0.8
     wanted = np.zeros_like(found)
-    for level, spacing in enumerate(tensor.hashed.spacings):
+    for level, spacing in enumerate(hashed.spacings):
         below = torch.floor(points[dense] / spacing).long()
         for corner in product((0, 1), repeat=3):
-            rows = hashed_row(tensor.hashed, below + torch.tensor(corner))
-            wanted[level * tensor.hashed.rows + rows.numpy()] = True
+            rows = hashed_row(hashed, below + torch.tensor(corner))
+            wanted[level * hashed.rows + rows.numpy()] = True
     assert not (wanted & ~found).any()
     assert (found & ~wanted).sum() < 0.6 * wanted.sum()  # a cell between texels is asked in whole
 
 
-def test_all_rows_of_a_level_that_is_met_everywhere_are_kept(monkeypatch):
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.trimming.MOST_MET", 1e-6)
-    assert asked_rows(sparse_detail(), 0).all()
+def test_all_rows_of_a_level_that_is_met_everywhere_are_kept():
+    field = sparse_detail(4)
+    assert asked_rows(field, field.shape.hashed).all()
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16", "int8", "int4"])
@@ -220,9 +206,9 @@ def test_a_file_holds_the_rows_that_are_asked_alone(monkeypatch, precision):
     back = VMField.from_state(read.arrays, read.metadata)
     assert torch.equal(back.params, stored(trimmed, precision).params)
     assert encode_field(FieldRecord("vm", *back.state()), precision) == small
-    assert back.tensors[0].held == trimmed.tensors[0].held
+    assert np.array_equal(back.held.rows, trimmed.held.rows)
     if precision == "float32":
-        assert all(torch.equal(back.sections(0)[name], view) for name, view in trimmed.sections(0).items())
+        assert all(torch.equal(back.sections()[name], view) for name, view in trimmed.sections().items())
 
 
 @pytest.mark.parametrize("precision", ["int8", "int4"])
@@ -233,36 +219,27 @@ def test_cut_numbers_keep_the_codes_that_they_had(monkeypatch, precision):
         THIRTY_TWO, (30, 30, 30), torch.float32, hashed=Hashed((0.31, 0.07), 1 << 14), scale=300.0, shift=-6.0
     )
     field = stored(field, precision)
-    middle, box = Lattice.over(field, field.aabb * 0.4, 8), field.tensors[0].aabb
+    middle, box = Lattice.over(field, field.aabb * 0.4, 8), field.box
     part = splitting.cut_out(field, box, Selection(middle, np.ones(len(middle.points), bool)))
-    first = np.rint((part.aabb[:3] - box[:3]) / field.tensors[0].voxel_size).astype(int)
+    first = np.rint(
+        (part.aabb[:3] - box[:3]) / ((box[3:] - box[:3]) / (np.array(field.resolution) - 1))
+    ).astype(int)
     assert (first % 8 == 0).all() and first.any()
     cut = without_unasked(part)
     assert torch.equal(stored(cut, precision).params, cut.params)
     own = tuple(slice(a, a + n) for a, n in zip(first[:2], cut.resolution, strict=False))
-    plane, whole = cut.sections(0)["density_plane_0"], field.sections(0)["density_plane_0"][own]
+    plane, whole = cut.sections()["density_plane_0"], field.sections()["density_plane_0"][own]
     assert ((plane == whole) | (plane == 0)).all() and (plane != 0).any()
-
-
-def test_blocks_keep_few_rows_few_and_are_said_to():
-    """And what a limit on bytes is held against knows of it."""
-    cut = without_unasked(sparse_detail(1 << 14, torch.float32))
-    field = blocks_of([Placed("a", cut, np.eye(4)), Placed("b", cut, affine(1.0, (3, 0, 0)))])
-    assert [t.held for t in field.tensors] == [cut.tensors[0].held]
-    for precision in ("float16", "int8"):
-        found = len(encode_field(FieldRecord("vm", *field.state()), precision))
-        said = BundleSizes().of(contents_of(field.shape, field.tensors, 2), precision)
-        assert found <= said <= 1.3 * found + 8000
 
 
 HOSTILE_HELD = {
     "too few bits": ("detail_blocks", lambda a: a[:-1], "told by a bit"),
     "other bits": ("detail_blocks", lambda a: np.zeros_like(a), "should be told"),
     "an empty block": ("detail_held", np.zeros_like, "none is"),
-    "other rows": ("detail_held", lambda a: a ^ np.uint8(255), "none is|its detail|should have shape"),
+    "other rows": ("detail_held", lambda a: a ^ np.uint8(255), "none is|the runs of|should have shape"),
     "masks of another type": ("detail_held", lambda a: a.astype(np.int32), "should be told"),
     "no masks": ("detail_held", lambda a: None, "should have shape"),
-    "other runs": ("detail.runs", lambda a: a[::-1] + np.uint8(1), "runs of its detail"),
+    "other runs": ("detail.runs", lambda a: a[::-1] + np.uint8(1), "the runs of"),
     "fewer numbers": ("detail", lambda a: a[:-1], "should have shape"),
 }
 
@@ -279,12 +256,12 @@ def test_held_rows_that_do_not_fit_are_refused(name):
         VMField.from_state(arrays, metadata)
 
 
-def test_what_a_small_file_unfolds_to_is_foretold_and_bounded(monkeypatch):
+def test_what_a_small_file_unfolds_to_is_foretold_and_bounded():
     arrays, metadata = without_unasked(sparse_detail(1 << 14, torch.float32)).state()
     shapes = {name: array.shape for name, array in arrays.items()}
     assert registry.kind("vm").held_bytes(100, shapes) >= 100 + 2 * (1 << 14) * 16
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.MAX_NUMBERS", 1 << 16)
-    with pytest.raises(ValueError, match="at most 65,536 are read"):
+    metadata["tensors"][0]["resolution"] = [8192] * 3
+    with pytest.raises(ValueError, match="at most 2,147,483,648 are read"):
         VMField.from_state(arrays, metadata)
 
 
@@ -312,7 +289,7 @@ def test_hostile_metadata_is_refused(change, said):
 def test_numbers_that_multiply_past_all_bounds_are_refused():
     arrays, metadata = random_detail().state()
     arrays["tensor_0.detail"] = np.full_like(arrays["tensor_0.detail"], 3e38)
-    with pytest.raises(ValueError, match="multiply to"):
+    with pytest.raises(ValueError, match="would reach"):
         VMField.from_state(arrays, metadata)
 
 
@@ -323,17 +300,17 @@ def test_a_need_that_is_not_known_is_refused():
 
 
 @pytest.mark.slow
-def test_it_learns_what_is_finer_than_texels(monkeypatch):
+def test_it_learns_what_is_finer_than_texels():
     """A checkerboard of a quarter of a texel: planes and lines can only say its mean, a detail the rest."""
-    monkeypatch.setattr("fusedrf_cli.engine.kinds.vm.field.DETAIL_FROM", 2)
     points = torch.from_numpy(points_in(BOX, 4000))
     wanted = ((points / 0.2).floor().sum(1) % 2)[:, None].expand(-1, 3).float()
     dirs = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(len(points), 3)
     left = {}
-    for hashed in (None, Hashed((0.2 / 3,), 1 << 16)):
-        field = VMField.create(BOX, (3, 3, 3), THIRTY_TWO, torch.Generator().manual_seed(0), "", hashed)
-        for name, view in field.sections(0).items():
-            if name.startswith("density"):
+    for hashed in (None, Hashed((0.2 / 3,), 1 << 16, learns_from=2)):
+        shape = replace(THIRTY_TWO, hashed=hashed)
+        field = VMField.create(shape, BOX, (3, 3, 3), torch.Generator().manual_seed(0))
+        for name, view in field.sections().items():
+            if name.startswith("density") and name != DETAIL:
                 view.fill_(1.0)  # matter, where a detail is asked for
         optimiser = Adam.of(field)
         for _ in range(60):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ..conftest import points_in, unit
-from .cases import KINDS, coarse_ownership  # noqa: F401  (a fixture)
+from .cases import KINDS  # noqa: F401  (a fixture)
 
 
 @pytest.fixture(params=KINDS)

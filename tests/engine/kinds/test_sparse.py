@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
+from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import render_rays

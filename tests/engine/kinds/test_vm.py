@@ -1,19 +1,12 @@
-"""VM fields as objects: parameters, resampling, several blocks, storage."""
+"""VM fields as objects: parameters, resampling, storage."""
 
 import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid
-from fusedrf_cli.engine.kinds.vm.bodies import NO_BLOCK
-from fusedrf_cli.engine.kinds.vm.field import Block, VMField, VMShape, VMTensor
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
-
-
-@pytest.fixture(autouse=True)
-def coarse(in_force):
-    """Ownership grids small enough to settle in no time."""
-    in_force(OccupancyConfig(scene_cells=30))
 
 
 def ask(field, points):
@@ -27,8 +20,8 @@ def ask(field, points):
 def test_sections_are_views_that_fill_the_vector():
     field = random_vm(resolution=(3, 4, 5))
     covered = torch.zeros(field.params.numel())
-    assert field.layout.shape == (1, 14) and field.layout[0, 13] == len(field.params)  # no detail
-    for offset, (name, view) in zip(field.layout[0, :13], field.sections(0).items(), strict=True):
+    assert len(field.starts) == 14 and field.starts[-1] == len(field.params)
+    for offset, (name, view) in zip(field.starts[:-1], field.sections().items(), strict=True):
         assert view.data_ptr() == field.params.data_ptr() + 8 * offset and offset % 16 == 0
         covered[offset : offset + view.numel()] += 1
         assert ("plane" in name, "line" in name, "basis" in name).count(True) == 1
@@ -52,7 +45,7 @@ def test_shapes_the_kernels_cannot_serve_are_refused(options, name):
 def test_an_untrained_field_is_thin_fog():
     """The shift of the softplus is chosen for a few percent along the diagonal, whatever the box's size."""
     for size in (0.01, 1.0, 300.0):
-        field = VMField.create(size * BOX, (9, 9, 9), THIRTY_TWO, torch.Generator().manual_seed(0))
+        field = VMField.create(THIRTY_TWO, size * BOX, (9, 9, 9), torch.Generator().manual_seed(0))
         sigma, rgb = ask(field, points_in(size * BOX, 500))
         diagonal = np.linalg.norm(size * (BOX[3:] - BOX[:3]))
         assert 0.02 < 1 - np.exp(-sigma.mean() * diagonal) < 0.1
@@ -61,14 +54,13 @@ def test_an_untrained_field_is_thin_fog():
 
 def test_creation_follows_the_seed():
     a, b, c = (
-        VMField.create(BOX, (4, 4, 4), SIXTY_FOUR, torch.Generator().manual_seed(s)).params for s in (1, 1, 2)
+        VMField.create(SIXTY_FOUR, BOX, (4, 4, 4), torch.Generator().manual_seed(s)).params for s in (1, 1, 2)
     )
     assert torch.equal(a, b) and not torch.equal(a, c)
 
 
-def test_voxel_size_is_the_finest_in_the_fields_frame():
-    matrix = np.diag([2.0, 0.5, 3.0, 1.0])
-    field = random_vm(resolution=(5, 8, 7), aabb=np.array([0.0, 0, 0, 4, 7, 6]), matrix=matrix)
+def test_voxel_size_is_the_finest():
+    field = random_vm(resolution=(5, 8, 7), aabb=np.array([0.0, 0, 0, 4, 7, 3]))
     assert field.voxel_size == pytest.approx(0.5)
 
 
@@ -79,14 +71,14 @@ def test_voxel_size_is_the_finest_in_the_fields_frame():
 def test_resampling_onto_the_same_is_the_identity(dtype):
     field = random_vm(dtype=dtype)
     same = field.resampled(field.aabb, (5, 8, 7))
-    for (name, old), new in zip(field.sections(0).items(), same.sections(0).values(), strict=True):
+    for (name, old), new in zip(field.sections().items(), same.sections().values(), strict=True):
         torch.testing.assert_close(new, old, rtol=1e-12, atol=1e-14, msg=name)
 
 
 def test_resampling_is_exact_for_ramps():
     """Planes and lines that are linear stay the same functions on any texels within the box."""
     field = random_vm()
-    for view in list(field.sections(0).values())[:-1]:
+    for view in list(field.sections().values())[:-1]:
         grid = torch.meshgrid(
             *[torch.linspace(0, 1, n, dtype=torch.float64) for n in view.shape[:-1]], indexing="ij"
         )
@@ -111,124 +103,59 @@ def test_resampling_onto_finer_texels_keeps_the_field():
 
 def test_a_grown_box_keeps_what_was_and_is_fog_outside():
     field = random_vm(resolution=(5, 8, 7))
-    voxel = field.tensors[0].voxel_size
+    voxel = (BOX[3:] - BOX[:3]) / (np.array(field.resolution) - 1)
     grown = np.concatenate([BOX[:3] - 2 * voxel, BOX[3:] + 3 * voxel])
     other = field.resampled(grown, (10, 13, 12)).with_occupancy(OccupancyGrid.full(grown))
     points = points_in(BOX, 200)
     for found, wanted in zip(ask(other, points), ask(field, points), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-7)
     outside = np.concatenate([BOX[3:] + voxel * np.array([[1.5, 1.5, 1.5], [2.9, 0.5, 1.0]])])
-    tensor = field.tensors[0]
     np.testing.assert_allclose(
-        ask(other, outside)[0], tensor.scale * np.log1p(np.exp(tensor.shift)), rtol=1e-12
+        ask(other, outside)[0], field.scale * np.log1p(np.exp(field.shift)), rtol=1e-12
     )
-
-
-# -- several blocks ------------------------------------------------------------------------------------------
-
-
-def placed(x: float) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[0, 3] = x
-    return matrix
-
-
-def assembled(*places: float, dtype=torch.float64) -> VMField:
-    """A field of one tensor per place along x, a third of its cells occupied."""
-    fields = [random_vm(seed=i, cells=4, dtype=dtype) for i in range(len(places))]
-    blocks = tuple(Block(i, placed(x), f"block {i}") for i, x in enumerate(places))
-    tensors, params = tuple(f.tensors[0] for f in fields), torch.cat([f.params for f in fields])
-    return VMField.assembled(fields[0].shape, tensors, blocks, params)
-
-
-def test_several_blocks_need_owners():
-    field = assembled(0.0, 3.0)
-    with pytest.raises(ValueError, match="ownership"):
-        VMField(field.shape, field.tensors, field.blocks, field.params, field.occupancy)
-
-
-def test_one_unmoved_block_is_the_field_itself():
-    field = random_vm(cells=4)
-    again = VMField.assembled(field.shape, field.tensors, field.blocks, field.params)
-    assert again.owners is None and again.occupancy.aabb is field.tensors[0].aabb
-    points = points_in(BOX, 100)
-    assert np.array_equal(ask(again, points)[0], ask(field, points)[0])
-
-
-def test_blocks_apart_answer_as_if_alone():
-    field = assembled(0.0, 10.0)
-    for i, x in enumerate((0.0, 10.0)):
-        alone, points = random_vm(seed=i, cells=4), points_in(BOX, 300)
-        for found, wanted in zip(ask(field, points + [x, 0, 0]), ask(alone, points), strict=True):
-            np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
-
-
-def test_two_overlapping_blocks_are_their_maximum():
-    field = assembled(0.0, 0.7)
-    points = points_in(field.aabb, 600)
-    parts = [ask(random_vm(seed=i, cells=4), points - [x, 0, 0]) for i, x in enumerate((0.0, 0.7))]
-    sigma, rgb = ask(field, points)
-    second = parts[1][0] > parts[0][0]
-    assert 0.1 < second.mean() < 0.9 and (sigma > 0).mean() > 0.2
-    np.testing.assert_allclose(sigma, np.where(second, parts[1][0], parts[0][0]), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(
-        rgb, np.where(second[:, None], parts[1][1], parts[0][1]), rtol=1e-9, atol=1e-12
-    )
-
-
-def test_owners_are_named_lower_first():
-    first, second = assembled(0.0, 0.7, 0.3).owners
-    both = second != NO_BLOCK
-    assert (
-        both.any() and (first[both] < second[both]).all() and (first[~both & (first != NO_BLOCK)] < 3).all()
-    )
-
-
-def test_blocks_in_one_place_are_settled_by_bounded_work(monkeypatch):
-    """Where many meet in many cells, neighbours are asked as one: of blocks that differ everywhere alike the
-    two densest still own all that they did, and cells that several make up are marked as one."""
-    places = (0.0, 0.02, 0.04, 0.06, 0.08)
-    whole = assembled(*places)
-    asked, peaks = [], VMField.peaks
-
-    def counted(self, lo, cell, cells, offsets, frame=0):
-        asked.append(len(cells))
-        return peaks(self, lo, cell, cells, offsets, frame)
-
-    monkeypatch.setattr(VMField, "peaks", counted)
-    module = "fusedrf_cli.engine.kinds.vm.field."
-    limit = 3_000 * len(places) * len(PROBES) * whole.shape.density_rank
-    monkeypatch.setattr(module + "MOST_PROBED", limit)
-    monkeypatch.setattr(module + "MOST_MARKED", sum(t.occupancy.occupied.sum() for t in whole.tensors) // 4)
-    found = assembled(*places)
-    assert len(asked) == len(places) and max(asked) <= 3_000
-    assert (found.occupancy.occupied >= whole.occupancy.occupied).all()
-    crowded = (whole.owners[1] != NO_BLOCK) & (found.owners[1] != NO_BLOCK)
-    alike = (whole.owners[0] == found.owners[0]) & (whole.owners[1] == found.owners[1])
-    assert crowded.sum() > 3_000 and alike[crowded].mean() > 0.5
 
 
 # -- storage -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("places", [(0.0,), (0.0, 0.7), (0.0, 0.7, 0.3)])
-def test_state_round_trip_is_equal_to_the_bit(places):
-    field = assembled(*places, dtype=torch.float32)
+def test_state_round_trip_is_equal_to_the_bit():
+    field = random_vm(dtype=torch.float32, cells=6)
     arrays, metadata = field.state()
     again = VMField.from_state({name: a.copy() for name, a in arrays.items()}, metadata)
     arrays_again, metadata_again = again.state()
-    assert metadata_again == metadata and arrays_again.keys() == arrays.keys()
+    assert metadata_again == metadata and [*arrays_again] == [*arrays]
     for name in arrays:
         assert arrays[name].tobytes() == arrays_again[name].tobytes(), name
-    assert np.array_equal(field.occupancy.occupied, again.occupancy.occupied)
-    if field.owners is not None:
-        assert all(np.array_equal(a, b) for a, b in zip(field.owners, again.owners, strict=True))
+    assert np.array_equal(field.occupancy.occupied, again.occupancy.occupied) and again.name == "one"
 
 
-@pytest.mark.parametrize("name", ["tensor_0.density_plane_1", "tensor_1.colour_basis", "tensor_1.occupancy"])
+def test_files_keep_their_words():
+    """Those of version 1.0, which readers of any version know."""
+    arrays, metadata = random_vm(SIXTY_FOUR, dtype=torch.float32, cells=4).state()
+    factors = [
+        f"{what}_{of}_{m}" for what in ("density", "colour") for of in ("plane", "line") for m in range(3)
+    ]
+    assert [*arrays] == [f"tensor_0.{name}" for name in (*factors, "colour_basis", "occupancy")]
+    assert metadata == {
+        "aabb": BOX.tolist(),
+        "shape": {"density_rank": 8, "colour_rank": 16, "sh_degree": 3},
+        "tensors": [
+            {
+                "resolution": [5, 8, 7],
+                "aabb": BOX.tolist(),
+                "scale": 3.0,
+                "shift": -1.0,
+                "occupancy": list(OccupancyGrid.full(BOX, 4).occupied.shape),
+            }
+        ],
+        "blocks": [{"tensor": 0, "object_to_field": np.eye(4).tolist(), "name": "one"}],
+    }
+
+
+@pytest.mark.parametrize("name", ["tensor_0.density_plane_1", "tensor_0.colour_basis", "tensor_0.occupancy"])
 @pytest.mark.parametrize("how", ["missing", "shape"])
 def test_an_array_that_does_not_fit_is_named(name, how):
-    arrays, metadata = assembled(0.0, 0.7, dtype=torch.float32).state()
+    arrays, metadata = random_vm(dtype=torch.float32, cells=4).state()
     arrays[name] = arrays[name][:-1]
     if how == "missing":
         del arrays[name]
@@ -236,6 +163,18 @@ def test_an_array_that_does_not_fit_is_named(name, how):
         VMField.from_state(arrays, metadata)
 
 
-def test_without_occupancy_all_is_occupied():
-    tensor = VMTensor((2, 2, 2), BOX, 1.0)
-    assert tensor.occupancy.occupied.all() and np.array_equal(tensor.occupancy.aabb, BOX)
+def test_what_is_no_field_of_one_object_is_refused():
+    """Several are read as nodes of a scene, before a field is made of any."""
+    arrays, metadata = random_vm(dtype=torch.float32).state()
+    (tensor,), (block,) = metadata["tensors"], metadata["blocks"]
+    turned = block | {"object_to_field": np.diag([2.0, 1, 1, 1]).tolist()}
+    for change, said in [
+        ({"tensors": [tensor, tensor]}, "one tensor and one block of it, found 2 and 1"),
+        ({"blocks": [block, block]}, "found 1 and 2"),
+        ({"blocks": []}, "found 1 and 0"),
+        ({"blocks": [block | {"tensor": 1}]}, "one block of it"),
+        ({"blocks": [turned]}, "place it as it is"),
+        ({"blocks": [block | {"tint": [1.0, 0.5, 1.0]}]}, "without a tint"),
+    ]:
+        with pytest.raises(ValueError, match=said):
+            VMField.from_state(arrays, metadata | change)

@@ -16,8 +16,8 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.vm.blocks import reshaped
-from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
+from fusedrf_cli.engine.kinds.vm.field import VMConfig
+from fusedrf_cli.engine.kinds.vm.trimming import reshaped
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -33,7 +33,7 @@ def slow_colour(field, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
     box = field.box
     inside = (point - box[:3]) / (box[3:] - box[:3])
     factors = field.slot_sections()["colour"]
-    products = plane_line.reference(factors, torch.from_numpy(inside[None]), None, 16)[0].numpy()
+    products = plane_line.reference(None, factors, torch.from_numpy(inside[None]), None, 16)[0].numpy()
     x = [*(float(row @ products) for row in field.basis.numpy()), *direction]
     values = x + [np.sin(f * v) for f in (1, 2) for v in x] + [np.cos(f * v) for f in (1, 2) for v in x]
     for i in range(3):
@@ -88,12 +88,12 @@ def test_what_a_vm_field_may_be_and_this_not_is_refused():
     arrays, metadata = random_field(torch.float32).state()
     (tensor,), (block,) = metadata["tensors"], metadata["blocks"]
     for change, said in (
-        ({"blocks": [block, block]}, "one block, found 2"),
+        ({"blocks": [block, block]}, "found 1 and 2"),
         (
             {"blocks": [block | {"object_to_field": np.diag([2.0, 1, 1, 1]).tolist()}]},
-            "should be the identity",
+            "place it as it is",
         ),
-        ({"tensors": [tensor | {"hashed": {"spacings": [0.1], "rows": 64}}]}, "no hashed detail"),
+        ({"tensors": [tensor | {"hashed": {"spacings": [0.1], "rows": 64}}]}, "no hash grid"),
     ):
         with pytest.raises(ValueError, match=said):
             VMMLPField.from_state(arrays, metadata | change)
@@ -229,7 +229,9 @@ def test_what_fills_a_layer_up_stays_zero(every_sample):
 def test_the_network_learns_at_a_rate_of_its_own():
     field = random_field(torch.float32)
     factors, basis, network = field.groups()
-    assert (factors.rate, basis.rate) == (1.0, BASIS_RATE) and network.rate == pytest.approx(BASIS_RATE / 3)
+    assert (factors.rate, basis.rate) == (1.0, VMConfig.basis_rate) and network.rate == pytest.approx(
+        VMConfig.basis_rate / 3
+    )
     assert (factors.low, basis.low, network.low) == (0, field.starts[12], field.starts[13])
     assert network.high == field.params.numel() and network.low % 16 == network.high % 16 == 0
 

@@ -21,7 +21,7 @@ from fusedrf_cli.engine.rendering.differentiable import (
 from tests.analytic.rays import affine, turn
 
 from ..conftest import Gaussian, random_vm, rays_at
-from ..kinds.cases import KINDS, SLOW_TO_COMPILE, coarse_ownership  # noqa: F401  (a fixture)
+from ..kinds.cases import KINDS, SLOW_TO_COMPILE  # noqa: F401  (a fixture)
 
 STEP = 0.04
 CHECK = {"fast_mode": True, "eps": 1e-7, "atol": 1e-6, "rtol": 1e-6}

@@ -3,7 +3,7 @@ and learn. But for slow tests the loops are run by Python, so that nothing is co
 
 from dataclasses import dataclass
 from functools import cache
-from types import FunctionType
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels import specialise
 from fusedrf_cli.engine.kernels.instances import FARTHEST, Instances
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import (
     bounded,
@@ -37,6 +38,7 @@ from tests.analytic.fields import Gaussian, Tint
 from tests.analytic.rays import affine, turn, unit
 
 from ..kernels.interpreted import interpreted
+from ..kinds.sparse_cases import random_sparse
 
 DVGO = {"shell": 0.2, "contracted_density": 1.0}
 CURVED = {
@@ -514,6 +516,19 @@ def test_what_is_no_space_is_refused(entry):
         space_named(entry)
 
 
+def test_kinds_that_follow_straight_lines_are_refused_in_curved_spaces():
+    bodies = ModuleType("straight")
+    exec(
+        "def advance(field, grid, place, many, steps, k, p, way, u, u0, step):\n    return k + 1",
+        vars(bodies),
+    )
+    with pytest.raises(ValueError, match="straight follows straight rays"):
+        specialise.specialised(bodies, {}, contracted_l2)
+    tree = random_sparse().fine
+    with pytest.raises(ValueError, match="bricks cannot lie in space 'contracted_linf'"):
+        SparseField(SparseShape(0), tree, 1.0, space=contracted_linf)
+
+
 # -- compiled ------------------------------------------------------------------------------------------------
 
 
@@ -539,21 +554,26 @@ def test_compiled_loops_answer_render_and_learn_as_interpreted_ones(space):
     assert np.corrcoef(results[0][1], results[1][1])[0, 1] > 0.99
 
 
+MIXED = {"L2": contracted_l2, "unbounded": unbounded, "NDC": ndc}
+SCENES = {**{name: {name: space} for name, space in ALL.items()}, "mixed": MIXED}
+
+
 @pytest.mark.slow
-@every
+@pytest.mark.parametrize("spaces", SCENES.values(), ids=SCENES)
 @pytest.mark.parametrize("rule", ["max", "add"])
-def test_a_hash_grid_and_a_ball_show_what_the_naive_composition_shows(space, rule, in_force):
-    """A field in the space and a `vm` field in a box, turned and stretched, by the composite and naively."""
+def test_hash_grids_and_a_ball_show_what_the_naive_composition_shows(spaces, rule, in_force):
+    """Fields in a space, or in several, and a `vm` field in a box, turned and stretched: by the composite and
+    naively."""
     in_force(OccupancyConfig(scene_cells=24))
-    field = hashed_in(space, torch.float32)
+    forwards = "NDC" in next(iter(spaces))
+    frame = np.eye(4) if forwards else affine(turn(20))
     ball = exported(Gaussian(20.0, tint=Tint.of(0.1, 0.2, 0.9)), "vm", (25, 25, 25))
-    spot = (0.2, 0.1, -2.0) if "ndc" in space.__name__ else (0.3, 0.1, 0.2)
-    placed = [Placed("field", field, affine(turn(20))), Placed("ball", ball, affine(0.5 * turn(40), spot))]
-    if "ndc" in space.__name__:
-        placed[0] = Placed("field", field, np.eye(4))
+    spot = (0.2, 0.1, -2.0) if forwards else (0.3, 0.1, 0.2)
+    placed = [Placed(name, hashed_in(space, torch.float32), frame) for name, space in spaces.items()]
+    placed.append(Placed("ball", ball, affine(0.5 * turn(40), spot)))
     composite, naive = Composite(placed, rule), ComposedField(placed, rule)
     naive.__dict__["occupancy"] = naive.occupancy.marked(np.ones_like(naive.occupancy.occupied))
-    rays_o, rays_d = some_rays(space, 300)
+    rays_o, rays_d = some_rays(next(iter(spaces.values())), 300)
     if naive.origin.shape == (3,):
         rays_o = rays_o - naive.origin
     else:

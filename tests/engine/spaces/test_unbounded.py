@@ -9,7 +9,6 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.visibility import shown_cells
-from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
@@ -17,7 +16,6 @@ from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
 from fusedrf_cli.engine.kernels.specialise import specialised
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.student import Way
-from fusedrf_cli.engine.kinds.vm.blocks import blocks_of
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
@@ -26,7 +24,7 @@ from fusedrf_cli.engine.spaces.unbounded import FAR, PIECES, WHOLE
 from tests.analytic.export import vm_field as exported
 from tests.analytic.export import way_of
 from tests.analytic.fields import Gaussian
-from tests.analytic.rays import affine, turn, unit
+from tests.analytic.rays import affine, unit
 
 from ..conftest import SIXTY_FOUR, random_vm
 
@@ -154,8 +152,7 @@ def even(sigma: float, resolution: int = 64) -> VMField:
     """A field whose numbers say one density everywhere, in float64, grey: sigma / n² per length."""
     plan = registry.kind("vm").plan_at(WHOLE, (resolution,) * 3, WAY)
     field = registry.kind("vm").create(plan, torch.Generator().manual_seed(0)).with_occupancy(GRID)
-    tensor = field.tensors[0]
-    object.__setattr__(tensor, "shift", float(np.log(np.expm1(sigma / tensor.scale))))
+    field.shift = float(np.log(np.expm1(sigma / field.scale)))
     return field.with_params(torch.zeros_like(field.params, dtype=torch.float64))
 
 
@@ -188,13 +185,13 @@ def random_field(seed: int = 0, box: np.ndarray = WHOLE) -> VMField:
     occupied = np.random.default_rng(seed).random((8, 8, 8)) < 0.7
     numbers = torch.randn(len(field.params), generator=generator, dtype=torch.float64)
     field = field.with_occupancy(OccupancyGrid(box, occupied, unbounded)).with_params(0.5 * numbers)
-    object.__setattr__(field.tensors[0], "shift", -4.0)  # dense enough to see
+    field.shift = -4.0  # dense enough to see
     return field
 
 
 def test_waves_and_the_one_pass_show_the_same():
     field = random_field()
-    field.sections(0)["colour_basis"].mul_(0.5)  # for colours as far apart as those of trained fields
+    field.basis.mul_(0.5)  # for colours as far apart as those of trained fields
     o = np.array([o for o, _ in rays(200)])
     d = np.array([d for _, d in rays(200)])
     out = np.zeros((len(o), 5), np.float32)
@@ -389,34 +386,11 @@ def test_around_a_camera_is_nothing(fisheye):
     assert grid.contains(np.array([0.4, 0.2, 0]) + 0.36 * away).all()
 
 
-def test_blocks_of_a_place_and_an_object_show_what_their_composition_does():
-    """A bounded and an unbounded tensor, the latter turned and scaled: compiled answers against the composed
-    scene and the reference."""
-    place, thing = random_field(1).with_occupancy(GRID), random_vm(dtype=torch.float64, cells=4)
-    matrix = affine(turn(30) @ np.diag([0.4, 0.5, 0.4]), (0.8, 0.5, -0.3))
-    base = affine(2.0, (0.3, 0, 0.1))
-    placed = [Placed("place", place, base), Placed("thing", thing, base @ matrix)]
-    scene = ComposedField(placed)
-    joined = blocks_of(scene.placed)
-    assert joined.space is unbounded and scene.occupancy.space is unbounded
-    rng = np.random.default_rng(2)
-    points = torch.from_numpy(rng.normal(size=(400, 3)) * np.exp(rng.normal(size=(400, 1))))
-    dirs = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(400, 3))), dim=1)
-    sigma, rgb = scene.query(points, dirs)
-    found, colour = joined.query(points, dirs)
-    same, told = joined.answers(joined.params, points, dirs)
-    assert (sigma > 0).sum() > 300
-    assert found.numpy() == pytest.approx(sigma.numpy(), rel=1e-4, abs=1e-6)
-    assert colour.numpy() == pytest.approx(rgb.numpy(), abs=1e-4)
-    assert same.numpy() == pytest.approx(found.numpy(), rel=1e-6, abs=1e-9)
-    assert told.numpy() == pytest.approx(colour.numpy(), abs=1e-6)
-
-
-def test_a_field_over_a_part_of_space_is_empty_elsewhere_and_can_be_placed():
-    """Photos that look one way are learnt in a box of the coordinates: alone, and in another place, the
-    compiled answers are the reference's and the composition's."""
+def test_a_field_over_a_part_of_space_is_empty_elsewhere():
+    """Photos that look one way are learnt in a box of the coordinates: the compiled answers are the
+    reference's."""
     box = np.array([-2.0, -1.0, -2.0, 1.5, 2.0, 1.0])
-    part, place = random_field(3, box), random_field(1)
+    part = random_field(3, box)
     rng = np.random.default_rng(2)
     points = torch.from_numpy(rng.normal(size=(400, 3)) * np.exp(rng.normal(size=(400, 1))))
     dirs = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(400, 3))), dim=1)
@@ -426,75 +400,6 @@ def test_a_field_over_a_part_of_space_is_empty_elsewhere_and_can_be_placed():
     assert not sigma[~((at >= box[:3]) & (at <= box[3:])).all(1)].any() and (sigma > 0).sum() > 100
     assert same.numpy() == pytest.approx(sigma.numpy(), rel=1e-6, abs=1e-9)
     assert told.numpy() == pytest.approx(rgb.numpy(), abs=1e-6)
-    matrix = affine(0.4, (0.3, 0.1, 0))
-    scene = ComposedField([Placed("place", place, np.eye(4)), Placed("part", part, matrix)])
-    joined = blocks_of(scene.placed)
-    found, colour = joined.query(points, dirs)
-    wanted, shown = scene.query(points, dirs)
-    assert (wanted > place.query(points, dirs)[0] + 1e-6).sum() > 20  # the part shows somewhere
-    assert found.numpy() == pytest.approx(wanted.numpy(), rel=1e-4, abs=1e-6)
-    assert colour.numpy() == pytest.approx(shown.numpy(), abs=1e-4)
-
-
-@pytest.mark.slow
-def test_only_what_is_near_an_object_is_sampled_as_finely_as_it(in_force):
-    """Blocks and their composition sample alike but for the place, which blocks ask at its own step, show
-    about what a finer step everywhere does, and a training step through samples that stand for many steps has
-    the gradient of its loss."""
-    in_force(OccupancyConfig(scene_cells=24))
-    place, thing = random_field(1), random_vm(dtype=torch.float64, cells=4)
-    small = Placed("thing", thing, affine(np.eye(3) * 0.1, (0.2, 0.1, 0)))
-    scene = ComposedField([Placed("place", place, np.eye(4)), small])
-    joined, grid = blocks_of(scene.placed), scene.occupancy
-    assert np.array_equal(joined.occupancy.stride, grid.stride) and joined.occupancy.unit == grid.unit
-    strides = grid.stride[grid.occupied]
-    assert strides.max() > 5 * strides.min() and (strides < 2 * strides.min()).mean() < 0.1
-    rng = np.random.default_rng(0)
-    d = unit(rng.normal(size=(64, 3)))
-    o = np.array([0.2, 0.1, 0]) - 0.5 * d
-    shown, fine = render_rays(scene, o, d)[:, :4], render_rays(scene, o, d, step=grid.unit / 2)[:, :4]
-    # the place has voxels of half its core, cut off at its cells
-    assert abs(render_rays(joined, o, d)[:, :4] - shown).mean() < 0.01
-    assert abs(shown - fine).mean() < 1e-3
-    behind = rng.random((3, 3))
-    batch = Batch(o[:3], d[:3], rng.random(3), rng.random((3, 4)), behind, 0.3, 0.0, grid.unit, -1.0)
-
-    def loss(params: torch.Tensor) -> float:
-        sums = np.zeros((1, 3))
-        joined.with_params(params).train_rays(batch, np.zeros((1, len(params))), sums)
-        return float(sums[0, 0] + 0.3 * sums[0, 1]) / 3
-
-    grads = np.zeros((1, len(joined.params)))
-    joined.train_rays(batch, grads, np.zeros((1, 3)))
-    for at in np.argsort(-abs(grads[0]))[:30:10]:
-        step = torch.zeros_like(joined.params)
-        step[at] = 1e-5
-        slope = (loss(joined.params + step) - loss(joined.params - step)) / 2e-5
-        assert grads[0, at] == pytest.approx(slope, rel=2e-2, abs=1e-6)
-
-
-def test_jumping_over_nothing_leaves_every_sample_with_matter(in_force):
-    """Blocks of which most cells are empty, in a box and in a place: the one pass, which jumps, and waves,
-    which take every sample, see the same."""
-    in_force(OccupancyConfig(scene_cells=24))
-    sparsely = np.random.default_rng(5).random((16, 16, 16)) < 0.03
-    thing = random_vm(dtype=torch.float64)
-    thing = thing.with_occupancy(OccupancyGrid(thing.aabb, sparsely))
-    place = random_field(1)
-    empty = np.zeros((16, 16, 16), bool)
-    empty[3:6, 2:14, 9:12] = True
-    place = place.with_occupancy(OccupancyGrid(WHOLE, empty, unbounded))
-    turned = affine(0.3 * turn(30), (0.2, 0.1, 0))
-    things = [Placed("one", thing, np.eye(4)), Placed("other", thing, turned)]
-    d = unit(np.random.default_rng(0).normal(size=(200, 3)))
-    o = np.array([0.2, 0.1, 0]) - 1.5 * d
-    for placed in (things, [Placed("place", place, np.eye(4)), things[1]]):
-        field = blocks_of(placed)
-        step, out = sampling_step(field), np.zeros((len(o), 5), np.float32)
-        march_rays(field, o, d, reach_of(len(o), 0.0, np.inf), step, 1e-9, out)
-        found = render_rays(field, o, d, early_stop=1e-9)
-        assert 0.1 < (found[:, 3] > 0.05).mean() < 0.98
-        assert found[:, 3:] == pytest.approx(out[:, 3:], rel=1e-5, abs=1e-6)
 
 
 def test_a_place_is_sampled_alike_whatever_stands_in_it(in_force):
@@ -508,10 +413,9 @@ def test_a_place_is_sampled_alike_whatever_stands_in_it(in_force):
     for size in (0.3, 0.06):
         small = Placed("thing", thing, affine(np.eye(3) * size, (0.9, 0.8, 0.9)))
         scene = ComposedField([Placed("place", place, np.eye(4)), small])
-        pictures.append([render_rays(field, o, d) for field in (scene, blocks_of(scene.placed))])
-    for one, other in zip(*pictures, strict=True):
-        assert (abs(one - other).max(1) < 1e-6).mean() > 0.6
-    assert (pictures[0][0][:, 3] > 0.3).mean() > 0.5
+        pictures.append(render_rays(scene, o, d))
+    assert (abs(pictures[0] - pictures[1]).max(1) < 1e-6).mean() > 0.6
+    assert (pictures[0][:, 3] > 0.3).mean() > 0.5
 
 
 @pytest.mark.parametrize("scale", [0.2, 0.08])
@@ -530,8 +434,7 @@ def test_no_sample_of_a_coarse_place_steps_over_a_fine_object(scale):
     every.__dict__["occupancy"] = replace(scene.occupancy, stride=None)
     wanted = render_rays(every, o, d)
     assert wanted[:, 3].max() > 0.9
-    for field in (scene, blocks_of(scene.placed)):
-        assert render_rays(field, o, d)[:, :4] == pytest.approx(wanted[:, :4], abs=0.01)
+    assert render_rays(scene, o, d)[:, :4] == pytest.approx(wanted[:, :4], abs=0.01)
 
 
 def test_gradients_in_points_cross_no_border_wrongly():

@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
+from fusedrf_cli.engine.encodings.bricks import COARSE, SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.asking import OCTANTS
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 
 MAX_LEVEL = 7
 MAX_TOP_CELLS = 1 << 22
@@ -66,6 +66,27 @@ class BrickTree:
     def of_same_box(self, level: np.ndarray, at: np.ndarray, mask: np.ndarray) -> "BrickTree":
         """Other bricks in this tree's top cells."""
         return BrickTree.of(self.lo, self.top, self.counts, level, at, mask, self.phase)
+
+    def coarser(self, halvings: int) -> "BrickTree":
+        """The tree whose voxels are at least 2^halvings times as wide as the finest, each active where any
+        in it was; in wider top cells where those are needed."""
+        finest = self.depth - halvings
+        level = np.minimum(self.level.astype(np.int64), finest)
+        brick, *inner = np.nonzero(self.mask)
+        up = (self.level - level)[brick]
+        voxel = (self.at[brick] * SIDE + np.stack(inner, 1)) >> up[:, None]
+        wider = max(-finest, 0)
+        level, cell = level[brick] + wider, voxel // SIDE
+        key, first, back = np.unique(
+            np.stack([level, node_keys(cell)], 1), axis=0, return_index=True, return_inverse=True
+        )
+        mask = np.zeros((len(key), SIDE, SIDE, SIDE), bool)
+        mask[(back.ravel(), *(voxel % SIDE).T)] = True
+        level, at = key[:, 0].astype(np.uint8), cell[first]
+        if not wider:
+            return self.of_same_box(level, at, mask)
+        counts = -(-np.asarray(self.counts) // 2**wider)
+        return BrickTree.of(self.lo, self.top * 2**wider, counts, level, at, mask)
 
     @property
     def depth(self) -> int:
@@ -137,9 +158,15 @@ class BrickTree:
         return cls(np.asarray(lo, np.float64), sides(top), tuple(counts), level, at, mask)
 
     @cached_property
+    def bits(self) -> np.ndarray:
+        """(N,) uint64, the masks: voxel (i, j, k) is bit (i * 4 + j) * 4 + k."""
+        weights = np.uint64(1) << np.arange(SIDE**3, dtype=np.uint64)
+        return (self.mask.reshape(-1, SIDE**3) * weights).sum(1, dtype=np.uint64)
+
+    @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as SparseArrays has them. Raises
-        ValueError where they would be too large."""
+        """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as encodings/bricks.py has
+        them. Raises ValueError where they would be too large."""
         depth = np.zeros(self.counts, np.uint8)
         held = np.zeros(self.counts, bool)
         for level in range(self.depth + 1):
@@ -239,6 +266,20 @@ class Lattice:
         """(V, 3) int64 in units of the tree, free ones first."""
         self.vertices[rank] = vertices
         self.spread = self._spread(keys, rank, hanging, parents)
+        self._coarser: dict[int, Lattice] = {}
+
+    def coarser(self, halvings: int) -> "Lattice":
+        """The vertices of `BrickTree.coarser`, made once."""
+        if not halvings:
+            return self
+        if halvings not in self._coarser:
+            self._coarser[halvings] = Lattice(self.tree.coarser(halvings), self.n)
+        return self._coarser[halvings]
+
+    @cached_property
+    def wider(self) -> "Lattice":
+        """The vertices of the same tree with COARSE voxels a side of a brick."""
+        return Lattice(self.tree, COARSE)
 
     @property
     def width(self) -> np.ndarray:
@@ -408,7 +449,7 @@ def csr(matrix) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def corner_offsets(n: int) -> np.ndarray:
     """(8,) offsets of a voxel's corners from its first in a brick of n voxels a side, as `corner` of
-    sparse/bodies.py."""
+    encodings/bricks.py."""
     return (OCTANTS * [(n + 1) ** 2, n + 1, 1]).sum(1)
 
 

@@ -15,21 +15,25 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.decoders import density_sum, sh
+from fusedrf_cli.engine.encodings import bricks
+from fusedrf_cli.engine.encodings.bricks import ROW, SIDE, active_at
 from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields.assembled import Assembled, Slot
 from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
     PER_CELL_MADE,
-    ComputedField,
     Reads,
     StoredAs,
     exact,
     runs_of,
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kernels.light import Exposure, Light
 from fusedrf_cli.engine.kernels.parts import LINE
-from fusedrf_cli.engine.kinds.sparse import bodies, reference, training
-from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
+from fusedrf_cli.engine.kernels.reference import exact as exact_tensor
+from fusedrf_cli.engine.kinds.sparse import training
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_BRICKS,
     MAX_TOP_CELLS,
@@ -41,15 +45,27 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
-PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
-PER_BRICK_MADE = 5000  # more while they are found
-PER_BRICK_JOINED = 20_000  # more while hanging vertices are found, where there are several levels
-PER_TOP_CELL = 10  # its table's place and depth
-PER_NODE = 60  # of a node while the tree is walked: its code and place, and those of its children
+
+@dataclass(frozen=True)
+class BricksConfig:
+    """Bytes in memory of a field of bricks, and how fine its occupancy is."""
+
+    per_brick: int = 1200
+    """Bytes in memory beside the numbers: rows of its vertices, its place, masks and tables."""
+    per_brick_made: int = 5000
+    """More while they are found."""
+    per_brick_joined: int = 20_000
+    """More while hanging vertices are found, where there are several levels."""
+    per_top_cell: int = 10
+    """Its table's place and depth."""
+    per_node: int = 60
+    """Of a node while the tree is walked: its code and place, and those of its children."""
+    occupancy_cells: int = 192
+    """Along the longest axis, at most, unless there are more top cells."""
+
+
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
-OCCUPANCY_CELLS = 192  # along the longest axis, at most, unless there are more top cells
-"""Bits of a mask: voxel (i, j, k) is bit (i * 4 + j) * 4 + k."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +90,22 @@ class SparseShape:
         return 3 * (self.coefficients - 1)
 
     @property
+    def colour(self) -> dict[str, int]:
+        """What the colour's encoding is called with."""
+        return {"numbers": 3 * self.coefficients}
+
+    @property
     def band_width(self) -> int:
         """Floats of a row of bands in memory."""
-        return -(-self.band_numbers // 8) * 8
+        return bricks.sizes(**self.colour)["BANDS"]
 
 
-class SparseField(ComputedField):
+class SparseField(Assembled):
     """Vertices of bricks; immutable but for `params`, which optimisers update in place (`settle`
     afterwards)."""
 
-    kind, bodies = "sparse", bodies
+    kind = "sparse"
+    shift = 0.0  # of the density feature
 
     def __init__(
         self,
@@ -93,9 +115,12 @@ class SparseField(ComputedField):
         params: torch.Tensor | None = None,
         space: ModuleType = bounded,
     ):
-        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space."""
+        """params (P,) float; None: zeros. The bricks lie in the coordinates of the space; ValueError where
+        rays are curved in it, since loops leave bricks along straight lines."""
+        if getattr(space, "CURVED", False):
+            raise ValueError(f"bricks cannot lie in space {name_of(space)!r}, in which rays are curved")
         self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
-        self.coarse = Lattice(fine.tree, COARSE) if shape.sh_degree else None
+        self.coarse = fine.wider if shape.sh_degree else None
         self.params = pages.zeros(self.size) if params is None else params
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":
@@ -119,7 +144,6 @@ class SparseField(ComputedField):
     def on(self, lattice: Lattice, space: ModuleType) -> "SparseField":
         """The same numbers on a part of its voxels, in the coordinates of a space."""
         other = SparseField(self.shape, lattice, self.scale, None, space).to(self.params.device)
-        other.tint = self.tint
         other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
         if other.coarse:
             other.bands[:] = self.bands[self.coarse.find(other.coarse.keys)[0]]
@@ -180,9 +204,13 @@ class SparseField(ComputedField):
         """(W, band_numbers) view of the coefficients of degree 1 and more, channel by channel."""
         if self.coarse is None:
             return self.params.new_zeros(0, 0)
+        return self._wide_bands[:, : self.shape.band_numbers]
+
+    @property
+    def _wide_bands(self) -> torch.Tensor:
+        """(W, band_width) the same with what fills up their rows, which is 0."""
         count = len(self.coarse.vertices)
-        wide = self.params[self.bands_at : self.bands_at + count * self.shape.band_width].view(count, -1)
-        return wide[:, : self.shape.band_numbers]
+        return self.params[self.bands_at : self.bands_at + count * self.shape.band_width].view(count, -1)
 
     @property
     def aabb(self) -> np.ndarray:
@@ -197,29 +225,51 @@ class SparseField(ComputedField):
     @cached_property
     def occupancy(self) -> OccupancyGrid:
         """Cells that active voxels reach."""
-        return replace(self.tree.occupancy(OCCUPANCY_CELLS), space=self.lies_in)
+        return replace(self.tree.occupancy(current(BricksConfig).occupancy_cells), space=self.lies_in)
 
-    def kernel_arrays(self, params: object) -> bodies.Arrays:
-        """See ComputedField."""
-        tree = self.tree
-        offset, depth, table = tree.tables
-        weights = np.uint64(1) << np.arange(SIDE**3, dtype=np.uint64)
-        mask = (tree.mask.reshape(-1, SIDE**3) * weights).sum(1, dtype=np.uint64)
-        return bodies.Arrays(
-            params,
-            self.bands_at,
-            self.scale,
-            tree.lo,
-            tree.top,
-            offset,
-            depth,
-            table,
-            tree.level,
-            mask,
-            self.fine.rows,
-            self.coarse.rows if self.coarse else np.zeros((0, 0), np.int32),
-            tree.depth,
-        )
+    @cached_property
+    def slots(self) -> dict[str, Slot]:
+        """See Assembled."""
+        colour = bricks.sizes(**self.shape.colour)["WIDTH"]
+        harmonics = {"width": colour, "coefficients": self.shape.coefficients, "apart": True}
+        return {
+            "density": Slot(bricks, {"numbers": 1}),
+            "colour": Slot(bricks, self.shape.colour),
+            "sigma": Slot(density_sum),
+            "rgb": Slot(sh, harmonics),
+        }
+
+    @property
+    def activation(self) -> np.ndarray:
+        """(2,) scale and shift, as kernels read them."""
+        return np.asarray([self.scale, self.shift])
+
+    @property
+    def cube(self) -> tuple[np.ndarray, np.ndarray]:
+        """See Assembled: the first top cell."""
+        return self.tree.lo, self.tree.top
+
+    @property
+    def vertex_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 125) and (N, 27) int32, rows of each brick's vertices, and of those of its bands."""
+        return self.fine.rows, self.coarse.rows if self.coarse else np.zeros((0, 0), np.int32)
+
+    def slot_starts(self) -> dict[str, np.ndarray]:
+        """See Assembled: of the rows and of the bands."""
+        both = np.array([0, self.bands_at])
+        return {"density": both, "colour": both, "sigma": both[:0], "rgb": both[:0]}
+
+    def slot_sections(self) -> dict[str, dict]:
+        """See Assembled."""
+        bands = {"bands": (self.coarse, self._wide_bands)} if self.coarse else {}
+        colour = bands | {"rows": (self.fine, self.rows)}
+        return {"density": {"rows": (self.fine, self.rows[:, :1])}, "colour": colour, "sigma": {}, "rgb": {}}
+
+    def located(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """See Assembled: in top cells, where a voxel is active."""
+        lo, side = (exact_tensor(corner, points.device) for corner in self.cube)
+        unit = (points - lo) / side
+        return unit, active_at(self.tree, unit)
 
     def exposed(
         self, low: np.ndarray, high: np.ndarray, directions: np.ndarray, far: float, blocked: float
@@ -227,18 +277,11 @@ class SparseField(ComputedField):
         """How much light reaches cubes of corners low and high (K, 3) along the clearest of the directions
         (D, 3), (K,), from `far` away or from outside the box, and the mean direction along which each is seen
         (K, 3), of length 1 where from one side alone. Light of less than `blocked` counts as none."""
-        light = bodies.Light(
-            exact((low + high) / 2), (high - low).min(1), exact(directions), float(far), float(blocked)
-        )
-        found = bodies.Exposure(np.zeros(len(low)), np.zeros((len(low), 3)))
-        self.loops.each("expose_voxel", self.arrays, self.grid, light, len(low), found)
+        middles, sides = exact((low + high) / 2), (high - low).min(1)
+        light = Light(middles, sides, exact(directions), float(far), float(blocked), self.voxel_size)
+        found = Exposure(np.zeros(len(low)), np.zeros((len(low), 3)))
+        self.loops.each("expose_cube", self.arrays, self.grid, light, len(low), found)
         return found.clearest, found.facing
-
-    def reference(
-        self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """See ComputedField and sparse/reference.py."""
-        return reference.query(self, params, points, dirs)
 
     # -- learning --------------------------------------------------------------------------------------------
 
@@ -300,14 +343,16 @@ class SparseField(ComputedField):
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs; with the tables that follow from the tree."""
+        config = current(BricksConfig)
         (bricks,), counts = shapes["masks"], metadata["counts"]
         top, bricks = math.prod(counts), bricks // 8
         entries, depth = table_entries(array("nodes"), top)
         numbers = sum(math.prod(shapes[name]) for name in ("rows", "bands") if name in shapes)
-        cells = OCCUPANCY_CELLS**3 if max(counts) < OCCUPANCY_CELLS else top
-        held = PER_BRICK * bricks + 4 * (numbers + entries) + PER_TOP_CELL * top + PER_CELL * cells
-        made = (PER_BRICK_MADE + (PER_BRICK_JOINED if depth else 0)) * bricks
-        return FieldNeeds(held, made + PER_CELL_MADE * cells + PER_NODE * 4 * shapes["nodes"][0])
+        cells = config.occupancy_cells**3 if max(counts) < config.occupancy_cells else top
+        held = config.per_brick * bricks + 4 * (numbers + entries) + PER_CELL * cells
+        held += config.per_top_cell * top
+        made = (config.per_brick_made + (config.per_brick_joined if depth else 0)) * bricks
+        return FieldNeeds(held, made + PER_CELL_MADE * cells + config.per_node * 4 * shapes["nodes"][0])
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "SparseField":

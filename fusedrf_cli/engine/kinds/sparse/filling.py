@@ -4,19 +4,19 @@ import numpy as np
 import torch
 from scipy import sparse
 
+from fusedrf_cli.engine.encodings.bricks import COARSE, SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.asking import (
-    LEAST,
-    MOST,
-    OCTANTS,
+    AskingConfig,
     density_features,
     dilated,
     inverse_softplus,
     seen_colours,
 )
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, corner_offsets
-from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField
+from fusedrf_cli.engine.kinds.sparse.field import SparseField
+from fusedrf_cli.engine.settings import current
 
 CORRECTIONS = 3
 
@@ -42,7 +42,9 @@ def density_scale(tree: BrickTree) -> float:
 
 def set_density(field: SparseField, sigma: np.ndarray) -> None:
     """Give the vertices densities (V,), as far as the feature's range goes."""
-    field.rows[:, 0] = torch.from_numpy(np.clip(inverse_softplus(sigma / field.scale), LEAST, MOST))
+    config = current(AskingConfig)
+    feature = np.clip(inverse_softplus(sigma / field.scale), config.least, config.most)
+    field.rows[:, 0] = torch.from_numpy(feature)
     field.settle()
 
 

@@ -4,23 +4,23 @@ A place is about as fine as the object that is densest there needs in world unit
 much, what is finest gives way most. What no camera sees is not held. filling.py says what the vertices get.
 """
 
+from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
 import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.kinds.asking import (
-    AT_ONCE,
-    LEAST,
+    AskingConfig,
     density,
     even_directions,
     pieces,
     placed_in,
     touching,
 )
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     MAX_TOP_CELLS,
@@ -31,29 +31,57 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     node_keys,
     sides,
 )
-from fusedrf_cli.engine.kinds.sparse.field import COARSE, SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
 from fusedrf_cli.engine.kinds.sparse.seen import can_be_cut
 from fusedrf_cli.engine.kinds.sparse.training import of_voxels
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 
-FINER = 0.6  # of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much
-YIELD = 1 / 6  # of its distance to the widest, in logarithms, by which a finer placed field gives way
-IN_PLACE = 0.5  # of the widening of a place, in logarithms, that of what stands in it: it takes few bricks
-DEEPEST = 6  # levels under the coarsest: where voxels differ by more, the widest are finer than needed
-FAINT = 1e-4  # optical depth of a voxel under which there is nothing
-LOST_DEPTH = 5e-3  # optical depth that leaving out voxels may take off a ray: opacity to half a percent
-MOST_LOST = 0.05  # optical depth of a voxel that is always held
-ODD_LINES = 20  # one line of voxels in so many may lose more: a few rays through thin haze decide nothing
-LOOKED_FROM = 20  # directions from which voxels are sought
-CAMERA_FAR = 0.1  # of the box's diagonal: the nearest a camera comes from which a voxel has to be seen
-BLOCKED = 0.05  # transmittance under which nothing is seen
-MOST_TRIED = 1 << 31  # bricks in a placed field's box
-ATTEMPTS, MOST_ATTEMPTS = 4, 10  # sizes that are tried; the most where none has fitted yet
-AIMED, FULL_ENOUGH = 0.97, 0.83  # of the numbers allowed
-FIRST_WIDENING = 2.0  # what is tried first is cheap
-FIRST_IN_PLACE = 4.0  # the same of a place, of which much more shows
-USUAL_SLOPE, SLOPE_IN_PLACE = -2.7, -2.1  # of the logarithm of numbers over that of the widening, as seen
+
+@dataclass(frozen=True)
+class ResampleConfig:
+    """How the bricks are found that a scene needs."""
+
+    finer: float = 0.6
+    """Of a teacher's voxel: a lattice that lies across its own needs finer ones to hold as much."""
+    give_way: float = 1 / 6
+    """Of its distance to the widest, in logarithms, by which a finer placed field gives way."""
+    in_place: float = 0.5
+    """Of the widening of a place, in logarithms, that of what stands in it: it takes few bricks."""
+    deepest: int = 6
+    """Levels under the coarsest: where voxels differ by more, the widest are finer than needed."""
+    faint: float = 1e-4
+    """Optical depth of a voxel under which there is nothing."""
+    lost_depth: float = 5e-3
+    """Optical depth that leaving out voxels may take off a ray: opacity to half a percent."""
+    most_lost: float = 0.05
+    """Optical depth of a voxel that is always held."""
+    odd_lines: int = 20
+    """One line of voxels in so many may lose more: a few rays through thin haze decide nothing."""
+    looked_from: int = 20
+    """Directions from which voxels are sought."""
+    camera_far: float = 0.1
+    """Of the box's diagonal: the nearest a camera comes from which a voxel has to be seen."""
+    blocked: float = 0.05
+    """Transmittance under which nothing is seen."""
+    most_tried: int = 1 << 31
+    """Bricks in a placed field's box."""
+    attempts: int = 4
+    """Sizes that are tried."""
+    most_attempts: int = 10
+    """Where none has fitted yet."""
+    aimed: float = 0.97
+    """Share of the numbers allowed that the next try aims at."""
+    full_enough: float = 0.83
+    """Share from which no other is tried."""
+    first_widening: float = 2.0
+    """What is tried first is cheap."""
+    first_in_place: float = 4.0
+    """The same of a place, of which much more shows."""
+    usual_slope: float = -2.7
+    """Of the logarithm of numbers over that of the widening, as seen."""
+    slope_in_place: float = -2.1
 
 
 class TooFewNumbers(ValueError):
@@ -77,11 +105,13 @@ def fitted(
     teacher: RadianceField, shape: SparseShape, max_numbers: int, per_brick: float
 ) -> tuple[Lattice, list[np.ndarray]]:
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
+    config = current(ResampleConfig)
     own, in_place = own_voxels(teacher), teacher.occupancy.space is not bounded
-    least = 1.0 if in_place else (own.min() / own.max()) ** YIELD  # no voxel is wider than needed then
-    widening, best, tried = FIRST_IN_PLACE if in_place else max(FIRST_WIDENING, least), None, []
-    for attempt in range(MOST_ATTEMPTS):
-        if attempt >= ATTEMPTS and best is not None:
+    # No voxel is wider than needed at the least widening.
+    least = 1.0 if in_place else (own.min() / own.max()) ** config.give_way
+    widening, best, tried = config.first_in_place if in_place else max(config.first_widening, least), None, []
+    for attempt in range(config.most_attempts):
+        if attempt >= config.attempts and best is not None:
             break
         try:
             found = occupied(teacher, widening)
@@ -93,12 +123,12 @@ def fitted(
         tried.append((np.log(widening), np.log(count)))
         if count <= max_numbers and (best is None or widening < best[0]):
             best = widening, found
-        if count <= max_numbers and (widening <= least or count >= FULL_ENOUGH * max_numbers):
+        if count <= max_numbers and (widening <= least or count >= config.full_enough * max_numbers):
             break
-        slope = SLOPE_IN_PLACE if in_place else USUAL_SLOPE
+        slope = config.slope_in_place if in_place else config.usual_slope
         if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
             slope = min(-1.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
-        wanted = tried[-1][0] + (np.log(AIMED * max_numbers) - tried[-1][1]) / slope
+        wanted = tried[-1][0] + (np.log(config.aimed * max_numbers) - tried[-1][1]) / slope
         widening = float(np.exp(np.clip(wanted, np.log(least), tried[-1][0] + 1)))
     if best is None:
         raise TooFewNumbers(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
@@ -108,15 +138,16 @@ def fitted(
 def number_count(lattice: Lattice, shape: SparseShape) -> int:
     """Numbers of a sparse field over a lattice."""
     count = 4 * lattice.free
-    return count + (shape.band_numbers * Lattice(lattice.tree, COARSE).free if shape.sh_degree else 0)
+    return count + (shape.band_numbers * lattice.wider.free if shape.sh_degree else 0)
 
 
 def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
     """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels are
-    FINER times as wide as `voxels_wanted` has it."""
-    needs = FINER * voxels_wanted(teacher, widening)
-    depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, DEEPEST))
-    top = SIDE * min(needs.max(), needs.min() * 2**DEEPEST)
+    `finer` times as wide as `voxels_wanted` has it."""
+    config = current(ResampleConfig)
+    needs = config.finer * voxels_wanted(teacher, widening)
+    depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, config.deepest))
+    top = SIDE * min(needs.max(), needs.min() * 2**config.deepest)
     box = teacher.occupancy.tight_aabb(0)
     while True:
         counts = np.maximum(np.ceil((box[3:] - box[:3]) / top + 0.5), 1).astype(int)
@@ -136,14 +167,15 @@ def own_voxels(teacher: RadianceField) -> np.ndarray:
 def voxels_wanted(teacher: RadianceField, widening: float) -> np.ndarray:
     """(P,) how wide a voxel may be for each placed field: as its own, or as much wider as a widening says.
 
-    What is finer than the widest own voxel gives way a little more: by YIELD of the distance, in logarithms.
-    What stands in a place gives way less than the place (IN_PLACE).
+    What is finer than the widest own voxel gives way a little more: by `give_way` of the distance, in
+    logarithms. What stands in a place gives way less than the place (`in_place`).
     """
+    config = current(ResampleConfig)
     own = own_voxels(teacher)
     if teacher.occupancy.space is bounded:
-        return np.maximum(own, widening * own ** (1 - YIELD) * own.max() ** YIELD)
+        return np.maximum(own, widening * own ** (1 - config.give_way) * own.max() ** config.give_way)
     place = np.array([p.unbounded for p in placed_in(teacher)])
-    return own * np.maximum(1, widening) ** np.where(place, 1, IN_PLACE)
+    return own * np.maximum(1, widening) ** np.where(place, 1, config.in_place)
 
 
 def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.ndarray]]:
@@ -157,7 +189,7 @@ def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.
     whole = BrickTree.of(lo, top, counts, level, at, np.ones((len(level), SIDE, SIDE, SIDE), bool))
     lattice = Lattice(whole, SIDE)
     sigma = density(teacher, lattice.places)
-    dense = (sigma * lattice.finest_voxel > FAINT)[lattice.corners].any(1)
+    dense = (sigma * lattice.finest_voxel > current(ResampleConfig).faint)[lattice.corners].any(1)
     lattice, (sigma,) = thinned(lattice, dense, sigma)
     field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree), space=teacher.occupancy.space)
     set_density(field, sigma)
@@ -194,19 +226,20 @@ def thinned(lattice: Lattice, kept: np.ndarray, *values: np.ndarray) -> tuple[La
 
 
 def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Which active voxels (K,) a camera sees anything of that is not closer than CAMERA_FAR times the box;
+    """Which active voxels (K,) a camera sees anything of that is not closer than `camera_far` times the box;
     and the mean direction (V, 3) along which each vertex is seen, of length 1 where from one side alone. With
     `which` (K,) bool only those voxels are looked at, and all others shown.
 
     What is hidden in solids is not held, and of haze as much is left out as no line of sight misses.
     """
+    config = current(ResampleConfig)
     lattice = field.fine
     which = np.ones(len(lattice.corners), bool) if which is None else which
     corners, box, feature = lattice.corners[which], field.aabb, field.rows[:, 0].numpy()
-    far = CAMERA_FAR * float(np.linalg.norm(box[3:] - box[:3]))
+    far = config.camera_far * float(np.linalg.norm(box[3:] - box[:3]))
     low, high = lattice.places[corners[:, 0]], lattice.places[corners[:, 7]]
-    clearest, facing = field.exposed(low, high, even_directions(LOOKED_FROM), far, BLOCKED)
-    sigma = np.where(feature > LEAST, field.scale * np.logaddexp(0, feature), 0)
+    clearest, facing = field.exposed(low, high, even_directions(config.looked_from), far, config.blocked)
+    sigma = np.where(feature > current(AskingConfig).least, field.scale * np.logaddexp(0, feature), 0)
     depth = sigma[corners].max(1) * (high - low).min(1) * clearest
     kept = which.copy()
     kept[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
@@ -226,7 +259,7 @@ def demanded(
     keys, inverse = np.unique(node_keys((bricks[:, None] * SIDE + inner).reshape(-1, 3)), return_inverse=True)
     places = lo + key_places(keys) * (side / SIDE)
     own = density(placed, places, space)
-    dense = own * np.min(side) / SIDE > FAINT
+    dense = own * np.min(side) / SIDE > current(ResampleConfig).faint
     for other in placed_in(teacher):
         beside = dense & holds(other, places, space)
         if other is not placed and beside.any():
@@ -259,12 +292,12 @@ def touched(
     corners = (grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell) @ matrix[:3, :3].T + matrix[:3, 3]
     first = np.clip(np.floor((placed.aabb[:3] - lo) / side).astype(int) - 1, 0, counts - 1)
     last = np.clip(np.floor((placed.aabb[3:] - lo) / side).astype(int) + 1, 0, counts - 1)
-    if np.prod(last - first + 1.0) > MOST_TRIED:
+    if np.prod(last - first + 1.0) > current(ResampleConfig).most_tried:
         raise ValueError(f"'{placed.name}' is too large for voxels so fine")
     found = np.zeros(last - first + 1, bool)
     start = ((corners - lo) / side - first).astype(np.float32)
     fewer, more = sorted((start, (inner / side).astype(np.float32)), key=len)
-    for part in pieces(len(more), AT_ONCE):
+    for part in pieces(len(more), current(AskingConfig).at_once):
         for offset in fewer:
             index = np.clip((more[part] + offset).astype(np.int32), 0, last - first)
             found[index[:, 0], index[:, 1], index[:, 2]] = True
@@ -277,12 +310,12 @@ def touched_in_space(
     """As `touched`, for a scene whose coordinates are not those of its frame: the bricks at one of whose
     points, a few per voxel apart, a cell of the placed field is occupied."""
     first, last = reached(placed, side, lo, counts, space)
-    if np.prod(last - first + 1.0) > MOST_TRIED:
+    if np.prod(last - first + 1.0) > current(ResampleConfig).most_tried:
         raise ValueError(f"'{placed.name}' is too large for voxels so fine")
     spots = np.linspace(-1 / SIDE, 1 + 1 / SIDE, SIDE if placed.field.voxel_size < np.min(side) else 2)
     inner = np.stack(np.meshgrid(spots, spots, spots, indexing="ij"), -1).reshape(-1, 3)
     grid, into, found = placed.field.occupancy, np.linalg.inv(placed.object_to_world), []
-    for part in pieces(int(np.prod(last - first + 1)), AT_ONCE // len(inner)):
+    for part in pieces(int(np.prod(last - first + 1)), current(AskingConfig).at_once // len(inner)):
         at = np.stack(np.unravel_index(np.arange(part.start, part.stop), last - first + 1), -1) + first
         points = torch.from_numpy((lo + (at[:, None] + inner) * side).reshape(-1, 3))
         points = space.placed(points).numpy() @ into[:3, :3].T + into[:3, 3]
@@ -340,15 +373,17 @@ def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def harmless(depth: np.ndarray, places: np.ndarray) -> float:
     """The largest optical depth of a voxel up to which voxels (K,) at places (K, 3) may be left out, when one
-    in ODD_LINES of the axis-parallel lines through them may lose more than LOST_DEPTH: thin fog is no
+    in `odd_lines` of the axis-parallel lines through them may lose more than `lost_depth`: thin fog is no
     emptiness."""
+    config = current(ResampleConfig)
     if not len(depth):
         return 0.0
     lines = []
     for a, b in ((0, 1), (0, 2), (1, 2)):
         lines.append(np.unique(places[:, a] << 21 | places[:, b], return_inverse=True)[1])
-    for threshold in MOST_LOST * 0.5 ** np.arange(12):
+    for threshold in config.most_lost * 0.5 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)
-        if max(np.quantile(np.bincount(line, lost), 1 - 1 / ODD_LINES) for line in lines) <= LOST_DEPTH:
+        most = max(np.quantile(np.bincount(line, lost), 1 - 1 / config.odd_lines) for line in lines)
+        if most <= config.lost_depth:
             return float(threshold)
     return 0.0

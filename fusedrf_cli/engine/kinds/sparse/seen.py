@@ -3,7 +3,7 @@ behind surfaces, or too thin to see, which bricks would hold at the cost of what
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,11 +15,20 @@ from fusedrf_cli.engine.fields.base import sampling_step
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, cell_counts
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.rendering.cameras import Camera
+from fusedrf_cli.engine.settings import current
 
-CELLS = 256  # along the longest side of a place
-RAYS = 1 << 20  # that look at the middle of the scene, where no views of it are known
-SHOWN_FROM = 5e-3  # weight on a ray from which what a cell holds counts
-SEED = 3_000_017
+
+@dataclass(frozen=True)
+class SeenConfig:
+    """How cells of a place are found that show."""
+
+    cells: int = 256
+    """Along the longest side of a place."""
+    rays: int = 1 << 20
+    """That look at the middle of the scene, where no views of it are known."""
+    shown_from: float = 5e-3
+    """Weight on a ray from which what a cell holds counts."""
+    seed: int = 3_000_017
 
 
 def as_seen(scene: ComposedField, views: Sequence[Camera]) -> ComposedField:
@@ -41,26 +50,28 @@ def can_be_cut(placed: Placed) -> bool:
 
 def cut_down(placed: Placed, rays_o: np.ndarray, rays_d: np.ndarray) -> Placed:
     """A place with those cells alone that rays (N, 3) of the scene's frame show."""
+    config = current(SeenConfig)
     field = opened(placed.field)
     grid = field.occupancy
-    finer = OccupancyGrid.full(grid.aabb, CELLS, grid.space)
-    finer = finer.marked(grid.contains(finer.centres()).reshape(cell_counts(grid.aabb, CELLS)))
+    finer = OccupancyGrid.full(grid.aabb, config.cells, grid.space)
+    finer = finer.marked(grid.contains(finer.centres()).reshape(cell_counts(grid.aabb, config.cells)))
     asked = field.with_occupancy(finer)
     origins = rays_o @ placed.world_to_object[:3, :3].T + placed.world_to_object[:3, 3]
     ways = rays_d @ placed.world_to_object[:3, :3].T
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    generator = torch.Generator().manual_seed(SEED)
+    generator = torch.Generator().manual_seed(config.seed)
     jitter = torch.rand(len(origins), generator=generator, dtype=torch.float64).numpy()
     weights = asked.weights_in_cells(origins, ways, jitter, 0.0, sampling_step(asked))
-    shown = finer.marked(weights > SHOWN_FROM).dilated().occupied & finer.occupied
+    shown = finer.marked(weights > config.shown_from).dilated().occupied & finer.occupied
     return replace(placed, field=field.with_occupancy(finer.marked(shown)))
 
 
 def rays_of(scene: ComposedField, views: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions (N, 3) of all pixels of the views; of none, of rays at the scene's middle
     and its objects."""
+    config = current(SeenConfig)
     if not views:
-        generator = torch.Generator().manual_seed(SEED)
-        return RaySampler.of(scene).draw(RAYS, generator)
+        generator = torch.Generator().manual_seed(config.seed)
+        return RaySampler.of(scene).draw(config.rays, generator)
     rays_o, rays_d = (np.concatenate(parts) for parts in zip(*(v.rays() for v in views), strict=True))
     return rays_o, rays_d

@@ -2,7 +2,7 @@
 rays."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from math import prod
@@ -12,10 +12,12 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
+from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
-from fusedrf_cli.engine.kinds.sparse.bodies import COARSE, ROW, SIDE
+from fusedrf_cli.engine.kinds.reduction import Reduction
+from fusedrf_cli.engine.kinds.sparse import coarsening
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
@@ -32,26 +34,48 @@ from fusedrf_cli.engine.kinds.student import (
     Way,
 )
 from fusedrf_cli.engine.selection.cells import Selection
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 
-PADDED = 1.6  # floats in memory for each number that is stored: rows are padded, hanging vertices too
-WHOLE_BELOW = 0.8  # of the numbers allowed: fewer are taken where no object needs more
-PER_NUMBER_FILLED = 130  # bytes, as seen: keys, places, indices and least squares of a vertex
-BYTES_PER_BRICK = 10  # masks and nodes
-DEGREE = 1  # measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0
-# Places are photographed from few sides, and what they say to others is anything: fitted by a lower degree,
-# it changes what photos do show. A park in 50 MB, before rays: 24.2 dB by degree 1, 30.0 by 2.
-DEGREE_IN_PLACE = 2
-DEGREES = (0, 1, 2)
-TRIES, SMALLER = 3, 0.97  # where a file is larger than was reckoned: by that factor under what would do
-LEAST_BYTES = 20_000  # told where nothing fits: a few hundred vertices and their bricks
-HELD_SHARE = 0.2  # of the vertices of a box: about what surfaces need
-# Of a field in memory, for which the lesson's rays do, and its steps. Four objects in 21 million: 0.3 dB lost
-# by it, 0.2 gained by three times the rays, 1.1 by seven times the rays and three times the steps.
-# A park in 50 million: a fourth time the steps, and a fuller file, 33.8 to 34.4 dB.
-TOLD_BY_RAYS, TOLD_BY_STEPS = 3_000_000, 6_000_000
-MOST_RAYS, MOST_STEPS, MOST_SAMPLES = 7, 4, 4  # times those of the lesson
-LADDER_BYTES = (1_000_000, 3_000_000, 8_000_000)
+
+@dataclass(frozen=True)
+class SparseConfig:
+    """How large a student of bricks is, and how much it is told."""
+
+    padded: float = 1.6
+    """Floats in memory for each number that is stored: rows are padded, hanging vertices too."""
+    whole_below: float = 0.8
+    """Of the numbers allowed: fewer are taken where no object needs more."""
+    per_number_filled: int = 130
+    """Bytes, as seen: keys, places, indices and least squares of a vertex."""
+    bytes_per_brick: int = 10
+    """Masks and nodes."""
+    degree: int = 1
+    """Measured at 5 million numbers: 35.7 dB, where a second degree leaves room for 34.0."""
+    degree_in_place: int = 2
+    """Places are photographed from few sides, and what they say to others is anything: fitted by a lower
+    degree, it changes what photos do show. A park in 50 MB, before rays: 24.2 dB by degree 1, 30.0 by
+    2."""
+    degrees: tuple[int, ...] = (0, 1, 2)
+    tries: int = 3
+    """Where a file is larger than was reckoned."""
+    smaller: float = 0.97
+    """By that factor under what would do."""
+    least_bytes: int = 20_000
+    """Told where nothing fits: a few hundred vertices and their bricks."""
+    held_share: float = 0.2
+    """Of the vertices of a box: about what surfaces need."""
+    told_by_rays: int = 3_000_000
+    """Numbers of a field in memory, for which the lesson's rays do. Four objects in 21 million: 0.3 dB
+    lost by it, 0.2 gained by three times the rays, 1.1 by seven times the rays and three times the steps.
+    A park in 50 million: a fourth time the steps, and a fuller file, 33.8 to 34.4 dB."""
+    told_by_steps: int = 6_000_000
+    """The same for its steps."""
+    most_rays: int = 7
+    """Times those of the lesson."""
+    most_steps: int = 4
+    most_samples: int = 4
+    ladder_bytes: tuple[int, ...] = (1_000_000, 3_000_000, 8_000_000)
 
 
 class SparseKind(Kind):
@@ -60,7 +84,7 @@ class SparseKind(Kind):
     name = "sparse"
     good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local."
     field = SparseField
-    takes = frozenset({"sh_degree"})
+    takes = reduces = frozenset({"sh_degree"})
     precisions = ("int8", "float16")
     beside_background = False  # its bricks are as coarse as the background where that is all there is
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
@@ -75,7 +99,7 @@ class SparseKind(Kind):
     def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
         """Floats of a field of surfaces in that box."""
         width = shape_of(way).band_width * COARSE**3 / SIDE**3
-        return int(HELD_SHARE * (ROW + width) * prod(resolution))
+        return int(current(SparseConfig).held_share * (ROW + width) * prod(resolution))
 
     def create(self, plan: Plan, generator: torch.Generator, name: str = "") -> SparseField:
         """All of the box in bricks of one level, thinly filled."""
@@ -90,6 +114,11 @@ class SparseKind(Kind):
     def student(self, scene: ComposedField, request: StudentRequest) -> "SparseStudent":
         """Bricks of a scene."""
         return SparseStudent(self, scene, request)
+
+    def reduction(self, outline: SparseField, voxel: float, way: Way) -> Reduction:
+        """See Kind and sparse/coarsening.py."""
+        degree = outline.shape.sh_degree if way.sh_degree is None else way.sh_degree
+        return coarsening.reduced(outline, voxel, degree)
 
     def describe(self, field: SparseField) -> dict:
         """The voxel and the bricks of every level, and how many vertices they have."""
@@ -122,10 +151,6 @@ class SparseKind(Kind):
         """A voxel is kept or not."""
         return self.cropped(field, holds)
 
-    def thinned(self, field: SparseField, factor: float) -> SparseField:
-        """The same vertices, with another scale."""
-        return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)
-
 
 class SparseStudent(MadeStudent):
     """Bricks about as fine as each object of a scene needs, all wider by one factor under a limit."""
@@ -136,12 +161,14 @@ class SparseStudent(MadeStudent):
 
     def lesson_of(self, numbers: int, seconds: float | None = None) -> DistilConfig:
         """See Student: the more numbers, the more rays, steps and samples."""
-        lesson, rays, more = self.lesson, *(max(1.0, numbers / n) for n in (TOLD_BY_RAYS, TOLD_BY_STEPS))
+        config = current(SparseConfig)
+        lesson, told = self.lesson, (config.told_by_rays, config.told_by_steps)
+        rays, more = (max(1.0, numbers / n) for n in told)
         return replace(
             lesson,
-            rays=round(lesson.rays * min(rays, MOST_RAYS)),
-            rgb_steps=round(lesson.rgb_steps * min(more, MOST_STEPS)),
-            rgb_samples=round(lesson.rgb_samples * min(more, MOST_SAMPLES)),
+            rays=round(lesson.rays * min(rays, config.most_rays)),
+            rgb_steps=round(lesson.rgb_steps * min(more, config.most_steps)),
+            rgb_samples=round(lesson.rgb_samples * min(more, config.most_samples)),
             time_budget=seconds,
         )
 
@@ -154,21 +181,23 @@ class SparseStudent(MadeStudent):
         """By precision, and degrees of the colour."""
         request = self.request
         precisions = (request.precision,) if request.precision else self.kind.precisions
-        degrees = DEGREES if request.sh_degree is None else (request.sh_degree,)
+        degrees = current(SparseConfig).degrees if request.sh_degree is None else (request.sh_degree,)
         return [[Way(p, None, degree) for degree in degrees] for p in precisions]
 
     def plain(self) -> Way:
         """The degree that was measured to be worth its bytes, of a place that of its sources."""
+        config = current(SparseConfig)
         request, in_place = self.request, self.scene.occupancy.space is not bounded
-        usual = DEGREE_IN_PLACE if in_place else DEGREE
+        usual = config.degree_in_place if in_place else config.degree
         degree = usual if request.sh_degree is None else request.sh_degree
         return Way(request.precision or self.kind.faithful, None, degree)
 
     def made(self, way: Way, limit: int) -> Made | None:
         """Bricks filled by asking the scene."""
+        config = current(SparseConfig)
         numbers = self.numbers_within(limit, way.precision)
-        per_brick = BYTES_PER_BRICK / self.request.sizes.per_number(way.precision)
-        for _ in range(TRIES):
+        per_brick = config.bytes_per_brick / self.request.sizes.per_number(way.precision)
+        for _ in range(config.tries):
             if numbers < 1:
                 return None
             try:
@@ -177,8 +206,8 @@ class SparseStudent(MadeStudent):
                 return None
             size, bricks = self.bytes_of(field, way), len(field.tree.level)
             if size <= limit:
-                return Made(field, size, field.numbers + per_brick * bricks < WHOLE_BELOW * numbers)
-            numbers = int(SMALLER * numbers * limit / size)
+                return Made(field, size, field.numbers + per_brick * bricks < config.whole_below * numbers)
+            numbers = int(config.smaller * numbers * limit / size)
         return None
 
     def numbers_within(self, limit: int, precision: str) -> int:
@@ -189,7 +218,7 @@ class SparseStudent(MadeStudent):
 
     def smallest(self) -> int:
         """About so many bytes for the widest voxels."""
-        return max(LEAST_BYTES, self.request.limit + 1)
+        return max(current(SparseConfig).least_bytes, self.request.limit + 1)
 
     def why(self, field: SparseField) -> str:
         """How fine the voxels are."""
@@ -197,14 +226,15 @@ class SparseStudent(MadeStudent):
 
     def needs(self) -> Needs:
         """Vertices while they are filled, padded rows afterwards."""
+        config = current(SparseConfig)
         numbers = self.numbers_within(self.request.limit, self.plain().precision)
-        filling = {"vertices while they are found and filled": float(PER_NUMBER_FILLED * numbers)}
-        return Needs(int(PADDED * numbers), making=filling, points=0)
+        filling = {"vertices while they are found and filled": float(config.per_number_filled * numbers)}
+        return Needs(int(config.padded * numbers), making=filling, points=0)
 
 
 def shape_of(way: Way) -> SparseShape:
     """The shape of a field in a way."""
-    return SparseShape(DEGREE if way.sh_degree is None else way.sh_degree)
+    return SparseShape(current(SparseConfig).degree if way.sh_degree is None else way.sh_degree)
 
 
 def bricks(resolution: tuple[int, int, int]) -> list[int]:
@@ -214,7 +244,7 @@ def bricks(resolution: tuple[int, int, int]) -> list[int]:
 
 def bricks_ladder() -> Ladder:
     """From few bricks to more, since many take minutes."""
-    for rgb, size, degree in product((False, True), LADDER_BYTES, (1, 0)):
+    for rgb, size, degree in product((False, True), current(SparseConfig).ladder_bytes, (1, 0)):
         yield Rung("int8", sh_degree=degree, max_size=size, rgb=rgb)
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kinds.asking import OCTANTS
-from fusedrf_cli.engine.kinds.sparse.bodies import SIDE
+from fusedrf_cli.engine.encodings.bricks import SIDE
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
 
 UNTRAINED = -8.0  # density feature: with SCALE_PER_EXTENT 4 % opacity along the diagonal of an untrained box

@@ -1,35 +1,45 @@
-"""Leaving out of a VM field what its pictures do not need: texels and rows of detail that nothing reads, and
-ranks of little energy.
-"""
+"""VM fields with other numbers of components, and leaving out of them what pictures do not need: texels and
+rows of a hash grid that nothing reads, and components of little energy."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Held
-from fusedrf_cli.engine.kinds.vm.field import MODES, VMField, VMShape, VMTensor
-from fusedrf_cli.engine.kinds.vm.reference import hashed_row
+from fusedrf_cli.engine.encodings.hash_runs import hashed_row
+from fusedrf_cli.engine.encodings.plane_line import MODES
+from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Hashed
+from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
+from fusedrf_cli.engine.settings import current
 
-REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
-ROUNDED = 1e-3
-"""Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
-MOST_MET = 8.0  # cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked
-VERTICES_AT_ONCE = 1 << 22  # of a detail's lattice: some 100 MB
+COMPONENTS = "density_rank", "colour_rank", "sh_degree"
 
 
-def read_texels(tensor: VMTensor, mode: int) -> np.ndarray:
+@dataclass(frozen=True)
+class TrimmingConfig:
+    """How a field is made smaller."""
+
+    regular: float = 1e-9
+    """Of the largest entry of a Gram matrix, added to its diagonal."""
+    rounded: float = 1e-3
+    """Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
+    most_met: float = 8.0
+    """Cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked."""
+    vertices_at_once: int = 1 << 22
+    """Of a lattice: some 100 MB."""
+
+
+def read_texels(field: VMField, mode: int) -> np.ndarray:
     """(na, nb) bool: the plane texels of a mode that some point of an occupied cell reads."""
     a, b, c = MODES[mode]
-    held = tensor.occupancy.occupied.any(axis=c)
+    held = field.occupancy.occupied.any(axis=c)
     sums = np.zeros(np.array(held.shape) + 1, np.int64)
     sums[1:, 1:] = held.cumsum(0).cumsum(1)
     (a0, a1), (b0, b1) = (
         reading_cells(n, cells)
-        for n, cells in zip((tensor.resolution[a], tensor.resolution[b]), held.shape, strict=True)
+        for n, cells in zip((field.resolution[a], field.resolution[b]), held.shape, strict=True)
     )
     return (sums[a1[:, None], b1] - sums[a0[:, None], b1] - sums[a1[:, None], b0] + sums[a0[:, None], b0]) > 0
 
@@ -49,74 +59,68 @@ def without_unread(field: VMField) -> VMField:
     texels cost next to nothing where blocks of numbers share a scale.
     """
     trimmed = field.with_params(field.params.clone())
-    for t, tensor in enumerate(trimmed.tensors):
-        sections = trimmed.sections(t)
-        for mode in range(3):
-            unread = torch.from_numpy(~read_texels(tensor, mode)).to(field.params.device)
-            for what in ("density", "colour"):
-                sections[f"{what}_plane_{mode}"][unread] = 0
+    sections = trimmed.sections()
+    for mode in range(3):
+        unread = torch.from_numpy(~read_texels(trimmed, mode)).to(field.params.device)
+        for what in ("density", "colour"):
+            sections[f"{what}_plane_{mode}"][unread] = 0
     return trimmed
 
 
 def without_unasked(field: VMField) -> VMField:
-    """The same field with 0 in all rows of its details that no occupied cell asks, and in all unread texels:
-    it answers the same there, and a file has the other rows alone."""
+    """The same field with 0 in all rows of its hash grid that no occupied cell asks, and in all unread
+    texels: it answers the same there, and a file has the other rows alone."""
     if field.params.device.type != "cpu":
         return without_unasked(field.to("cpu")).to(field.params.device)
-    trimmed, tensors = without_unread(field), list(field.tensors)
-    for t, tensor in enumerate(tensors):
-        if tensor.hashed:
-            detail = trimmed.sections(t)["detail"]
-            detail[torch.from_numpy(~asked_rows(field, t))] = 0
-            held = Held.of(detail.numpy())
-            tensors[t] = replace(tensor, held=held and (held.count, len(held.masks)))
-    params, occupancy = trimmed.params, field.occupancy
-    return VMField(field.shape, tuple(tensors), field.blocks, params, occupancy, field.owners)
+    trimmed = without_unread(field)
+    if field.shape.hashed:
+        trimmed.sections()[DETAIL][torch.from_numpy(~asked_rows(field, field.shape.hashed))] = 0
+    return trimmed
 
 
-def asked_rows(field: VMField, t: int) -> np.ndarray:
-    """(R,) bool: the rows of tensor t's detail that some point of an occupied cell asks, where planes and
+def asked_rows(field: VMField, hashed: Hashed) -> np.ndarray:
+    """(R,) bool: the rows of a field's hash grid that some point of an occupied cell asks, where planes and
     lines say that there may be matter; all of a level of which so many cells are met that most are."""
-    tensor, asked = field.tensors[t], matter_texels(field, t)
-    sides, occupied = tensor.aabb[3:] - tensor.aabb[:3], tensor.occupancy.occupied.mean()
-    found = np.zeros(tensor.hashed.shape[0], bool)
-    for level, spacing in enumerate(tensor.hashed.spacings):
-        own = found[level * tensor.hashed.rows : (level + 1) * tensor.hashed.rows]
-        if occupied * (sides / spacing).prod() > MOST_MET * tensor.hashed.rows:
+    asked, sides, occupied = matter_texels(field), field.box[3:] - field.box[:3], field.occupancy.occupied
+    found = np.zeros(hashed.shape[0], bool)
+    for level, spacing in enumerate(hashed.spacings):
+        own = found[level * hashed.rows : (level + 1) * hashed.rows]
+        if occupied.mean() * (sides / spacing).prod() > current(TrimmingConfig).most_met * hashed.rows:
             own[:] = True
             continue
-        for vertices in met_vertices(tensor, asked, spacing):
-            own[hashed_row(tensor.hashed, torch.from_numpy(vertices)).numpy()] = True
+        for vertices in met_vertices(field.box, (asked, occupied), spacing):
+            own[hashed_row(hashed, torch.from_numpy(vertices)).numpy()] = True
     return found
 
 
-def matter_texels(field: VMField, t: int) -> np.ndarray:
-    """(nx - 1, ny - 1, nz - 1) bool: the cells between tensor t's texels in which planes and lines may say
-    that there is matter. A product of bilinear and linear is trilinear, so it is largest at a corner."""
-    tensor, sections = field.tensors[t], field.sections(t)
+def matter_texels(field: VMField) -> np.ndarray:
+    """(nx - 1, ny - 1, nz - 1) bool: the cells between texels in which planes and lines may say that there is
+    matter. A product of bilinear and linear is trilinear, so it is largest at a corner."""
+    sections = field.sections()
     planes, lines = (
         [sections[f"density_{what}_{m}"].double() for m in range(3)] for what in ("plane", "line")
     )
     cells = []
-    for i in range(tensor.resolution[0]):  # a layer of texels at a time
+    for i in range(field.resolution[0]):  # a layer of texels at a time
         layer = planes[0][i] @ lines[0].T + lines[1] @ planes[1][i].T + (planes[2] @ lines[2][i])
-        high = (layer + tensor.shift > EMPTY_FROM - ROUNDED).numpy()
+        high = (layer + field.shift > EMPTY_FROM - current(TrimmingConfig).rounded).numpy()
         square = high[:-1, :-1] | high[1:, :-1] | high[:-1, 1:] | high[1:, 1:]
         cells.append(square)
     return np.stack([one | other for one, other in zip(cells[:-1], cells[1:], strict=True)])
 
 
-def met_vertices(tensor: VMTensor, asked: np.ndarray, spacing: float) -> Iterator[np.ndarray]:
-    """(N, 3) int64, a part after the other: the vertices of a lattice of that spacing around the points of
-    occupied cells that lie in the asked ones (X, Y, Z) bool of the tensor's box."""
-    first = np.floor(tensor.aabb[:3] / spacing - ROUNDED).astype(np.int64)
-    count = np.floor(tensor.aabb[3:] / spacing + ROUNDED).astype(np.int64) + 1 - first
-    layers = max(1, VERTICES_AT_ONCE // int(count[1:].prod()))
+def met_vertices(box: np.ndarray, masks: tuple[np.ndarray, ...], spacing: float) -> Iterator[np.ndarray]:
+    """(N, 3) int64, a part after the other: the vertices of a lattice of that spacing around the points of a
+    box (6,) that lie in marked cells (X, Y, Z) of all the masks over it."""
+    config = current(TrimmingConfig)
+    first = np.floor(box[:3] / spacing - config.rounded).astype(np.int64)
+    count = np.floor(box[3:] / spacing + config.rounded).astype(np.int64) + 1 - first
+    layers = max(1, config.vertices_at_once // int(count[1:].prod()))
     for start in range(0, count[0], layers):
         low, sides = first + [start, 0, 0], np.array([min(layers, count[0] - start), *count[1:]])
         cells = np.ones(sides, bool)
-        for mask in (asked, tensor.occupancy.occupied):
-            cells &= overlapping(mask, tensor.aabb, low, sides, spacing)
+        for mask in masks:
+            cells &= overlapping(mask, box, low, sides, spacing)
         met = np.zeros(sides + 1, bool)
         for corner in product((0, 1), repeat=3):
             met[tuple(slice(c, c + n) for c, n in zip(corner, sides, strict=True))] |= cells
@@ -130,7 +134,7 @@ def overlapping(
     marked cells (X, Y, Z) of a box (6,)."""
     for axis, cells in enumerate(mask.shape):
         ends = (low[axis] + np.arange(sides[axis] + 1)) * spacing - box[axis]
-        at, off = ends / (box[axis + 3] - box[axis]) * cells, ROUNDED * spacing
+        at, off = ends / (box[axis + 3] - box[axis]) * cells, current(TrimmingConfig).rounded * spacing
         off *= cells / (box[axis + 3] - box[axis])
         begin = np.floor(at[:-1] - off).clip(0, cells - 1).astype(np.int64)
         last = (np.ceil(at[1:] + off) - 1).clip(0, cells - 1).astype(np.int64)
@@ -141,9 +145,54 @@ def overlapping(
     return mask
 
 
+def components(shape: VMShape) -> tuple[int, ...]:
+    """Ranks and SH degree of a shape."""
+    return tuple(getattr(shape, name) for name in COMPONENTS)
+
+
 def smaller_shape(a: VMShape, b: VMShape) -> VMShape:
-    """The largest shape that both of two hold."""
-    return VMShape(*(min(getattr(a, name), getattr(b, name)) for name in vars(a)))
+    """The first shape with no more components and bands than the second has."""
+    return replace(a, **{name: min(getattr(a, name), getattr(b, name)) for name in COMPONENTS})
+
+
+def common_shape(shapes: list[VMShape]) -> VMShape:
+    """The first shape with as many components and bands as any of them has."""
+    most = {name: max(getattr(shape, name) for shape in shapes) for name in COMPONENTS}
+    return replace(shapes[0], **most)
+
+
+def reshaped(field: VMField, shape: VMShape) -> VMField:
+    """The same field with the components and coefficients of a shape, as many at least, the new ones zero."""
+    wide = replace(field.shape, **{name: getattr(shape, name) for name in COMPONENTS})
+    if wide == field.shape:
+        return field
+    new, old_rank = in_shape(field, wide), field.shape.colour_rank
+    target = new.sections()
+    for name, old in field.sections().items():
+        if name == "colour_basis":
+            for mode in range(3):
+                source, at = old[..., mode * old_rank : (mode + 1) * old_rank], mode * wide.colour_rank
+                target[name][:, : source.shape[1], at : at + source.shape[2]] = source
+        else:
+            target[name][..., : old.shape[-1]] = old
+    return new
+
+
+def in_shape(field: VMField, shape: VMShape) -> VMField:
+    """A field of zeros of a shape, which lies as another does."""
+    new = type(field)(shape, field.box, field.resolution, field.scale, field.shift, occupancy=field.occupancy)
+    new.params, new.name = new.params.to(field.params.dtype), field.name
+    return new
+
+
+def without_detail(field: VMField) -> VMField:
+    """A field without what is finer than its texels."""
+    if field.shape.hashed is None:
+        return field
+    new = in_shape(field, replace(field.shape, hashed=None))
+    for name, view in new.sections().items():
+        view.copy_(field.sections()[name])
+    return new
 
 
 def truncated(field: VMField, shape: VMShape) -> VMField:
@@ -159,19 +208,19 @@ def truncated(field: VMField, shape: VMShape) -> VMField:
         return field
     if field.params.device.type != "cpu":
         return truncated(field.to("cpu"), shape).to(field.params.device)
-    params = pages.zeros(sum(t.size(least) for t in field.tensors), field.params.dtype)
-    small = VMField(least, field.tensors, field.blocks, params, field.occupancy, field.owners)
-    for t in range(len(field.tensors)):
-        old = {name: view.double().numpy() for name, view in field.sections(t).items()}
-        old["colour_basis"] = old["colour_basis"][:, : least.coefficients]
-        kept = {name: old[name] for name in old.keys() & {"detail"}}
-        for name, values in (truncated_tensor(old, least) | kept).items():
-            small.sections(t)[name].copy_(torch.from_numpy(values))
+    small, sections = in_shape(field, least), field.sections()
+    old = {name: view.double().numpy() for name, view in sections.items() if name != DETAIL}
+    old["colour_basis"] = old["colour_basis"][:, : least.coefficients]
+    target = small.sections()
+    for name, values in truncated_sections(old, least).items():
+        target[name].copy_(torch.from_numpy(values))
+    if DETAIL in target:
+        target[DETAIL].copy_(sections[DETAIL])
     return small
 
 
-def truncated_tensor(old: dict[str, np.ndarray], shape: VMShape) -> dict[str, np.ndarray]:
-    """The 13 sections of one tensor at lower ranks, from those it has (float64)."""
+def truncated_sections(old: dict[str, np.ndarray], shape: VMShape) -> dict[str, np.ndarray]:
+    """The 13 sections of a field at lower ranks, from those it has (float64)."""
     new, rank = {}, old["colour_line_0"].shape[1]
     basis = old["colour_basis"]
     kept_basis = np.zeros((*basis.shape[:2], 3 * shape.colour_rank))
@@ -213,7 +262,7 @@ def fewer_components(
         return list(range(rank)), plane
     flat = plane.reshape(-1, rank)
     of_planes, of_rest = flat.T @ flat, (line.T @ line) * (basis.T @ basis)
-    of_rest = of_rest + REGULAR * of_rest.max() * np.eye(rank)
+    of_rest = of_rest + current(TrimmingConfig).regular * of_rest.max() * np.eye(rank)
     kept: list[int] = []
     for _ in range(count):
         others = [r for r in range(rank) if r not in kept]

@@ -1,11 +1,10 @@
 """The `vm-mlp` field: planes times lines, and colour by a network on features and view (TensoRF, Chen et al.,
 ECCV 2022, with MLP_Fea shading; decoders/tensorf_mlp.py).
 
-In files it is a `vm` field of one tensor in the field's own frame, whose colour basis (3, K, 3 rank), read as
-a matrix (3 K, 3 rank), makes the network's features, and the network's layers beside it.
+In files it is a `vm` field, whose colour basis (3, K, 3 rank), read as a matrix (3 K, 3 rank), makes the
+network's features, and the network's layers beside it.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,26 +12,23 @@ import torch
 
 from fusedrf_cli.engine.decoders import density_sum, tensorf_mlp
 from fusedrf_cli.engine.encodings import plane_line
-from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.fields.base import FieldNeeds
-from fusedrf_cli.engine.fields.computed import Reads
-from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE, VMShape
-from fusedrf_cli.engine.spaces import bounded, name_of
+from fusedrf_cli.engine.fields.assembled import RankedShape, Slot
+from fusedrf_cli.engine.kinds.vm.field import VMConfig, VMField, box_metadata
+from fusedrf_cli.engine.settings import current
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
 MAX_WIDTH = 256  # of a stored field
-FACTOR_SPREAD = 0.1  # TensoRF's, of planes and lines
-TENSOR = "tensor_0."  # in front of the names that a `vm` field's only tensor has
 
 
 @dataclass(frozen=True)
-class VMMLPShape(VMShape):
+class VMMLPShape(RankedShape):
     """Ranks; the degree stands for the number of features."""
 
     sh_degree: int = FEATURE_DEGREE
     width: int = WIDTH
     """Outputs of the network's hidden layers."""
+    hashed = None
 
     def __post_init__(self):
         """Refuse what the kernels were not written for."""
@@ -46,43 +42,32 @@ class VMMLPShape(VMShape):
         return 3 * self.coefficients
 
 
-class VMMLPField(AssembledField):
-    """One VM tensor and a colour network."""
+class VMMLPField(VMField):
+    """Planes and lines, and a colour network."""
 
     kind = "vm-mlp"
     shape_type = VMMLPShape
-    name = ""
-    """Of the object that it is, as files say."""
 
     @classmethod
     def slots_of(cls, shape: VMMLPShape) -> dict[str, Slot]:
         """See AssembledField."""
-        rank, density = {"rank": shape.colour_rank}, {"rank": shape.density_rank}
         network = {"width": 3 * shape.colour_rank, "rows": shape.features, "hidden": shape.width}
         return {
-            "density": Slot(plane_line, density, f"{TENSOR}density_", spread=FACTOR_SPREAD),
-            "colour": Slot(plane_line, rank, f"{TENSOR}colour_", spread=FACTOR_SPREAD),
+            "density": Slot(plane_line, {"rank": shape.density_rank}, "density_"),
+            "colour": Slot(plane_line, {"rank": shape.colour_rank}, "colour_"),
             "sigma": Slot(density_sum),
-            "rgb": Slot(tensorf_mlp, network, "network.", BASIS_RATE),
+            "rgb": Slot(tensorf_mlp, network, "network.", current(VMConfig).basis_rate),
         }
 
     @classmethod
     def create(
         cls, shape: VMMLPShape, box: np.ndarray, resolution: tuple[int, int, int], generator: torch.Generator
     ) -> "VMMLPField":
-        """See BoxField; matrix and layers are uniform as a linear layer's."""
+        """See VMField; layers are uniform as linear ones."""
         field = super().create(shape, box, resolution, generator)
-        bound = field.basis.shape[1] ** -0.5
-        field.basis.uniform_(-bound, bound, generator=generator)
         for name, weight in untrained(shape.features, shape.width, generator).items():
             field.weights[name].copy_(weight)
         return field
-
-    def resampled(self, box: np.ndarray, resolution: tuple[int, int, int]) -> "VMMLPField":
-        """See BoxField."""
-        new = super().resampled(box, resolution)
-        new.name = self.name
-        return new
 
     @property
     def basis(self) -> torch.Tensor:
@@ -100,30 +85,15 @@ class VMMLPField(AssembledField):
 
     # -- storing ---------------------------------------------------------------------------------------------
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict]:
-        """Arrays and metadata of a `vm` field of one tensor, and the network's weights."""
-        arrays, own = super().state()
-        basis = arrays.pop("network.basis").reshape(3, self.shape.coefficients, -1)
-        for i in range(tensorf_mlp.LAYERS):
-            arrays.pop(f"network.layer_{i}")
-        cells = [name for name in arrays if name.startswith("occupancy")]
-        arrays |= {TENSOR + name: arrays.pop(name) for name in cells} | {f"{TENSOR}colour_basis": basis}
+    def numbers(self) -> dict[str, np.ndarray]:
+        """See VMField: with the network's weights."""
+        arrays = super().numbers()
+        own = {name: arrays.pop(name) for name in [*arrays] if "network." in name}
+        basis = own[self.stored_name("network.basis")]
+        arrays[self.stored_name("colour_basis")] = basis.reshape(3, self.shape.coefficients, -1)
         for name, view in self.weights.items():
             arrays[f"network.{name}"] = np.ascontiguousarray(view.detach().cpu().numpy())
-        shape = {name: own["shape"][name] for name in ("density_rank", "colour_rank", "sh_degree")}
-        tensor = {name: own[name] for name in ("resolution", "aabb", "scale", "shift")}
-        tensor["occupancy"] = own["cells"]["counts"]
-        if self.space is not bounded:
-            tensor["space"] = name_of(self.space)
-        block = {"tensor": 0, "object_to_field": np.eye(4).tolist(), "name": self.name}
-        needs = {"needs": own["needs"]} if "needs" in own else {}
-        box = self.occupancy.aabb.tolist()
-        return arrays, needs | {"aabb": box, "shape": shape, "tensors": [tensor], "blocks": [block]}
-
-    @classmethod
-    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
-        """See Kind.field_needs."""
-        return super().needs(box_metadata(metadata, shapes["network.0.bias"][0]), shapes, array)
+        return arrays
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMMLPField":
@@ -131,40 +101,22 @@ class VMMLPField(AssembledField):
         bias = arrays.get("network.0.bias")
         if bias is None or bias.ndim != 1 or not 0 < len(bias) <= MAX_WIDTH:
             raise ValueError(f"array 'network.0.bias' is no vector of at most {MAX_WIDTH} numbers")
-        own = box_metadata(metadata, len(bias))
-        shape = VMMLPShape(**own["shape"])
-        basis = f"{TENSOR}colour_basis"
+        if "hashed" in box_metadata(cls.kind, metadata)["shape"]:
+            raise ValueError("a vm-mlp field has no hash grid")
+        metadata = metadata | {"shape": metadata["shape"] | {"width": len(bias)}}
+        shape, basis = VMMLPShape(**metadata["shape"]), cls.stored_name("colour_basis")
         expected = {basis: (3, shape.coefficients, 3 * shape.colour_rank)}
         expected |= {f"network.{n}": s for n, s in weight_shapes(shape.features, shape.width).items()}
         for name, size in expected.items():
             if name not in arrays or arrays[name].shape != size:
                 have = list(arrays[name].shape) if name in arrays else "nothing"
                 raise ValueError(f"array '{name}' should have shape {list(size)}, found {have}")
-        cells = [name for name in arrays if name.startswith(f"{TENSOR}occupancy")]
-        boxed = arrays | {name.removeprefix(TENSOR): arrays[name] for name in cells}
-        boxed["network.basis"] = arrays[basis].reshape(shape.features, -1)
+        own = {cls.stored_name("network.basis"): arrays[basis].reshape(shape.features, -1)}
         for i, (inputs, outputs) in enumerate(tensorf_mlp.layer_shapes(shape.features, shape.width)):
-            layer = boxed[f"network.layer_{i}"] = np.zeros((inputs + 1, outputs), np.float32)
+            layer = own[cls.stored_name(f"network.layer_{i}")] = np.zeros((inputs + 1, outputs), np.float32)
             weight, given = arrays[f"network.{i}.weight"], arrays[f"network.{i}.bias"]
             layer[: weight.shape[1], : len(weight)], layer[-1, : len(given)] = weight.T, given
-        field = super().from_state(boxed, own)
-        field.name = str(metadata["blocks"][0]["name"])
-        return field
-
-
-def box_metadata(metadata: dict, width: int) -> dict:
-    """The metadata of a `vm` field of one tensor as BoxField's, with the network's width. Raises ValueError
-    where there are several tensors, or the one is placed anywhere but in the field's own frame."""
-    if len(metadata["tensors"]) != 1 or len(metadata["blocks"]) != 1:
-        raise ValueError(f"a vm-mlp field has one block, found {len(metadata['blocks'])}")
-    (tensor,), (block,) = metadata["tensors"], metadata["blocks"]
-    if not np.array_equal(block["object_to_field"], np.eye(4)):
-        raise ValueError("block 0: object_to_field of a vm-mlp field should be the identity")
-    if "hashed" in tensor:
-        raise ValueError("a vm-mlp field has no hashed detail")
-    cells = {"aabb": tensor["aabb"], "counts": tensor["occupancy"], "space": tensor.get("space", "bounded")}
-    own = {name: tensor[name] for name in ("resolution", "aabb", "scale", "shift")}
-    return own | {"cells": cells, "shape": metadata["shape"] | {"width": width}}
+        return super().from_state(arrays | own, metadata)
 
 
 def weight_shapes(features: int, width: int) -> dict[str, tuple[int, ...]]:
