@@ -72,9 +72,9 @@ from fusedrf_cli.requests import RenderRequest
 def command(**words):
     """Render pictures or a film.
 
-    SCENE is a bundle, a scene.json, or - for a scene on stdin. An unbounded scene
-    learnt from photos is shown as one of them shows it, and --orbit circles what they look at, at their distance and height;
-    where they were taken from one side, it swings to and fro between them. Anything else is framed from
+    SCENE is a bundle, a scene.json, or - for a scene on stdin. An unbounded scene learnt from photos is shown
+    as one of them shows it, and --orbit circles what they look at, at their distance and height; where they
+    were taken from one side, it swings to and fro between them. Anything else is framed from
     outside. --look-at, --view-from, --zoom and --up change that view or orbit.
 
     A scene.json of vm fields is put together in memory first, which takes a second or two, and is then as
