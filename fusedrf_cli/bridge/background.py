@@ -16,10 +16,20 @@ from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.student import StudentRequest
+from fusedrf_cli.engine.settings import current
 
-MOST_OF_FILE = 0.7  # that a background may take, so that what stands in it has numbers enough
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """How a background is taken over."""
+
+    most_of_file: float = 0.7
+    """That a background may take, so that what stands in it has numbers enough."""
+    alike: float = 1e-3
+    """Entries of two rotations that count as one."""
+
+
 PRECISIONS = ("float16", "int8", "int4")  # the dearest first
-ALIKE = 1e-3  # entries of two rotations that count as one
 LEARNT = "fused"  # the node of what was learnt
 
 
@@ -69,14 +79,12 @@ def kept_background(kind: Kind, scene: ComposedField, asked: StudentRequest) -> 
     back = np.linalg.inv(turn)
     objects = ComposedField([replace(p, object_to_world=back @ p.object_to_world) for p in others])
     for field, precision, size in ways_to_store(around[0].field, asked):
-        if size <= MOST_OF_FILE * (asked.limit - asked.overhead):
+        if size <= current(BackgroundConfig).most_of_file * (asked.limit - asked.overhead):
             return Background(replace(around[0], field=field), precision, size, turn, objects)
     return None
 
 
-def ways_to_store(
-    field: StoredField, asked: StudentRequest
-) -> Iterator[tuple[StoredField, str | None, int]]:
+def ways_to_store(field: StoredField, asked: StudentRequest) -> Iterator[tuple[StoredField, str | None, int]]:
     """A field, the precision that it is stored in, and its bytes: as its source has it, then in fewer bits
     each time."""
     own = asked.stored_bytes.get(id(field))
@@ -90,12 +98,13 @@ def ways_to_store(
 def turn_of(objects: list[Placed]) -> np.ndarray:
     """(4, 4) the turn by which most of the objects' texels are placed: a decomposition holds them best along
     their own axes. Of as many either way, one that does not depend on the objects' order."""
+    config = current(BackgroundConfig)
     turns = [turned_only(p.object_to_world[:3, :3]) for p in objects]
     texels = np.array([(extent(p) / p.voxel_size) ** 2 for p in objects])
-    alike = np.array([[np.abs(a - b).max() < ALIKE for a in turns] for b in turns])
+    alike = np.array([[np.abs(a - b).max() < config.alike for a in turns] for b in turns])
     ranked = [(float(f"{n:.6g}"), turn.tolist()) for n, turn in zip(alike @ texels, turns, strict=True)]
     found, most = np.eye(4), np.array(max(ranked)[1])
-    if np.abs(most - np.eye(3)).max() >= ALIKE:
+    if np.abs(most - np.eye(3)).max() >= config.alike:
         found[:3, :3] = most
     return found
 

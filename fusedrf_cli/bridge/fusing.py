@@ -23,7 +23,7 @@ from fusedrf_cli.bridge.running import (
     load_checkpoint,
     written_somewhere,
 )
-from fusedrf_cli.bridge.scene import LoadedScene, refuse_options, unusable_kind
+from fusedrf_cli.bridge.scene import LoadedScene, note_options, refuse_options, unusable_kind
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.bridge.sources import load_to_fuse
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -39,8 +39,15 @@ from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
 from fusedrf_cli.report import readable_size
 from fusedrf_cli.requests import FuseRequest
 
-DEFAULT_MAX_SIZE = 25_000_000  # and what the places among the sources take
-CONDITION_NOTED = 1.01  # a stretch beyond this shows in a translucent medium (by 1/255 of its opacity)
+
+@dataclass(frozen=True)
+class FusingConfig:
+    """What a fuse keeps within, and tells."""
+
+    default_max_size: int = 25_000_000
+    """Bytes, beside what the places among the sources take."""
+    condition_noted: float = 1.01
+    """A stretch beyond this shows in a translucent medium (by 1/255 of its opacity)."""
 
 
 Load = Callable[[FuseRequest, Memory, str, object], LoadedScene]
@@ -62,6 +69,8 @@ def fuse(
         scene = Scene.of(loaded)
         kind, suits = choose_kind(request.kind, loaded, scene.composed)
         refuse_options(kind, request)
+        if kind.field is None:
+            note_options(request, loaded, progress)
         started = time.monotonic()
         bundle = FusedBundle(request, everything, loaded, kind.field is not None)
         cameras = kept_cameras(loaded, progress)
@@ -171,7 +180,7 @@ def student_request(request: FuseRequest, scene: Scene, overhead: int) -> Studen
     """What is asked of the kind's student; overhead: bytes of the bundle besides its fields."""
     return StudentRequest(
         sizes=BundleSizes(),
-        limit=request.max_size or DEFAULT_MAX_SIZE + place_bytes(scene.loaded),
+        limit=request.max_size or current(FusingConfig).default_max_size + place_bytes(scene.loaded),
         overhead=overhead,
         target=request.target_psnr,
         precision=request.precision,
@@ -426,7 +435,7 @@ def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
     too few voxels for."""
     config = current(DetailConfig)
     for d in details:
-        if d.opacity_off and d.stretch > CONDITION_NOTED:
+        if d.opacity_off and d.stretch > current(FusingConfig).condition_noted:
             progress.warn(
                 f"'{d.name}' is stretched by {d.stretch:.2f}: where it is translucent its "
                 f"opacity may be off by up to {d.opacity_off:.3f}"

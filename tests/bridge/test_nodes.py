@@ -11,6 +11,7 @@ from formats.bundle import OpenBundle, read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, write_field
 from tests.bridge.conftest import done, invoke
+from tests.engine.conftest import BOX
 from tests.engine.kinds.cases import random_boxed, random_vm
 from tests.engine.kinds.sparse_cases import random_sparse
 
@@ -189,8 +190,49 @@ def test_fields_of_any_kinds_are_fused_without_learning(folder, report, run):
     for a, b in zip(one.fields, other.fields, strict=True):
         np.testing.assert_allclose(a.placed.object_to_world, b.placed.object_to_world, atol=1e-12)
         assert (a.member, a.whole, a.groups) == (b.member, b.whole, b.groups)
-    result = run("fuse", "scene.json", "--kind", "blocks", "--ranks", "8,16", "-o", "x.rfpack")
-    assert result.exit_code == 2 and "--ranks applies to" in result.stderr
+    result = run("fuse", "dense.rfpack", "--kind", "blocks", "--ranks", "8,16", "-o", "x.rfpack")
+    assert result.exit_code == 2 and "--ranks does not apply to kind dense" in result.stderr
+
+
+@pytest.fixture
+def wide(folder):
+    """wide.json: of four kinds, on texels finer than what they show, and a copy of one that is half as large;
+    returns their bytes."""
+    nodes = []
+    for kind, make in MAKERS.items():
+        field = make() if kind == "sparse" else make().resampled(BOX, (33, 33, 33))
+        name = str(folder / f"{kind}.rfpack")
+        write_field(name, field, kind, precision=PRECISIONS[kind], overwrite=True)
+        nodes.append(make_node(kind, source=f"{kind}.rfpack", translation=(2.5 * len(nodes), 0, 0)))
+    nodes.append(make_node("twin", source="vm.rfpack", translation=(2, 2, 0), scale=(0.5, 0.5, 0.5)))
+    write_scene(folder / "wide.json", SceneGraph(tuple(nodes)))
+    return sum((folder / f"{kind}.rfpack").stat().st_size for kind in MAKERS)
+
+
+@pytest.mark.slow
+def test_fields_of_any_kinds_are_made_smaller(folder, report, run, wide):
+    """By a common voxel, each in its own kind and place; what they were made of is found again."""
+    whole = report("fuse", "wide.json", "-o", "whole.rfpack")
+    assert whole["bytes"] > 0.9 * wide and (whole["nodes"], whole["fields"]) == (5, 4)
+    said = report("fuse", "wide.json", "-o", "half.rfpack", "--max-size", str(wide // 2))
+    assert said["bytes"] <= wide // 2 and (said["nodes"], said["fields"]) == (5, 4)
+    assert [one["kind"] for one in said["chosen"]["fields"]] == list(MAKERS)
+    assert said["psnr"]["stored"] > 30
+    bundles = [OpenBundle(folder / f"{name}.rfpack") for name in ("whole", "half")]
+    for one, other in zip(*(bundle.scene.leaves() for bundle in bundles), strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.object_to_world, other.object_to_world)
+    (entry,) = bundles[1].scene.history
+    files = {f"{kind}.rfpack" for kind in MAKERS}
+    assert {told["source"] for told in entry["sources"].values()} <= files and entry["sources"]
+    report("fuse", "half.rfpack", "-o", "again.rfpack")
+    assert members(folder / "again.rfpack") == members(folder / "whole.rfpack")
+    told = run("fuse", "wide.json", "-o", "x.rfpack", "--ranks", "8,16", "--max-size", str(wide // 2))
+    assert "--ranks does not apply to fields of kind cp, dense, sparse" in told.stderr
+    (folder / "dense.rfpack").unlink()
+    itself = report("fuse", "half.rfpack", "-o", "itself.rfpack")
+    assert any("the source of 'dense' is not found" in warning for warning in itself["warnings"])
+    assert members(folder / "itself.rfpack") == members(folder / "half.rfpack")
 
 
 @pytest.mark.slow

@@ -28,6 +28,8 @@ class Slot:
     """In front of the names of its sections, in files."""
     rate: float = 1.0
     """What its numbers learn at, relative to the optimiser's rate and to what the module says."""
+    spread: float | None = None
+    """Standard deviation of an untrained field's numbers; None: what the module says."""
 
     @property
     def sizes(self) -> dict[str, int | float]:
@@ -43,7 +45,12 @@ class Slot:
         if not hasattr(self.module, "sections"):
             return []
         return [
-            replace(part, name=self.prefix + part.name, rate=self.rate * part.rate)
+            replace(
+                part,
+                name=self.prefix + part.name,
+                rate=self.rate * part.rate,
+                spread=part.spread if self.spread is None else self.spread,
+            )
             for part in self.module.sections(resolution, **self.options)
         ]
 

@@ -71,12 +71,12 @@ def own_cell(field, place):
     return colour_locate(field, place[0])
 
 
-def begin(field, frame, d, scratch):
+def begin(field, d, scratch):
     """See loops.py."""
     rgb_ray_setup(field, d, scratch)
 
 
-def end(field, frame, d, scratch, grad):
+def end(field, d, scratch, grad):
     """See loops.py."""
     rgb_ray_backward(field, d, scratch, grad)
 
@@ -268,8 +268,8 @@ def arrays_of(module: ModuleType) -> type:
 
 
 def arrays_type(slots: dict[str, ModuleType]) -> type:
-    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
-    that is kept by its types must find it (kernels/tinting.py)."""
+    """The type of the arrays of an assembly: one for each, found in this module by its name, without
+    which another process would take it for another type and compile all loops over it again."""
     name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
     if name not in globals():
         prefixed = [

@@ -5,6 +5,7 @@ lie on the device or on the host: what is on the host is copied to the device an
 back. NUMBA_ENABLE_CUDASIM=1 runs all of this without a GPU.
 """
 
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from types import FunctionType, ModuleType, SimpleNamespace
 
@@ -16,11 +17,21 @@ from numba.np.numpy_support import from_dtype
 
 from fusedrf_cli.engine.kernels import parts, specialise
 from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, Kept
+from fusedrf_cli.engine.settings import current
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 THREADS = 1 if SIMULATED else 128  # the simulator's threads are Python's, one after the other
-RAYS_IN_FLIGHT = 1 << 14  # rays of a training pass that have scratch memory at the same time
-POINTS_IN_FLIGHT = 1 << 18
+
+
+@dataclass(frozen=True)
+class CudaConfig:
+    """What has memory of a GPU at the same time."""
+
+    rays_in_flight: int = 1 << 14
+    """Rays of a training pass that have scratch memory at the same time."""
+    points_in_flight: int = 1 << 18
+    """The same of points."""
+
 
 if not SIMULATED:  # whose compiler has settings of its own
     from numba.cuda.core import caching, config
@@ -131,10 +142,11 @@ class Loops:
 
     def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
         """See specialise.Loops; all is added to row 0 of grads and loss."""
+        config = current(CudaConfig)
         kernel = self._kernel(sweep_thread, item, field)
         # as much for few rays as for many: their number changes from step to step, and memory is slow to be
         # had
-        in_flight = RAYS_IN_FLIGHT if most > 1 else min(count, POINTS_IN_FLIGHT)
+        in_flight = config.rays_in_flight if most > 1 else min(count, config.points_in_flight)
         if count:
             *room, losses = sweep_memory(most, in_flight, field.params.dtype)
             launch(kernel, in_flight, (field, grid, batch, count, *room, losses), (grads,))
@@ -277,6 +289,18 @@ def on_device(value):
     if isinstance(value, np.ndarray):
         return value if SIMULATED else cuda.to_device(np.ascontiguousarray(value))
     return type(value)(*map(on_device, value)) if hasattr(value, "_fields") else value
+
+
+def on_host(array) -> np.ndarray:
+    """An array of the device, copied here; one that lies here as it is."""
+    return array if isinstance(array, np.ndarray) else array.copy_to_host()
+
+
+def segments() -> ModuleType:
+    """The loops over rays of scenes of several instances."""
+    from fusedrf_cli.engine.kernels import cuda_segments
+
+    return cuda_segments
 
 
 def launch(kernel, threads: int, inputs: tuple, outputs: tuple) -> None:

@@ -20,11 +20,10 @@ gradients are gathered:
                                        adds to grad what d_sigma, and where shaded d_rgb (3), send back; rgb
                                        and memory[at:] are as `colour` left them
 And what it may have, with the defaults below:
-    started, standing                  once per ray of a picture, and before each `density` along a ray
-    begin, end                         once per ray and frame before the first `colour`, and after the last
+    begin, end                         once per ray before the first `colour`, and after the last
                                        `backward`: fold the direction into a basis; scatter its gradient, and
                                        leave 0 what has gathered it
-    frame_of, keep, again, advance, known, unstretched, ahead_density, ahead_colour
+    keep, again, advance, known, ahead_density, ahead_colour
     COLOUR_FROM, LEARN_FROM, SHADING_COST among its sizes
 """
 
@@ -110,7 +109,6 @@ class Cells(NamedTuple):
     cell: object  # (3,) size of a cell
     cells: object  # (N, 3) int64
     offsets: object  # (K, 3) in [0, 1], where in a cell
-    frame: object  # int, one of the field's frames
 
 
 class Kept(NamedTuple):
@@ -135,25 +133,12 @@ class Kept(NamedTuple):
 # -- what a kind may leave out -------------------------------------------------------------------------------
 
 
-def started(field, step, scratch):
-    """Prepare `scratch` for the samples, so far apart, of a ray of a picture."""
+def begin(field, d, scratch):
+    """Prepare `scratch` for colours seen along d."""
 
 
-def standing(field, many, scratch):
-    """Prepare `scratch` for a sample that stands for so many steps."""
-
-
-def begin(field, frame, d, scratch):
-    """Prepare `scratch` for colours seen along d in a frame."""
-
-
-def end(field, frame, d, scratch, grad):
+def end(field, d, scratch, grad):
     """Send back what `backward` has gathered in `scratch` since `begin`, and clear it."""
-
-
-def frame_of(place):
-    """The frame that a place belongs to, from 0 on: `begin` is called where it changes."""
-    return 0
 
 
 def keep(place):
@@ -176,11 +161,6 @@ def advance(field, grid, place, many, steps, k, p, way, u, u0, step):
 def known(field, grid, p):
     """Whether a query of p is answered at all."""
     return occupied(grid, p)
-
-
-def unstretched(field, grid, frame, p, scratch):
-    """σ at p of a frame, in units of that frame."""
-    return density(field, grid, 0, p, (0.0, 0.0, 1.0), scratch)[0]
 
 
 def ahead_density(field, array, held, p):
@@ -228,7 +208,6 @@ def met(field, grid, line, k, many, u, step, d, scratch):
     point; the share of the light that is lost there; and what `density` says besides σ."""
     origin, way, course = line
     p = position_at(origin, way, u)
-    standing(field, many, scratch)
     sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
     opacity = 0.0
     if steps > 0:
@@ -252,7 +231,7 @@ def query_point(field, grid, asked, i, scratch, memory, out):
         if steps > 0:
             out.sigma[i] = rate(p, d) * sigma
             if asked.with_colour and sigma > 0:
-                begin(field, frame_of(place), d, scratch)
+                begin(field, d, scratch)
                 rgb = colour(field, place, p, d, scratch, memory, 0)
                 out.rgb[i, 0], out.rgb[i, 1], out.rgb[i, 2] = rgb
 
@@ -271,16 +250,15 @@ def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
     if known(field, grid, p):
         sigma, pre, steps, place = density(field, grid, 0, p, d, scratch)
         if steps > 0 and sigma > 0:
-            frame = frame_of(place)
             shaded = d_rgb[0] != 0 or d_rgb[1] != 0 or d_rgb[2] != 0
             rgb = 0.0, 0.0, 0.0
             if shaded:
-                begin(field, frame, d, scratch)
+                begin(field, d, scratch)
                 rgb = colour(field, place, p, d, scratch, kept.memory, 0)
             d_sigma = rate(p, d) * float(sent.d_sigma[i])
             backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, kept.memory, 0, grad)
             if shaded:
-                end(field, frame, d, scratch, grad)
+                end(field, d, scratch, grad)
 
 
 def drawn(jitter):
@@ -322,13 +300,13 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
     red, green, blue = 0.0, 0.0, 0.0
     trans, waiting = 1.0, 0.0
-    count, shaded, current, chance = 0, 0, -1, drawn(batch.jitter[i])
+    count, shaded, chance = 0, 0, drawn(batch.jitter[i])
     last, begun = kept.memory.shape[0] - KEPT, entered(o, d, batch.near)
     held = 0
     for number in range(PIECES):
         if trans <= batch.early_stop:
             break
-        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, math.inf)
+        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, FARTHEST)
         u0 = u0 + batch.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         ask_for(field, held, origin, way, u0, step, k, many)
@@ -354,9 +332,8 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
                     kept.along[count] = share_along(distance(course, u))
                 waiting += weight
                 if waiting > LEARN_FROM:
-                    if frame_of(place) != current:
-                        current = frame_of(place)
-                        begin(field, current, d, scratch)
+                    if shaded == 0:
+                        begin(field, d, scratch)
                     at = min(shaded * KEPT, last)
                     if times > 0.0:
                         ahead_colour(field, grad, held, p)
@@ -376,18 +353,17 @@ def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
     work = count + SHADING_COST * shaded
     d_colour, d_trans = compared(batch, i, (red, green, blue), trans, work, loss)
     if count > 0:
-        taken = count, shaded, current
+        taken = count, shaded
         train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad)
 
 
 def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad):
-    """The way back of `train_ray` over the samples taken: (how many, how many of them shaded, the frame begun
-    last).
+    """The way back of `train_ray` over the samples taken: (how many, how many of them shaded).
 
     d_colour is the gradient of the loss in the ray's colour, d_trans that in the transmittance behind it;
     `behind` gathers the share of all that lies behind a sample.
     """
-    count, shaded, current = taken
+    count, shaded = taken
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
     last = kept.memory.shape[0] - KEPT
     overwritten = shaded * KEPT > kept.memory.shape[0]
@@ -402,11 +378,11 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         for q in range(count):
             before = before[0] + kept.weight[q], before[1] + kept.weight[q] * kept.along[q]
     number = kept.piece[count - 1]
-    origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
+    origin, way, u0, _, course = piece(number, grid, o, d, batch.near, FARTHEST)
     for q in range(count - 1, -1, -1):
         if PIECES > 1 and kept.piece[q] != number:
             number = kept.piece[q]
-            origin, way, u0, _, course = piece(number, grid, o, d, batch.near, math.inf)
+            origin, way, u0, _, course = piece(number, grid, o, d, batch.near, FARTHEST)
         u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
         p = position_at(origin, way, u)
         place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
@@ -414,10 +390,6 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
         if at >= 0:
             rgb = kept.rgb[q, 0], kept.rgb[q, 1], kept.rgb[q, 2]
             own = d_colour[0] * rgb[0] + d_colour[1] * rgb[1] + d_colour[2] * rgb[2]
-            if frame_of(place) != current:
-                end(field, current, d, scratch, grad)
-                current = frame_of(place)
-                begin(field, current, d, scratch)
             if overwritten and at == last:
                 colour(field, place, p, d, scratch, kept.memory, last)
             carried = kept.carried[q]
@@ -441,7 +413,7 @@ def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_tr
                 field, place, p, d, kept.pre[q], d_sigma, at >= 0, rgb, d_rgb, scratch, kept.memory, at, grad
             )
     if shaded > 0:
-        end(field, current, d, scratch, grad)
+        end(field, d, scratch, grad)
 
 
 def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
@@ -451,7 +423,7 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
     nx, ny, nz = grid.skip.shape
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, math.inf)
+        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, FARTHEST)
         u0 = u0 + rays.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
@@ -478,7 +450,7 @@ def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
     nx, ny, nz = rays.counts[0], rays.counts[1], rays.counts[2]
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, math.inf)
+        origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, FARTHEST)
         u0 = u0 + rays.jitter[i] * step
         k, many = next_sample(grid, origin, way, u0, u1, step, 0)
         while k >= 0 and trans > rays.early_stop:
@@ -499,13 +471,13 @@ def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
 
 
 def peak_of_cell(field, grid, cells, i, scratch, memory, out):
-    """Largest σ of a frame, in its units, per length of the coordinates, over `offsets` in cell i."""
+    """Largest σ, per length of the coordinates, over `offsets` in cell i."""
     best = 0.0
     for q in range(cells.offsets.shape[0]):
         x = cells.lo[0] + (cells.cells[i, 0] + cells.offsets[q, 0]) * cells.cell[0]
         y = cells.lo[1] + (cells.cells[i, 1] + cells.offsets[q, 1]) * cells.cell[1]
         z = cells.lo[2] + (cells.cells[i, 2] + cells.offsets[q, 2]) * cells.cell[2]
-        sigma = unstretched(field, grid, cells.frame, (x, y, z), scratch)
+        sigma = density(field, grid, 0, (x, y, z), (0.0, 0.0, 1.0), scratch)[0]
         best = max(best, depth_per_coordinate((x, y, z)) * sigma)
     out[i] = best
 

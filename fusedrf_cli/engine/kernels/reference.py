@@ -1,8 +1,8 @@
-"""What the kinds' references share: the readable truth of the kernels in plain torch, for any float dtype and
-device, differentiable, and slow.
+"""What references share: the readable truth of the kernels in plain torch, for any float dtype and device,
+differentiable, and slow.
 
-A kind's own `reference.py` says what its field answers; tests hold the compiled loops to it, and where a
-device has no compiled loops it answers itself. `unit` are coordinates in a box, 0 at its lower face and 1 at
+The `reference` of a field says what it answers; tests hold the compiled loops to it, and where a device has
+no compiled loops it answers itself. `unit` are coordinates in a box, 0 at its lower face and 1 at
 its upper one.
 """
 

@@ -13,11 +13,10 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, light, loops, parts, tinting
+from fusedrf_cli.engine.kernels import instances, light, loops, parts
 from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": task, "sweep_task": task}
-TINTED = "TINTED"  # among the sizes of a field that has tints
 body = njit(**FLAGS, forceinline=True, _nrt=False)
 
 
@@ -64,8 +63,6 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
     names, functions = namespace(bodies, space)
     if getattr(space, "CURVED", False) and names["advance"] is not loops.advance:
         raise ValueError(f"{bodies.__name__} follows straight rays, which {space.__name__} has none of")
-    if TINTED in sizes:
-        functions = tinting.tinted(functions)
     names |= sizes
     tag = combination(bodies, sizes, space, names)
     for name, function in functions.items():
@@ -75,7 +72,7 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
 
 def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, light, *bases_of(space), space, *(family(bodies) if bodies else ())]
+    modules = [loops, instances, light, *bases_of(space), space, *([bodies] if bodies else ())]
     names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
     own = {module.__name__ for module in modules}
     found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}
@@ -86,17 +83,6 @@ def bases_of(space: ModuleType) -> list[ModuleType]:
     """The modules of other spaces that a space takes functions from."""
     taken = {f.__module__ for f in vars(space).values() if isinstance(f, FunctionType)}
     return [sys.modules[name] for name in sorted(taken - {space.__name__})]
-
-
-def family(bodies: ModuleType) -> list[ModuleType]:
-    """The modules of other kinds that a kind's module takes functions from, and itself last; of an assembly
-    itself alone (kernels/assembled.py)."""
-    if hasattr(bodies, "functions"):
-        return [bodies]
-    taken = {f.__module__ for f in vars(bodies).values() if isinstance(f, FunctionType)}
-    others = [sys.modules[name] for name in sorted(taken - {bodies.__name__})]
-    others = [module for module in others if hasattr(module, "Arrays")]
-    return [module for other in others for module in family(other)] + [bodies]
 
 
 def rebound(function: FunctionType, names: dict, tag: str) -> FunctionType:

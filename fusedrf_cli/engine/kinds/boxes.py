@@ -1,7 +1,7 @@
 """Kinds whose fields lie over one box, on texels along its axes (engine/fields/box.py)."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -20,9 +20,17 @@ from fusedrf_cli.engine.kinds.student import (
     Way,
     finest_within,
 )
+from fusedrf_cli.engine.settings import current
 
-COUNTED = 3  # times the used vertices are counted to find how many fit
-MOST_HELD = 60_000_000  # numbers in memory: with what learning adds, some 1.5 GB
+
+@dataclass(frozen=True)
+class BoxesConfig:
+    """How large a field on one grid gets."""
+
+    counted: int = 3
+    """Times the used vertices are counted to find how many fit."""
+    most_held: int = 60_000_000
+    """Numbers in memory: with what learning adds, some 1.5 GB."""
 
 
 class BoxKind(Kind):
@@ -30,6 +38,11 @@ class BoxKind(Kind):
     parts."""
 
     field: type[BoxField]
+
+    @property
+    def reduces(self) -> frozenset[str]:
+        """See Kind; ranks are of too different a use from kind to kind to have one bound."""
+        return self.takes & {"sh_degree"}
 
     @property
     def usual(self) -> object:
@@ -61,14 +74,15 @@ class BoxKind(Kind):
         return (GridStudent if on_vertices else Student)(self, scene, request)
 
     def reduction(self, outline: BoxField, voxel: float, way: Way) -> Reduction:
-        """See Kind: fewer texels, and SH bands where the kind has them. Ranks are of too different a use from
-        kind to kind to have one bound."""
+        """See Kind: fewer texels, and SH bands where the kind has them."""
         box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
         same, shape, unit = resolution == outline.resolution, outline.shape, (outline.scale, outline.shift)
-        if way.sh_degree is not None and "sh_degree" in self.takes:
+        if way.sh_degree is not None and "sh_degree" in self.reduces:
             shape = replace(shape, sh_degree=min(shape.sh_degree, way.sh_degree))
         bare = type(outline)(shape, box, resolution, *unit, outline.params, outline.occupancy)
-        sections = [Section(part.name, bare.stored_shape(part)) for part in bare.parts]
+        on_vertices = any(part.on_vertices for part in bare.parts)
+        used = int(np.count_nonzero(bare.used)) if on_vertices else 0
+        sections = [Section(part.name, bare.stored_shape(part, used)) for part in bare.parts]
 
         def make(field: BoxField) -> BoxField:
             small = field if same else field.resampled(box, resolution)
@@ -114,14 +128,15 @@ class GridStudent(Student):
 
     def plan(self, way: Way, numbers: int) -> Plan:
         """See Student; `numbers` counts what is stored."""
+        config = current(BoxesConfig)
         box, kind, cells = self.scene.aabb, self.kind, self.cells
         share = min(1.0, float(cells.occupied.mean()))
 
         def wanted(resolution: tuple[int, int, int]) -> float:
             stored = share * sum(np.prod(section.shape) for section in kind.sections(way, resolution))
-            return max(stored, kind.numbers(way, resolution) * numbers / MOST_HELD)
+            return max(stored, kind.numbers(way, resolution) * numbers / config.most_held)
 
-        for _ in range(COUNTED):  # coarser grids have more vertices just beyond the cells
+        for _ in range(config.counted):  # coarser grids have more vertices just beyond the cells
             resolution = finest_within(box, self.finer * self.scene.voxel_size, wanted, numbers)
             used = np.count_nonzero(used_vertices(cells, box, resolution))
             share = used / np.prod(resolution)

@@ -110,7 +110,7 @@ class InstancesStudent(MadeStudent):
         """By precision, and ranks, where any of the fields has such."""
         request = self.request
         precisions = (request.precision,) if request.precision else self.kind.precisions
-        ranked = any("ranks" in kind.takes for kind in self.kinds)
+        ranked = any("ranks" in kind.reduces for kind in self.kinds)
         ranks = (request.ranks,) if request.ranks or not ranked else self.ranks
         return [[Way(p, r, request.sh_degree) for r in ranks] for p in precisions]
 

@@ -28,6 +28,7 @@ from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     size_before,
 )
 from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
+    ENDLESS,
     FAR,
     LEARN_FROM,
     LENT_FROM,
@@ -103,7 +104,7 @@ def stretch(begun, grid, o, d, far):
     low = -last if region == INWARDS else (-edge if region == INSIDE else edge)
     high = -edge if region == INWARDS else (edge if region == INSIDE else last)
     following = max(middle + high / speed, t0), min(region + 1, BEYOND)
-    low, high = max((t0 - middle) * speed, low), min((far - middle) * speed, high)
+    low, high = max((t0 - middle) * speed, low), min((min(far, ENDLESS) - middle) * speed, high)
     per, length = 0.0, high - low
     if region != INSIDE:
         per = b / math.sqrt(SHELL * SHELL + (1.0 + SHELL) * (1.0 + SHELL) * b * b)

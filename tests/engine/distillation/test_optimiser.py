@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
+from fusedrf_cli.engine.kinds.vm.field import VMConfig
 from tests.engine.conftest import THIRTY_TWO, random_vm
 from tests.engine.kinds.cases import random_detail
 
@@ -16,7 +16,7 @@ def test_groups_cover_all_and_part_at_the_bases():
     assert groups[0].low == 0 and groups[-1].high == field.params.numel()
     assert all(a.high == b.low for a, b in zip(groups, groups[1:], strict=False))
     assert all(group.low % 16 == 0 == group.high % 16 for group in groups)
-    assert [group.rate for group in groups] == [1.0, BASIS_RATE]
+    assert [group.rate for group in groups] == [1.0, VMConfig.basis_rate]
 
 
 def test_first_step_moves_factors_by_the_rate_and_bases_by_its_share():
@@ -29,7 +29,7 @@ def test_first_step_moves_factors_by_the_rate_and_bases_by_its_share():
     moved = (before - field.params).numpy()
     basis = field.starts[12]
     np.testing.assert_allclose(moved[:basis], 0.5, rtol=1e-4)
-    np.testing.assert_allclose(moved[basis:], 0.5 * BASIS_RATE, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(moved[basis:], 0.5 * VMConfig.basis_rate, rtol=1e-3, atol=1e-6)
     assert (optimiser.grads == 0).all()
 
 

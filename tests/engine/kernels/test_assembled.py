@@ -180,7 +180,7 @@ def test_a_place_is_made_again_of_what_is_kept_of_it():
         names["keep"](names["density"](field.arrays, field.grid, 0, tuple(p), d, scratch)[3]) for p in points
     ]
     assert 5 < sum(kept) < 25
-    names["begin"](field.arrays, 0, d, scratch)
+    names["begin"](field.arrays, d, scratch)
     for p, held, colour in zip(points, kept, expected, strict=True):
         place = names["again"](field.arrays, held, tuple(p))
         shown = names["colour"](field.arrays, place, tuple(p), d, scratch, memory, 0)

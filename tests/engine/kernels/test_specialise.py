@@ -8,13 +8,13 @@ from types import ModuleType
 import pytest
 
 from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis
-from fusedrf_cli.engine.encodings import bricks, line
+from fusedrf_cli.engine.encodings import bricks, line, plane_line
 from fusedrf_cli.engine.kernels import instances, light, loops, parts, specialise
 from fusedrf_cli.engine.kernels.assembled import assemble
-from fusedrf_cli.engine.kinds.vm import bodies as vm
 from fusedrf_cli.engine.spaces import SPACES, bounded
 from tests.engine.kinds.cases import KINDS
 
+VM = assemble(plane_line, plane_line, density_sum, sh_basis)
 CP = assemble(line, line, density_sum, sh_basis)
 SPARSE = assemble(bricks, bricks, density_sum, sh)
 SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
@@ -23,8 +23,7 @@ SCRIPT = """
 import numpy as np, sys, torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.kernels.loops import Answers, Points
-from fusedrf_cli.engine.kernels.specialise import TINTED, Loops
-from fusedrf_cli.engine.kernels.tinting import with_tints
+from fusedrf_cli.engine.kernels.specialise import Loops
 from fusedrf_cli.engine.spaces import bounded
 sys.path.insert(0, {folder!r})
 import toy
@@ -35,10 +34,8 @@ with kernels.telling_of_compilation(lambda: told.append(1)):
     for rank in map(int, sys.argv[1:]):
         found = Answers(np.zeros(1), np.zeros((1, 3)))
         asked = Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
-        sizes, arrays = {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}, field
-        if {tinted}:
-            sizes[TINTED], arrays = 1, with_tints(field, np.full((1, 3), 0.4))
-        Loops(toy, sizes, bounded).each("query_point", arrays, grid, asked, 1, found)
+        sizes = {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}
+        Loops(toy, sizes, bounded).each("query_point", field, grid, asked, 1, found)
         print(found.sigma[0], found.rgb[0, 0])
 print(len(told))
 """
@@ -67,8 +64,8 @@ def ask(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
 
-    def run(*ranks: int, tinted: bool = False, script: str = SCRIPT) -> list[str]:
-        script = script.format(folder=str(tmp_path), tinted=tinted)
+    def run(*ranks: int, script: str = SCRIPT) -> list[str]:
+        script = script.format(folder=str(tmp_path))
         command = [sys.executable, "-c", script, *map(str, ranks)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -82,12 +79,6 @@ def test_sizes_have_code_of_their_own_and_a_second_process_compiles_nothing(ask)
     """Two sizes of one kind, in one cache: without a name of its own one would load the other's code."""
     assert ask(8, 16) == ["8.0 0.25", "16.0 0.25", "1"]
     assert ask(16, 8) == ["16.0 0.25", "8.0 0.25", "0"]
-
-
-def test_a_second_process_compiles_nothing_of_a_field_with_tints(ask):
-    """Its arrays are of a type made while running, which is to be found again by its name."""
-    assert ask(8, tinted=True) == ["8.0 0.1", "1"]
-    assert ask(8, tinted=True) == ["8.0 0.1", "0"]
 
 
 PARTS = """
@@ -141,7 +132,7 @@ def test_a_changed_file_of_a_plug_in_is_compiled_anew(ask):
     assert ask(8) == ["8.0 0.35", "1"]
 
 
-def tag(bodies: ModuleType = vm, sizes: dict = SIZES, space: ModuleType = bounded) -> str:
+def tag(bodies: ModuleType = VM, sizes: dict = SIZES, space: ModuleType = bounded) -> str:
     return specialise.specialised(bodies, sizes, space)[0]
 
 
@@ -153,17 +144,17 @@ def test_kinds_sizes_and_spaces_have_names_of_their_own():
 
 
 def test_every_function_carries_the_name():
-    name, names = specialise.specialised(vm, SIZES, bounded)
+    name, names = specialise.specialised(VM, SIZES, bounded)
     for function in ("density", "colour", "query_point", "train_ray", "piece", "march"):
         assert names[function].py_func.__qualname__ == f"{function}_{name}"
-    runs = specialise.Loops(vm, SIZES, bounded)
+    runs = specialise.Loops(VM, SIZES, bounded)
     runs = [runs._over("each", item) for item in ("query_point", "show_ray")]
     assert len({run.py_func.__qualname__ for run in runs}) == 2
 
 
 HOOKS = {
-    "started", "standing", "begin", "end", "frame_of", "keep", "again", "advance", "known", "unstretched",
-    "ahead_density", "ahead_colour", "COLOUR_FROM", "LEARN_FROM", "LENT_FROM", "REST_FROM", "SHADING_COST",
+    "begin", "end", "keep", "again", "advance", "known", "ahead_density", "ahead_colour", "COLOUR_FROM",
+    "LEARN_FROM", "LENT_FROM", "REST_FROM", "SHADING_COST",
     "next_sample", "next_change", "optical_length",
 }  # fmt: skip
 """What a kind or a space may have in place of the loops' own, see loops.py."""
@@ -175,8 +166,7 @@ def test_no_name_means_two_things_in_a_namespace(name, space):
     """It is flat, and the later name wins: a template's constant would be a kind's offset in scratch."""
     field = KINDS[name]()
     ours = [vars(module) for module in (parts, loops, instances, light, space)]
-    theirs = {k: v for module in specialise.family(field.bodies) for k, v in vars(module).items()}
-    theirs |= getattr(field.bodies, "functions", {})
+    theirs = vars(field.bodies)
     meanings: dict[str, object] = {}
     for names in (*ours, theirs, field.bodies.sizes(field)):
         for key, value in names.items():

@@ -74,7 +74,7 @@ def test_fewer_bands_are_those_that_the_field_has(kind):
 def drop_bands(field) -> None:
     """Set a field's SH bands above the first to 0."""
     own = field.shape.coefficients
-    for name, part in field.sections().items() if field.kind != "vm" else field.sections(0).items():
+    for name, part in field.sections().items():
         if name.endswith("basis"):
             part[:, 1:] = 0
         elif name == "colour":

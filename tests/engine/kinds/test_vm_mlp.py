@@ -16,7 +16,7 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import loops
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE
+from fusedrf_cli.engine.kinds.vm.field import VMConfig
 from fusedrf_cli.engine.kinds.vm.trimming import reshaped
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
 from fusedrf_cli.engine.rendering.cameras import orbit
@@ -229,7 +229,9 @@ def test_what_fills_a_layer_up_stays_zero(every_sample):
 def test_the_network_learns_at_a_rate_of_its_own():
     field = random_field(torch.float32)
     factors, basis, network = field.groups()
-    assert (factors.rate, basis.rate) == (1.0, BASIS_RATE) and network.rate == pytest.approx(BASIS_RATE / 3)
+    assert (factors.rate, basis.rate) == (1.0, VMConfig.basis_rate) and network.rate == pytest.approx(
+        VMConfig.basis_rate / 3
+    )
     assert (factors.low, basis.low, network.low) == (0, field.starts[12], field.starts[13])
     assert network.high == field.params.numel() and network.low % 16 == network.high % 16 == 0
 

@@ -45,14 +45,27 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
-PER_BRICK = 1200  # bytes in memory beside the numbers: rows of its vertices, its place, masks and tables
-PER_BRICK_MADE = 5000  # more while they are found
-PER_BRICK_JOINED = 20_000  # more while hanging vertices are found, where there are several levels
-PER_TOP_CELL = 10  # its table's place and depth
-PER_NODE = 60  # of a node while the tree is walked: its code and place, and those of its children
+
+@dataclass(frozen=True)
+class BricksConfig:
+    """Bytes in memory of a field of bricks, and how fine its occupancy is."""
+
+    per_brick: int = 1200
+    """Bytes in memory beside the numbers: rows of its vertices, its place, masks and tables."""
+    per_brick_made: int = 5000
+    """More while they are found."""
+    per_brick_joined: int = 20_000
+    """More while hanging vertices are found, where there are several levels."""
+    per_top_cell: int = 10
+    """Its table's place and depth."""
+    per_node: int = 60
+    """Of a node while the tree is walked: its code and place, and those of its children."""
+    occupancy_cells: int = 192
+    """Along the longest axis, at most, unless there are more top cells."""
+
+
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
-OCCUPANCY_CELLS = 192  # along the longest axis, at most, unless there are more top cells
 
 
 @dataclass(frozen=True)
@@ -131,7 +144,6 @@ class SparseField(Assembled):
     def on(self, lattice: Lattice, space: ModuleType) -> "SparseField":
         """The same numbers on a part of its voxels, in the coordinates of a space."""
         other = SparseField(self.shape, lattice, self.scale, None, space).to(self.params.device)
-        other.tint = self.tint
         other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
         if other.coarse:
             other.bands[:] = self.bands[self.coarse.find(other.coarse.keys)[0]]
@@ -213,7 +225,7 @@ class SparseField(Assembled):
     @cached_property
     def occupancy(self) -> OccupancyGrid:
         """Cells that active voxels reach."""
-        return replace(self.tree.occupancy(OCCUPANCY_CELLS), space=self.lies_in)
+        return replace(self.tree.occupancy(current(BricksConfig).occupancy_cells), space=self.lies_in)
 
     @cached_property
     def slots(self) -> dict[str, Slot]:
@@ -331,14 +343,16 @@ class SparseField(Assembled):
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs; with the tables that follow from the tree."""
+        config = current(BricksConfig)
         (bricks,), counts = shapes["masks"], metadata["counts"]
         top, bricks = math.prod(counts), bricks // 8
         entries, depth = table_entries(array("nodes"), top)
         numbers = sum(math.prod(shapes[name]) for name in ("rows", "bands") if name in shapes)
-        cells = OCCUPANCY_CELLS**3 if max(counts) < OCCUPANCY_CELLS else top
-        held = PER_BRICK * bricks + 4 * (numbers + entries) + PER_TOP_CELL * top + PER_CELL * cells
-        made = (PER_BRICK_MADE + (PER_BRICK_JOINED if depth else 0)) * bricks
-        return FieldNeeds(held, made + PER_CELL_MADE * cells + PER_NODE * 4 * shapes["nodes"][0])
+        cells = config.occupancy_cells**3 if max(counts) < config.occupancy_cells else top
+        held = config.per_brick * bricks + 4 * (numbers + entries) + PER_CELL * cells
+        held += config.per_top_cell * top
+        made = (config.per_brick_made + (config.per_brick_joined if depth else 0)) * bricks
+        return FieldNeeds(held, made + PER_CELL_MADE * cells + config.per_node * 4 * shapes["nodes"][0])
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "SparseField":

@@ -84,7 +84,7 @@ class SparseKind(Kind):
     name = "sparse"
     good_for = "Scenes of any sources and any rule, with detail in few places; edits stay local."
     field = SparseField
-    takes = frozenset({"sh_degree"})
+    takes = reduces = frozenset({"sh_degree"})
     precisions = ("int8", "float16")
     beside_background = False  # its bricks are as coarse as the background where that is all there is
     faithful = "int8"  # measured: not 0.01 dB less than float16, in half the bytes
@@ -150,10 +150,6 @@ class SparseKind(Kind):
     def restricted(self, field: SparseField, holds: splitting.Holds) -> SparseField | None:
         """A voxel is kept or not."""
         return self.cropped(field, holds)
-
-    def thinned(self, field: SparseField, factor: float) -> SparseField:
-        """The same vertices, with another scale."""
-        return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)
 
 
 class SparseStudent(MadeStudent):

@@ -12,6 +12,7 @@ from math import prod
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
@@ -21,18 +22,28 @@ from fusedrf_cli.engine.fields.computed import (
     FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
-    WHITE,
     Reads,
     packed_bits,
     runs_of,
 )
 from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, ROW, Hashed, Held
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of
 
-CELLS_PER_NUMBER = 4  # of a field, from which on its cells are stored in bricks where these are smaller
-BASIS_RATE = 0.15  # of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less
-MAX_NUMBERS = 2 << 30  # of a field that is read: of a hash grid a file may hold few rows
+
+@dataclass(frozen=True)
+class VMConfig:
+    """How a field of planes and lines learns and is stored."""
+
+    cells_per_number: int = 4
+    """Of a field, from which on its cells are stored in bricks where these are smaller."""
+    basis_rate: float = 0.15
+    """Of the factors'; at a third of it, as in TensoRF, a fox after a minute shows 0.5 dB less."""
+    max_numbers: int = 2 << 30
+    """Of a field that is read: of a hash grid a file may hold few rows."""
+
+
 TENSOR = "tensor_0."  # in front of the names that its arrays have in files
 DETAIL = "density_detail"  # the rows of the hash grid
 
@@ -53,6 +64,7 @@ class VMField(AssembledField):
     @classmethod
     def slots_of(cls, shape: VMShape) -> dict[str, Slot]:
         """See AssembledField."""
+        config = current(VMConfig)
         density, basis = {"rank": shape.density_rank}, {"coefficients": shape.coefficients}
         encoding = plane_line
         if shape.hashed is not None:
@@ -61,7 +73,7 @@ class VMField(AssembledField):
             "density": Slot(encoding, density, "density_"),
             "colour": Slot(plane_line, {"rank": shape.colour_rank}, "colour_"),
             "sigma": Slot(density_sum),
-            "rgb": Slot(sh_basis, {"width": 3 * shape.colour_rank} | basis, "colour_", BASIS_RATE),
+            "rgb": Slot(sh_basis, {"width": 3 * shape.colour_rank} | basis, "colour_", config.basis_rate),
         }
 
     @classmethod
@@ -119,7 +131,7 @@ class VMField(AssembledField):
         """See BoxField."""
         arrays = self.numbers()
         hashed, held = self.shape.hashed, runs_of(self.stored_name(DETAIL)) in arrays
-        few = 0 if held else min(FEW_CELLS, CELLS_PER_NUMBER * self.size)
+        few = 0 if held else min(FEW_CELLS, current(VMConfig).cells_per_number * self.size)
         cells = packed_bits(self.stored_name("occupancy"), self.occupancy.occupied, few)
         needs = {"hashed"} if hashed else set()
         needs |= ({"held", "runs"} if held else set()) | ({"held"} if len(cells) > 1 else set())
@@ -152,12 +164,13 @@ class VMField(AssembledField):
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
         """See BoxField."""
+        config = current(VMConfig)
         own = box_metadata(cls.kind, metadata)
         numbers = cls.size_of(
             cls.shape_type(**own["shape"]), whole_numbers(own["resolution"], 2, "resolution")
         )
-        if numbers > MAX_NUMBERS:
-            raise ValueError(f"it has {numbers:,} numbers, but at most {MAX_NUMBERS:,} are read")
+        if numbers > config.max_numbers:
+            raise ValueError(f"it has {numbers:,} numbers, but at most {config.max_numbers:,} are read")
         field = super().from_state(with_all_rows(arrays, own["shape"].get("hashed")), own)
         field.name = str(metadata["blocks"][0]["name"])
         return field

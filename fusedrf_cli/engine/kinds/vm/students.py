@@ -38,9 +38,19 @@ class VMConfig:
 
 
 MAX_DEGREE = 3
-COARSER = 1.5  # times its own voxel: how coarse a field can get before it is left without its detail
+
+
+@dataclass(frozen=True)
+class VMStudentConfig:
+    """How students of planes and lines begin, and how coarse they get."""
+
+    coarser: float = 1.5
+    """Times its own voxel: how coarse a field can get before it is left without its detail."""
+    noise: float = 0.03
+    """Of the factors of a student that takes over others' numbers."""
+
+
 BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
-NOISE = 0.03  # of the factors of a student that takes over others' numbers
 
 
 def shape_within(way: Way) -> VMShape:
@@ -55,7 +65,7 @@ class VMKind(BoxKind):
     name = "vm"
     good_for = "Objects and scenes in their own axes: small, smooth, quick to train."
     field = VMField
-    takes = frozenset({"ranks", "sh_degree"})
+    takes = reduces = frozenset({"ranks", "sh_degree"})
     takes_over = True
     hashes = True
     distilled = "int8"  # measured: four objects in 25 MB, 0.6 dB more than half the numbers in float16
@@ -127,11 +137,11 @@ class VMKind(BoxKind):
         return outline
 
     def reduction(self, outline: VMField, voxel: float, way: Way) -> Reduction:
-        """See Kind: fewer texels, without the detail where they are more than COARSER times as wide; fewer
+        """See Kind: fewer texels, without the detail where they are more than `coarser` times as wide; fewer
         components and bands, chosen by energy. What no occupied cell reads is 0."""
         box, resolution = outline.box, coarser(outline.box, outline.resolution, voxel)
         shape, same = smaller_shape(outline.shape, shape_within(way)), resolution == outline.resolution
-        wide = max(outline.resolution) > COARSER * max(resolution)
+        wide = max(outline.resolution) > current(VMStudentConfig).coarser * max(resolution)
         small = VMField(
             replace(shape, hashed=None) if wide else shape,
             box, resolution, outline.scale, outline.shift, outline.params, outline.occupancy,
@@ -182,7 +192,7 @@ def add_noise(student: VMField, generator: torch.Generator) -> None:
     ever."""
     for name, section in student.sections().items():
         if "_plane_" in name or "_line_" in name:
-            section += NOISE * torch.randn(section.shape, generator=generator)
+            section += current(VMStudentConfig).noise * torch.randn(section.shape, generator=generator)
 
 
 def contents_of(field: VMField, held: Held | None) -> Contents:

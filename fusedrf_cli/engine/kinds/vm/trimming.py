@@ -2,7 +2,7 @@
 rows of a hash grid that nothing reads, and components of little energy."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -12,14 +12,23 @@ from fusedrf_cli.engine.encodings.hash_runs import hashed_row
 from fusedrf_cli.engine.encodings.plane_line import MODES
 from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Hashed
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
+from fusedrf_cli.engine.settings import current
 
 COMPONENTS = "density_rank", "colour_rank", "sh_degree"
 
-REGULAR = 1e-9  # of the largest entry of a Gram matrix, added to its diagonal
-ROUNDED = 1e-3
-"""Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
-MOST_MET = 8.0  # cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked
-VERTICES_AT_ONCE = 1 << 22  # of a lattice: some 100 MB
+
+@dataclass(frozen=True)
+class TrimmingConfig:
+    """How a field is made smaller."""
+
+    regular: float = 1e-9
+    """Of the largest entry of a Gram matrix, added to its diagonal."""
+    rounded: float = 1e-3
+    """Of a density before activation, and of the spacing of vertices: more than rounding makes of them."""
+    most_met: float = 8.0
+    """Cells of a detail's lattice for each of its rows: then nine in ten of the rows are asked."""
+    vertices_at_once: int = 1 << 22
+    """Of a lattice: some 100 MB."""
 
 
 def read_texels(field: VMField, mode: int) -> np.ndarray:
@@ -76,7 +85,7 @@ def asked_rows(field: VMField, hashed: Hashed) -> np.ndarray:
     found = np.zeros(hashed.shape[0], bool)
     for level, spacing in enumerate(hashed.spacings):
         own = found[level * hashed.rows : (level + 1) * hashed.rows]
-        if occupied.mean() * (sides / spacing).prod() > MOST_MET * hashed.rows:
+        if occupied.mean() * (sides / spacing).prod() > current(TrimmingConfig).most_met * hashed.rows:
             own[:] = True
             continue
         for vertices in met_vertices(field.box, (asked, occupied), spacing):
@@ -94,7 +103,7 @@ def matter_texels(field: VMField) -> np.ndarray:
     cells = []
     for i in range(field.resolution[0]):  # a layer of texels at a time
         layer = planes[0][i] @ lines[0].T + lines[1] @ planes[1][i].T + (planes[2] @ lines[2][i])
-        high = (layer + field.shift > EMPTY_FROM - ROUNDED).numpy()
+        high = (layer + field.shift > EMPTY_FROM - current(TrimmingConfig).rounded).numpy()
         square = high[:-1, :-1] | high[1:, :-1] | high[:-1, 1:] | high[1:, 1:]
         cells.append(square)
     return np.stack([one | other for one, other in zip(cells[:-1], cells[1:], strict=True)])
@@ -103,9 +112,10 @@ def matter_texels(field: VMField) -> np.ndarray:
 def met_vertices(box: np.ndarray, masks: tuple[np.ndarray, ...], spacing: float) -> Iterator[np.ndarray]:
     """(N, 3) int64, a part after the other: the vertices of a lattice of that spacing around the points of a
     box (6,) that lie in marked cells (X, Y, Z) of all the masks over it."""
-    first = np.floor(box[:3] / spacing - ROUNDED).astype(np.int64)
-    count = np.floor(box[3:] / spacing + ROUNDED).astype(np.int64) + 1 - first
-    layers = max(1, VERTICES_AT_ONCE // int(count[1:].prod()))
+    config = current(TrimmingConfig)
+    first = np.floor(box[:3] / spacing - config.rounded).astype(np.int64)
+    count = np.floor(box[3:] / spacing + config.rounded).astype(np.int64) + 1 - first
+    layers = max(1, config.vertices_at_once // int(count[1:].prod()))
     for start in range(0, count[0], layers):
         low, sides = first + [start, 0, 0], np.array([min(layers, count[0] - start), *count[1:]])
         cells = np.ones(sides, bool)
@@ -124,7 +134,7 @@ def overlapping(
     marked cells (X, Y, Z) of a box (6,)."""
     for axis, cells in enumerate(mask.shape):
         ends = (low[axis] + np.arange(sides[axis] + 1)) * spacing - box[axis]
-        at, off = ends / (box[axis + 3] - box[axis]) * cells, ROUNDED * spacing
+        at, off = ends / (box[axis + 3] - box[axis]) * cells, current(TrimmingConfig).rounded * spacing
         off *= cells / (box[axis + 3] - box[axis])
         begin = np.floor(at[:-1] - off).clip(0, cells - 1).astype(np.int64)
         last = (np.ceil(at[1:] + off) - 1).clip(0, cells - 1).astype(np.int64)
@@ -252,7 +262,7 @@ def fewer_components(
         return list(range(rank)), plane
     flat = plane.reshape(-1, rank)
     of_planes, of_rest = flat.T @ flat, (line.T @ line) * (basis.T @ basis)
-    of_rest = of_rest + REGULAR * of_rest.max() * np.eye(rank)
+    of_rest = of_rest + current(TrimmingConfig).regular * of_rest.max() * np.eye(rank)
     kept: list[int] = []
     for _ in range(count):
         others = [r for r in range(rank) if r not in kept]

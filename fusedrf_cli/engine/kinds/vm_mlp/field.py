@@ -13,7 +13,8 @@ import torch
 from fusedrf_cli.engine.decoders import density_sum, tensorf_mlp
 from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.fields.assembled import RankedShape, Slot
-from fusedrf_cli.engine.kinds.vm.field import BASIS_RATE, VMField, box_metadata
+from fusedrf_cli.engine.kinds.vm.field import VMConfig, VMField, box_metadata
+from fusedrf_cli.engine.settings import current
 
 FEATURE_DEGREE = 2  # the degree whose SH basis has 3 * 9 = 27 rows, TensoRF's number of features
 WIDTH = 64
@@ -55,7 +56,7 @@ class VMMLPField(VMField):
             "density": Slot(plane_line, {"rank": shape.density_rank}, "density_"),
             "colour": Slot(plane_line, {"rank": shape.colour_rank}, "colour_"),
             "sigma": Slot(density_sum),
-            "rgb": Slot(tensorf_mlp, network, "network.", BASIS_RATE),
+            "rgb": Slot(tensorf_mlp, network, "network.", current(VMConfig).basis_rate),
         }
 
     @classmethod
