@@ -47,10 +47,11 @@ class ChartConfig:
     rounds: int = 5
     """Of frames, all fields taking turns."""
     per_pixel_kept: int = 12
-    """Bytes of a picture that is compared with."""
+    """Bytes of a pixel that is compared with."""
     noise: float = 0.05
+    """Share by which costs differ that are taken as equal."""
     behind: float = 0.5
-    """DB."""
+    """dB that a point is worse by than one of another group in as few bytes, which is then ahead."""
     lagging: int = 3
     """How many times longer a group waits that is behind others."""
 
