@@ -23,7 +23,7 @@ from formats.errors import BadHeader, ChecksumMismatch, MissingFile, NewerVersio
 Saved = tuple[dict[str, np.ndarray], dict]
 """Arrays and JSON-able state of an interrupted run."""
 MAGIC = b"fusedrf checkpoint\n"
-VERSION = 2
+VERSION = 3
 DIGEST_BYTES = 32
 MAX_HEADER_BYTES = 1 << 26
 MAX_DIMENSIONS = 8

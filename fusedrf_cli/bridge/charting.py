@@ -17,13 +17,14 @@ from fusedrf_cli import plots
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
 from fusedrf_cli.bridge.ladders import flags_of
 from fusedrf_cli.bridge.looks import looks_of
-from fusedrf_cli.bridge.memory import Memory, measured, picture, sources
+from fusedrf_cli.bridge.memory import Memory, measured, sources
 from fusedrf_cli.bridge.pictures import WHITE
-from fusedrf_cli.bridge.rendering import renderable
+from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable
 from fusedrf_cli.bridge.running import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
 from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.bridge.sources import as_it_is
+from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.distillation.judging import JudgingConfig
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds import registry
@@ -115,8 +116,9 @@ class Benchmark:
         chart = current(ChartConfig)
         config = current(JudgingConfig)
         loaded = load_scene(scene, allow_outside, memory, place)
-        composed = loaded.composed()
-        needed = sources(loaded.sizes) | picture(*size, composed=True) | measured(*size)
+        needed = sources(loaded.sizes) | frame_memory(None, *size) | measured(*size)
+        composed = composite_of(loaded, memory, needed)
+        needed |= frame_memory(composed, *size)
         if box is None:
             cameras = [look.camera for look in looks_of(loaded, composed, chart.views, size, chart.held_out)]
             box = placed_box(composed.occupancy.subject, composed.origin)
@@ -147,10 +149,12 @@ class Benchmark:
         """Median milliseconds of a frame of the scene as composed, and of every fused bundle: all take
         turns, so that what else the machine does meets them alike.
         """
-        shelf = Shelf(self.memory.room(picture(*self.size, composed=True)))
         camera = framing_camera(self.box, 0.9, 0.45, *self.size)
         loaded = load_scene(self.scene, self.allow_outside, self.memory, self.place)
-        composed = loaded.composed()
+        needed = frame_memory(None, *self.size)
+        composed = composite_of(loaded, self.memory, needed)
+        needed |= sources(loaded.resident) if isinstance(composed, Composite) else {}
+        shelf = Shelf(self.memory.room(needed | frame_memory(composed, *self.size)))
         sizes = [sum(load_scene(str(path), budget=self.memory).sizes) for path in bundles]
         seconds = [[] for _ in range(1 + len(bundles))]
         for done in range(1 + current(ChartConfig).rounds):  # the first warms up

@@ -75,7 +75,7 @@ class Whole:
         loaded.shelf.resize(sum(loaded.sizes))
         whole = cls(draft, loaded, field, origin)
         for leaf, placed in whole.nodes:
-            own = placed.field if leaf.whole else make_field(draft.bundle.field(leaf.field), path)
+            own = make_field(draft.bundle.field(leaf.field), path) if leaf.crops else placed.field
             whole.raw[leaf.name] = opened(own)
         return whole
 

@@ -237,9 +237,12 @@ class BoxField(ComputedField):
         """The name in files of the array of a part."""
         return name
 
-    def stored_shape(self, part: Part) -> tuple[int, ...]:
-        """Shape under which a part is stored; of vertices, the used ones in order."""
-        shape = (int(np.count_nonzero(self.used)), *part.shape[3:]) if part.on_vertices else part.shape
+    def stored_shape(self, part: Part, used: int | None = None) -> tuple[int, ...]:
+        """Shape under which a part is stored; of vertices, the used ones in order. used: how many these are,
+        where that is known."""
+        if part.on_vertices and used is None:
+            used = int(np.count_nonzero(self.used))
+        shape = (used, *part.shape[3:]) if part.on_vertices else part.shape
         return shape if part.columns is None else (*shape[:-1], part.columns)
 
     def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:

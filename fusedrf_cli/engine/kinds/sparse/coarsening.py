@@ -50,7 +50,6 @@ def coarsened(field: SparseField, halvings: int) -> SparseField:
     if other.coarse:
         bands, held = kept_rows(field.coarse, other.coarse, field.bands, halvings)
         other.bands[:] = torch.from_numpy(dilated(other.coarse, bands, held)[0])
-    other.tint = field.tint
     other.settle()
     return other
 
@@ -66,7 +65,7 @@ def truncated(field: SparseField, shape: SparseShape) -> SparseField:
     if shape == field.shape:
         return field
     other = SparseField(shape, field.fine, field.scale, space=field.lies_in)
-    other.rows[:], other.tint = field.rows, field.tint
+    other.rows[:] = field.rows
     if other.coarse:
         count = len(field.bands)
         bands = field.bands.reshape(count, 3, -1)[..., : shape.coefficients - 1]

@@ -144,7 +144,6 @@ class SparseField(Assembled):
     def on(self, lattice: Lattice, space: ModuleType) -> "SparseField":
         """The same numbers on a part of its voxels, in the coordinates of a space."""
         other = SparseField(self.shape, lattice, self.scale, None, space).to(self.params.device)
-        other.tint = self.tint
         other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
         if other.coarse:
             other.bands[:] = self.bands[self.coarse.find(other.coarse.keys)[0]]

@@ -151,10 +151,6 @@ class SparseKind(Kind):
         """A voxel is kept or not."""
         return self.cropped(field, holds)
 
-    def thinned(self, field: SparseField, factor: float) -> SparseField:
-        """The same vertices, with another scale."""
-        return SparseField(field.shape, field.fine, field.scale * factor, field.params, field.space)
-
 
 class SparseStudent(MadeStudent):
     """Bricks about as fine as each object of a scene needs, all wider by one factor under a limit."""
