@@ -18,7 +18,7 @@ ORDER ?=
 SCENE ?=
 SHARE ?= 1
 
-.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real ablation stability clean
+.PHONY: help demo test test-order test-slow fuzz docs lint bench bench-paper bench-real stability clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -57,10 +57,6 @@ bench: $(VENV)  ## the measurements that the claims rest on; DATA= a folder with
 	$(PYTHON) -m benchmarks
 	$(if $(DATA),$(PYTHON) -m benchmarks.filled $(DATA))
 
-ablation: $(VENV)  ## what each part of distilling is worth; SCENE= for one of your own, SHARE= for fewer steps
-	mkdir -p build
-	$(PYTHON) -m benchmarks.ablation build/ablation $(SCENE) --share $(SHARE)
-
 bench-paper: $(VENV)  ## the paper's experiments: docs/paper; DATA= a folder with chair/ and fuze/
 	$(PYTHON) -m benchmarks.paper $(if $(DATA),--data $(DATA))
 
@@ -68,8 +64,6 @@ bench-real: $(VENV)  ## real captures: docs/real; DATA= a folder of captures, SH
 	$(PYTHON) -m benchmarks.real $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.placed $(DATA) --share $(SHARE)
 	$(PYTHON) -m benchmarks.extraction $(DATA) --share $(SHARE)
-	$(PYTHON) -m benchmarks.strip $(DATA)
-	$(PYTHON) -m benchmarks.edits $(DATA)
 
 stability: $(VENV)  ## the failure suite at length: docs/stability.md and its chart
 	mkdir -p build

@@ -1,1 +1,1 @@
-"""What the claims rest on; each module is a command: python -m benchmarks.must_show."""
+"""What the claims rest on; each module is a command: python -m benchmarks.filled DATA."""

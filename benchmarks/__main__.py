@@ -1,11 +1,7 @@
-"""Kernel speed against the torch reference in the same run, and against what the machine can do: python -m
-benchmarks (or make bench).
+"""Kernel speed against the torch reference in the same run: python -m benchmarks (or make bench).
 
 Prints a Markdown table. Ratios are medians over runs that alternate with the reference's, since a bare time
-says little of a shared machine. Work is counted from the formulas: floating-point operations (a multiply-add
-is two) and bytes of texels asked for. Both are given as shares of the machine's peaks measured in the same
-run: multiply-adds in registers, bytes streamed from memory, and cache lines fetched at random from an array
-as large as the field.
+says little of a shared machine.
 """
 
 import statistics
@@ -16,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from benchmarks.peaks import Peaks, measured_peaks
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import Points
@@ -32,7 +27,6 @@ POINTS, RAYS, REPEATS, TEXELS, CELLS, FRAME = 1 << 17, 1 << 11, 5, 224, 96, 800
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
 STEP = 1.0 / TEXELS
 EARLY_STOP = 1e-3
-LINE = 64  # bytes
 
 
 @dataclass(frozen=True)
@@ -46,10 +40,6 @@ class Row:
     ours: Callable[[], object]
     theirs: Callable[[], object]
     their_count: float
-    flops: float = 0.0
-    """Floating-point operations per unit; 0: not counted."""
-    bytes: float = 0.0
-    """Bytes of texels and gradients per unit."""
 
 
 def alternate(row: Row) -> tuple[float, float]:
@@ -78,30 +68,6 @@ def shell_field(generator: torch.Generator) -> VMField:
     return field.with_occupancy(OccupancyGrid(BOX, abs(radius - 0.7) < 0.04))
 
 
-def counts(shape: VMShape) -> dict[str, tuple[float, float]]:
-    """(floating-point operations, bytes) of a point's density and colour, forward and backward.
-
-    Per mode and component a bilinear plane (7 operations), a line (3) and their product (1); four texels of
-    the plane and two of the line are read, and backward read again, and their gradients read and written.
-    """
-    density, colour = 3 * shape.density_rank, 3 * shape.colour_rank
-    fold = 3 * 2 * shape.coefficients * colour  # SH into the colour basis
-    dot = 3 * 2 * colour
-    texels = 6 * 4
-    return {
-        "density": (12 * density, texels * density),
-        "density backward": (24 * density, 3 * texels * density),
-        "colour": (11 * colour + fold + dot, texels * colour),
-        "colour backward": (22 * colour + fold + 3 * dot + fold, 3 * texels * colour),
-    }
-
-
-def total(shape: VMShape, *names: str) -> tuple[float, float]:
-    """Summed operations and bytes of some of `counts`."""
-    found = counts(shape)
-    return tuple(float(sum(found[name][i] for name in names)) for i in range(2))
-
-
 def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> Row:
     """A query of random points and its backward pass, all cells occupied."""
     points = torch.rand(POINTS, 3, generator=generator, dtype=torch.float64) * 2 - 1
@@ -127,10 +93,8 @@ def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> 
             features = density.module.reference(field, sections, unit, None, **density.options)
             reference.density(features.sum(1), field.scale, field.shift).sum().backward()
 
-    # the kernels evaluate again in the backward pass what they did not keep
-    names = ["density", "density", "density backward"] + with_colour * ["colour", "colour", "colour backward"]
     what = "query forward and backward, density" + with_colour * " and colour"
-    return Row(what, "point", POINTS, ours, theirs, POINTS, *total(field.shape, *names))
+    return Row(what, "point", POINTS, ours, theirs, POINTS)
 
 
 def rays_through(generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -209,9 +173,7 @@ def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, ray
         ((depth**2).mean() + 2 * ((rgb - 0.5) ** 2).mean()).backward()
         other.step()
 
-    names = ["density"] * 2 + ["density backward"] + ["colour"] * 2 + ["colour backward"]
-    work = total(field.shape, *names)
-    return Row("fusing step, points", "point", len(chosen), ours, theirs, len(chosen), *work)
+    return Row("fusing step, points", "point", len(chosen), ours, theirs, len(chosen))
 
 
 def frame_row(field: VMField) -> Row:
@@ -228,21 +190,10 @@ def frame_row(field: VMField) -> Row:
     return Row(what, "ray", FRAME**2, lambda: render_image(field, camera), theirs, len(some[0]))
 
 
-def line(row: Row, peaks: Peaks) -> str:
+def line(row: Row) -> str:
     """The row of the table."""
     seconds, ratio = alternate(row)
-    words = [row.what, f"{1e-6 / seconds:.2f} M {row.unit}s/s", f"{ratio:.1f}"]
-    if row.flops:
-        words += [
-            f"{row.flops:.0f}",
-            f"{row.flops / seconds / peaks.flops:.0%}",
-            f"{row.bytes:.0f}",
-            f"{row.bytes / seconds / peaks.stream:.0%}",
-            f"{row.bytes / LINE / seconds / peaks.lines:.0%}",
-        ]
-    else:
-        words += ["", "", "", "", ""]
-    return "| " + " | ".join(words) + " |"
+    return f"| {row.what} | {1e-6 / seconds:.2f} M {row.unit}s/s | {ratio:.1f} |"
 
 
 def main() -> None:
@@ -251,14 +202,9 @@ def main() -> None:
     full = VMField.create(VMShape(), BOX, (TEXELS,) * 3, generator)
     shell = shell_field(generator)
     rays = rays_through(generator)
-    peaks = measured_peaks(full.params.numel())
-    print(f"{TEXELS} texels per axis, ranks 16 and 24, SH degree 2; {torch.get_num_threads()} threads")
-    print(
-        f"peaks: {peaks.flops / 1e9:.0f} GFLOP/s, {peaks.stream / 1e9:.1f} GB/s streamed, "
-        f"{peaks.lines / 1e6:.0f} M random cache lines/s\n"
-    )
-    print("| work | rate | times faster than torch | FLOP | of peak | bytes | of stream | of random lines |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(f"{TEXELS} texels per axis, ranks 16 and 24, SH degree 2; {torch.get_num_threads()} threads\n")
+    print("| work | rate | times faster than torch |")
+    print("|---|---|---|")
     for row in (
         query_row(full, generator, False),
         query_row(full, generator, True),
@@ -267,7 +213,7 @@ def main() -> None:
         fuse_row(shell, generator, *rays),
         frame_row(shell),
     ):
-        print(line(row, peaks), flush=True)
+        print(line(row), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
 """Frames of scenes of many objects and kinds: python -m benchmarks.filled DATA [--keep FOLDER] [--naive 200]
+    [--first] [--fused]
 
 DATA is a folder with bear/, chair/ and fuze/fuze.obj. Sources are learnt for half a minute each, the bear,
 which is the background, for a minute. Prints Markdown tables of frames that take turns:
@@ -6,14 +7,16 @@ which is the background, for a minute. Prints Markdown tables of frames that tak
     400 x 400 in which small copies of a chair and a bottle stand on the bear's rock, seen from one of its
     photos' cameras and from close by; N counts the background;
     300 x 300 in which 1,000 copies of ten fields stand there.
-*Over* is the median over the first frame of the table, each turn's own; *ready* is what there is to do before
-a loaded scene is drawn. With --naive, *to naive* is the PSNR in dB to the naive composition in frames of that
-size by the pictures' own steps, and *at a quarter* by a quarter of them both.
+*Over* is the median over the first frame of the table, each turn's own, by the clock and by the time of all
+cores; *ready* is what there is to do before a loaded scene is drawn. With --naive, *to naive* is the PSNR in
+dB to the naive composition in frames of that size by the pictures' own steps, and *at a quarter* by a quarter
+of them both. With --first, the seconds of `fusedrf render` of the four kinds, with nothing compiled and after
+that; with --fused, what the four of one kind and of four show of their scenes when they are fused to as many
+bytes, half of those of the four kinds.
 """
 
 import argparse
-import json
-import statistics
+import os
 import subprocess
 import sys
 import tempfile
@@ -23,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.must_show import PLACES
+from benchmarks.paper.sources import PLACES, make, write_scene
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell
 from benchmarks.placed import SOURCES, STANDS, UPRIGHT
@@ -101,8 +104,7 @@ def train(folder: Path, data: Path) -> None:
             fusedrf(folder, "train", str(data / where), *words)
     if not (folder / "ground.rfpack").exists():
         tell("training ground")
-        made = Path(__file__).parents[1] / "examples" / "make_scene.py"
-        subprocess.run([sys.executable, str(made), str(folder)], check=True, stdout=subprocess.DEVNULL)
+        make("make_scene.py", folder)
         fusedrf(folder, "train", "ground.glb", "-o", "ground.rfpack", "--time-budget", "30")
     for node, kind in KINDS.items():
         source = "fuze" if node == "bottle" else "chair"
@@ -112,11 +114,10 @@ def train(folder: Path, data: Path) -> None:
             fusedrf(folder, "convert", f"{source}.rfpack", *words)
 
 
-def placed(folder: Path, nodes: list[dict]) -> list[Placed]:
-    """The nodes' fields in memory, equal ones once."""
-    content = {"format": "rfpack", "version": "1.0", "composition": "max", "nodes": nodes}
-    (folder / "filled.json").write_text(json.dumps(content))
-    return [replace(p, field=opened(p.field)) for p in load_scene(str(folder / "filled.json")).placed]
+def placed(folder: Path, nodes: list[dict], name: str = "filled") -> list[Placed]:
+    """The nodes' fields in memory, equal ones once; the scene is kept by its name."""
+    path = write_scene(folder / f"{name}.json", nodes)
+    return [replace(p, field=opened(p.field)) for p in load_scene(str(path)).placed]
 
 
 def filled_frames(folder: Path) -> list[Frame]:
@@ -129,12 +130,12 @@ def filled_frames(folder: Path) -> list[Frame]:
         else node
         for node in alike
     ]
-    scene = placed(folder, alike)
+    scene = placed(folder, alike, "alike")
     boxes = np.stack([p.aabb for p in scene])
     box = np.concatenate([boxes[:, :3].min(0), boxes[:, 3:].max(0)])
     camera = framing_camera(box, 0.9, 0.6, FILLED, FILLED)
     camera = replace(camera, fl_x=ZOOM * camera.fl_x, fl_y=ZOOM * camera.fl_y)
-    return [Frame("four, vm", scene, camera), Frame("four kinds", placed(folder, mixed), camera)]
+    return [Frame("four, vm", scene, camera), Frame("four kinds", placed(folder, mixed, "four"), camera)]
 
 
 def crowd(folder: Path, count: int, most: int = NUMBERS[-1], size: float = SHRUNK) -> list[Placed]:
@@ -182,17 +183,44 @@ def crowded_frames(folder: Path) -> list[list[Frame]]:
 
 def rows(frames: list[Frame], repeats: int, naive: int) -> list[dict]:
     """A table's rows of frames that take turns, after a turn that loads kernels."""
-    scenes, took = [frame.ready() for frame in frames], [[] for _ in frames]
-    for _ in range(1 + repeats):
-        for frame, (scene, _), times in zip(frames, scenes, took, strict=True):
-            started = time.perf_counter()
+    scenes, took = [frame.ready() for frame in frames], np.empty((len(frames), 1 + repeats, 2))
+    for turn in range(1 + repeats):
+        for i, (frame, (scene, _)) in enumerate(zip(frames, scenes, strict=True)):
+            started = time.perf_counter(), time.process_time()
             render_image(scene, frame.camera, origin=scene.origin)
-            times.append(time.perf_counter() - started)
+            took[i, turn] = np.subtract((time.perf_counter(), time.process_time()), started)
+    seconds, over = np.median(took[:, 1:], 1), np.median(took[:, 1:] / took[0, 1:], 1)
     found = []
-    for frame, (_, ready), times in zip(frames, scenes, took, strict=True):
-        over = statistics.median(a / b for a, b in zip(times[1:], took[0][1:], strict=True))
-        row = {"frame": frame.what, "ready, s": f"{ready:.3f}", "s": f"{statistics.median(times[1:]):.3f}"}
-        found.append(row | {"over": f"{over:.3f}"} | (frame.likeness(naive) if naive else {}))
+    for i, (frame, (_, ready)) in enumerate(zip(frames, scenes, strict=True)):
+        row = {"frame": frame.what, "ready, s": f"{ready:.3f}", "s": f"{seconds[i, 0]:.3f}"}
+        row |= {"over": f"{over[i, 0]:.3f}", "over, all cores": f"{over[i, 1]:.3f}"}
+        found.append(row | (frame.likeness(naive) if naive else {}))
+    return found
+
+
+def first_frames(folder: Path) -> list[dict]:
+    """The seconds of a command that draws the four kinds, with an empty cache of kernels and with a full
+    one."""
+    words = ["render", "four.json", "-o", "four.png", "--size", f"{SMALL}x{SMALL}", "-w"]
+    line, found = [sys.executable, "-m", "fusedrf_cli", *words], []
+    with tempfile.TemporaryDirectory() as cache:
+        for what in ("nothing compiled", "kernels kept"):
+            started = time.perf_counter()
+            subprocess.run(line, cwd=folder, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True)
+            found.append({"first frame": what, "s": f"{time.perf_counter() - started:.1f}"})
+    return found
+
+
+def fused_alike(folder: Path) -> list[dict]:
+    """What the four show when they are fused to half the bytes of the four kinds."""
+    names = {"ground.rfpack", "chair-sparse.rfpack", "chair-dense.rfpack", "fuze-cp.rfpack"}
+    most, found = sum((folder / name).stat().st_size for name in names) // 2, []
+    for scene in ("alike", "four"):
+        words = ("--kind", "blocks", "--max-size", str(most))
+        said = fusedrf(folder, "fuse", f"{scene}.json", "-o", f"{scene}.rfpack", *words)
+        psnr = fusedrf(folder, "eval", f"{scene}.rfpack", "--against", f"{scene}.json")["mean"]["psnr"]
+        seconds = f"{said['total_seconds']:.1f}"
+        found.append({"fused": scene, "bytes": said["bytes"], "dB": f"{psnr:.2f}", "s": seconds})
     return found
 
 
@@ -203,6 +231,8 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="a folder in which trained sources are kept")
     parser.add_argument("--frames", type=int, default=5, help="that a median is taken of")
     parser.add_argument("--naive", type=int, default=0, help="pixels a side of frames of both compositions")
+    parser.add_argument("--first", action="store_true", help="the first frame's seconds, too")
+    parser.add_argument("--fused", action="store_true", help="what fusing to half the bytes leaves, too")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = (asked.keep or Path(name)).resolve()
@@ -210,6 +240,9 @@ def main() -> None:
         train(folder, asked.data.resolve())
         for frames in [filled_frames(folder), *crowded_frames(folder)]:
             print(markdown(rows(frames, asked.frames, asked.naive)), flush=True)
+        for wanted, measure in ((asked.first, first_frames), (asked.fused, fused_alike)):
+            if wanted:
+                print(markdown(measure(folder)), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Scenes as functions of torch: open a bundle, ask it, render it, learn its numbers, a camera's pose or where
 an object stands, and save it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,8 @@ import torch
 
 from fusedrf_cli.bridge.saving import save_scene
 from fusedrf_cli.bridge.scene import LoadedScene, grouped, load_scene, short_origin
-from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.composition.differentiable import Poses, numbers, query
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placed_box
@@ -96,10 +97,11 @@ class Scene:
     ) -> torch.Tensor:
         """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) with unit directions.
 
-        near is the distance at which rays begin. step is the distance of samples, None: as fine as what is
-        there; samples behind which less light than early_stop is left are not asked. Both are lengths of the
-        world, or of the frame of a field that fills all of space, where there is one. Where nothing needs a
-        gradient this is many times faster.
+        near is the distance at which rays begin. step is the distance of samples in what is finest, None: as
+        fine as that is; in other fields they lie as much farther apart as these are coarser. Samples behind
+        which less light than early_stop is left are not asked. Both are lengths of the world, or of the frame
+        of a field that fills all of space, where there is one. Where nothing needs a gradient this is many
+        times faster.
         """
         field, origin, poses = self._asked()
         how = {"poses": poses, "origin": origin, "near": near, "step": step, "early_stop": early_stop}
@@ -147,14 +149,19 @@ class Scene:
         placement (4, 4)), and those placements in its frame that need a gradient."""
         now = self._now()
         learnt = {name: pose for name, pose in self.placements.items() if pose.requires_grad}
+        shown = {placed.name: placed for placed in self._loaded.placed}
         (name, place), *others = now.items()
+        alone = not others and not learnt and shown[name].as_it_is
         moved = np.array_equal(place[:3, :3], np.eye(3))
-        if not others and not learnt and (moved or self.fields[name].occupancy.space is not bounded):
+        if alone and (moved or self.fields[name].occupancy.space is not bounded):
             return self.fields[name], short_origin(place), None
         known = self._composed and {p.name: p.object_to_world for p in self._composed[0]}
         if not known or any(not np.array_equal(known[name], pose) for name, pose in now.items()):
-            placed = [Placed(name, self.fields[name], pose) for name, pose in now.items()]
+            placed = [
+                replace(shown[name], field=self.fields[name], object_to_world=pose)
+                for name, pose in now.items()
+            ]
             parts = grouped(placed, [source.groups for source in self._loaded.fields], self.rule)
-            self._composed = placed, ComposedField(parts, self.rule)
+            self._composed = placed, as_composite(ComposedField(parts, self.rule))
         field = self._composed[1]
         return field, field.origin, shifted(learnt, field.origin)

@@ -17,7 +17,7 @@ from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
 from fusedrf_cli.bridge.making import Kept
-from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes
+from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
 from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import StoredField
@@ -38,7 +38,7 @@ class FusedBundle:
         self.kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
         self.nodes = history_nodes(loaded, request.output, self.kept)
         self.composed = loaded.composed()
-        self.graph = SceneGraph(()) if learnt else named_graph(request, everything, loaded)
+        self.graph = named_graph(request, everything, loaded)
         self.framing: tuple[float, ...] | None = None
         self.cameras: dict | None = None
 
@@ -98,7 +98,9 @@ class FusedBundle:
         else:
             own = add(writer, stays.field, background.precision)
         name = free_name(source.placed.name, {LEARNT})
-        node = Node(name, own, None, placement_of(source.placed.object_to_world), True)
+        leaf = next(leaf for leaf, f in self.leaves if f is source)
+        at = placement_of(leaf.object_to_world)
+        node = Node(name, own, None, at, True, showing=showing_of(stays))
         place = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
         return SceneGraph((node, Node(LEARNT, member, None, place)))
 

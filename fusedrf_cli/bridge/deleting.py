@@ -30,8 +30,6 @@ from fusedrf_cli.requests import DeleteRequest
 
 RESTORED = "restored"
 """Nodes of what fills a cut are named `restored/...`."""
-OVERLAP = 2.0
-"""Cells by which what fills a cut reaches beyond it: those are kept that lie wholly inside."""
 EMPTIED = "cells of the field that it was distilled into emptied, and filled by nodes; no number changes"
 
 
@@ -135,7 +133,8 @@ class Deletion:
     def fill(self, one: Placed, precision: str, box: np.ndarray, widest: float) -> None:
         """Add a node that shows what a field has in a box (6,) of the world, and in cells that reach into it;
         widest: the side of those that were emptied."""
-        grown = box + (widest + OVERLAP * side_of(one)) * np.repeat([-1, 1], 3)
+        # Two cells beyond the cut: those are kept that lie wholly inside.
+        grown = box + (widest + 2 * side_of(one)) * np.repeat([-1, 1], 3)
         part = self.part(one, "cropped", lambda at: inside(at, grown))
         if part is not None:
             part = registry.kind(part.kind).trimmed(part)

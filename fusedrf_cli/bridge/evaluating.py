@@ -9,7 +9,7 @@ from formats.captures import is_capture, read_capture
 from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.memory import Memory, measured, sources
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
-from fusedrf_cli.bridge.rendering import in_memory, picture_memory, renderable, tell_of_work
+from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable, tell_of_work
 from fusedrf_cli.bridge.running import engine
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.distillation.judging import JudgingConfig
@@ -40,7 +40,6 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
         progress.phase("reading", None)
         budget = Memory(request.memory)
         loaded = load_scene(bundle, allow_outside, budget, place)
-        field, origin = renderable(loaded)
         pairs = (
             capture_pairs(against, request.split, request.size)
             if is_capture(against)
@@ -51,9 +50,8 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
             camera = pair.camera
             if i == 0:
                 side = camera.width, camera.height
-                needed = picture_memory(None, [camera], film=False) | measured(*side)
-                field = in_memory(loaded, field, needed, budget)
-                needed = picture_memory(field, [camera], film=False) | measured(*side)
+                field, origin = renderable(loaded, budget, frame_memory(None, *side) | measured(*side))
+                needed = frame_memory(field, *side) | measured(*side)
                 budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
                 tell_of_work(bundle, field, total * side[0] * side[1], progress)
                 progress.phase("rendering", total)
@@ -144,14 +142,12 @@ def scene_pairs(
     evaluation = current(EvaluationConfig)
     config = current(JudgingConfig)
     loaded = load_scene(against, allow_outside, budget, place)
-    field, origin = renderable(loaded)
-    width, height = size or evaluation.size
-    views = looks_of(loaded, loaded.composed(), evaluation.views, (width, height), evaluation.seed)
-    cameras = [look.camera for look in views]
-    needed = sources(loaded.resident) | picture_memory(field, cameras, film=False) | measured(width, height)
-    budget.expect(needed, advice="give a smaller --size")
-    field = in_memory(loaded, field, picture_memory(field, cameras, film=False), budget)
+    size = size or evaluation.size
+    field = composite_of(loaded, budget, frame_memory(None, *size) | measured(*size))
+    views = looks_of(loaded, field, evaluation.views, size, evaluation.seed)
+    needed = frame_memory(field, *size) | measured(*size)
+    budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
     for look in views:
-        shot = render_image(field, look.camera, origin=origin)
+        shot = render_image(field, look.camera, origin=field.origin)
         every = np.ones(shot.opacity.shape, bool)
         yield Pair(look.camera, shot.over(WHITE), every, shot.opacity > config.covered, look.of), len(views)

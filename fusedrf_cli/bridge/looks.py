@@ -17,6 +17,7 @@ from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import Composite, as_composite
 from fusedrf_cli.engine.distillation.judging import JudgingConfig
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
@@ -114,7 +115,8 @@ def all_of_it(camera: Camera, subject: Subject) -> float:
 
 def share_seen(scene: LoadedScene, composed: ComposedField) -> Seen:
     """`share_shown` of the objects of a scene, which `composed` is as one field."""
-    alone = {p.name: ComposedField([p]) for p in scene.placed if not p.unbounded}
+    answered = as_composite if isinstance(composed, Composite) else lambda alone: alone
+    alone = {p.name: answered(ComposedField([p])) for p in scene.placed if not p.unbounded}
     return partial(share_shown, composed, alone)
 
 

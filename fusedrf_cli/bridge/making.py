@@ -115,10 +115,10 @@ class Maker:
         self.views = current(MakingConfig).views if compares else lesson.views
         size = lesson.view_size, lesson.view_size
         seed = current(JudgingConfig).judged_seed, 3, request.seed
-        self.looks = looks_of(scene.loaded, scene.composed, self.views, size, seed)
         self.answered = as_composite if together else lambda scene: scene
         self.sources = {id(leaf.field) for leaf in scene.composed.leaves()}
         truth = self.teacher = self.answered(scene.composed)
+        self.looks = looks_of(scene.loaded, truth, self.views, size, seed)
         self.sampler = scene.sampler
         if student.scene is not scene.composed:
             self.teacher = self.answered(student.scene)
@@ -329,8 +329,8 @@ class Maker:
         field, start = self.student.begun(plan, before, background, generator)
         if wanted and start == NOTHING:
             self.progress.warn(
-                f"'{background.name}' is of another kind, turned or stretched, so the student starts from "
-                "nothing"
+                f"'{background.name}' is of another kind, turned, stretched or tinted, so the student starts "
+                "from nothing"
             )
         taken_over = wanted and start != NOTHING and same_texels(field, background.field)
         return field, start, {"coarse_from": None, "rate": config.rate_in_place} if taken_over else {}

@@ -2,9 +2,10 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from fusedrf_cli.engine.rendering.volume import RenderedImage, render_bands, ren
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import RenderRequest
+
+NOTHING_ELSE: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ def render(request: RenderRequest, progress) -> dict:
         progress.phase("reading", None)
         budget = Memory(request.memory)
         loaded = load_scene(request.scene, request.allow_outside, budget, place)
-        field, origin = renderable(loaded, reference=True)
+        field, origin = reference(loaded)
         views = choose_views(request, loaded, field, origin)
         if suffix in FILMS:
             check_sizes(output, views)
@@ -62,7 +65,7 @@ def render(request: RenderRequest, progress) -> dict:
                 f"{output}: {len(views)} views do not fit one picture; give a folder, a .gif or a .mp4"
             )
         if not request.naive:
-            field = in_memory(loaded, field, picture_memory(None, views, suffix in FILMS), budget)
+            field, origin = renderable(loaded, budget, picture_memory(None, views, suffix in FILMS))
         needed = picture_memory(field, views, suffix in FILMS)
         held = isinstance(field, Composite)
         loaded.shelf.resize(sum(loaded.sizes) if held else budget.room(needed))
@@ -91,12 +94,17 @@ def render(request: RenderRequest, progress) -> dict:
 def picture_memory(field, views: list[Camera], film: bool) -> dict[str, float]:
     """What rendering needs beside the sources; field None: of what is still to become a Composite."""
     largest = max(views, key=lambda view: view.width * view.height)
+    needed = frame_memory(field, largest.width, largest.height)
     pixels = largest.width * largest.height
-    composed = field is not None and not hasattr(field, "render_rays")
-    needed = picture(largest.width, largest.height, composed=composed)
-    if field is None or isinstance(field, Composite):
-        needed |= segments(pixels)
     return needed | ({"the film": pixels * (current(WorkConfig).frame_bytes + len(views))} if film else {})
+
+
+def frame_memory(field, width: int, height: int) -> dict[str, float]:
+    """The same of one picture of a size."""
+    composed = field is not None and not hasattr(field, "render_rays")
+    needed = picture(width, height, composed=composed)
+    held = field is None or isinstance(field, Composite)
+    return needed | (segments(width * height) if held else {})
 
 
 def tell_of_work(scene: str, field, rays: int, progress) -> None:
@@ -118,23 +126,33 @@ def rays_of(views: list[Camera]) -> int:
     return sum(view.width * view.height for view in views)
 
 
-def renderable(loaded: LoadedScene, reference: bool = False) -> tuple[object, np.ndarray]:
-    """The field to march, and where its frame lies in the world (see `render_image`): a lone field is taken
-    as it is; the nodes of a bundle are a Composite, but for a reference, where they can be.
-    """
+def reference(loaded: LoadedScene) -> tuple[RadianceField, np.ndarray]:
+    """A scene as one field, and where the frame of that lies in the world (see `render_image`): a lone field
+    as it is, else the naive composition."""
+    composed = loaded.lone() or loaded.composed()
+    return composed if isinstance(composed, tuple) else (composed, composed.origin)
+
+
+def renderable(
+    loaded: LoadedScene, budget: Memory | None = None, needed: Mapping[str, float] = NOTHING_ELSE
+) -> tuple[RadianceField, np.ndarray]:
+    """The same of what is marched; see `composite_of`."""
     if (lone := loaded.lone()) is not None:
         return lone
+    composed = composite_of(loaded, budget, needed)
+    return composed, composed.origin
+
+
+def composite_of(
+    loaded: LoadedScene, budget: Memory | None = None, needed: Mapping[str, float] = NOTHING_ELSE
+) -> ComposedField:
+    """A scene as a Composite, whose fields are all in memory, where compiled loops compute all of them and
+    the budget has room for them beside what is needed; else its naive composition."""
     composed = loaded.composed()
-    return composed if reference or loaded.bundle is None else as_composite(composed), composed.origin
-
-
-def in_memory(loaded: LoadedScene, field: RadianceField, needed: dict, budget: Memory) -> RadianceField:
-    """A composed scene as a Composite, whose fields are all in memory, where compiled loops compute all of
-    them and there is room; else the field as it is. needed: for its pictures."""
-    if not isinstance(field, ComposedField) or budget.room(sources(loaded.resident) | needed) < 0:
-        return field
+    if budget is not None and budget.room(sources(loaded.resident) | needed) < 0:
+        return composed
     loaded.shelf.resize(sum(loaded.sizes))
-    return as_composite(field)
+    return as_composite(composed)
 
 
 def check_sizes(output: str, views: list[Camera]) -> None:

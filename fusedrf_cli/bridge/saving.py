@@ -11,7 +11,7 @@ from formats.records import FieldRecord
 from formats.scene import Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.rigs import kept_cameras
-from fusedrf_cli.bridge.scene import LoadedScene
+from fusedrf_cli.bridge.scene import LoadedScene, showing_of
 from fusedrf_cli.engine.fields.base import StoredField
 
 
@@ -36,9 +36,8 @@ def save_scene(
         field = fields[name]
         if id(field) not in members:
             members[id(field)] = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
-        tint = getattr(field, "tint", None)  # which the field itself does not store
         node = placed_node(name, members[id(field)], placements[name], source.background)
-        nodes.append(node if tint is None else shown(node, {"tint": list(tint)}))
+        nodes.append(shown(node, showing_of(source.placed)))
     history = ()
     if scene.bundle is not None:
         history = scene.graph.history

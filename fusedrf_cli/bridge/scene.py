@@ -13,14 +13,14 @@ import numpy as np
 from formats.bundle import BundleWriter, OpenBundle, is_bundle, shared_members
 from formats.errors import FormatError
 from formats.graph import placement_of
-from formats.nodes import WHITE, Leaf, check_affine
+from formats.nodes import Leaf, check_affine
 from formats.records import FieldRecord, as_stored, reading_size
 from formats.scene import MAX_SCENE_BYTES, SceneGraph, dump_scene, make_node, parse_scene
 from formats.sources import expand_scene, inline_scenes, resolve_source
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory, sources
 from fusedrf_cli.bridge.shelf import Shelf
-from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.affine import WHITE, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
@@ -108,9 +108,9 @@ class LoadedScene:
         )
 
     def lone(self) -> tuple[StoredField, np.ndarray] | None:
-        """The field of a scene that is one field, and where its frame lies in the world: a position (3,)
-        where it is only moved, else a placement (4, 4)."""
-        if len(self.fields) == 1:
+        """The field of a scene that is one field, shown as it is, and where its frame lies in the world: a
+        position (3,) where it is only moved, else a placement (4, 4)."""
+        if len(self.fields) == 1 and self.fields[0].placed.as_it_is:
             placed = self.fields[0].placed
             return opened(placed.field), short_origin(placed.object_to_world)
         return None
@@ -311,13 +311,13 @@ class _Loader:
         where, key = f"{bundle.path}: node '{leaf.name}'", key_of(leaf, member)
 
         def read():
-            return as_shown(make_field(bundle.field(member), where), leaf, where).to(self.place)
+            return cropped(make_field(bundle.field(member), where), leaf, where).to(self.place)
 
         if key not in self.fields:
             self.fields[key] = StreamedField(lambda: self.shelf.take(key, needs.held, read))
         try:
             check_affine(leaf.object_to_world, f"node '{leaf.name}' in the world")
-            placed = Placed(leaf.name, self.fields[key], leaf.object_to_world)
+            placed = Placed(leaf.name, self.fields[key], leaf.object_to_world, leaf.opacity, leaf.tint)
         except FormatError as error:
             raise error.within(str(self.path)) from error
         except ValueError as error:
@@ -327,16 +327,16 @@ class _Loader:
 
 
 def key_of(leaf: Leaf, member: str) -> str:
-    """What tells fields apart: their numbers, and what is shown of them."""
-    return member if leaf.whole else f"{member} {leaf.opacity} {leaf.tint} {leaf.crops}"
+    """What tells fields apart: their numbers, and what crops leave of them."""
+    return f"{member} {leaf.crops}" if leaf.crops else member
 
 
 def as_shown_needs(needs: FieldNeeds, leaf: Leaf) -> FieldNeeds:
     """What a leaf's field needs: what is cropped is a copy of some of it."""
-    return needs if leaf.whole else replace(needs, unwritten=0)
+    return replace(needs, unwritten=0) if leaf.crops else needs
 
 
-def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
+def cropped(field: StoredField, leaf: Leaf, where: str) -> StoredField:
     """As `part_shown`. InvalidInput where that is nothing."""
     shown = part_shown(field, leaf, where)
     if shown is None:
@@ -345,17 +345,16 @@ def as_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField:
 
 
 def part_shown(field: StoredField, leaf: Leaf, where: str) -> StoredField | None:
-    """What a leaf shows of its field: all of it, or what its crops hold, with its density times its opacity
-    and its colours times its tint; None where that is nothing. InvalidInput where the kind of field has no
-    such."""
-    kind = registry.kind(field.kind)
+    """What a leaf shows of its field: all of it, or what its crops hold; None where that is nothing.
+    InvalidInput where the kind of field cannot be cropped."""
+    if not leaf.crops:
+        return field
     try:
-        shown = field if leaf.opacity == 1 else kind.thinned(field, leaf.opacity)
-        if leaf.crops:
-            shown = kind.cropped(shown, lambda points: np.all([c.holds(points) for c in leaf.crops], 0))
+        return registry.kind(field.kind).cropped(
+            field, lambda points: np.all([crop.holds(points) for crop in leaf.crops], 0)
+        )
     except ValueError as error:
         raise InvalidInput(f"{where}: {error}") from error
-    return shown if shown is None or leaf.tint == WHITE else kind.tinted(shown, leaf.tint)
 
 
 def background_of(scene: LoadedScene) -> SourceField:
@@ -416,6 +415,12 @@ def write_field(
         writer.copy_field(bundle, kept_member)
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size
+
+
+def showing_of(placed: Placed) -> dict:
+    """What a node says of how a placed field is shown."""
+    words = {} if placed.opacity == 1 else {"opacity": placed.opacity}
+    return words | ({} if tuple(placed.tint) == WHITE else {"tint": list(placed.tint)})
 
 
 def graph_of(member: str, name: str, origin: np.ndarray | None, about: SceneGraph) -> SceneGraph:

@@ -110,12 +110,18 @@ def test_a_source_that_is_replaced_meanwhile_is_read_as_it_was(folder, tmp_path)
 
 
 def test_nodes_that_show_a_field_differently_each_count(folder):
-    """A field that is thinned has numbers of its own: so many take so many times the memory."""
+    """A field that is cropped has numbers of its own: so many take so many times the memory. Tints and
+    opacities are the nodes', which share the field."""
     red = make_node("n", source="red.rfpack")
-    nodes = [replace(red, name=f"n{i}", showing={"opacity": 0.1 * i}) for i in range(1, 9)]
-    write_scene(folder / "thinned.json", SceneGraph(tuple(nodes)))
-    sizes = load_scene(str(folder / "thinned.json")).sizes
-    assert len(sizes) == 8 and len(load_scene(str(folder / "scene.json")).sizes) == 3
+    shown = {"cropped": lambda i: {"crop": [0, 0, 0, 0.1 * i]}}
+    shown["shared"] = lambda i: {"opacity": 0.1 * i, "tint": [0.1 * i, 1, 1]}
+    for name, showing in shown.items():
+        nodes = [replace(red, name=f"n{i}", showing=showing(i)) for i in range(2, 9)]
+        write_scene(folder / f"{name}.json", SceneGraph(tuple(nodes)))
+    assert len(load_scene(str(folder / "cropped.json")).sizes) == 7
+    assert len(load_scene(str(folder / "scene.json")).sizes) == 3
+    shared = load_scene(str(folder / "shared.json"))
+    assert len(shared.sizes) == 1 and len({p.tint for p in shared.placed}) == 7
 
 
 class Fog:

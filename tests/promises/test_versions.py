@@ -15,7 +15,7 @@ from formats.errors import FormatWarning, NewerVersion
 from formats.images import read_image
 from formats.rig import read_rig
 from formats.scene import dump_scene
-from fusedrf_cli.bridge.rendering import renderable, to_pixels
+from fusedrf_cli.bridge.rendering import reference, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, placement
@@ -33,7 +33,7 @@ FINE = 0.003  # a step so small that pictures show what a pack holds, not how it
 
 def rendered(path) -> np.ndarray:
     """(48, 48, 3) uint8 of a pack, as pair.png was made."""
-    field, origin = renderable(load_scene(str(path)), reference=True)
+    field, origin = reference(load_scene(str(path)))
     if isinstance(field, ComposedField):  # all of it at the same step
         field.__dict__["occupancy"] = replace(field.occupancy, stride=None)
     camera = orbit(field.occupancy.tight_aabb(0), 1, 48, 48)[0]

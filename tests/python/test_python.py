@@ -14,6 +14,7 @@ import fusedrf_cli
 from formats.errors import FormatError, OutputExists
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, write_field
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.python import camera_rays, open_scene, rigid_motion
@@ -70,7 +71,7 @@ def test_the_page_runs_as_it_is_written():
 
 
 def test_a_picture_is_that_of_the_command_line():
-    scene, loaded = open_scene("scene.json"), load_scene("scene.json").composed()
+    scene, loaded = open_scene("scene.json"), as_composite(load_scene("scene.json").composed())
     camera = scene.camera(0.9, 0.45, 40, 30)
     wanted = render_image(loaded, camera, origin=loaded.origin)
     found = scene.render(camera)

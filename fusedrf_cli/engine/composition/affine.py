@@ -7,7 +7,7 @@ exact for any invertible M; a uniform scale k gives σ_object / k. Matrices are 
 on points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
 
@@ -19,16 +19,21 @@ from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.spaces import bounded
 
+WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
 CONDITION_LIMIT = 1e6  # a flatter placement cannot be inverted to float32's accuracy
 
 
 @dataclass(frozen=True)
 class Placed:
-    """A field placed in a world frame; `ComposedField` asks it there."""
+    """A field placed in a world frame, as `ComposedField` and `Composite` show it there."""
 
     name: str
     field: RadianceField
     object_to_world: np.ndarray
+    opacity: float = 1.0
+    """Its density is multiplied by this."""
+    tint: tuple[float, float, float] = WHITE
+    """Its colours are multiplied by these, red, green and blue."""
 
     def __post_init__(self):
         """Raises ValueError for a map that is singular or nearly so."""
@@ -64,6 +69,11 @@ class Placed:
         """That the field lies in."""
         return self.field.occupancy.space
 
+    @property
+    def as_it_is(self) -> bool:
+        """Whether its density and its colours are the field's own."""
+        return self.opacity == 1 and tuple(self.tint) == WHITE
+
     def reaches(self, box: np.ndarray) -> bool:
         """Whether there may be anything of it in a box (6,) of the world."""
         return self.unbounded or bool((self.aabb[:3] <= box[3:]).all() and (box[:3] <= self.aabb[3:]).all())
@@ -94,10 +104,35 @@ class Placed:
         stretch = v.norm(dim=1)
         return exact(points, device) @ linear.T + shift, v / stretch[:, None], stretch
 
+    def query(
+        self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """σ (N,) float64 per unit of the world and rgb (N, 3) float32 at points (N, 3) along unit dirs (N,
+        3) of the world. Not differentiable."""
+        x, d, stretch = self.to_object(points, dirs)
+        sigma, rgb = self.field.query(x, d, with_colour)
+        return self.shown(sigma.double() * stretch, rgb.float())
+
+    def shown(self, sigma: torch.Tensor, rgb: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Densities (N,) times its opacity, and colours (N, 3) times its tint."""
+        if self.as_it_is:
+            return sigma, rgb
+        return sigma * self.opacity, rgb * rgb.new_tensor(self.tint)
+
     def moved(self, origin: np.ndarray) -> "Placed":
         """The same placement seen from a frame that lies at `origin`: a position (3,), or a placement (4,
         4)."""
-        return Placed(self.name, self.field, seen_placement(self.object_to_world, origin))
+        return replace(self, object_to_world=seen_placement(self.object_to_world, origin))
+
+    def within(self, outer: "Placed") -> "Placed":
+        """Itself where the composed scene that it is part of is placed, in the frame of that."""
+        return Placed(
+            f"{outer.name}/{self.name}",
+            self.field,
+            outer.object_to_world @ self.object_to_world,
+            outer.opacity * self.opacity,
+            tuple(np.multiply(outer.tint, self.tint).tolist()),
+        )
 
 
 def rigid_motion(twist: torch.Tensor) -> torch.Tensor:

@@ -76,9 +76,7 @@ class ComposedField:
         found = []
         for p in self.placed:
             inner = p.field.leaves() if isinstance(p.field, ComposedField) else None
-            matrix = p.object_to_world
-            placed = [replace(q, object_to_world=matrix @ q.object_to_world) for q in inner or ()]
-            found += [p] if inner is None else placed
+            found += [p] if inner is None else [replace(q.within(p), name=q.name) for q in inner]
         return found
 
     def with_fields(self, change: Callable[[RadianceField], RadianceField]) -> "ComposedField":
@@ -152,20 +150,20 @@ class ComposedField:
     def _densest(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
         """Where a field is denser than those before it (at points of indices `inside`), its answer is
         taken."""
-        found = _sigma(placed, points[inside], dirs[inside])
+        found = placed.query(points[inside], dirs[inside], False)[0].float()
         denser = found > sigma[inside]
         won = inside[denser]
         sigma[won] = found[denser]
         if with_colour and len(won):
-            rgb[won] = _colour(placed, points[won], dirs[won])
+            rgb[won] = placed.query(points[won], dirs[won])[1]
 
     def _sum(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
         """A field's density at points of indices `inside`, and its colour by that weight, added."""
-        found = _sigma(placed, points[inside], dirs[inside]).double()
+        found = placed.query(points[inside], dirs[inside], False)[0].float().double()
         sigma[inside] += found
         seen = inside[found > 0]
         if with_colour and len(seen):
-            rgb[seen] += found[found > 0, None] * _colour(placed, points[seen], dirs[seen]).double()
+            rgb[seen] += found[found > 0, None] * placed.query(points[seen], dirs[seen])[1].double()
 
 
 def occupied_at(field: RadianceField, points: np.ndarray) -> np.ndarray:
@@ -185,15 +183,3 @@ def largest(placed: list[Placed]) -> Placed:
     """Of fields that fill all of space the one with the largest core."""
     around = [p for p in placed if p.unbounded]
     return max(around, key=lambda p: abs(np.linalg.det(p.object_to_world[:3, :3])))
-
-
-def _sigma(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
-    """(N,) float32 density of a placed field per unit of the frame it is placed in."""
-    x, d, stretch = placed.to_object(points, dirs)
-    return (placed.field.query(x, d, with_colour=False)[0].double() * stretch).float()
-
-
-def _colour(placed: Placed, points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
-    """(N, 3) float32 colour of a placed field."""
-    x, d, _ = placed.to_object(points, dirs)
-    return placed.field.query(x, d)[1].float()

@@ -11,7 +11,6 @@ from types import ModuleType
 
 import numpy as np
 import torch
-from numba import get_num_threads
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -19,7 +18,6 @@ from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.computed import ComputedField, exact
 from fusedrf_cli.engine.fields.occupancy import box_corners, squeezed
 from fusedrf_cli.engine.fields.streamed import opened
-from fusedrf_cli.engine.kernels import segments
 from fusedrf_cli.engine.kernels.instances import (
     FARTHEST,
     MAX_TRACED,
@@ -30,7 +28,14 @@ from fusedrf_cli.engine.kernels.instances import (
     Traces,
 )
 from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, RAYS_PER_TASK
-from fusedrf_cli.engine.kernels.segments import RayBatch, Segments
+from fusedrf_cli.engine.kernels.segments import (
+    SHARED,
+    Groups,
+    RayBatch,
+    Segments,
+    points_in_sphere,
+    sort_slots,
+)
 
 MEETING = 8  # instances in one segment of a ray for which there is room at first
 SLOTS_AT_ONCE = 1 << 14  # of which the samples are kept: 20 MB
@@ -38,14 +43,15 @@ ROUNDING = 1e-6  # share of a sphere's radius by which it is larger
 
 
 def can_be_composite(placed: Iterable[Placed], rule: str = "max") -> bool:
-    """Whether a Composite can be made of placed fields: not of those that only plain torch computes, nor of
-    composed scenes of two more rules than its own."""
+    """Whether a Composite can be made of placed fields: not of those that only plain torch computes, or that
+    lie on two devices, nor of composed scenes of two more rules than its own."""
     try:
         leaves = [leaf for members, _ in groups_of(placed, rule) for leaf in members]
     except ValueError:
         return False
     fields = [opened(leaf.field) for leaf in leaves]
-    return all(isinstance(f, ComputedField) and f.device_loops is not None for f in fields)
+    computed = all(isinstance(f, ComputedField) and f.device_loops is not None for f in fields)
+    return computed and len({f.device_loops for f in fields}) == 1
 
 
 def groups_of(placed: Iterable[Placed], rule: str) -> list[tuple[list[Placed], str]]:
@@ -58,10 +64,7 @@ def groups_of(placed: Iterable[Placed], rule: str) -> list[tuple[list[Placed], s
         if not isinstance(scene, ComposedField):
             groups.append(([p], rule))
             continue
-        inner = [
-            Placed(f"{p.name}/{q.name}", q.field, p.object_to_world @ q.object_to_world) for q in scene.placed
-        ]
-        below = groups_of(inner, scene.rule)
+        below = groups_of([q.within(p) for q in scene.placed], scene.rule)
         if scene.rule == rule:
             groups += below
         elif all(len(members) == 1 for members, _ in below):
@@ -100,7 +103,7 @@ class Composite(ComposedField):
     def posed(self, poses: Mapping[str, np.ndarray]) -> "Composite":
         """See ComposedField."""
         other = super().posed(poses)
-        for name in ("groups", "leaves", "instances", "spaces", "sampling_step"):
+        for name in ("groups", "parts", "instances", "placed_instances", "spaces", "sampling_step"):
             other.__dict__.pop(name, None)
         return other
 
@@ -113,7 +116,7 @@ class Composite(ComposedField):
         return groups
 
     @cached_property
-    def leaves(self) -> list[Placed]:
+    def parts(self) -> list[Placed]:
         """The instances, in this frame."""
         return [leaf for members, _ in self.groups for leaf in members]
 
@@ -125,7 +128,7 @@ class Composite(ComposedField):
     @cached_property
     def fields(self) -> list[ComputedField]:
         """The field of each instance."""
-        return [opened(p.field) for p in self.leaves]
+        return [opened(p.field) for p in self.parts]
 
     @cached_property
     def field_of(self) -> np.ndarray:
@@ -140,7 +143,7 @@ class Composite(ComposedField):
         skip = {b: grids[b].skip.ravel() for b in np.unique(self.field_of)}
         first = dict(zip(skip, np.cumsum([0, *map(len, skip.values())]), strict=False))
         return Instances(
-            np.stack([p.world_to_object[:3] for p in self.leaves]),
+            np.stack([p.world_to_object[:3] for p in self.parts]),
             *(
                 np.stack(rows)
                 for rows in zip(*((g.aabb[:3], g.aabb[3:], g.cell) for g in grids), strict=True)
@@ -149,20 +152,21 @@ class Composite(ComposedField):
             np.array([first[b] for b in self.field_of], np.int64),
             np.concatenate(list(skip.values())),
             np.array([sampling_step(field) for field in self.fields]),
-            np.stack([sphere_around(p, f) for p, f in zip(self.leaves, self.fields, strict=True)]),
-            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.leaves], np.int64),
+            np.stack([sphere_around(p, f) for p, f in zip(self.parts, self.fields, strict=True)]),
+            np.array([self.spaces.index(p.space) if p.unbounded else 0 for p in self.parts], np.int64),
+            np.array([(p.opacity, *p.tint) for p in self.parts]),
         )
 
     @cached_property
     def spaces(self) -> tuple[ModuleType, ...]:
         """Those without end that instances lie in, by name."""
-        found = {p.space for p in self.leaves if p.unbounded}
+        found = {p.space for p in self.parts if p.unbounded}
         return tuple(sorted(found, key=lambda space: space.__name__))
 
     @cached_property
     def sampling_step(self) -> float:
         """The finest at which an instance is sampled, in this frame; see base.py."""
-        pairs = zip(self.fields, self.leaves, strict=True)
+        pairs = zip(self.fields, self.parts, strict=True)
         return min(sampling_step(field) * squeezed(p.object_to_world) for field, p in pairs)
 
     # -- points ----------------------------------------------------------------------------------------------
@@ -190,21 +194,25 @@ class Composite(ComposedField):
     ) -> PointAnswers:
         """What instances (M,) composed by a rule answer at points (N, 3) along dirs (N, 3)."""
         matrix, adds, n = self.instances.world_to_instance, rule == "add", len(points)
-        asked = PointQuery(points, dirs, None, 0, matrix, adds, False)
+        loops = self.device_loops
+        place = loops.on_device
+        asked = PointQuery(place(points), place(dirs), None, 0, matrix, self.instances.shown, adds, False)
         answers = PointAnswers(np.zeros(n), np.full(n, -1), np.empty(n, np.int64), np.zeros((n, 3)))
+        answers = place(answers)
         near = {b: self.points_near(points, b) for b in members}
         for b, chosen in near.items():
             self.ask("densest_at", asked._replace(chosen=chosen, instance=b), answers)
+        sigma, densest = loops.on_host(answers.sigma), loops.on_host(answers.densest)
         for b, chosen in near.items() if with_colour else ():
-            shown = answers.sigma[chosen] > 0 if adds else answers.densest[chosen] == b
+            shown = sigma[chosen] > 0 if adds else densest[chosen] == b
             coloured = asked._replace(chosen=chosen[shown], instance=b, with_colour=True)
             self.ask("colour_at", coloured, answers)
-        return answers
+        return answers._replace(sigma=sigma, rgb=loops.on_host(answers.rgb))
 
     def points_near(self, points: np.ndarray, b: int) -> np.ndarray:
         """(M,) those of points (N, 3) that may lie in the occupied cells of an instance."""
         found = np.empty(len(points), np.int64)
-        return found[: segments.points_in_sphere(points, self.instances.spheres[b], found)]
+        return found[: points_in_sphere(points, self.instances.spheres[b], found)]
 
     def ask(self, item: str, query: PointQuery, answers: PointAnswers) -> None:
         """Let an instance enter its answers at the query's points."""
@@ -225,87 +233,113 @@ class Composite(ComposedField):
         """See ComputedField; instances are sampled at as many times their own steps as the step is times
         `sampling_step`."""
         rays = RayBatch(exact(rays_o), exact(rays_d), np.minimum(exact(reach), FARTHEST))
-        march = Waves(self, rays, step / self.sampling_step, early_stop, out)
+        march = Waves(self, rays, step / self.sampling_step, early_stop, np.zeros_like(out))
         while march.go_on():
             pass
+        out[:] = self.device_loops.on_host(march.out)
 
-    def rules(self, instance: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-        """The `groups` of `merge_samples` for slots of instances (S,)."""
+    @property
+    def device_loops(self) -> ModuleType:
+        """Of the device that all fields' numbers lie on."""
+        return self.fields[0].device_loops
+
+    def rules(self, instance: np.ndarray) -> Groups:
+        """By which slots of instances (S,) are composed."""
         adds = np.array([rule == "add" for _, rule in self.groups])
-        return self.group[instance], adds, self.rule == "add"
+        return Groups(self.group[instance], adds, self.rule == "add")
+
+    @cached_property
+    def placed_instances(self) -> Instances:
+        """`instances` where the loops read them."""
+        return self.device_loops.on_device(self.instances)
 
     @cached_property
     def traces(self) -> Traces:
         """Room for the samples of SLOTS_AT_ONCE slots, used again and again: fresh memory is slow to be
         had."""
-        return room_for_traces(SLOTS_AT_ONCE)
+        return self.device_loops.on_device(room_for_traces(SLOTS_AT_ONCE))
 
 
 class Waves:
-    """Rays on their way through a scene."""
+    """Rays on their way through a scene. Arrays lie where the loops read them, on a GPU or here; what comes
+    here of them is which instances meet where, by which work is sorted."""
 
     def __init__(self, scene: Composite, rays: RayBatch, times: float, early_stop: float, out: np.ndarray):
-        """times: how many times the instances' own steps their samples are apart."""
-        self.scene, self.rays, self.early_stop, self.out = scene, rays, early_stop, out
+        """times: how many times the instances' own steps their samples are apart. out (N, 5) is 0."""
+        self.scene, self.early_stop, self.loops = scene, early_stop, scene.device_loops
+        self.segment_loops, place = self.loops.segments(), self.loops.on_device
         self.steps = times * scene.instances.step
         n = len(out)
-        self.segments = Segments(
+        found = Segments(
             *np.empty((2, n)), np.empty(n, np.int64), np.empty(n), rays.reach[:, 0].copy(),
             np.empty(n, np.int64), np.empty((n, MEETING), np.int64),
         )  # fmt: skip
-        self.left = self.numbers = np.arange(n)
+        self.rays, self.out, self.segments = place(rays), place(out), place(found)
+        self.left = np.arange(n)
+        self.numbers = place(self.left)
         unbounded = np.flatnonzero(scene.instances.spheres[:, 3] >= FARTHEST)
-        self.unbounded = np.full(n, unbounded[0]) if len(unbounded) == 1 else None
-        out[:] = 0
+        self.unbounded = place(np.full(n, unbounded[0])) if len(unbounded) == 1 else None
+
+    def told(self, name: str) -> np.ndarray:
+        """An array of the segments, here."""
+        return self.loops.on_host(getattr(self.segments, name))
+
+    def here(self) -> Segments:
+        """The segments, here."""
+        return Segments(*(self.told(name) for name in Segments._fields))
 
     def go_on(self) -> bool:
         """Take the rays that are left through their next segments; whether any are left behind them."""
-        left, found = self.left, self.find(self.left)
+        left = self.left
+        self.find(left)
+        found = self.segments
         if self.unbounded is not None:
-            alone = left[found.alone_to[left] > found.alone_from[left]]
+            alone = left[self.told("alone_to")[left] > self.told("alone_from")[left]]
             ends = found.alone_from, found.alone_to
             self.each("show_ray", alone, self.numbers, self.unbounded, ends, self.out)
         shared = self.each("show_ray", left, self.numbers, found.instance, (found.begin, found.end), self.out)
         for part in self.parts(shared):
             self.show_shared(part)
-        after = np.empty_like(left)
-        count = segments.rays_left(left, self.rays, found, self.out, self.early_stop, after)
-        self.left = after[:count]
-        return count > 0
+        self.left = self.segment_loops.rays_left(left, self.rays, found, self.out, self.early_stop)
+        return len(self.left) > 0
 
-    def find(self, left: np.ndarray) -> Segments:
+    def find(self, left: np.ndarray) -> None:
         """The next segments of rays left (M,). Where more instances meet than there is room for, they are
         looked for again with more room."""
-        arguments = self.rays, self.scene.instances
-        next_segments = segments.next_segments_in(self.scene.spaces)
-        next_segments(*arguments, left, get_num_threads(), self.segments)
-        shared = left[self.segments.instance[left] == segments.SHARED]
-        found, room = self.segments.n_meeting[shared], self.segments.meeting.shape[1]
-        if len(shared) and found.max() > room:
-            again = shared[found > room]
-            wider = np.empty((len(self.out), found.max()), np.int64)
-            wider[:, :room] = self.segments.meeting
-            self.segments = self.segments._replace(meeting=wider)
-            self.segments.end[again] = self.segments.alone_from[again]
-            next_segments(*arguments, again, get_num_threads(), self.segments)
-        return self.segments
+        arguments = self.rays, self.scene.placed_instances, self.scene.spaces
+        self.segment_loops.next_segments(*arguments, left, self.segments)
+        shared = left[self.told("instance")[left] == SHARED]
+        if not len(shared):
+            return
+        meet, room = self.told("n_meeting")[shared], self.segments.meeting.shape[1]
+        if meet.max() > room:
+            again, found = shared[meet > room], self.here()
+            wider = np.empty((len(found.end), meet.max()), np.int64)
+            wider[:, :room] = found.meeting
+            found.end[again] = found.alone_from[again]
+            self.segments = self.loops.on_device(found._replace(meeting=wider))
+            self.segment_loops.next_segments(*arguments, again, self.segments)
 
     def parts(self, shared: np.ndarray) -> list[np.ndarray]:
         """Rays (M,) whose segments are shared in runs of about SLOTS_AT_ONCE slots."""
-        slots = np.cumsum(self.segments.n_meeting[shared])
-        cuts = np.flatnonzero(np.diff(slots // SLOTS_AT_ONCE)) + 1
-        return np.split(shared, cuts) if len(shared) else []
+        if not len(shared):
+            return []
+        slots = np.cumsum(self.told("n_meeting")[shared])
+        return np.split(shared, np.flatnonzero(np.diff(slots // SLOTS_AT_ONCE)) + 1)
 
     def show_shared(self, shared: np.ndarray) -> None:
         """The shared segments of rays (M,)."""
-        found, counts = self.segments, self.segments.n_meeting[shared]
+        found, counts, place = self.segments, self.told("n_meeting")[shared], self.loops.on_device
         start = np.concatenate([[0], np.cumsum(counts)])
         there = np.arange(found.meeting.shape[1]) < counts[:, None]
-        slots = np.arange(start[-1]), np.repeat(shared, counts), found.meeting[shared][there]
-        traces = self.scene.traces if start[-1] <= SLOTS_AT_ONCE else room_for_traces(start[-1])
-        ends, groups = (found.begin, found.end), self.scene.rules(slots[2])
+        instance = self.told("meeting")[shared][there]
+        slots = np.arange(start[-1]), place(np.repeat(shared, counts)), place(instance)
+        few = start[-1] <= SLOTS_AT_ONCE
+        traces = self.scene.traces if few else place(room_for_traces(start[-1]))
+        ends, groups = (found.begin, found.end), self.scene.rules(instance)
+        merged = self.early_stop, groups, traces, found.end, self.out
         self.each("trace_ray", *slots, ends, traces)
-        segments.merge_samples(shared, start, self.early_stop, groups, traces, found.end, self.out)
+        self.segment_loops.merge_samples(shared, start, *merged)
         self.add_samples(shared, start, slots, ends, traces)
 
     def add_samples(
@@ -313,20 +347,19 @@ class Waves:
     ) -> None:
         """Add what the samples of rays shared (M,) show, by the weights that they were given."""
         self.each("shade_ray", *slots, ends, traces)
-        segments.add_colours(shared, start, traces, self.out)
+        self.segment_loops.add_colours(shared, start, traces, self.out)
 
-    def each(
-        self, item: str, chosen: np.ndarray, ray: np.ndarray, instance: np.ndarray, ends: tuple, out: object
-    ) -> np.ndarray:
+    def each(self, item: str, chosen: np.ndarray, ray: object, instance: object, ends: tuple, out: object):
         """An item of work for slots chosen (M,), of ray (S,) and instance (S,), by the loops of each field;
-        returns the slots that are SHARED. ends: from and to which distances (N,)."""
+        returns the slots (K,) that are SHARED. ends: from and to which distances (N,)."""
         scene, order = self.scene, np.empty_like(chosen)
         stops = np.empty(len(scene.fields) + 1, np.int64)
-        segments.sort_slots(chosen, instance, scene.field_of, stops, order)
+        sort_slots(chosen, self.loops.on_host(instance), scene.field_of, stops, order)
+        placed = scene.placed_instances
         for b in np.flatnonzero(np.diff(stops)):
             part = order[stops[b] : stops[b + 1]]
             slots = Slots(
-                *self.rays, part, ray, instance, *ends, scene.instances.world_to_instance,
+                *self.rays, part, ray, instance, *ends, placed.world_to_instance, placed.shown,
                 float(self.steps[b]), float(self.early_stop), self.out,
             )  # fmt: skip
             scene.fields[b].each(item, slots, len(part), out, RAYS_PER_TASK)

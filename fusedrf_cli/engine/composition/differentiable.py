@@ -13,6 +13,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.fields import differentiable
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, box_corners
@@ -34,11 +35,24 @@ def query(
     (N, 3) of its frame, as `fields.differentiable.query`; differentiable in `poses` too. Raises ValueError
     for a pose of what the field does not place."""
     check_names(field, poses)
+    if isinstance(field, Composite) and not needs_gradient(field, points, dirs, *(poses or {}).values()):
+        kind, device = float_type(field), device_of(field)
+        for part in parts(field):
+            differentiable.settle(part)
+        found = structure(field, poses).query(points, dirs, with_colour)
+        return tuple(answers.to(device, kind) for answers in found)
     if isinstance(field, ComposedField):
         return composed_query(field, points, dirs, poses or {}, with_colour)
     if isinstance(field, Placed):
         return placed_query(field, points, dirs, (poses or {}).get(field.name), with_colour)
     return differentiable.query(field, points, dirs, with_colour=with_colour)
+
+
+def needs_gradient(field: RadianceField, *inputs: torch.Tensor) -> bool:
+    """Whether a gradient is wanted of anything that a field's answers follow from."""
+    if not torch.is_grad_enabled():
+        return False
+    return any(x.requires_grad for x in inputs) or any(p.requires_grad for p in numbers(field))
 
 
 def check_names(field: RadianceField | Placed, poses: Poses | None) -> None:
@@ -103,7 +117,7 @@ def placed_query(
     device = device_of(placed.field)
     x, d, stretch = placed.to_object(exact(points, device), dirs.to(device), pose)
     sigma, rgb = query(opened(placed.field), x, d, with_colour=with_colour)
-    return (exact(sigma, device) * stretch).to(sigma.dtype), rgb
+    return placed.shown((exact(sigma, device) * stretch).to(sigma.dtype), rgb)
 
 
 def structure(field: RadianceField, poses: Poses | None) -> RadianceField:

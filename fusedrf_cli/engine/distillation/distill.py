@@ -44,7 +44,7 @@ from fusedrf_cli.engine.settings import current
 
 @dataclass(frozen=True)
 class Recipe:
-    """The parts of the method, of which benchmarks/ablation.py replaces one at a time."""
+    """The parts of the method."""
 
     chance: Chance = matter_first
     density_loss: DensityLoss = log_depth

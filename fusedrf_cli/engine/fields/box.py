@@ -22,12 +22,9 @@ from fusedrf_cli.engine.fields.computed import (
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
-PAGE = 2 << 20  # bytes, of a large one: a vertex that is used may be alone in its
-PER_VERTEX_FOUND = 7  # bytes of a vertex, or of a cell, while the used ones are found
 LINE = 16  # floats: a part begins on a cache line
 MAX_TEXELS = 8192  # per axis, in a stored field
 MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
-ON_TEXEL = 1e-9  # spacings from one, within which a place is that of the texel
 DENSITY_SHIFT = -8.0  # softplus(-8) * 75 * sqrt(3) = 4 % opacity along the diagonal of an untrained box
 DENSITY_SCALE_PER_EXTENT = 75.0
 
@@ -240,9 +237,12 @@ class BoxField(ComputedField):
         """The name in files of the array of a part."""
         return name
 
-    def stored_shape(self, part: Part) -> tuple[int, ...]:
-        """Shape under which a part is stored; of vertices, the used ones in order."""
-        shape = (int(np.count_nonzero(self.used)), *part.shape[3:]) if part.on_vertices else part.shape
+    def stored_shape(self, part: Part, used: int | None = None) -> tuple[int, ...]:
+        """Shape under which a part is stored; of vertices, the used ones in order. used: how many these are,
+        where that is known."""
+        if part.on_vertices and used is None:
+            used = int(np.count_nonzero(self.used))
+        shape = (used, *part.shape[3:]) if part.on_vertices else part.shape
         return shape if part.columns is None else (*shape[:-1], part.columns)
 
     def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
@@ -270,8 +270,10 @@ class BoxField(ComputedField):
         for part in parts:
             if part.on_vertices:  # used_vertices axis by axis, and the used ones' places
                 halves, used = [math.prod([*texels[:n], *counts[n:]]) for n in range(4)], shapes[part.name][0]
-                made = max(made, PER_VERTEX_FOUND * max(halves), math.prod(texels) + 8 * used)
-                unwritten += max(0, 4 * math.prod(part.shape) - used * PAGE)
+                # 7 bytes of a vertex, or of a cell, while the used ones are found; of these each may be
+                # alone in a large page.
+                made = max(made, 7 * max(halves), math.prod(texels) + 8 * used)
+                unwritten += max(0, 4 * math.prod(part.shape) - used * (2 << 20))
         return FieldNeeds(4 * numbers + PER_CELL * math.prod(counts), made, unwritten)
 
     @classmethod
@@ -376,7 +378,7 @@ def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> tor
     n = values.shape[axis]
     position = unit * (n - 1)
     whole = position.round()
-    position = torch.where((position - whole).abs() < ON_TEXEL, whole, position)
+    position = torch.where((position - whole).abs() < 1e-9, whole, position)
     lower = position.floor().clamp(0, n - 2).long()
     fraction = (position - lower).to(values.dtype)
     inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)

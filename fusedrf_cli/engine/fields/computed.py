@@ -25,15 +25,11 @@ from fusedrf_cli.engine.kernels.loops import (
     Voting,
     Weighed,
 )
-from fusedrf_cli.engine.kernels.specialise import TINTED
-from fusedrf_cli.engine.kernels.tinting import with_tints
 
-CELLS_AT_ONCE = 1 << 18
 BRICK = 4  # cells a side
 FEW_CELLS, MOST_CELLS = 1 << 22, 1 << 26
 """Of a grid up to which files have its bits one after the other, and that is read in bricks: no grid of a fit
 has more than the first."""
-WORTH = 0.75  # of the bytes of all bits, from which bricks are worth it
 StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
 """The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
 the runs of its rows, or None."""
@@ -76,9 +72,6 @@ class Batch(NamedTuple):
     exposure: np.ndarray = AS_IT_IS
 
 
-WHITE = (1.0, 1.0, 1.0)  # the tint that changes nothing
-
-
 @dataclass(frozen=True)
 class Group:
     """A stretch of a field's numbers that learn at one rate."""
@@ -106,9 +99,6 @@ class ComputedField:
     params: torch.Tensor
     occupancy: OccupancyGrid
 
-    tint: tuple[float, float, float] | None = None
-    """That the colours of all of it are multiplied by; None: none. It is not stored, but where a kind has
-    tints of its own."""
     resolution: tuple[int, int, int] | None = None
     """Texels per axis of a field on one grid over its box; None: it has none, and cells are not its to give
     up."""
@@ -155,8 +145,6 @@ class ComputedField:
         """σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it, by `reference`."""
         at = self.space.contracted(points)
         sigma, rgb = self.reference(params, at, dirs)
-        if self.tint is not None:
-            rgb = rgb * torch.tensor(self.tint, dtype=rgb.dtype, device=rgb.device)
         return sigma * self.space.density_rates(at, dirs.to(at)).to(sigma.dtype), rgb
 
     # -- the same field otherwise ------------------------------------------------------------------------
@@ -207,11 +195,6 @@ class ComputedField:
         """That its numbers and its cells lie in; its points and directions are those of its frame."""
         return self.occupancy.space
 
-    @property
-    def tints(self) -> np.ndarray | None:
-        """(1, 3) what colours are multiplied by; None where that changes nothing."""
-        return None if self.tint is None else np.array([self.tint])
-
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs."""
@@ -231,16 +214,13 @@ class ComputedField:
     def loops(self) -> kernels.cpu.Loops:
         """The loops for fields of these sizes, on the device that the numbers lie on."""
         sizes = self.bodies.sizes(self)
-        if self.tints is not None:
-            sizes |= {TINTED: 1}
         return self.device_loops.loops_for(self.bodies, tuple(sorted(sizes.items())), self.space)
 
     @cached_property
     def arrays(self) -> NamedTuple:
         """What kernels read; `params` is shared, not copied."""
         loops = self.device_loops
-        arrays, tints = self.kernel_arrays(loops.shared(self.params)), self.tints
-        return loops.on_device(arrays if tints is None else with_tints(arrays, tints))
+        return loops.on_device(self.kernel_arrays(loops.shared(self.params)))
 
     @cached_property
     def grid(self) -> GridArrays:
@@ -285,7 +265,7 @@ class ComputedField:
         first, (begin, end) = np.zeros(count, np.int64), np.ascontiguousarray(reach.T)
         slots = Slots(
             exact(rays_o), exact(rays_d), reach, each, each, first, begin, end, np.eye(4)[None, :3],
-            float(step), float(early_stop), out,
+            np.ones((1, 4)), float(step), float(early_stop), out,
         )  # fmt: skip
         out[:] = 0
         self.each("show_ray", slots, count, out, RAYS_PER_TASK)
@@ -298,8 +278,9 @@ class ComputedField:
         """(N,) largest σ over offsets (K, 3) in each of `cells` (N, 3) int64 of a grid with corner lo (3,)
         and cells of size cell (3,)."""
         out = np.zeros(len(cells), self.real)
-        for start in range(0, len(cells), CELLS_AT_ONCE):  # between which an interrupt is heard
-            part = slice(start, start + CELLS_AT_ONCE)
+        at_once = 1 << 18  # between which an interrupt is heard
+        for start in range(0, len(cells), at_once):
+            part = slice(start, start + at_once)
             own = np.ascontiguousarray(cells[part], np.int64)
             asked = Cells(exact(lo), exact(cell), own, exact(offsets))
             self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(own), out[part])
@@ -409,7 +390,8 @@ def packed_bits(name: str, grid: np.ndarray, least: int = FEW_CELLS) -> dict[str
     some, whole = bricks.any(1), bricks.all(1)
     mixed = np.packbits(bricks[some & ~whole], axis=1)
     parts = {f"{name}.bricks": np.packbits(np.stack([some, whole])), f"{name}.mixed": mixed}
-    return parts if sum(part.nbytes for part in parts.values()) < WORTH * packed[name].nbytes else packed
+    # Bricks are worth it up to three quarters of the bytes of all bits.
+    return parts if sum(part.nbytes for part in parts.values()) < 0.75 * packed[name].nbytes else packed
 
 
 def in_bricks(grid: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ MAX_LEVELS, MAX_ROWS = 8, 1 << 24
 MAX_VERTEX = 1 << 20  # along an axis: past it, float32 would not tell where between two a point is
 TOGETHER = 64  # rows that files code by one scale
 PER_BLOCK = TOGETHER // RUN // 8 + 1 + 2 * ROW  # bytes of those: which are held, how many, and scales
-WORTH = 0.75  # of the bytes of all rows: up to which a file has those alone that are not 0
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,8 @@ class Held:
             return None
         held = cls(detail.reshape(-1, RUN * ROW).any(1))
         bytes_held = held.count * ROW + len(held.masks) * PER_BLOCK
-        return held if bytes_held <= WORTH * ROW * len(detail) else None
+        # A file has those alone that are not 0 up to three quarters of the bytes of all rows.
+        return held if bytes_held <= 0.75 * ROW * len(detail) else None
 
     @property
     def rows(self) -> np.ndarray:

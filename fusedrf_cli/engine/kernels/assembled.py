@@ -268,8 +268,8 @@ def arrays_of(module: ModuleType) -> type:
 
 
 def arrays_type(slots: dict[str, ModuleType]) -> type:
-    """The type of the arrays of an assembly: one for each, found in this module by its name, as compiled code
-    that is kept by its types must find it (kernels/tinting.py)."""
+    """The type of the arrays of an assembly: one for each, found in this module by its name, without
+    which another process would take it for another type and compile all loops over it again."""
     name = "Arrays_" + "_".join(module.__name__.replace(".", "_") for module in slots.values())
     if name not in globals():
         prefixed = [

@@ -291,6 +291,18 @@ def on_device(value):
     return type(value)(*map(on_device, value)) if hasattr(value, "_fields") else value
 
 
+def on_host(array) -> np.ndarray:
+    """An array of the device, copied here; one that lies here as it is."""
+    return array if isinstance(array, np.ndarray) else array.copy_to_host()
+
+
+def segments() -> ModuleType:
+    """The loops over rays of scenes of several instances."""
+    from fusedrf_cli.engine.kernels import cuda_segments
+
+    return cuda_segments
+
+
 def launch(kernel, threads: int, inputs: tuple, outputs: tuple) -> None:
     """Run a kernel with so many threads; its last arguments are the arrays, or tuples of them, it writes."""
     if threads:

@@ -40,6 +40,7 @@ class Instances(NamedTuple):
     step: object  # (B,) at which it is sampled, in its own coordinates
     spheres: object  # (B, 4) centre and radius around its occupied cells, in the scene's frame; or infinite
     space: object  # (B,) int64 of an instance without end its number among the spaces of these; else 0
+    shown: object  # (B, 4) what its density is multiplied by, and its colours: red, green and blue
 
 
 class Box(NamedTuple):
@@ -61,6 +62,7 @@ class Slots(NamedTuple):
     begin: object  # (N,) float64, where the ray's segment begins
     end: object  # (N,) float64, where it ends
     world_to_instance: object  # (B, 3, 4)
+    shown: object  # (B, 4), see Instances
     step: object  # float, in the coordinates of the instance
     early_stop: object  # float, the transmittance at which a ray ends
     rendered: object  # (N, 5) what lies before the segment, as `show_ray` leaves it
@@ -89,6 +91,7 @@ class PointQuery(NamedTuple):
     chosen: object  # (M,) int64
     instance: object  # int
     world_to_instance: object  # (B, 3, 4)
+    shown: object  # (B, 4), see Instances
     adds: object  # bool: densities add up, and colours by their shares
     with_colour: object  # bool
 
@@ -151,8 +154,10 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
     A sample sits in the middle of the steps it stands for. `pending` is the weight of samples too light to be
     shaded: the next one that is lends them its colour, at the end of the segment the last one.
     """
-    r, o, d, length = slot_ray(slots, slots.chosen[i])
-    step, far = slots.step, slots.reach[r, 1] * length
+    s = slots.chosen[i]
+    r, o, d, length = slot_ray(slots, s)
+    step, far, shown = slots.step, slots.reach[r, 1] * length, slots.shown[slots.instance[s]]
+    thick = shown[0]
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
     trans, pending, enough = 1.0 - out[r, 3], 0.0, COLOUR_FROM
@@ -167,11 +172,11 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
         index, many = next_sample(grid, origin, way, u0, u1, step, index)
         while index >= 0 and trans > slots.early_stop:
             u = u0 + 0.5 * between(index, many) * step
-            p, opacity, _, steps, place = met(
-                field, grid, (origin, way, warp), index, many, u, step, d, scratch
-            )
+            p = position_at(origin, way, u)
+            sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0:
-                weight = trans * opacity
+                tau = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
+                weight = trans * (1.0 - math.exp(-tau))
                 if slots.early_stop > 0.0 and trans - weight <= REST_FROM:
                     weight = trans
                 trans -= weight
@@ -188,9 +193,9 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
                     pending, enough = 0.0, LENT_FROM
             index = advance(field, grid, place, many, steps, index, p, way, u, u0, step)
             index, many = next_sample(grid, origin, way, u0, u1, step, index)
-    out[r, 0] += red + pending * c_r
-    out[r, 1] += green + pending * c_g
-    out[r, 2] += blue + pending * c_b
+    out[r, 0] += shown[1] * (red + pending * c_r)
+    out[r, 1] += shown[2] * (green + pending * c_g)
+    out[r, 2] += shown[3] * (blue + pending * c_b)
     out[r, 3] = 1.0 - trans
     out[r, 4] += depth / length
 
@@ -199,7 +204,7 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
     """The samples of slot chosen[i] that are not empty, up to where they alone would leave no light."""
     s = slots.chosen[i]
     r, o, d, length = slot_ray(slots, s)
-    step, far = slots.step, slots.reach[r, 1] * length
+    step, far, thick = slots.step, slots.reach[r, 1] * length, slots.shown[slots.instance[s], 0]
     trans, count, complete = 1.0 - slots.rendered[r, 3], 0, FARTHEST
     begun = entered(o, d, slots.reach[r, 0] * length)
     for _ in range(PIECES):
@@ -215,7 +220,7 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
             p = position_at(origin, way, u)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0 and sigma > 0.0:
-                depth = sigma * optical_length(warp, p, d, u, many, steps, step)
+                depth = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
                 low, high = interval(warp, u + 0.5 * (steps - 1) * many * step, steps * many * step)
                 out.low[s, count], out.high[s, count] = low / length, high / length
                 out.middle[s, count] = distance(warp, u) / length
@@ -235,6 +240,7 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
     `show_ray`."""
     s = slots.chosen[i]
     _, o, d, length = slot_ray(slots, s)
+    shown = slots.shown[slots.instance[s]]
     red, green, blue = 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
     pending, enough, ready = 0.0, COLOUR_FROM, False
@@ -251,17 +257,17 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
             green += pending * c_g
             blue += pending * c_b
             pending, enough = 0.0, LENT_FROM
-    out.rgb[s, 0] = red + pending * c_r
-    out.rgb[s, 1] = green + pending * c_g
-    out.rgb[s, 2] = blue + pending * c_b
+    out.rgb[s, 0] = shown[1] * (red + pending * c_r)
+    out.rgb[s, 1] = shown[2] * (green + pending * c_g)
+    out.rgb[s, 2] = shown[3] * (blue + pending * c_b)
 
 
 # -- points --------------------------------------------------------------------------------------------------
 
 
 def point_in_instance(field, grid, query, i):
-    """Point chosen[i] in the instance's space, the unit direction there, and how long a unit of the scene's
-    is along it; asks for the numbers that a later point will read."""
+    """Point chosen[i] in the instance's space, the unit direction there, and what densities there are times
+    in the scene's frame; asks for the numbers that a later point will read."""
     matrix, b, n = query.world_to_instance, query.instance, i + POINTS_AHEAD
     if n < query.chosen.shape[0]:
         p = point(ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[n])[0])
@@ -270,16 +276,17 @@ def point_in_instance(field, grid, query, i):
             if query.with_colour:
                 ahead_colour(field, field.params, 0, p)
     o, d, length = ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[i])
-    return point(o), (d[0] / length, d[1] / length, d[2] / length), length
+    p, d = point(o), (d[0] / length, d[1] / length, d[2] / length)
+    return p, d, rate(p, d) * length * query.shown[b, 0]
 
 
 def densest_at(field, grid, query, i, scratch, memory, out):
     """Enter an instance's density at point chosen[i] where it is the densest so far, or add it."""
     j = query.chosen[i]
-    p, d, length = point_in_instance(field, grid, query, i)
+    p, d, times = point_in_instance(field, grid, query, i)
     if known(field, grid, p):
         sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
-        sigma *= rate(p, d) * length
+        sigma *= times
         if steps > 0 and query.adds:
             out.sigma[j] += sigma
         elif steps > 0 and sigma > DENSER * out.sigma[j]:
@@ -289,22 +296,22 @@ def densest_at(field, grid, query, i, scratch, memory, out):
 def colour_at(field, grid, query, i, scratch, memory, out):
     """An instance's colour at point chosen[i], where it is the densest, or its share by density where they
     add up."""
-    j, share = query.chosen[i], 1.0
-    p, d, length = point_in_instance(field, grid, query, i)
+    j, share, shown = query.chosen[i], 1.0, query.shown[query.instance]
+    p, d, times = point_in_instance(field, grid, query, i)
     if query.adds:
         if not known(field, grid, p):
             return
         sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
         if steps == 0 or sigma <= 0.0:
             return
-        share = sigma * rate(p, d) * length / out.sigma[j]
+        share = sigma * times / out.sigma[j]
     else:
         place = again(field, out.cell[j], p)
     begin(field, d, scratch)
     c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
-    out.rgb[j, 0] += share * c_r
-    out.rgb[j, 1] += share * c_g
-    out.rgb[j, 2] += share * c_b
+    out.rgb[j, 0] += share * shown[1] * c_r
+    out.rgb[j, 1] += share * shown[2] * c_g
+    out.rgb[j, 2] += share * shown[3] * c_b
 
 
 # -- occupancy along a ray -----------------------------------------------------------------------------------

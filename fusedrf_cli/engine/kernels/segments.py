@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
+from numba import get_num_threads, prange
 
 from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER, FARTHEST
 from fusedrf_cli.engine.kernels.parts import along, body
@@ -17,10 +17,11 @@ from fusedrf_cli.engine.kernels.specialise import body as inlined
 from fusedrf_cli.engine.kernels.specialise import loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
-TILE = 256  # rays, which lie close together in pictures
+TILE, FEW = 256, 16  # rays, which lie close together in pictures
 PER_TASK = 1024
 GAP = 4.0  # steps: occupied cells that are no farther apart belong together
 ROUNDING = 1e-6  # of angles, in radians, and of distances, by which rays may come nearer than is reckoned
+TIED = 1e-12  # of a distance, by which is looked farther for what begins where another does
 DONE, SHARED = -1, -2  # of a ray's segment: there is none; several instances meet in it
 
 
@@ -45,6 +46,15 @@ class Segments(NamedTuple):
     meeting: object  # (N, W) int64, they in order, where that is room enough
 
 
+class Groups(NamedTuple):
+    """By which rules S slots are composed: where they do not add up, the densest counts. Slots of a ray that
+    belong to one group lie side by side."""
+
+    group: object  # (S,) int64 of each slot
+    adds: object  # (G,) bool, whether samples of a group add up
+    all_add: object  # bool, whether groups do
+
+
 next_in_box, next_in_space = (loops_for(None, (), s).names["next_change"] for s in (bounded, unbounded))
 ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
 
@@ -55,7 +65,7 @@ ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
 @body
 def bundle_of(rays, chosen, low, high):
     """A cone that holds the directions of rays chosen[low:high], and a ball that holds their origins: centre,
-    radius, axis and half angle."""
+    radius, axis, and sine and cosine of half its angle."""
     rays_o, rays_d, r = rays.rays_o, rays.rays_d, chosen[low]
     x, y, z = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
     dx, dy, dz, wide = 0.0, 0.0, 0.0, 0.0
@@ -66,24 +76,28 @@ def bundle_of(rays, chosen, low, high):
         wide = max(wide, ox * ox + oy * oy + oz * oz)
     length, least = math.sqrt(dx * dx + dy * dy + dz * dz), 1.0
     if length <= 0.0:
-        return (x, y, z), math.sqrt(wide), (1.0, 0.0, 0.0), math.pi
+        return (x, y, z), math.sqrt(wide), (1.0, 0.0, 0.0), (0.0, -1.0)
     dx, dy, dz = dx / length, dy / length, dz / length
     for i in range(low, high):
         r = chosen[i]
         least = min(least, rays_d[r, 0] * dx + rays_d[r, 1] * dy + rays_d[r, 2] * dz)
-    return (x, y, z), math.sqrt(wide), (dx, dy, dz), math.acos(max(least, -1.0))
+    least = max(least, -1.0)
+    return (x, y, z), math.sqrt(wide), (dx, dy, dz), (math.sqrt(max(1.0 - least * least, 0.0)), least)
 
 
 @body
-def bundle_may_reach(bundle, sphere):
-    """Whether a ray of a bundle, see `bundle_of`, may come into a sphere (centre and radius)."""
-    centre, wide, axis, angle = bundle
+def bundle_reaches(bundle, sphere):
+    """From which distance on a ray of a bundle, see `bundle_of`, may be in a sphere (centre and radius), or
+    FARTHEST where none comes there: a sphere is reached whose centre is no farther from the cone than its
+    radius."""
+    centre, wide, axis, (sine, cosine) = bundle
     x, y, z = sphere[0] - centre[0], sphere[1] - centre[1], sphere[2] - centre[2]
-    far, radius = math.sqrt(x * x + y * y + z * z), sphere[3] + wide
-    if far * (1 - ROUNDING) <= radius:
-        return True
-    off = math.acos(min(max((x * axis[0] + y * axis[1] + z * axis[2]) / far, -1.0), 1.0))
-    return off - math.asin(radius / far) <= angle + ROUNDING
+    square, radius = x * x + y * y + z * z, sphere[3] + wide
+    far, along_axis = math.sqrt(square), x * axis[0] + y * axis[1] + z * axis[2]
+    aside = math.sqrt(max(square - along_axis * along_axis, 0.0))
+    if cosine > 0.0 and aside * cosine - along_axis * sine > radius + ROUNDING * far:
+        return FARTHEST
+    return far * (1 - ROUNDING) - radius
 
 
 @body
@@ -98,20 +112,48 @@ def ray_reaches(rays, r, sphere, begin, end):
 
 
 @body
-def instances_near(rays, instances, chosen, low, high, near):
-    """The instances that rays chosen[low:high] may meet into near (B,), unbounded ones first: how many of
-    these, and how many in all."""
+def instances_near(rays, instances, chosen, low, high, near, begins):
+    """The instances that rays chosen[low:high] may meet into near (B,), unbounded ones first, the others by
+    where they may begin, which goes into begins (B,): how many are unbounded, and how many there are."""
     bundle, count = bundle_of(rays, chosen, low, high), 0
     for b in range(instances.step.shape[0]):
         if instances.spheres[b, 3] >= FARTHEST:
-            near[count] = b
+            near[count], begins[count] = b, -FARTHEST
             count += 1
     n_unbounded = count
     for b in range(instances.step.shape[0]):
-        if instances.spheres[b, 3] < FARTHEST and bundle_may_reach(bundle, instances.spheres[b]):
-            near[count] = b
-            count += 1
+        if instances.spheres[b, 3] < FARTHEST:
+            at = bundle_reaches(bundle, instances.spheres[b])
+            if at < FARTHEST:
+                near[count], begins[count] = b, at
+                count += 1
+    sort_by(begins, near, n_unbounded, count)
     return n_unbounded, count
+
+
+@body
+def fewer_near(rays, instances, chosen, low, high, near, begins, count, few, few_begin):
+    """Those of instances near[:count] that rays chosen[low:high], some of those that they are near to, may
+    meet, in the same order, into few (B,) and few_begin (B,): how many."""
+    bundle, left = bundle_of(rays, chosen, low, high), 0
+    for c in range(count):
+        unbounded = begins[c] <= -FARTHEST
+        if unbounded or bundle_reaches(bundle, instances.spheres[near[c]]) < FARTHEST:
+            few[left], few_begin[left] = near[c], begins[c]
+            left += 1
+    return left
+
+
+@body
+def sort_by(keys, values, low, high):
+    """Order keys[low:high], and values with them, by Shell's method with Ciura's gaps."""
+    for gap in (701, 301, 132, 57, 23, 10, 4, 1):
+        for i in range(low + gap, high):
+            key, value, j = keys[i], values[i], i
+            while j - gap >= low and keys[j - gap] > key:
+                keys[j], values[j] = keys[j - gap], values[j - gap]
+                j -= gap
+            keys[j], values[j] = key, value
 
 
 # -- the next segment of a ray -------------------------------------------------------------------------------
@@ -137,16 +179,21 @@ def occupied_from(rays, instances, b, r, begin, end):
 
 
 @body
-def first_two(rays, instances, r, near, low, high, begin, two):
+def first_two(rays, instances, r, near, begins, low, high, begin, two):
     """Those two of instances near[low:high], and of `two`, whose occupied cells come first on ray r from
-    `begin` on: (where the first begins, where the second does, the first, the second, a step of the
-    first)."""
+    `begin` on: (where the first begins, where the second does, the first, the second, a step of the first).
+    Of those that begin at one place, as all do in which the ray is already, the ones of the lowest numbers
+    come first, whatever order they are in."""
     for c in range(low, high):
-        at, step = occupied_from(rays, instances, near[c], r, begin, two[1])
-        if at < two[0]:
-            two = at, two[0], near[c], two[2], step
-        elif at < two[1]:
-            two = two[0], at, two[2], near[c], two[4]
+        end = two[1] + TIED * abs(two[1])
+        if begins[c] > end:
+            break
+        b = near[c]
+        at, step = occupied_from(rays, instances, b, r, begin, end)
+        if at < two[0] or (at == two[0] and b < two[2]):
+            two = at, two[0], b, two[2], step
+        elif at < two[1] or (at == two[1] and b < two[3]):
+            two = two[0], at, two[2], b, two[4]
     return two
 
 
@@ -160,11 +207,13 @@ def end_of_meeting(rays, instances, r, two, far):
 
 
 @body
-def note_meeting(rays, instances, r, near, count, begin, end, segments):
+def note_meeting(rays, instances, r, near, begins, count, begin, end, segments):
     """Enter those of instances near[:count] that have occupied cells on ray r between two distances, in
     order."""
     found, room = 0, segments.meeting.shape[1]
     for c in range(count):
+        if begins[c] > end:
+            break
         at, _ = occupied_from(rays, instances, near[c], r, begin, end)
         if at < end:
             k = min(found, room - 1)
@@ -176,33 +225,49 @@ def note_meeting(rays, instances, r, near, count, begin, end, segments):
     segments.n_meeting[r] = found
 
 
+@body
+def segment_of(rays, instances, r, near, begins, n_unbounded, count, segments):
+    """Enter the next segment of ray r, which may meet instances near[:count], n_unbounded of them without
+    end."""
+    begin, far = segments.end[r], rays.reach[r, 1]
+    two = far, far, DONE, DONE, 0.0
+    two = first_two(rays, instances, r, near, begins, n_unbounded, count, begin, two)
+    segments.alone_from[r], segments.alone_to[r] = begin, begin
+    if n_unbounded == 1 and (two[2] == DONE or two[0] - begin > GAP * two[4]):
+        begin = two[0]
+        segments.alone_to[r] = begin
+    if begin < far:
+        two = first_two(rays, instances, r, near, begins, 0, n_unbounded, begin, two)
+    segments.begin[r] = max(begin, two[0] - two[4])  # what was walked over need not be walked over again
+    segments.instance[r] = two[2]
+    if two[2] != DONE:
+        if two[3] == DONE or two[1] - two[0] > GAP * two[4]:
+            segments.end[r] = two[1]
+        else:
+            segments.instance[r], segments.end[r] = SHARED, end_of_meeting(rays, instances, r, two, far)
+            note_meeting(rays, instances, r, near, begins, count, begin, segments.end[r], segments)
+
+
 @task
-def segment_task(rays, instances, chosen, low, high, near, segments):
-    """`next_segments` of rays chosen[low:high]; near (B,) is room."""
-    n_unbounded, count = instances_near(rays, instances, chosen, low, high, near)
-    for i in range(low, high):
-        r = chosen[i]
-        begin, far = segments.end[r], rays.reach[r, 1]
-        two = first_two(rays, instances, r, near, n_unbounded, count, begin, (far, far, DONE, DONE, 0.0))
-        segments.alone_from[r], segments.alone_to[r] = begin, begin
-        if n_unbounded == 1 and (two[2] == DONE or two[0] - begin > GAP * two[4]):
-            begin = two[0]
-            segments.alone_to[r] = begin
-        if begin < far:
-            two = first_two(rays, instances, r, near, 0, n_unbounded, begin, two)
-        segments.begin[r] = max(begin, two[0] - two[4])  # what was walked over need not be walked over again
-        segments.instance[r] = two[2]
-        if two[2] != DONE:
-            if two[3] == DONE or two[1] - two[0] > GAP * two[4]:
-                segments.end[r] = two[1]
-            else:
-                segments.instance[r], segments.end[r] = SHARED, end_of_meeting(rays, instances, r, two, far)
-                note_meeting(rays, instances, r, near, count, begin, segments.end[r], segments)
+def segment_task(rays, instances, chosen, low, high, near, begins, few, few_begin, segments):
+    """`next_segments` of rays chosen[low:high]; near, begins, few and few_begin (B,) are room."""
+    n_unbounded, count = instances_near(rays, instances, chosen, low, high, near, begins)
+    for start in range(low, high, FEW):
+        stop = min(high, start + FEW)
+        left = fewer_near(rays, instances, chosen, start, stop, near, begins, count, few, few_begin)
+        for i in range(start, stop):
+            segment_of(rays, instances, chosen[i], few, few_begin, n_unbounded, left, segments)
+
+
+def next_segments(rays, instances, spaces, chosen, segments):
+    """The next segments of rays chosen (M,), from where their last ended. spaces are those that instances
+    without end lie in, as Instances.space counts them."""
+    segments_loop_in(spaces)(rays, instances, chosen, get_num_threads(), segments)
 
 
 @loop
-def next_segments(rays, instances, chosen, threads, segments):
-    """The next segments of rays chosen (M,), from where their last ended."""
+def segments_loop(rays, instances, chosen, threads, segments):
+    """`next_segments` by so many threads."""
     n = chosen.shape[0]
     tasks = (n + TILE - 1) // TILE
     each_has = (tasks + threads - 1) // threads
@@ -210,8 +275,10 @@ def next_segments(rays, instances, chosen, threads, segments):
         part = turn % each_has * threads + turn // each_has
         low, high = part * TILE, min(n, (part + 1) * TILE)
         if low < high:
-            near = np.empty(instances.step.shape[0], np.int64)
-            segment_task(rays, instances, chosen, low, high, near, segments)
+            count = instances.step.shape[0]
+            near, few = np.empty(count, np.int64), np.empty(count, np.int64)
+            begins, few_begin = np.empty(count), np.empty(count)
+            segment_task(rays, instances, chosen, low, high, near, begins, few, few_begin, segments)
 
 
 # -- other spaces than bounded and unbounded ones ------------------------------------------------------------
@@ -224,28 +291,28 @@ def next_in_either(instances, b, o, d, t, end, gap):
     return next_in_others(instances, b, o, d, t, end, gap)
 
 
+def next_in_any(changes, tag, compiled):
+    """`next_change` of instances in several spaces, by that of each, as `compiled` makes functions."""
+    found = changes[-1]
+    for number in range(len(changes) - 2, -1, -1):
+        names = {"next_in_this": changes[number], "next_in_others": found, "NUMBER": number}
+        found = compiled(rebound(next_in_either, names, f"{tag}_{number}"))
+    return found
+
+
 @cache
-def next_segments_in(spaces: tuple[ModuleType, ...]):
-    """`next_segments` for scenes whose instances that have no sphere around them lie in some spaces, which
-    Instances.space counts. What most scenes have is compiled without the others."""
+def segments_loop_in(spaces: tuple[ModuleType, ...]):
+    """`segments_loop` for instances in some spaces. What most scenes have is compiled without the others."""
     if spaces in ((), (unbounded,)):
-        return next_segments
+        return segments_loop
     loops = [loops_for(None, (), space) for space in spaces]
-    found, tag = loops[-1].names["next_change"], loops[-1].tag
-    for number in range(len(spaces) - 2, -1, -1):
-        tag = f"{loops[number].tag}_{tag}"
-        names = {
-            "next_in_this": loops[number].names["next_change"],
-            "next_in_others": found,
-            "NUMBER": number,
-        }
-        found = task(rebound(next_in_either, names, tag))
-    names = globals() | {"next_in_space": found}
-    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting):
+    tag = "_".join(each.tag for each in loops)
+    names = globals() | {"next_in_space": next_in_any([one.names["next_change"] for one in loops], tag, task)}
+    for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting, segment_of):
         name = function.py_func.__name__
         names[name] = inlined(rebound(function.py_func, names, tag))
     names["segment_task"] = task(rebound(segment_task.py_func, names, tag))
-    return loop(rebound(next_segments.py_func, names, tag))
+    return loop(rebound(segments_loop.py_func, names, tag))
 
 
 # -- slots and rays ------------------------------------------------------------------------------------------
@@ -271,16 +338,27 @@ def sort_slots(chosen, instance, field_of, ends, order):
             ends[f] += 1
 
 
+@body
+def goes_on(r, rays, segments, rendered, early_stop):
+    """Whether ray r goes on behind its segment. One whose segment has no length does not: it would never come
+    any farther."""
+    moved = segments.instance[r] != DONE and segments.end[r] > segments.alone_from[r]
+    return moved and segments.end[r] < rays.reach[r, 1] and rendered[r, 3] < 1.0 - early_stop
+
+
+def rays_left(chosen, rays, segments, rendered, early_stop):
+    """Those of rays chosen (M,) that go on behind their segments."""
+    left = np.empty_like(chosen)
+    return left[: rays_left_task(chosen, rays, segments, rendered, early_stop, left)]
+
+
 @task
-def rays_left(chosen, rays, segments, rendered, early_stop, left):
-    """Those of rays chosen (M,) that go on behind their segments into left (M,): how many. A ray whose
-    segment has no length ends: it would never come any farther."""
+def rays_left_task(chosen, rays, segments, rendered, early_stop, left):
+    """`rays_left` into left (M,): how many."""
     count = 0
     for i in range(chosen.shape[0]):
-        r = chosen[i]
-        moved = segments.instance[r] != DONE and segments.end[r] > segments.alone_from[r]
-        if moved and segments.end[r] < rays.reach[r, 1] and rendered[r, 3] < 1.0 - early_stop:
-            left[count] = r
+        if goes_on(chosen[i], rays, segments, rendered, early_stop):
+            left[count] = chosen[i]
             count += 1
     return count
 
@@ -370,21 +448,16 @@ def merge_ray(traces, group, adds, all_add, s0, s1, r, early_stop, segment_end, 
 @task
 def merge_task(shared, start, low, high, early_stop, groups, traces, segment_end, out):
     """`merge_samples` for rays shared[low:high]."""
-    group, adds, all_add = groups
     for m in range(low, high):
-        s0, s1 = start[m], start[m + 1]
-        merge_ray(traces, group, adds, all_add, s0, s1, shared[m], early_stop, segment_end, out)
+        s0, s1, r = start[m], start[m + 1], shared[m]
+        merge_ray(traces, groups.group, groups.adds, groups.all_add, s0, s1, r, early_stop, segment_end, out)
 
 
 @loop
 def merge_samples(shared, start, early_stop, groups, traces, segment_end, out):
     """Composite the samples of rays shared (M,), slots start[m] to start[m + 1] of the m-th, as piecewise
     constant densities behind what out (N, 5) has. Leaves in traces.weight what each takes of the light, and
-    in segment_end (N,) how far that went.
-
-    groups is (the group of each slot (S,), whether samples of a group add up (G,), whether groups do): where
-    they do not, the densest counts. Slots of a ray that belong to one group lie side by side.
-    """
+    in segment_end (N,) how far that went."""
     m = shared.shape[0]
     for part in prange((m + PER_TASK - 1) // PER_TASK):
         low, high = part * PER_TASK, min(m, (part + 1) * PER_TASK)

@@ -13,11 +13,10 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, light, loops, parts, tinting
+from fusedrf_cli.engine.kernels import instances, light, loops, parts
 from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
 
 ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": task, "sweep_task": task}
-TINTED = "TINTED"  # among the sizes of a field that has tints
 body = njit(**FLAGS, forceinline=True, _nrt=False)
 
 
@@ -64,8 +63,6 @@ def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleT
     names, functions = namespace(bodies, space)
     if getattr(space, "CURVED", False) and names["advance"] is not loops.advance:
         raise ValueError(f"{bodies.__name__} follows straight rays, which {space.__name__} has none of")
-    if TINTED in sizes:
-        functions = tinting.tinted(functions)
     names |= sizes
     tag = combination(bodies, sizes, space, names)
     for name, function in functions.items():

@@ -109,10 +109,10 @@ def lattice_of(scene: ComposedField) -> Lattice | None:
     """The lattice of a scene of one field that is neither turned nor stretched; None where there is none."""
     placed = scene.placed[0]
     matrix = placed.object_to_world
-    if len(scene.placed) > 1 or not np.array_equal(matrix[:3, :3], np.eye(3)):
+    if len(scene.placed) > 1 or not placed.as_it_is or not np.array_equal(matrix[:3, :3], np.eye(3)):
         return None
     field = opened(placed.field)
-    if getattr(field, "resolution", None) is None or field.tints is not None:
+    if getattr(field, "resolution", None) is None:
         return None
     origin = matrix[:3, 3]
     everywhere = field.with_occupancy(OccupancyGrid.full(field.aabb))

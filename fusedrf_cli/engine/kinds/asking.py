@@ -75,12 +75,7 @@ def density(source, places: np.ndarray, space: ModuleType | None = None) -> np.n
         points = space.placed(torch.from_numpy(places[part]))
         for axis in axes:
             dirs = torch.from_numpy(np.broadcast_to(axis, points.shape).copy())
-            if isinstance(source, Placed):
-                x, d, stretch = source.to_object(points, dirs)
-                sigma = source.field.query(x, d, False)[0].double() * stretch
-            else:
-                sigma = source.query(points, dirs, False)[0].double()
-            found[part] += sigma.numpy() / len(axes)
+            found[part] += source.query(points, dirs, False)[0].double().numpy() / len(axes)
     return found / space.rates(torch.from_numpy(places)).numpy()
 
 

@@ -80,7 +80,9 @@ class BoxKind(Kind):
         if way.sh_degree is not None and "sh_degree" in self.reduces:
             shape = replace(shape, sh_degree=min(shape.sh_degree, way.sh_degree))
         bare = type(outline)(shape, box, resolution, *unit, outline.params, outline.occupancy)
-        sections = [Section(part.name, bare.stored_shape(part)) for part in bare.parts]
+        on_vertices = any(part.on_vertices for part in bare.parts)
+        used = int(np.count_nonzero(bare.used)) if on_vertices else 0
+        sections = [Section(part.name, bare.stored_shape(part, used)) for part in bare.parts]
 
         def make(field: BoxField) -> BoxField:
             small = field if same else field.resampled(box, resolution)

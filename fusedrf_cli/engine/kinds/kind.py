@@ -5,7 +5,6 @@ it is here: it is then trained from photos, distilled from any scene, grown, edi
 """
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
 from fusedrf_cli.engine.fields.base import FieldNeeds, RadianceField, StoredField
 from fusedrf_cli.engine.fields.box import BoxField
-from fusedrf_cli.engine.fields.computed import WHITE, ComputedField, Reads
+from fusedrf_cli.engine.fields.computed import ComputedField, Reads
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
@@ -182,15 +181,3 @@ class Kind:
         if not isinstance(field, BoxField):
             raise ValueError(f"a field of kind '{self.name}' cannot be taken apart; convert it to kind 'vm'")
         return field
-
-    def thinned(self, field: StoredField, factor: float) -> StoredField:
-        """A field with so many times the density everywhere. Raises ValueError where the kind has no such."""
-        other = copy(self.on_one_grid(field))
-        other.scale = field.scale * factor
-        return other._afresh("arrays")
-
-    def tinted(self, field: StoredField, tint: tuple[float, float, float]) -> StoredField:
-        """A field whose colours are multiplied by r, g, b."""
-        other = copy(field)
-        other.tint = tuple(np.multiply(field.tint or WHITE, tint).tolist())
-        return other._afresh("arrays", "loops")

@@ -360,7 +360,7 @@ class Student:
         scene = self.scene
         if before is not None:
             return self.kind.grown(before, plan).with_occupancy(scene.occupancy), "a smaller student"
-        if background is not None:
+        if background is not None and background.as_it_is:
             taken = self.kind.taken_over(background, plan, scene, generator)
             if taken is not None:
                 return taken, f"the weights of '{background.name}'"

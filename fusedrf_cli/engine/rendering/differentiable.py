@@ -16,7 +16,7 @@ from fusedrf_cli.engine.composition.differentiable import (
     Poses,
     bounds,
     device_of,
-    numbers,
+    needs_gradient,
     parts,
     query,
     structure,
@@ -95,13 +95,6 @@ def render_rays(
     columns = torch.cat([rgb, torch.ones_like(sigma)[:, None], ts.to(sigma.dtype)[:, None]], 1)
     found = sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
     return in_lengths(found, per_length)
-
-
-def needs_gradient(field: RadianceField, *inputs: torch.Tensor) -> bool:
-    """Whether a gradient is wanted of anything that a rendering follows from."""
-    if not torch.is_grad_enabled():
-        return False
-    return any(x.requires_grad for x in inputs) or any(p.requires_grad for p in numbers(field))
 
 
 def seen_from(

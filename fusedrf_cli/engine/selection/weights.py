@@ -7,7 +7,6 @@ from fusedrf_cli.engine.composition.composite import Composite, Waves
 from fusedrf_cli.engine.fields.base import RadianceField, sampling_step
 from fusedrf_cli.engine.fields.computed import exact
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, mapped
-from fusedrf_cli.engine.kernels import segments
 from fusedrf_cli.engine.kernels.instances import FARTHEST, Traces
 from fusedrf_cli.engine.kernels.segments import DONE, RayBatch
 from fusedrf_cli.engine.rendering.volume import RenderConfig, reach_of, waves, weights_from_depths
@@ -94,27 +93,29 @@ class WeightWaves(Waves):
 
     def go_on(self) -> bool:
         """See Waves. A segment that an unbounded instance has alone is a wave of its own."""
-        left, found = self.left, self.find(self.left)
+        left = self.left
+        self.find(left)
+        found, host = self.here(), self.loops.on_host
         alone = left[found.alone_to[left] > found.alone_from[left]]
         if len(alone):
             found.begin[alone], found.end[alone] = found.alone_from[alone], found.alone_to[alone]
-            found.instance[alone] = self.unbounded[alone]
+            found.instance[alone] = host(self.unbounded)[alone]
         single = left[found.instance[left] >= 0]
         found.meeting[single, 0], found.n_meeting[single] = found.instance[single], 1
+        self.segments = self.loops.on_device(found)
         for part in self.parts(left[found.instance[left] != DONE]):
             self.show_shared(part)
-        after = np.empty_like(left)
-        count = segments.rays_left(left, self.rays, found, self.out, self.early_stop, after)
-        self.left = after[:count]
-        return count > 0
+        self.left = self.segment_loops.rays_left(left, self.rays, self.segments, self.out, self.early_stop)
+        return len(self.left) > 0
 
     def add_samples(
         self, shared: np.ndarray, start: np.ndarray, slots: tuple, ends: tuple, traces: Traces
     ) -> None:
         """See Waves: count them."""
-        chosen, ray, _ = slots
-        there = np.arange(traces.weight.shape[1]) < traces.count[chosen][:, None]
-        slot, sample = np.nonzero(there & (traces.weight[chosen] > 0))
-        ray, distance = ray[slot], traces.middle[slot, sample]
-        points = self.rays.rays_o[ray] + distance[:, None] * self.rays.rays_d[ray]
-        self.tally.add(points, traces.weight[slot, sample], self.inside[ray])
+        host, (chosen, ray, _) = self.loops.on_host, slots
+        weight, count = host(traces.weight), host(traces.count)
+        there = np.arange(weight.shape[1]) < count[chosen][:, None]
+        slot, sample = np.nonzero(there & (weight[chosen] > 0))
+        ray, distance = host(ray)[slot], host(traces.middle)[slot, sample]
+        points = host(self.rays.rays_o)[ray] + distance[:, None] * host(self.rays.rays_d)[ray]
+        self.tally.add(points, weight[slot, sample], self.inside[ray])

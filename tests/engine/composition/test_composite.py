@@ -1,6 +1,7 @@
 """The composite against the naive composition, which asks every field at every sample, and against slow loops
 of its own: any kinds, rules and spaces mixed."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -73,9 +74,10 @@ SPOTS = {
 
 
 def scenes(pair: str, spots: str, rule: str) -> tuple[Composite, ComposedField]:
-    """Two placed fields, composed by both: by the second one sampled evenly, in all of space too."""
-    fields = PAIRS[pair]()
-    placed = [Placed(f"n{i}", f, m) for i, (f, m) in enumerate(zip(fields, SPOTS[spots], strict=True))]
+    """Two placed fields, one as it is, composed by both: by the second one sampled evenly, in all of space
+    too."""
+    (one, other), (here, there) = PAIRS[pair](), SPOTS[spots]
+    placed = [Placed("n0", one, here), Placed("n1", other, there, 0.8, (0.9, 0.4, 1.0))]
     naive = ComposedField(placed, rule)
     naive.__dict__["occupancy"] = naive.occupancy.marked(naive.occupancy.occupied)
     return Composite(placed, rule), naive
@@ -173,7 +175,8 @@ def test_a_placed_field_shows_what_it_shows_in_its_own_frame(matrix):
 def test_a_scene_a_million_of_its_sizes_away_is_the_same():
     near, _ = scenes("vm and sparse", "in one another", "max")
     away = np.array([1e6, -2e6, 0.5e6])
-    placed = [Placed(p.name, p.field, p.object_to_world + away_by(near.origin + away)) for p in near.placed]
+    shift = away_by(near.origin + away)
+    placed = [replace(p, object_to_world=p.object_to_world + shift) for p in near.placed]
     far, (rays_o, rays_d) = Composite(placed), same_rays(near, *some_rays())
     moved = rays_o + (near.origin + away) - far.origin
     assert_same(render_rays(far, moved, rays_d), render_rays(near, rays_o, rays_d), 1e-4)
@@ -256,8 +259,25 @@ def test_segments_do_not_depend_on_the_number_of_threads(threads, monkeypatch):
     scene, _ = scenes("unbounded and vm", "in one another", "max")
     rays_o, rays_d = same_rays(scene, *some_rays(2000))
     wanted = render_rays(scene, rays_o, rays_d)
-    monkeypatch.setattr("fusedrf_cli.engine.composition.composite.get_num_threads", lambda: threads)
+    monkeypatch.setattr("fusedrf_cli.engine.kernels.segments.get_num_threads", lambda: threads)
     assert np.array_equal(render_rays(scene, rays_o, rays_d), wanted)
+
+
+def test_rays_through_a_crowd_do_not_depend_on_their_company():
+    """Which instances are looked for, and in what order, goes by rays that lie side by side."""
+    rng, field = np.random.default_rng(4), blob("vm")
+    spots = [affine(0.3 * turn(rng.uniform(0, 360)), rng.uniform(-1.5, 1.5, 3)) for _ in range(40)]
+    placed = [Placed(f"n{i}", field, spot) for i, spot in enumerate([*spots, spots[7]])]
+    scene = Composite([Placed("around", surroundings(), np.eye(4)), *placed])
+    rays_o, rays_d = same_rays(scene, *some_rays(600))
+    together, order = render_rays(scene, rays_o, rays_d), rng.permutation(600)
+    assert np.array_equal(render_rays(scene, rays_o[order], rays_d[order]), together[order])
+    assert np.array_equal(render_rays(scene, rays_o[:1], rays_d[:1]), together[:1])
+    crowd, naive = Composite(placed), ComposedField(placed)
+    rays = same_rays(crowd, *some_rays(200))
+    truth = naively(naive, *rays, sampling_step(crowd) / 8)
+    found = render_rays(crowd, *rays, step=sampling_step(crowd) / 4, early_stop=1e-4)
+    assert truth[:, 3].max() > 0.5 and np.sqrt(np.mean((found - truth)[:, :4] ** 2)) < 1e-2
 
 
 def test_copies_that_are_posed_otherwise_lie_there():

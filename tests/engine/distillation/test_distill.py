@@ -3,6 +3,7 @@
 import contextlib
 import json
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, texels
 from fusedrf_cli.engine.kinds.student import DistilConfig, finest_within
 from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import way_of
 from tests.analytic.rays import affine, turn
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, points_in, random_vm, unit
@@ -28,7 +30,8 @@ SAMPLER = RaySampler([TEACHER.occupancy.tight_aabb(0)])
 SETTINGS = DistilConfig(
     rays=4000, steps=60, points_per_step=1 << 13, rgb_steps=30, rgb_samples=1 << 13, views=2, view_size=32
 )
-NUMBERS = THIRTY_TWO.size(texels(BOX, 32))
+numbers = partial(VMField.size_of, THIRTY_TWO)
+NUMBERS = numbers(texels(BOX, 32))
 WAY = way_of(THIRTY_TWO)
 
 
@@ -249,10 +252,10 @@ def test_a_turned_background_cannot_be_taken_over(linear):
 
 
 def test_resolution_is_the_teachers_or_what_fits():
-    assert finest_within(BOX, 0.1, THIRTY_TWO.size, 10**9) == texels(BOX, 23)
-    tight = THIRTY_TWO.size(texels(BOX, 40))
-    found = finest_within(BOX, 1e-3, THIRTY_TWO.size, tight)
-    assert 0.9 * tight < THIRTY_TWO.size(found) <= tight
+    assert finest_within(BOX, 0.1, numbers, 10**9) == texels(BOX, 23)
+    tight = numbers(texels(BOX, 40))
+    found = finest_within(BOX, 1e-3, numbers, tight)
+    assert 0.9 * tight < numbers(found) <= tight
 
 
 def test_pruned_drops_empty_cells_only():

@@ -23,8 +23,7 @@ SCRIPT = """
 import numpy as np, sys, torch
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.kernels.loops import Answers, Points
-from fusedrf_cli.engine.kernels.specialise import TINTED, Loops
-from fusedrf_cli.engine.kernels.tinting import with_tints
+from fusedrf_cli.engine.kernels.specialise import Loops
 from fusedrf_cli.engine.spaces import bounded
 sys.path.insert(0, {folder!r})
 import toy
@@ -35,10 +34,8 @@ with kernels.telling_of_compilation(lambda: told.append(1)):
     for rank in map(int, sys.argv[1:]):
         found = Answers(np.zeros(1), np.zeros((1, 3)))
         asked = Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
-        sizes, arrays = {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}, field
-        if {tinted}:
-            sizes[TINTED], arrays = 1, with_tints(field, np.full((1, 3), 0.4))
-        Loops(toy, sizes, bounded).each("query_point", arrays, grid, asked, 1, found)
+        sizes = {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}
+        Loops(toy, sizes, bounded).each("query_point", field, grid, asked, 1, found)
         print(found.sigma[0], found.rgb[0, 0])
 print(len(told))
 """
@@ -67,8 +64,8 @@ def ask(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
 
-    def run(*ranks: int, tinted: bool = False, script: str = SCRIPT) -> list[str]:
-        script = script.format(folder=str(tmp_path), tinted=tinted)
+    def run(*ranks: int, script: str = SCRIPT) -> list[str]:
+        script = script.format(folder=str(tmp_path))
         command = [sys.executable, "-c", script, *map(str, ranks)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
@@ -82,12 +79,6 @@ def test_sizes_have_code_of_their_own_and_a_second_process_compiles_nothing(ask)
     """Two sizes of one kind, in one cache: without a name of its own one would load the other's code."""
     assert ask(8, 16) == ["8.0 0.25", "16.0 0.25", "1"]
     assert ask(16, 8) == ["16.0 0.25", "8.0 0.25", "0"]
-
-
-def test_a_second_process_compiles_nothing_of_a_field_with_tints(ask):
-    """Its arrays are of a type made while running, which is to be found again by its name."""
-    assert ask(8, tinted=True) == ["8.0 0.1", "1"]
-    assert ask(8, tinted=True) == ["8.0 0.1", "0"]
 
 
 PARTS = """

@@ -9,8 +9,17 @@ import torch
 from fusedrf_cli.engine.decoders import density_sum, sh
 from fusedrf_cli.engine.encodings import grid
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
+from fusedrf_cli.engine.settings import current
 
-DENSITY_RATE, COLOUR_RATE = 60.0, 10.0  # a vertex is touched seldom; slower ones leave haze for long
+
+@dataclass(frozen=True)
+class DenseConfig:
+    """How fast the vertices of a grid learn."""
+
+    density_rate: float = 60.0
+    """A vertex is touched seldom; slower ones leave haze for long."""
+    colour_rate: float = 10.0
+    """Likewise."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +58,11 @@ class DenseField(AssembledField):
     @classmethod
     def slots_of(cls, shape: DenseShape) -> dict[str, Slot]:
         """See AssembledField."""
+        config = current(DenseConfig)
         harmonics = {"width": shape.width, "coefficients": shape.coefficients}
         return {
-            "density": Slot(grid, {"numbers": 1}, "density", DENSITY_RATE),
-            "colour": Slot(grid, {"numbers": shape.numbers}, "colour", COLOUR_RATE),
+            "density": Slot(grid, {"numbers": 1}, "density", config.density_rate),
+            "colour": Slot(grid, {"numbers": shape.numbers}, "colour", config.colour_rate),
             "sigma": Slot(density_sum),
             "rgb": Slot(sh, harmonics),
         }

@@ -6,10 +6,18 @@ from dataclasses import dataclass, replace
 from fusedrf_cli.engine.decoders import density_sum, sh_mlp
 from fusedrf_cli.engine.encodings import grid
 from fusedrf_cli.engine.fields.assembled import Slot
-from fusedrf_cli.engine.kinds.dense.field import COLOUR_RATE, DENSITY_RATE, DenseField
+from fusedrf_cli.engine.kinds.dense.field import DenseConfig, DenseField
+from fusedrf_cli.engine.settings import current
 
-DECODER_RATE = 0.05  # 1e-3 where features learn at 2e-2, as other networks of the kind
-FEATURE_SPREAD = 0.1  # features that were all alike would never come apart
+
+@dataclass(frozen=True)
+class DenseMLPConfig:
+    """How features and their network begin and learn."""
+
+    decoder_rate: float = 0.05
+    """1e-3 where features learn at 2e-2, as other networks of the kind."""
+    feature_spread: float = 0.1
+    """Features that were all alike would never come apart."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +48,16 @@ class DenseMLPField(DenseField):
     @classmethod
     def slots_of(cls, shape: DenseMLPShape) -> dict[str, Slot]:
         """See AssembledField."""
+        densemlp = current(DenseMLPConfig)
+        config = current(DenseConfig)
         layers = {"width": shape.width, "hidden": shape.hidden}
         return {
-            "density": Slot(grid, {"numbers": 1}, "density", DENSITY_RATE),
-            "colour": Slot(grid, {"numbers": shape.width}, "colour", COLOUR_RATE, FEATURE_SPREAD),
+            "density": Slot(grid, {"numbers": 1}, "density", config.density_rate),
+            "colour": Slot(
+                grid, {"numbers": shape.width}, "colour", config.colour_rate, densemlp.feature_spread
+            ),
             "sigma": Slot(density_sum),
-            "rgb": Slot(sh_mlp, layers, "decoder.", 0.0 if shape.shared else DECODER_RATE),
+            "rgb": Slot(sh_mlp, layers, "decoder.", 0.0 if shape.shared else densemlp.decoder_rate),
         }
 
     def sharing(self, other: "DenseMLPField") -> "DenseMLPField":

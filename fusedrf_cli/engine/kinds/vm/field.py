@@ -12,6 +12,7 @@ from math import prod
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
@@ -21,7 +22,6 @@ from fusedrf_cli.engine.fields.computed import (
     FEW_CELLS,
     PER_CELL,
     PER_CELL_MADE,
-    WHITE,
     Reads,
     packed_bits,
     runs_of,
