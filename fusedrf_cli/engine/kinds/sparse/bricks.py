@@ -14,13 +14,23 @@ from scipy import sparse
 from fusedrf_cli.engine.encodings.bricks import COARSE, SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.reference import OCTANTS
+from fusedrf_cli.engine.settings import current
+
+
+@dataclass(frozen=True)
+class BrickLimits:
+    """How large a tree of bricks may be."""
+
+    top_cells: int = 1 << 22
+    bricks: int = 1 << 22
+    entries: int = 1 << 26
+    """Of all top cells' tables: 256 MB."""
+    entries_at_once: int = 1 << 20
+    """While they are filled."""
+
 
 MAX_LEVEL = 7
-MAX_TOP_CELLS = 1 << 22
 LONGEST = (1 << 20) // (SIDE << MAX_LEVEL)  # top cells along an axis: places in units fit in 21 bits
-MAX_ENTRIES = 1 << 26  # of all top cells' tables: 256 MB
-ENTRIES_AT_ONCE = 1 << 20  # while they are filled
-MAX_BRICKS = 1 << 22
 
 EMPTY, BRICK, SPLIT = 0, 1, 2
 MORTON_SPREAD = (  # shifts and masks that put two zeros behind each of 21 bits
@@ -167,15 +177,16 @@ class BrickTree:
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(offset (X, Y, Z) int64, depth (X, Y, Z) uint8, table (E,) int32) as encodings/bricks.py has
         them. Raises ValueError where they would be too large."""
+        limits = current(BrickLimits)
         depth = np.zeros(self.counts, np.uint8)
         held = np.zeros(self.counts, bool)
         for level in range(self.depth + 1):
             cell = tuple((self.at[self.level == level] >> level).T)
             depth[cell], held[cell] = level, True
         sizes = np.where(held, 1 << (3 * depth.astype(np.int64)), 0)
-        if sizes.sum() > MAX_ENTRIES:
+        if sizes.sum() > limits.entries:
             raise ValueError(
-                f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {MAX_ENTRIES:,}"
+                f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {limits.entries:,}"
             )
         offset = np.where(held, (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape), -1)
         table = np.empty(int(sizes.sum()), np.int32)
@@ -416,6 +427,7 @@ class Lattice:
 def table_entries(nodes: np.ndarray, top: int) -> tuple[int, int]:
     """How many entries the tables of `top` top cells have, at most, and how deep these go, as their nodes'
     codes tell (`packed`)."""
+    limits = current(BrickLimits)
     code = np.unpackbits(nodes).reshape(-1, 2)
     split = (code[:, 0] == 1) & (code[:, 1] == 0)
     level, start, count, cells = 0, 0, top, 0
@@ -424,7 +436,7 @@ def table_entries(nodes: np.ndarray, top: int) -> tuple[int, int]:
         cells = inner if level == 0 else cells
         start, count, level = start + count, 8 * inner, level + 1
     depth = min(level - 1, MAX_LEVEL)
-    return min(top + cells * 8**depth, MAX_ENTRIES), depth
+    return min(top + cells * 8**depth, limits.entries), depth
 
 
 def sides(top) -> np.ndarray:
@@ -434,9 +446,10 @@ def sides(top) -> np.ndarray:
 
 def check_counts(counts) -> None:
     """Raise ValueError where there are more top cells than a tree may have."""
-    if max(counts) > LONGEST or np.prod(np.asarray(counts, np.float64)) > MAX_TOP_CELLS:
+    limits = current(BrickLimits)
+    if max(counts) > LONGEST or np.prod(np.asarray(counts, np.float64)) > limits.top_cells:
         raise ValueError(
-            f"counts should be at most {LONGEST} top cells each and {MAX_TOP_CELLS} in all, found "
+            f"counts should be at most {LONGEST} top cells each and {limits.top_cells} in all, found "
             f"{list(counts)}"
         )
 
@@ -501,11 +514,12 @@ def fill_cubes(
 ) -> None:
     """Write values (M,) into the entries that nodes (M, 3) of a level cover, in those top cells that have a
     table."""
+    limits = current(BrickLimits)
     cell = nodes >> level
     start, deep = offset[tuple(cell.T)], depth[tuple(cell.T)].astype(np.int64)
     for finer in range(MAX_LEVEL - level + 1):
         reached = np.flatnonzero((start >= 0) & (deep == level + finer))
-        at_once = max(1, ENTRIES_AT_ONCE >> 3 * finer)
+        at_once = max(1, limits.entries_at_once >> 3 * finer)
         for first in range(0, len(reached), at_once):
             own = reached[first : first + at_once]
             a, b, c = ((nodes[own] - (cell[own] << level)) << finer).T
