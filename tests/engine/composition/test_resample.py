@@ -10,14 +10,9 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.asking import colours, even_directions
-from fusedrf_cli.engine.kinds.sparse.bricks import (
-    MAX_LEVEL,
-    BrickTree,
-    Lattice,
-    key_places,
-    node_keys,
-)
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, BrickTree, key_places, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseShape
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.kinds.sparse.resample import (
     at_vertices,
     frame_of,

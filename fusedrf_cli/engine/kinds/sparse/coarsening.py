@@ -5,9 +5,10 @@ import torch
 
 from fusedrf_cli.engine.kinds.asking import density_features, dilated
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, Lattice, node_keys
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.kinds.student import Contents, Section
 from fusedrf_cli.engine.spaces import bounded
 

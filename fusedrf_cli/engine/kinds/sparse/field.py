@@ -35,13 +35,8 @@ from fusedrf_cli.engine.kernels.light import Exposure, Light
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kernels.reference import exact as exact_tensor
 from fusedrf_cli.engine.kinds.sparse import training
-from fusedrf_cli.engine.kinds.sparse.bricks import (
-    BrickLimits,
-    BrickTree,
-    Lattice,
-    check_counts,
-    table_entries,
-)
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickLimits, BrickTree, check_counts, table_entries
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 

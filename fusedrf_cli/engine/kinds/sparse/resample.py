@@ -24,7 +24,6 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     BrickLimits,
     BrickTree,
-    Lattice,
     children,
     key_places,
     node_keys,
@@ -32,6 +31,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 )
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.kinds.sparse.seen import can_be_cut
 from fusedrf_cli.engine.kinds.sparse.training import of_voxels
 from fusedrf_cli.engine.settings import current

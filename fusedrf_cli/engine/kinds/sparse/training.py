@@ -9,7 +9,8 @@ import torch
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.box import DENSITY_SHIFT
 from fusedrf_cli.engine.kernels.reference import OCTANTS
-from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 
 INSIDE = 1e-6  # of a voxel: so far from its corners it is asked whether it lies in an occupied cell
 
