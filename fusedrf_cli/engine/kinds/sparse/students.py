@@ -47,8 +47,9 @@ class SparseConfig:
     """Floats in memory for each number that is stored: rows are padded, hanging vertices too."""
     whole_below: float = 0.8
     """Of the numbers allowed: fewer are taken where no object needs more."""
-    per_number_filled: int = 130
-    """Bytes, as seen: keys, places, indices and least squares of a vertex."""
+    per_number_filled: int = 150
+    """Bytes, as seen, of vertices while they are sought, before any is left out: keys, positions and indices,
+    of two sizes at once. Three objects in 25 MB took 180, five sixths of which is left (decision 034)."""
     bytes_per_brick: int = 10
     """Masks and nodes."""
     degree: int = 1

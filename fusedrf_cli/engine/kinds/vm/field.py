@@ -155,7 +155,7 @@ class VMField(AssembledField):
         """See Kind.field_needs."""
         own, rows = box_metadata(cls.kind, metadata), cls.stored_name(DETAIL)
         hashed = own["shape"].get("hashed")
-        whole = dict(shapes) | ({} if hashed is None else {rows: hashed.shape})  # a file may have few
+        whole = dict(shapes) | ({} if hashed is None else {rows: hashed.shape})  # a file may have few of them
         stored = [shape for name, shape in whole.items() if ".occupancy" not in name]
         numbers = sum(-(-prod(shape) // LINE) * LINE for shape in stored)
         cells = prod(whole_numbers(own["cells"]["counts"], 1, "cells"))
