@@ -37,14 +37,27 @@ from fusedrf_cli.errors import FusedRFError, Interrupted, InvalidInput, UsagePro
 from fusedrf_cli.progress import NullProgress
 from fusedrf_cli.requests import ChartRequest, FuseRequest
 
-VIEWS = 8
-HELD_OUT = (JudgingConfig.judged_seed, 2)  # a pair seeds a stream that no single number, as of --seed, does
-ROUNDS = 5  # of frames, all fields taking turns
-PER_PIXEL_KEPT = 12  # bytes of a picture that is compared with
+
+@dataclass(frozen=True)
+class ChartConfig:
+    """How fused fields are compared, and in which order they are tried."""
+
+    views: int = 8
+    held_out: tuple[int, int] = (JudgingConfig.judged_seed, 2)
+    """A pair seeds a stream that no single number, as of --seed, does."""
+    rounds: int = 5
+    """Of frames, all fields taking turns."""
+    per_pixel_kept: int = 12
+    """Bytes of a pixel that is compared with."""
+    noise: float = 0.05
+    """Share by which costs differ that are taken as equal."""
+    behind: float = 0.5
+    """dB that a point is worse by than one of another group in as few bytes, which is then ahead."""
+    lagging: int = 3
+    """How many times longer a group waits that is behind others."""
+
+
 COSTS = ("seconds", "bytes", "ms")
-NOISE = 0.05
-BEHIND = 0.5  # dB
-LAGGING = 3  # how many times longer a group waits that is behind others
 NOTHING_TRIED = "no way to fuse was left to try; ask for other --kinds, or give more --budget"
 
 
@@ -55,7 +68,7 @@ class Point:
     flags: str
     kind: str
     psnr: float
-    """dB against the scene as composed, mean of VIEWS views over white that nothing was trained on."""
+    """dB against the scene as composed, mean of `views` views over white that nothing was trained on."""
     ssim: float
     covered: float
     """dB over the pixels in which the scene as composed shows something."""
@@ -100,17 +113,18 @@ class Benchmark:
     ):
         """Render the scene as composed, by default from where the scene and its objects were photographed;
         given a box (6,) of the world, from all around that."""
+        chart = current(ChartConfig)
         config = current(JudgingConfig)
         loaded = load_scene(scene, allow_outside, memory, place)
         needed = sources(loaded.sizes) | frame_memory(None, *size) | measured(*size)
         composed = composite_of(loaded, memory, needed)
         needed |= frame_memory(composed, *size)
         if box is None:
-            cameras = [look.camera for look in looks_of(loaded, composed, VIEWS, size, HELD_OUT)]
+            cameras = [look.camera for look in looks_of(loaded, composed, chart.views, size, chart.held_out)]
             box = placed_box(composed.occupancy.subject, composed.origin)
         else:
-            cameras = scattered(box, VIEWS, *size, seed=HELD_OUT)
-        needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * PER_PIXEL_KEPT
+            cameras = scattered(box, chart.views, *size, seed=chart.held_out)
+        needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * chart.per_pixel_kept
         memory.expect(needed, advice="give a smaller --size")
         shots = [render_image(composed, c, origin=composed.origin) for c in cameras]
         truth, seen = [shot.over(WHITE) for shot in shots], [shot.opacity > config.covered for shot in shots]
@@ -143,7 +157,7 @@ class Benchmark:
         shelf = Shelf(self.memory.room(needed | frame_memory(composed, *self.size)))
         sizes = [sum(load_scene(str(path), budget=self.memory).sizes) for path in bundles]
         seconds = [[] for _ in range(1 + len(bundles))]
-        for done in range(1 + ROUNDS):  # the first warms up
+        for done in range(1 + current(ChartConfig).rounds):  # the first warms up
             seconds[0].append(frame_seconds(composed, camera, composed.origin))
             for i, (path, size) in enumerate(zip(bundles, sizes, strict=True), 1):
                 found = shelf.take(
@@ -181,7 +195,7 @@ def chart(request: ChartRequest, progress) -> dict:
             raise unusable_kind(error) from error
         with run.kept():
             left = run.climb(waiting, budget)
-            progress.phase("frames", 1 + ROUNDS)
+            progress.phase("frames", 1 + current(ChartConfig).rounds)
             composed_ms, *ms = benchmark.frame_times(run.bundles, progress.advance)
     for point, value in zip(run.points, ms, strict=True):
         point.ms = value
@@ -248,8 +262,11 @@ class Climber:
         """Whether its last point is well surpassed by another one with no more bytes. It may overtake at
         smaller sizes, so that it only waits.
         """
+        config = current(ChartConfig)
         last = self.points[-1] if self.points else None
-        return last is not None and any(p.bytes <= last.bytes and p.psnr >= last.psnr + BEHIND for p in found)
+        return last is not None and any(
+            p.bytes <= last.bytes and p.psnr >= last.psnr + config.behind for p in found
+        )
 
 
 class Charting:
@@ -284,7 +301,7 @@ class Charting:
 
     def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
         """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
-        next comes the group that has had the least time, of which one counts for LAGGING where other groups
+        next comes the group that has had the least time, of which one counts for `lagging` where other groups
         surpass all of it, and of its ladders one that is not behind, with the fewest rungs. Returns how many
         ladders were left off.
         """
@@ -297,7 +314,7 @@ class Charting:
         while any(climbers.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
             due = {
-                g: LAGGING * spent[g] if self.lags(found) else spent[g]
+                g: current(ChartConfig).lagging * spent[g] if self.lags(found) else spent[g]
                 for g, found in climbers.items()
                 if found
             }
@@ -352,10 +369,10 @@ class Charting:
 
 def mark_frontiers(points: list[Point]) -> None:
     """Note at every point for which COSTS no other one is at least as good for less. Times that differ by
-    less than NOISE are taken as equal.
+    less than `noise` are taken as equal.
     """
     for cost in COSTS:
-        margin, least = 1 if cost == "bytes" else 1 + NOISE, np.inf
+        margin, least = 1 if cost == "bytes" else 1 + current(ChartConfig).noise, np.inf
         for point in sorted(points, key=lambda p: (-p.psnr, getattr(p, cost), p.seconds)):
             if getattr(point, cost) * margin < least:
                 least = getattr(point, cost)

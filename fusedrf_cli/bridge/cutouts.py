@@ -1,6 +1,6 @@
 """Bundles of an object that was cut out, and of what is left without it, before they are written."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -26,19 +26,23 @@ from fusedrf_cli.engine.kinds import registry
 class Cutout:
     """Nodes of a bundle with parts of their fields: a graph, and the bytes that it names."""
 
-    def __init__(self, whole: Whole, fields: Fields, precision: str | None, rounded: bool):
-        """fields: by the names of visible nodes; those of the bundle keep their bytes. precision: of
-        all numbers; None: a part is stored as its node's field, or, where that would round its numbers once
-        more and they may not be `rounded`, in float16."""
+    def __init__(
+        self, whole: Whole, fields: Fields, hidden: Container[str], precision: str | None, rounded: bool
+    ):
+        """fields: by the names of visible nodes; those of the bundle keep their bytes. hidden: which nodes
+        that are not visible are in it. precision: of all numbers; None: a part is stored as its node's field,
+        or, where that would round its numbers once more and they may not be `rounded`, in float16."""
         self.whole, self.precision, self.rounded = whole, precision, rounded
-        self.writer, self.stored = BundleWriter(), {}
+        self.writer = BundleWriter()
         members = {leaf.name: self.member(leaf, fields.get(leaf.name)) for leaf, _ in whole.nodes}
-        self.graph = with_leaves(whole.scene, lambda node: self.in_place_of(node, members))
 
-    def in_place_of(self, node: Node, members: dict[str, str | None]) -> Node | None:
-        """A node with its part of the field; None without one, and of what is hidden."""
-        member = members.get(node.name)
-        return None if member is None else replace(node, field=member)
+        def after(node: Node) -> Node | None:
+            if node.name not in members and node.name in hidden:
+                members[node.name] = self.copied(node.field)
+            member = members.get(node.name)
+            return None if member is None else replace(node, field=member)
+
+        self.graph = with_leaves(whole.scene, after)
 
     def member(self, leaf: Leaf, part: StoredField | None) -> str | None:
         """What a part of a node's field is stored as; None of what shows nothing."""
@@ -126,25 +130,21 @@ class ObjectCutout(Cutout):
         fields: Fields,
         precision: str | None,
         name: str,
-        keeps_names: bool,
+        named: Container[str],
         framing: Sequence[float],
         cameras: dict | None,
     ):
-        """keeps_names: whether it is nodes of that name as they are. framing: (6,) in the world."""
-        super().__init__(whole, fields, precision, False)
-        nodes = tuple(lifted(node, {name} if keeps_names else ()) for node in self.graph.nodes)
+        """named: those nodes by their names, where it is nodes of its name as they are. framing: (6,) in the
+        world."""
+        super().__init__(whole, fields, named, precision, False)
+        nodes = tuple(lifted(foreground(node), {name} if named else ()) for node in self.graph.nodes)
         self.graph = SceneGraph(
-            nodes if keeps_names else self.as_one(nodes, name),
+            nodes if named else self.as_one(nodes, name),
             self.graph.composition,
             framing=tuple(float(x) for x in framing),
             cameras=cameras,
             generator=f"fusedrf {__version__}",
         )
-
-    def in_place_of(self, node: Node, members: dict[str, str | None]) -> Node | None:
-        """See Cutout: what stands free is no background."""
-        node = super().in_place_of(node, members)
-        return node and replace(node, background=False)
 
     def as_one(self, nodes: tuple[Node, ...], name: str) -> tuple[Node, ...]:
         """Nodes as one of a name, which holds them."""
@@ -157,15 +157,23 @@ class ObjectCutout(Cutout):
 class RestCutout(Cutout):
     """What is left, with all else that the bundle has."""
 
-    def __init__(self, whole: Whole, fields: Fields, precision: str | None, names: Sequence[str]):
-        """names: of what was taken out."""
-        super().__init__(whole, fields, precision, True)
+    def __init__(
+        self,
+        whole: Whole,
+        fields: Fields,
+        precision: str | None,
+        name: str | None,
+        named: Container[str],
+    ):
+        """name: of what was taken out; named: its nodes, by their names, where it is nodes as they are."""
+        hidden = {leaf.name for leaf in whole.scene.leaves() if leaf.name not in named}
+        super().__init__(whole, fields, hidden, precision, True)
         bundle, draft = whole.draft.bundle, whole.draft
         placed = {leaf.field for leaf in whole.scene.leaves()}
         for member in bundle.headers:  # what no node places was kept for the history
             if member not in placed and member not in self.writer.members:
                 self.writer.copy_field(bundle, member)
-        entry = {"event": "extracted", "names": list(names)}
+        entry = {"event": "extracted", "names": [name] if name else []}
         used = {leaf.field for leaf in self.graph.leaves()}
         self.graph = replace(
             self.graph,
@@ -174,15 +182,14 @@ class RestCutout(Cutout):
             generator=f"fusedrf {__version__}",
         )
 
-    def in_place_of(self, node: Node, members: dict[str, str | None]) -> Node | None:
-        """See Cutout: what is hidden stays."""
-        if node.name not in members:
-            return replace(node, field=self.copied(node.field))
-        return super().in_place_of(node, members)
-
     def add(self, one: Placed) -> None:
         """One more node, of a field that lies in the whole's frame."""
         at = placement(self.whole.origin) @ one.object_to_world
         member = self.put(one.field, self.precision or self.whole.precision)
         name = free_name(one.name, {node.name for node, _, _ in self.graph.walk()})
         self.graph = with_nodes(self.graph, [Node(name, member, None, placement_of(at))])
+
+
+def foreground(node: Node) -> Node:
+    """A node that is no background, as what stands free is none, and neither are those in it."""
+    return replace(node, background=False, children=tuple(foreground(child) for child in node.children))

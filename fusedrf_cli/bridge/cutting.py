@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from formats.graph import belongs
 from formats.records import BYTES_PER_NUMBER
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.editing import Draft
@@ -63,6 +62,11 @@ class Whole:
         """The bundle at a path, with all its fields in memory."""
         config = current(CuttingConfig)
         draft = Draft(path, memory)
+        outside = [leaf for leaf in draft.graph.leaves() if leaf.field is None]
+        if outside:
+            raise InvalidInput(
+                f"{path}: its node '{outside[0].name}' names a source beside it; fuse it first"
+            )
         loaded = draft.before
         lone = loaded.lone()
         field, origin = lone or ((scene := as_composite(loaded.composed())), scene.origin)
@@ -117,14 +121,10 @@ class Whole:
         rule = self.loaded.composition
         return as_composite(ComposedField(grouped(found, groups, rule), rule, origin=self.origin))
 
-    def named(self, name: str) -> tuple[Fields, Fields]:
-        """The fields of the nodes that go by a name, or are in one that does, and all others."""
-        own: set[str] = set()
-        for node, _, _ in self.scene.walk():
-            if belongs(node.name, {name}):
-                own |= {leaf.name for leaf in SceneGraph((node,)).leaves()}
-        found = {key: one for key, one in self.raw.items() if key in own}
-        return found, {key: one for key, one in self.raw.items() if key not in own}
+    def named(self, names: Container[str]) -> tuple[Fields, Fields]:
+        """The fields of nodes of some names, and all others."""
+        found = {key: one for key, one in self.raw.items() if key in names}
+        return found, {key: one for key, one in self.raw.items() if key not in names}
 
     @property
     def precision(self) -> str:

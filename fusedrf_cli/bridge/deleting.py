@@ -9,13 +9,13 @@ import numpy as np
 
 from formats.bundle import PART
 from formats.graph import belongs, placement_of, with_field, without
-from formats.nodes import WHITE, Leaf, Node
+from formats.nodes import Leaf, Node
 from fusedrf_cli.bridge.distilled import holders_in, inside
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit
 from fusedrf_cli.bridge.mending import LEARNT, Frame, Teacher, hole_of, learnt_from, learnt_surfaces, up_of
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import load_found, make_field
+from fusedrf_cli.bridge.scene import load_found, make_field, showing_of
 from fusedrf_cli.bridge.sources import Elsewhere, leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.detail import extent
@@ -207,8 +207,8 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
     nodes = []
     for part, file, member in own:
         draft.writer.copy_field(file, member)
-        tint = {} if part.tint == WHITE else {"tint": list(part.tint)}
-        nodes.append(Node(part.name, member, None, placement_of(part.object_to_world), showing=tint))
+        at = placement_of(part.object_to_world)
+        nodes.append(Node(part.name, member, None, at, showing=showing_of(part)))
     if not own:
         deletion.progress.warn(
             f"the source of '{name}' is gone, has changed, or lies outside of the folder: what its box holds "
@@ -222,12 +222,8 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
             if part is not None:
                 part = registry.kind(part.kind).trimmed(part)
                 member = draft.put(part, draft.fields.headers[holder.field].precision)
-                words = f"{new_name}/{number}", member, None, placement_of(one.object_to_world)
-                nodes.append(
-                    Node(
-                        *words,
-                    )
-                )
+                at = placement_of(one.object_to_world)
+                nodes.append(Node(f"{new_name}/{number}", member, None, at, showing=showing_of(holder)))
     if not nodes:
         raise InvalidInput(f"{draft.path}: there is nothing of '{name}' in its field; delete it")
     return replace(nodes[0], name=new_name) if len(nodes) == 1 else Node(new_name, children=tuple(nodes))

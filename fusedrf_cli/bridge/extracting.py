@@ -10,6 +10,7 @@ import numpy as np
 
 from formats.bundle import OpenBundle
 from formats.errors import FormatError
+from formats.graph import chosen, leaf_names
 from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph
 from formats.views import View
@@ -76,21 +77,21 @@ def extract(request: ExtractRequest, progress) -> dict:
         whole = Whole.read(request.field, memory)
         rig = rig_for(request, whole)
         progress.phase("choosing", None)
-        found, rest, figures = parted(request, whole, rig, progress)
+        named = named_nodes(request, whole)
+        found, rest, figures = parted(request, whole, named, rig, progress)
         shown = whole.composed(found)
         box = placed_box(subject(shown), whole.origin)
         left = whole.composed(rest) if request.invert or request.preview else None
         if request.invert:
             if left is None:
                 raise InvalidInput(f"{request.field}: nothing is left beside the object; leave --invert out")
-            cutout = RestCutout(whole, rest, request.precision, [request.name] if request.name else [])
+            cutout = RestCutout(whole, rest, request.precision, request.name, named)
             frame = Frame(whole.path, whole.scene, whole.field, whole.origin)
             fillings, figures["hole"] = mended(request, frame, left, shown, memory, place, progress)
             for one in fillings:
                 cutout.add(one)
         else:
             cameras = own_cameras(whole.scene, box)
-            named = request.name not in (None, *whole.draft.inside)
             name = request.name or OBJECT
             cutout = ObjectCutout(whole, found, request.precision, name, named, box, cameras)
         if request.max_size is not None:
@@ -118,17 +119,35 @@ def extract(request: ExtractRequest, progress) -> dict:
     }
 
 
+def named_nodes(request: ExtractRequest, whole: Whole) -> set[str]:
+    """The nodes that hold a field and go by the name that was asked for, or are in one that does; none where
+    that is an object in a distilled field. InvalidInput where there is nothing of that name."""
+    if request.name is None:
+        return set()
+    if request.masks or request.points or request.boxes or request.spheres or request.mesh:
+        raise UsageProblem("--name takes a whole part; leave out what else tells of the object")
+    if request.name in whole.draft.inside:
+        return set()
+    named = leaf_names(chosen(whole.scene, {request.name}))
+    if not named:
+        held = ", ".join(sorted(whole.draft.names))
+        raise InvalidInput(f"{request.field}: there is no part '{request.name}'; it holds {held}")
+    if named.isdisjoint(whole.raw):
+        raise InvalidInput(f"{request.field}: '{request.name}' is hidden; show it, or choose another part")
+    return named
+
+
 def parted(
-    request: ExtractRequest, whole: Whole, rig: dict[str, View], progress
+    request: ExtractRequest, whole: Whole, named: set[str], rig: dict[str, View], progress
 ) -> tuple[Fields, Fields, dict]:
-    """The object's fields, those that are left, and what the report says of how it was chosen. InvalidInput
-    where there is no such object."""
+    """The object's fields, those that are left, and what the report says of how it was chosen; named: its
+    nodes, where it is those. InvalidInput where there is no such object."""
+    if named:
+        return *whole.named(named), {}
     extracting = current(ExtractingConfig)
     config = current(SelectingConfig)
     by_name = request.name is not None
-    told = told_by_name(request, whole) if by_name else told_by(request, whole, rig, progress)
-    if told is None:
-        return *whole.named(request.name), {}
+    told = told_by_name(request.name, whole) if by_name else told_by(request, whole, rig, progress)
     selection = selected(whole.field, told)
     cameras = watching(whole)
     shown = shown_by(whole.field, selection.lattice, cameras)
@@ -158,25 +177,20 @@ def parted(
     return found, rest, {"sure": round(selection.sure, 3), "seen": share}
 
 
-def told_by_name(request: ExtractRequest, whole: Whole) -> Told | None:
+def told_by_name(name: str, whole: Whole) -> Told:
     """What tells of an object that was distilled into a field with others: where it stood, and the cells of
-    its source; of what they stood in, that it is none of them. None of one that is a node."""
-    if request.masks or request.points or request.boxes or request.spheres or request.mesh:
-        raise UsageProblem("--name takes a whole part; leave out what else tells of the object")
-    name, inside = request.name, whole.draft.inside
-    if name not in inside:
-        if not whole.named(name)[0]:
-            held = ", ".join(sorted(whole.draft.names))
-            raise InvalidInput(f"{request.field}: there is no part '{name}'; it holds {held}")
-        return None
-    origin, background = placement(whole.origin), bool(inside[name].get("background"))
+    its source; of what they stood in, that it is none of them."""
+    inside, origin = whole.draft.inside, placement(whole.origin)
+    background = bool(inside[name].get("background"))
     beside = 0.5 * whole.field.voxel_size * squeezed(origin)
-    told = [node for key, node in inside.items() if background is not bool(key == name)]
+    told = [node for key, node in inside.items() if (key != name) == background]
     shapes = [DistilledShape(node, whole.draft.bundle, beside) for node in told]
 
     def holds(points: np.ndarray) -> np.ndarray:
-        at = points @ origin[:3, :3].T + origin[:3, 3]
-        return np.any([shape.holds(at) for shape in shapes], 0) != background
+        at, found = points @ origin[:3, :3].T + origin[:3, 3], np.zeros(len(points), bool)
+        for shape in shapes:
+            found |= shape.holds(at)
+        return found != background
 
     none = np.zeros((0, 3))
     return Told(holds, [], [], none, none, touches=True)

@@ -442,8 +442,7 @@ def warn_of_detail(details: list[Detail], remedy: str, progress) -> None:
             )
         if d.voxels_across < config.enough_voxels:
             progress.warn(f"'{d.name}' is only {d.voxels_across:.2g} voxels across; use {remedy}")
-    coarse = [d for d in details if d.held_voxel > d.own_voxel * (1 + 1e-6)]
-    if coarse:
+    if coarse := [d for d in details if d.held_voxel > d.own_voxel * (1 + 1e-6)]:
         worst = max(coarse, key=lambda d: d.held_voxel / d.own_voxel)
         progress.warn(
             f"{len(coarse)} of {len(details)} objects are held at coarser voxels than their own, "

@@ -417,8 +417,8 @@ def write_field(
     return Path(output).stat().st_size
 
 
-def showing_of(placed: Placed) -> dict:
-    """What a node says of how a placed field is shown."""
+def showing_of(placed: Placed | Leaf) -> dict:
+    """What a node says of how a placed field is shown, but for crops."""
     words = {} if placed.opacity == 1 else {"opacity": placed.opacity}
     return words | ({} if tuple(placed.tint) == WHITE else {"tint": list(placed.tint)})
 

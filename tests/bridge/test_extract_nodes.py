@@ -215,6 +215,11 @@ def test_a_group_by_its_name_is_that_subtree(folder, report):
     assert psnr(pixels(folder / "again.rfpack"), pixels(folder / "rich.rfpack")) > 60
 
 
+def test_what_is_hidden_has_to_be_shown_first(run):
+    result = run("extract", "rich.rfpack", "--name", "hidden", "-o", "hidden.rfpack")
+    assert result.exit_code == 3 and "'hidden' is hidden" in result.stderr
+
+
 def test_a_node_of_a_group_is_shown_as_it_was(folder, report):
     """Its tint is that of all the nodes around it."""
     report("extract", "rich.rfpack", "--name", "red", "-o", "red.rfpack")
@@ -241,3 +246,12 @@ def test_one_of_two_copies_is_cut_and_the_hidden_stay(folder, report):
     assert len(leaves["object/green"].crops) == 1 and leaves["object/red"].groups[0][1] == "add"
     report("compose", "object.rfpack", "rest.rfpack", "-o", "both.json")
     assert psnr(pixels(folder / "both.json"), pixels(folder / "rich.rfpack")) > 35
+
+
+def test_nodes_of_two_kinds_take_no_more_bytes_than_allowed(folder, report):
+    words = ("extract", "three.rfpack", *CORNER, "-o", "object.rfpack", "-w")
+    whole = report(*words)["bytes"]
+    said = report(*words, "--max-size", str(2 * whole // 3))
+    assert said["bytes"] == (folder / "object.rfpack").stat().st_size <= 2 * whole // 3
+    assert said["kind"] == "dense, vm" and said["psnr"]["stored"] > 20
+    assert set(members(folder / "object.rfpack")) == {"object/floor", "object/red"}

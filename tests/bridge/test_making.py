@@ -29,6 +29,7 @@ from fusedrf_cli.engine.kinds.student import (
     Way,
 )
 from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_rays
 from fusedrf_cli.progress import NullProgress
@@ -164,7 +165,8 @@ def test_all_sizes_together_keep_to_the_budget(run, monkeypatch):
 
 @pytest.mark.parametrize("steps, part", [(0, 1.0), (10, DistilConfig.points_part)])
 def test_a_phase_without_steps_takes_no_time_from_the_other(steps, part):
-    student = VM.empty(SCENE, way_of(SHAPE), SHAPE.size((16,) * 3), torch.Generator().manual_seed(0), "")
+    most = VMField.size_of(SHAPE, (16,) * 3)
+    student = VM.empty(SCENE, way_of(SHAPE), most, torch.Generator().manual_seed(0), "")
     settings = TinySettings(steps=steps, rgb_steps=10, time_budget=8.0)
     run = DistillRun(SCENE, student, SAMPLER, settings)
     assert run._share(10, 8.0 * part) == pytest.approx(1.0)

@@ -104,7 +104,7 @@ def test_a_vm_student_of_a_place_begins_as_the_place():
         return kind.place_of(room, plan, scene)
 
     student = taken(scene.placed[0], scene)
-    assert student.shape == SHAPE and torch.equal(student.params, room.params)
+    assert student.shape == room.shape and torch.equal(student.params, room.params)
     at = 12 * unit(np.random.default_rng(0).normal(size=(2000, 3)))
     points, dirs = torch.from_numpy(at * np.array([60, 1, 1])), torch.from_numpy(unit(at))
     (sigma, rgb), (wanted, colour) = student.query(points, dirs), room.query(points, dirs)

@@ -117,7 +117,7 @@ def test_a_fused_scene_keeps_tints_through_edits(report, folder, picture):
     report("compose", "red.rfpack", *words, "-o", "s.json")
     for kind in ("blocks", "vm"):
         report("fuse", "s.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-rgb", "-w")
-        said = report("eval", f"{kind}.rfpack", "s.json", "--size", "96x96")
+        said = report("eval", f"{kind}.rfpack", "--against", "s.json", "--size", "96x96")
         assert said["mean"]["psnr"] > (90 if kind == "blocks" else 20)
     report("move", "blocks.rfpack", "dark", "-t", "0,0.4,0", "-o", "moved.rfpack")
     report("compose", "red.rfpack", *words[:4], "0.8,0.4,0", *words[5:], "-o", "there.json")

@@ -295,7 +295,7 @@ def test_b8_an_opaque_box_from_inside(row, kind):
 
 def test_b8_an_opaque_teacher_gives_finite_losses(row):
     teacher = scene_of((Box(1e8, 0.5, tint=scenes.RED), np.eye(4))).composed("vm")
-    settings, numbers = TinySettings(steps=20, rays=1000), SHAPE.size((16, 16, 16))
+    settings, numbers = TinySettings(steps=20, rays=1000), VMField.size_of(SHAPE, (16, 16, 16))
     student = VM.empty(teacher, way_of(SHAPE), numbers, torch.Generator().manual_seed(0), "one")
     student, report = distill(teacher, student, RaySampler([teacher.occupancy.tight_aabb(0)]), settings)
     told = (report.psnr_before_rgb, report.psnr_after_rgb, student.params.abs().max())

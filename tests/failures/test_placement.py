@@ -19,6 +19,7 @@ from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.student import DistilConfig
 from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.analytic import scenes
 from tests.analytic.export import SHAPE, exported, way_of
@@ -142,7 +143,7 @@ def test_a2_the_measured_opacity_keeps_to_the_prediction(row, condition):
     """A translucent stretched ball distilled to one isotropic tensor, against its closed depth."""
     scene = scene_of((Gaussian(density=4.0, centre=(0, 0, 0), tint=scenes.RED), affine((1, 1, condition))))
     composed = scene.composed()
-    settings, numbers = DistilConfig(rays=30_000, steps=400), SHAPE.size((48, 48, 48))
+    settings, numbers = DistilConfig(rays=30_000, steps=400), VMField.size_of(SHAPE, (48, 48, 48))
     generator = torch.Generator().manual_seed(0)
     student = VM.empty(composed, way_of(SHAPE), numbers, generator, "one")
     sampler = RaySampler([composed.occupancy.tight_aabb(0)])

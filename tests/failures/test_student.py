@@ -19,6 +19,7 @@ from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.kinds.student import Way
 from fusedrf_cli.engine.kinds.vm import KIND as VM
+from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from fusedrf_cli.main import cli
@@ -290,7 +291,7 @@ def distilled(scene, seed: int, **more):
     teacher = scene.composed("vm")
     settings = TinySettings(seed=seed, steps=300, rays=12000, **more)
     generator = torch.Generator().manual_seed(seed)
-    student = VM.empty(teacher, way_of(SHAPE), SHAPE.size((32,) * 3), generator, "student")
+    student = VM.empty(teacher, way_of(SHAPE), VMField.size_of(SHAPE, (32,) * 3), generator, "student")
     boxes = [teacher.occupancy.tight_aabb(0), *(p.aabb for p in teacher.placed)]
     return distill(teacher, student, RaySampler(boxes), settings, rgb=False)[0], teacher
 

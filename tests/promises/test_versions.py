@@ -17,6 +17,7 @@ from formats.rig import read_rig
 from formats.scene import dump_scene
 from fusedrf_cli.bridge.rendering import reference, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, placement
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -33,6 +34,8 @@ FINE = 0.003  # a step so small that pictures show what a pack holds, not how it
 def rendered(path) -> np.ndarray:
     """(48, 48, 3) uint8 of a pack, as pair.png was made."""
     field, origin = reference(load_scene(str(path)))
+    if isinstance(field, ComposedField):  # all of it at the same step
+        field.__dict__["occupancy"] = replace(field.occupancy, stride=None)
     camera = orbit(field.occupancy.tight_aabb(0), 1, 48, 48)[0]
     linear, pose = placement(origin)[:3, :3], camera.camera_to_world.copy()
     pose[:3, 3] = linear @ pose[:3, 3] + placement(origin)[:3, 3]

@@ -67,7 +67,7 @@ def arrays(field, starts: np.ndarray, numbers: int) -> Arrays:
 
 
 def reference(field, sections: dict, unit: torch.Tensor, read: None, numbers: int) -> torch.Tensor:
-    """See encodings; a section is a lattice of vertices (kinds/sparse/bricks.py) and its rows (V, R). Which
+    """See encodings; a section is a lattice of vertices (kinds/sparse/lattice.py) and its rows (V, R). Which
     voxel a point lies in is a constant; where none is active, what is answered means nothing."""
     return torch.cat([blend(lattice, settled(lattice, rows), unit) for lattice, rows in sections.values()], 1)
 

@@ -26,12 +26,10 @@ from fusedrf_cli.engine.kernels.loops import (
     Weighed,
 )
 
-CELLS_AT_ONCE = 1 << 18
 BRICK = 4  # cells a side
 FEW_CELLS, MOST_CELLS = 1 << 22, 1 << 26
 """Of a grid up to which files have its bits one after the other, and that is read in bricks: no grid of a fit
 has more than the first."""
-WORTH = 0.75  # of the bytes of all bits, from which bricks are worth it
 StoredAs = Callable[[np.ndarray, str, np.ndarray | None], np.ndarray]
 """The numbers that an array (V, C) comes back with from a bundle: of the array, its name and the lengths of
 the runs of its rows, or None."""
@@ -280,8 +278,9 @@ class ComputedField:
         """(N,) largest σ over offsets (K, 3) in each of `cells` (N, 3) int64 of a grid with corner lo (3,)
         and cells of size cell (3,)."""
         out = np.zeros(len(cells), self.real)
-        for start in range(0, len(cells), CELLS_AT_ONCE):  # between which an interrupt is heard
-            part = slice(start, start + CELLS_AT_ONCE)
+        at_once = 1 << 18  # between which an interrupt is heard
+        for start in range(0, len(cells), at_once):
+            part = slice(start, start + at_once)
             own = np.ascontiguousarray(cells[part], np.int64)
             asked = Cells(exact(lo), exact(cell), own, exact(offsets))
             self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(own), out[part])
@@ -391,7 +390,8 @@ def packed_bits(name: str, grid: np.ndarray, least: int = FEW_CELLS) -> dict[str
     some, whole = bricks.any(1), bricks.all(1)
     mixed = np.packbits(bricks[some & ~whole], axis=1)
     parts = {f"{name}.bricks": np.packbits(np.stack([some, whole])), f"{name}.mixed": mixed}
-    return parts if sum(part.nbytes for part in parts.values()) < WORTH * packed[name].nbytes else packed
+    # Bricks are worth it up to three quarters of the bytes of all bits.
+    return parts if sum(part.nbytes for part in parts.values()) < 0.75 * packed[name].nbytes else packed
 
 
 def in_bricks(grid: np.ndarray) -> np.ndarray:

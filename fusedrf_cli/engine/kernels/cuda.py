@@ -288,7 +288,10 @@ def on_device(value):
     """A host array's copy on the device, a tuple of arrays with all of them there; all else as it is."""
     if isinstance(value, np.ndarray):
         return value if SIMULATED else cuda.to_device(np.ascontiguousarray(value))
-    return type(value)(*map(on_device, value)) if hasattr(value, "_fields") else value
+    if not hasattr(value, "_fields"):
+        return value
+    copies = {id(part): on_device(part) for part in value}  # what two slots of a field read is copied once
+    return type(value)(*(copies[id(part)] for part in value))
 
 
 def on_host(array) -> np.ndarray:

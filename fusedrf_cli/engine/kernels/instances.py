@@ -173,7 +173,6 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
         while index >= 0 and trans > slots.early_stop:
             u = u0 + 0.5 * between(index, many) * step
             p = position_at(origin, way, u)
-            standing(field, many, scratch)
             sigma, _, steps, place = density(field, grid, index, p, d, scratch)
             if steps > 0:
                 tau = thick * sigma * optical_length(warp, p, d, u, many, steps, step)

@@ -173,16 +173,17 @@ def render_rays(
     step: float,
     early_stop: float = 0.0,
     jitter=0.5,
-    colour_from: float = 0.0,
-    lent_from: float | None = None,
+    lending: tuple[float, float | None] = (0.0, None),
 ) -> torch.Tensor:
     """(N, 5) premultiplied rgb, opacity and Σ w t of rays (N, 3) float64 through a field that has a
     `reference`, on the CPU.
 
     Every sample of the lattice is asked. A sample counts while the transmittance before it is over
-    early_stop, and its colour where its weight is over colour_from: both thresholds are the kernels' own, 0
-    leaves them out. With lent_from, light samples take other ones' colours as in pictures (`lent`).
+    early_stop, and its colour where its weight is over the first number of `lending`: both thresholds are the
+    kernels' own, 0 leaves them out. With a second one, light samples take other ones' colours as in pictures
+    (`lent`).
     """
+    colour_from, lent_from = lending
     ts, taken = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter, dtype=torch.float64))
     points = (rays_o[:, None] + ts[..., None] * rays_d[:, None])[taken]
     dirs = rays_d[:, None].expand(*ts.shape, 3)[taken]

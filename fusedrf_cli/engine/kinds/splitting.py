@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyConfig, OccupancyGrid, cell_counts
+from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.selection.cells import Selection
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
@@ -29,7 +30,7 @@ class SplittingConfig:
 
 OWN, OTHER = 1, 2
 """Of what is in a cell of a selection."""
-CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(-1, 3)
+CORNERS = OCTANTS - 0.5
 Holds = Callable[[np.ndarray], np.ndarray]
 """Which points (N, 3) of a frame are kept, (N,) bool."""
 KeepsCells = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -161,7 +161,9 @@ class Selection:
 
     def seen_from(self, object_to_frame: np.ndarray) -> "Selection":
         """The same object for a field that lies in this one's frame by a (4, 4)."""
-        return replace(self, object_to_lattice=self.object_to_lattice @ object_to_frame)
+        other = replace(self, object_to_lattice=self.object_to_lattice @ object_to_frame)
+        other.__dict__.update(object=self.object, other=self.other)  # of many nodes made once
+        return other
 
     def lattice_points(self, points: np.ndarray, space: ModuleType) -> np.ndarray:
         """(N, 3) points of the coordinates of a space, of the field that is cut, in those of the lattice."""

@@ -10,15 +10,17 @@ from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.asking import colours, even_directions
-from fusedrf_cli.engine.kinds.sparse.bricks import (
-    MAX_LEVEL,
-    BrickTree,
-    Lattice,
-    key_places,
-    node_keys,
-)
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, BrickTree, key_places, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseShape
-from fusedrf_cli.engine.kinds.sparse.resample import frame_of, leaves, one_of_eight, resampled, voxels_wanted
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.resample import (
+    at_vertices,
+    frame_of,
+    leaves,
+    one_of_eight,
+    resampled,
+    voxels_wanted,
+)
 from fusedrf_cli.engine.rendering.cameras import scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -211,3 +213,13 @@ def test_an_object_at_a_twentieth_of_the_scene_keeps_its_detail():
         for f in (field, teacher)
     ]
     assert psnr(*shots) > 33
+
+
+def test_what_voxels_are_worth_is_summed_at_their_corners(rng):
+    corners = rng.integers(0, 9, (40, 8))
+    values = rng.normal(size=(40, 3))
+    wanted = np.zeros((9, 3))
+    for own, value in zip(corners, values, strict=True):
+        for vertex in own:
+            wanted[vertex] += value
+    np.testing.assert_allclose(at_vertices(corners, values, 9), wanted)

@@ -9,15 +9,18 @@ from fusedrf_cli.engine.distillation.epochs import Epochs
 from fusedrf_cli.engine.distillation.finish import RayLesson
 from fusedrf_cli.engine.distillation.pixels import ShownRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
+from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.engine.conftest import BOX, THIRTY_TWO, random_vm
 
 
 @pytest.fixture
 def pair():
-    """A field, and the same at less than half its resolution."""
+    """A field that some rays miss, and the same at less than half its resolution."""
     smooth = random_vm(THIRTY_TWO, resolution=(3, 3, 3), dtype=torch.float32, seed=1)
-    whole, few = smooth.resampled(BOX, (20, 21, 22)), smooth.resampled(BOX, (4, 4, 5))
+    grid = OccupancyGrid(BOX, np.arange(64).reshape(4, 4, 4) < 32)
+    sizes = (20, 21, 22), (4, 4, 5)
+    whole, few = (smooth.resampled(BOX, size).with_occupancy(grid) for size in sizes)
     few.params += 0.3 * torch.randn(few.params.shape, generator=torch.Generator().manual_seed(3))
     return whole, few
 

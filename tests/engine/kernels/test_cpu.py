@@ -301,7 +301,7 @@ def test_render_is_the_reference(cells, early_stop):
     rays_d[36:40] *= -1  # and some that miss
     found = render(field, rays_o, rays_d, early_stop=early_stop)
     rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
-    cuts = dict(early_stop=early_stop, colour_from=loops.COLOUR_FROM, lent_from=loops.LENT_FROM)
+    cuts = dict(early_stop=early_stop, lending=(loops.COLOUR_FROM, loops.LENT_FROM))
     wanted = reference.render_rays(field, *rays, 0.0, 0.05, **cuts).numpy()
     assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.3
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)

@@ -53,12 +53,12 @@ def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
     return field.with_params(numbers.to(dtype))
 
 
-BOXED = [name for name in registry.names() if isinstance(registry.kind(name), BoxKind)]
 KINDS = {
     "vm": lambda: random_vm(cells=4),
     "vm, detail": random_detail,
     "vm-mlp": lambda: random_vm_mlp(cells=4),
     "sparse": lambda: random_sparse(0, depth=0),
     "sparse, levels and bands": lambda: random_sparse(2, depth=2),
-    **{name: partial(random_boxed, name) for name in BOXED},
 }
+BOXED = [name for name in registry.names() if isinstance(registry.kind(name), BoxKind) and name not in KINDS]
+KINDS |= {name: partial(random_boxed, name) for name in BOXED}

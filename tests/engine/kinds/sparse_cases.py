@@ -4,8 +4,9 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.encodings.bricks import SIDE
-from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, children, node_keys
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, children, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 
 LO, TOP, COUNTS = np.array([-1.0, -0.7, 0.2]), np.array([0.6, 0.7, 0.55]), (3, 2, 3)
 

@@ -9,12 +9,12 @@ from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     BrickTree,
-    Lattice,
     children,
     key_places,
     morton,
     node_keys,
 )
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from tests.engine.kinds.sparse_cases import random_tree
 
 

@@ -8,8 +8,9 @@ from formats.records import FieldRecord, encode_field
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.kinds.registry import kind
-from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.kinds.student import Way
 from tests.analytic.rays import points_in, unit
 from tests.engine.kinds.sparse_cases import random_sparse, random_tree

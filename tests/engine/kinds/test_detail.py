@@ -259,7 +259,7 @@ def test_held_rows_that_do_not_fit_are_refused(name):
 def test_what_a_small_file_unfolds_to_is_foretold_and_bounded():
     arrays, metadata = without_unasked(sparse_detail(1 << 14, torch.float32)).state()
     shapes = {name: array.shape for name, array in arrays.items()}
-    assert registry.kind("vm").held_bytes(100, shapes) >= 100 + 2 * (1 << 14) * 16
+    assert VMField.needs(metadata, shapes, arrays.get).held >= 2 * (1 << 14) * 16
     metadata["tensors"][0]["resolution"] = [8192] * 3
     with pytest.raises(ValueError, match="at most 2,147,483,648 are read"):
         VMField.from_state(arrays, metadata)

@@ -11,8 +11,9 @@ from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.fields import Slow
 from tests.analytic.rays import points_in, rays_at, unit

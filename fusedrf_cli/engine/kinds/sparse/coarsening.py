@@ -5,13 +5,12 @@ import torch
 
 from fusedrf_cli.engine.kinds.asking import density_features, dilated
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, Lattice, node_keys
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.kinds.student import Contents, Section
 from fusedrf_cli.engine.spaces import bounded
-
-LEAST_WEIGHT = 1e-3  # of a vertex with a colour of its own, beside one that shows something
 
 
 def reduced(outline: SparseField, voxel: float, degree: int) -> Reduction:
@@ -44,7 +43,8 @@ def coarsened(field: SparseField, halvings: int) -> SparseField:
     other = SparseField(field.shape, new, density_scale(new.tree), space=field.lies_in)
     rows, held = kept_rows(field.fine, new, field.rows, halvings)
     sigma = np.where(held, field.scale * np.logaddexp(0, rows[:, 0]), 0)
-    weight = np.where(held, np.maximum(-np.expm1(-sigma * new.finest_voxel), LEAST_WEIGHT), 0)
+    # a vertex with a colour of its own counts for little beside one that shows something
+    weight = np.where(held, np.maximum(-np.expm1(-sigma * new.finest_voxel), 1e-3), 0)
     other.rows[:, 0] = torch.from_numpy(density_features(field, new, sigma, other.scale))
     other.rows[:, 1:] = torch.from_numpy(dilated(new, rows[:, 1:], weight)[0])
     if other.coarse:

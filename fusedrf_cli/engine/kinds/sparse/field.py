@@ -21,6 +21,7 @@ from fusedrf_cli.engine.encodings.bricks import ROW, SIDE, active_at
 from fusedrf_cli.engine.fields import pages
 from fusedrf_cli.engine.fields.assembled import Assembled, Slot
 from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples
+from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
     PER_CELL_MADE,
@@ -34,14 +35,8 @@ from fusedrf_cli.engine.kernels.light import Exposure, Light
 from fusedrf_cli.engine.kernels.parts import LINE
 from fusedrf_cli.engine.kernels.reference import exact as exact_tensor
 from fusedrf_cli.engine.kinds.sparse import training
-from fusedrf_cli.engine.kinds.sparse.bricks import (
-    MAX_BRICKS,
-    MAX_TOP_CELLS,
-    BrickTree,
-    Lattice,
-    check_counts,
-    table_entries,
-)
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickLimits, BrickTree, check_counts, table_entries
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
@@ -64,7 +59,6 @@ class BricksConfig:
     """Along the longest axis, at most, unless there are more top cells."""
 
 
-MAX_ANSWER = 1e25  # of a density or a logit: finite in float32 also after a placement's largest stretch
 MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
 
 
@@ -380,11 +374,12 @@ class SparseField(Assembled):
 
 def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     """The tree of a stored field. Raises ValueError naming what does not fit."""
+    limits = current(BrickLimits)
     config = current(SamplingConfig)
     counts = metadata["counts"]
     if not isinstance(counts, list) or len(counts) != 3:
         raise ValueError(f"counts should be three whole numbers, found {counts}")
-    counts = tuple(whole(n, "counts", 1, MAX_TOP_CELLS) for n in counts)
+    counts = tuple(whole(n, "counts", 1, limits.top_cells) for n in counts)
     check_counts(counts)
     if not isinstance(metadata["top"], list) or len(metadata["top"]) != 3:
         raise ValueError(f"top should be three numbers, found {metadata['top']}")
@@ -398,8 +393,8 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
         found = arrays.get(name)
         if found is None or found.dtype != np.uint8 or found.ndim != 1:
             raise ValueError(f"array '{name}' should be bytes in one dimension")
-    if len(arrays["masks"]) > 8 * MAX_BRICKS:
-        raise ValueError(f"there should be at most {MAX_BRICKS} bricks, found {len(arrays['masks']) // 8}")
+    if len(arrays["masks"]) > 8 * limits.bricks:
+        raise ValueError(f"there should be at most {limits.bricks} bricks, found {len(arrays['masks']) // 8}")
     tree = BrickTree.unpacked(aabb[:3], top, counts, arrays["nodes"], arrays["masks"])
     phase = metadata.get("phase", [0, 0, 0])
     if not isinstance(phase, list) or len(phase) != 3:

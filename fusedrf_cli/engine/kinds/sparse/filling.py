@@ -14,8 +14,9 @@ from fusedrf_cli.engine.kinds.asking import (
     inverse_softplus,
     seen_colours,
 )
-from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice, corner_offsets
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice, corner_offsets
 from fusedrf_cli.engine.settings import current
 
 CORRECTIONS = 3

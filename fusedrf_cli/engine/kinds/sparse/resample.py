@@ -19,13 +19,11 @@ from fusedrf_cli.engine.kinds.asking import (
     even_directions,
     pieces,
     placed_in,
-    touching,
 )
 from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
-    MAX_TOP_CELLS,
+    BrickLimits,
     BrickTree,
-    Lattice,
     children,
     key_places,
     node_keys,
@@ -33,6 +31,7 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
 )
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 from fusedrf_cli.engine.kinds.sparse.seen import can_be_cut
 from fusedrf_cli.engine.kinds.sparse.training import of_voxels
 from fusedrf_cli.engine.settings import current
@@ -144,6 +143,7 @@ def number_count(lattice: Lattice, shape: SparseShape) -> int:
 def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.ndarray, tuple, list[int]]:
     """(lower corner, side of a top cell, top cells per axis, level of each placed field) where voxels are
     `finer` times as wide as `voxels_wanted` has it."""
+    limits = current(BrickLimits)
     config = current(ResampleConfig)
     needs = config.finer * voxels_wanted(teacher, widening)
     depth = int(np.clip(np.round(np.log2(needs.max() / needs.min())), 0, config.deepest))
@@ -151,7 +151,7 @@ def frame_of(teacher: RadianceField, widening: float) -> tuple[np.ndarray, np.nd
     box = teacher.occupancy.tight_aabb(0)
     while True:
         counts = np.maximum(np.ceil((box[3:] - box[:3]) / top + 0.5), 1).astype(int)
-        if np.prod(counts.astype(float)) <= MAX_TOP_CELLS // 4:
+        if np.prod(counts.astype(float)) <= limits.top_cells // 4:
             break
         depth, top = min(depth + 1, MAX_LEVEL), 2 * top
     lo = (box[:3] + box[3:] - top * counts) / 2
@@ -186,8 +186,8 @@ def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.
     for placed, level in zip(placed_in(teacher), levels, strict=True):
         wanted[level].append(demanded(teacher, placed, level, lo, top, counts))
     level, at = leaves([np.unique(np.concatenate(w)) if w else np.zeros(0, np.int64) for w in wanted])
-    whole = BrickTree.of(lo, top, counts, level, at, np.ones((len(level), SIDE, SIDE, SIDE), bool))
-    lattice = Lattice(whole, SIDE)
+    mask = np.ones((len(level), SIDE, SIDE, SIDE), bool)
+    lattice = Lattice(BrickTree.of(lo, top, counts, level, at, mask), SIDE)
     sigma = density(teacher, lattice.places)
     dense = (sigma * lattice.finest_voxel > current(ResampleConfig).faint)[lattice.corners].any(1)
     lattice, (sigma,) = thinned(lattice, dense, sigma)
@@ -244,8 +244,18 @@ def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarr
     kept = which.copy()
     kept[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
     told = np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * kept[which])[:, None]
-    summed = touching(lattice)[which].T @ told
+    summed = at_vertices(corners, told, len(lattice.places))
     return kept | ~which, summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
+
+
+def at_vertices(corners: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """(count, D) sums at vertices of what voxels (K,) of corners (K, 8) are worth (K, D); column by column,
+    since a matrix of them all would take the most memory of anything."""
+    found = np.zeros((count, values.shape[1]))
+    for corner in corners.T:
+        for column, total in zip(values.T, found.T, strict=True):
+            total += np.bincount(corner, column, count)
+    return found
 
 
 def demanded(

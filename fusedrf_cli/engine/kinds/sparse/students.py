@@ -13,6 +13,7 @@ import torch
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.detail import Detail, extent, opacity_off
 from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
+from fusedrf_cli.engine.fields.box import DENSITY_SCALE_PER_EXTENT, DENSITY_SHIFT
 from fusedrf_cli.engine.kinds import splitting
 from fusedrf_cli.engine.kinds.kind import Kind
 from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
@@ -21,7 +22,7 @@ from fusedrf_cli.engine.kinds.sparse import coarsening
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.resample import TooFewNumbers, resampled
 from fusedrf_cli.engine.kinds.sparse.seen import as_seen
-from fusedrf_cli.engine.kinds.sparse.training import SCALE_PER_EXTENT, UNTRAINED, whole_lattice
+from fusedrf_cli.engine.kinds.sparse.training import whole_lattice
 from fusedrf_cli.engine.kinds.student import (
     Contents,
     DistilConfig,
@@ -46,8 +47,9 @@ class SparseConfig:
     """Floats in memory for each number that is stored: rows are padded, hanging vertices too."""
     whole_below: float = 0.8
     """Of the numbers allowed: fewer are taken where no object needs more."""
-    per_number_filled: int = 130
-    """Bytes, as seen: keys, places, indices and least squares of a vertex."""
+    per_number_filled: int = 150
+    """Bytes, as seen, of vertices while they are sought, before any is left out: keys, positions and indices,
+    of two sizes at once. Three objects in 25 MB took 180, five sixths of which is left (decision 034)."""
     bytes_per_brick: int = 10
     """Masks and nodes."""
     degree: int = 1
@@ -106,9 +108,9 @@ class SparseKind(Kind):
         field = SparseField(
             shape_of(plan.way),
             whole_lattice(plan.box, plan.resolution),
-            SCALE_PER_EXTENT / float((plan.box[3:] - plan.box[:3]).mean()),
+            DENSITY_SCALE_PER_EXTENT / float((plan.box[3:] - plan.box[:3]).mean()),
         )
-        field.rows[:, 0] = UNTRAINED
+        field.rows[:, 0] = DENSITY_SHIFT
         return field
 
     def student(self, scene: ComposedField, request: StudentRequest) -> "SparseStudent":

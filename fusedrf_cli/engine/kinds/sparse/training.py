@@ -7,11 +7,11 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.encodings.bricks import SIDE
+from fusedrf_cli.engine.fields.box import DENSITY_SHIFT
 from fusedrf_cli.engine.kernels.reference import OCTANTS
-from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, Lattice
+from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
+from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
 
-UNTRAINED = -8.0  # density feature: with SCALE_PER_EXTENT 4 % opacity along the diagonal of an untrained box
-SCALE_PER_EXTENT = 75.0
 INSIDE = 1e-6  # of a voxel: so far from its corners it is asked whether it lies in an occupied cell
 
 
@@ -79,7 +79,7 @@ def carried(field, lattice: Lattice):
     other = type(field)(field.shape, lattice, field.scale, space=field.space)
     here = field.to("cpu")
     missing = torch.zeros(here.rows.shape[1])
-    missing[0] = UNTRAINED
+    missing[0] = DENSITY_SHIFT
     other.rows[:] = interpolated(here.fine, here.rows, missing, other.fine)
     if other.coarse:
         nothing = torch.zeros(here.bands.shape[1])

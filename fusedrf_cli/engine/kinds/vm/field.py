@@ -153,12 +153,12 @@ class VMField(AssembledField):
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
         """See Kind.field_needs."""
-        (tensor,) = metadata["tensors"]
-        rows, hashed = cls.stored_name(DETAIL), tensor.get("hashed")
-        whole = {rows: (len(hashed["spacings"]) * hashed["rows"], ROW)} if hashed and rows in shapes else {}
-        stored = {name: shape for name, shape in (shapes | whole).items() if ".occupancy" not in name}
-        numbers = sum(-(-prod(shape) // LINE) * LINE for shape in stored.values())
-        cells = prod(tensor["occupancy"])
+        own, rows = box_metadata(cls.kind, metadata), cls.stored_name(DETAIL)
+        hashed = own["shape"].get("hashed")
+        whole = dict(shapes) | ({} if hashed is None else {rows: hashed.shape})  # a file may have few of them
+        stored = [shape for name, shape in whole.items() if ".occupancy" not in name]
+        numbers = sum(-(-prod(shape) // LINE) * LINE for shape in stored)
+        cells = prod(whole_numbers(own["cells"]["counts"], 1, "cells"))
         return FieldNeeds(4 * numbers + PER_CELL * cells, PER_CELL_MADE * cells)
 
     @classmethod

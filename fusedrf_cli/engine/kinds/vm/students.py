@@ -1,6 +1,5 @@
 """A vm field as a student: over a scene's box, from a background's numbers where these can be taken over."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +8,6 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.assembled import MAX_RANK
-from fusedrf_cli.engine.fields.computed import BRICK
 from fusedrf_cli.engine.fields.hashed import PER_BLOCK, ROW, TOGETHER, Held
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds.boxes import BoxKind
@@ -48,9 +46,6 @@ class VMStudentConfig:
     """Times its own voxel: how coarse a field can get before it is left without its detail."""
     noise: float = 0.03
     """Of the factors of a student that takes over others' numbers."""
-
-
-BLOCKS, BRICKS = ".detail_blocks", ".occupancy.bricks"  # ends of names of arrays that tell what is stored
 
 
 def shape_within(way: Way) -> VMShape:
@@ -167,11 +162,6 @@ class VMKind(BoxKind):
         if shape.hashed:
             told["detail_rows"] = held.count if held else shape.hashed.shape[0]
         return told
-
-    def held_bytes(self, decoded: int, shapes: Mapping[str, tuple[int, ...]]) -> int:
-        """With all rows of hash grids, and all cells, of which few are stored."""
-        bits = {end: sum(8 * s[0] for n, s in shapes.items() if n.endswith(end)) for end in (BLOCKS, BRICKS)}
-        return decoded + 4 * bits[BLOCKS] * TOGETHER * ROW + bits[BRICKS] // 2 * BRICK**3
 
 
 def upright(background: Placed) -> VMField | None:
