@@ -137,4 +137,4 @@ def test_a_kind_that_nobody_has_is_a_clear_sentence(run, folder):
 
 def test_auto_says_why(report):
     said = report("fuse", "pair.json", "-o", "fused.rfpack")
-    assert said["kind"] == "blocks" and "vm" in said["kind_because"]
+    assert said["kind"] == "blocks" and "a field of its own" in said["kind_because"]

@@ -311,12 +311,16 @@ class BoxField(ComputedField):
         """Raise ValueError where a density feature of that size gives an answer beyond MAX_ANSWER."""
         density = self.scale * (largest + abs(self.shift) + 1)
         if not density <= MAX_ANSWER:
-            raise ValueError(f"the density would reach {density:.3g}, expected at most {MAX_ANSWER:g}")
+            arrays = f"arrays '{self.stored_name('density')}*'"
+            said = f"the density would reach {density:.3g} by {arrays}"
+            raise ValueError(f"{said}, expected at most {MAX_ANSWER:g}")
 
     def check_logit(self, largest: float) -> None:
         """Raise ValueError where a colour's logit could be beyond MAX_ANSWER."""
         if not largest <= MAX_ANSWER:
-            raise ValueError(f"a colour's logit would reach {largest:.3g}, expected at most {MAX_ANSWER:g}")
+            arrays = f"arrays '{self.stored_name('colour')}*'"
+            said = f"a colour's logit would reach {largest:.3g} by {arrays}"
+            raise ValueError(f"{said}, expected at most {MAX_ANSWER:g}")
 
 
 def largest(values: torch.Tensor, kept: int = 0) -> torch.Tensor:
