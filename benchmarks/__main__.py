@@ -14,7 +14,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.teacher import Points
+from fusedrf_cli.engine.distillation.teacher import TeacherPoints
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import cpu, reference
@@ -156,7 +156,7 @@ def fuse_row(field: VMField, generator: torch.Generator, rays_o: np.ndarray, ray
     points = centres[torch.randint(len(centres), (POINTS,), generator=generator)]
     dirs = torch.from_numpy(rays_d).repeat(POINTS // RAYS, 1)
     asked = torch.full((POINTS,), 20.0), torch.full((POINTS, 3), 0.5)
-    mine, pool = Adam.of(field), Points(points, dirs, *asked, torch.ones(POINTS))
+    mine, pool = Adam.of(field), TeacherPoints(points, dirs, *asked, torch.ones(POINTS))
     batch, chosen = pool.batch(0, 1 << 15), torch.arange(1 << 15)
 
     def ours():

@@ -30,8 +30,8 @@ from benchmarks.paper.sources import PLACES, make, write_scene
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell
 from benchmarks.placed import SOURCES, STANDS, UPRIGHT
+from fusedrf_cli.bridge.capture_cameras import camera_set_of
 from fusedrf_cli.bridge.pictures import camera_of
-from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -163,7 +163,7 @@ def of_ten_fields(scene: list[Placed]) -> list[Placed]:
 
 def crowded_frames(folder: Path) -> list[list[Frame]]:
     """Far and close, a frame for each number of objects; and that of a crowd."""
-    view = rig_of(load_scene(str(folder / "bear.rfpack"))).typical
+    view = camera_set_of(load_scene(str(folder / "bear.rfpack"))).typical
     far = camera_of(view.reframed(SMALL, SMALL))
     pose = far.camera_to_world.copy()
     pose[:3, 3] += CLOSE * (np.mean([at for _, at in STANDS.values()], axis=0) - pose[:3, 3])

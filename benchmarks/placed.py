@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, kept_rows, tell, write_csv
-from fusedrf_cli.bridge.looks import share_seen, subjects_of
+from benchmarks.paper.work import fusedrf, stored_rows, tell, write_csv
+from fusedrf_cli.bridge.capture_cameras import camera_set_of
+from fusedrf_cli.bridge.evaluation_views import share_seen, view_targets
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
-from fusedrf_cli.bridge.rigs import rig_of
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.rendering.volume import render_image
 
@@ -76,8 +76,8 @@ def check_seen(folder: Path) -> None:
     is said of it would be of fog."""
     loaded = load_scene(str(folder / "scene.json"))
     seen = share_seen(loaded, loaded.composed())
-    cameras = [camera_of(view) for view in rig_of(loaded).views]
-    for subject in subjects_of(loaded):
+    cameras = [camera_of(view) for view in camera_set_of(loaded).views]
+    for subject in view_targets(loaded):
         if not any(seen(camera, subject) > 0 for camera in cameras):
             raise SystemExit(f"{folder / 'scene.json'}: '{subject.name}' is seen in none of the photos")
 
@@ -106,7 +106,7 @@ def measured(folder: Path, kind: str) -> dict:
 def frame_seconds(bundles: list[Path]) -> list[float]:
     """The median seconds of a frame of each, taking turns after one that loads kernels."""
     loaded = [load_scene(str(path)) for path in bundles]
-    camera = camera_of(rig_of(loaded[-1]).typical.reframed(*FRAME))
+    camera = camera_of(camera_set_of(loaded[-1]).typical.reframed(*FRAME))
     fields = [renderable(scene) for scene in loaded]
     took: list[list[float]] = [[] for _ in bundles]
     for _ in range(1 + FRAMES):
@@ -120,7 +120,7 @@ def frame_seconds(bundles: list[Path]) -> list[float]:
 def write_page(out: Path, rows: list[dict]) -> None:
     """placed.csv and placed.md, with the rows that are there of other kinds."""
     path = out / "placed.csv"
-    rows = rows + kept_rows(path, "kind", {row["kind"] for row in rows})
+    rows = rows + stored_rows(path, "kind", {row["kind"] for row in rows})
     rows.sort(key=lambda row: KINDS.index(row["kind"]))
     write_csv(path, rows)
     text = f"# Objects on a real background\n\n{ABOUT}\n\n{markdown(rows)}"

@@ -20,7 +20,7 @@ from PIL import Image
 
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
-from benchmarks.paper.work import fusedrf, kept_rows, tell, write_csv
+from benchmarks.paper.work import fusedrf, stored_rows, tell, write_csv
 from formats.captures import hold_out, is_capture, read_capture
 from formats.errors import FormatError
 from formats.views import Capture, View
@@ -171,7 +171,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         field = Path(folder) / "field.rfpack"
         for name, capture in captures(asked.data):
-            rows = kept_rows(asked.out / "real.csv", "capture", {name})
+            rows = stored_rows(asked.out / "real.csv", "capture", {name})
             for seconds in BUDGETS.get(name, current(RealConfig).others):
                 rows.append(measured(asked.data / name, name, capture, seconds * asked.share, field))
             write_pair(field, capture.test[len(capture.test) // 2], asked.out / f"{name}.jpg")

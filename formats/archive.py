@@ -24,7 +24,7 @@ from formats.errors import (
     ResourceError,
     TruncatedBundle,
 )
-from formats.inputs import open_input
+from formats.safe_input import open_input
 
 ALIGNMENT = 64
 MAX_ARCHIVE = 2**32 - 2

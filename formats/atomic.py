@@ -124,9 +124,9 @@ def hidden_sibling(target: Path, ending: str) -> Path:
 
 def remove_unfinished() -> None:
     """Remove the temporaries of this process, which ends without going on."""
-    for place in list(unfinished):
+    for path in list(unfinished):
         with contextlib.suppress(OSError):
-            _remove(place)
+            _remove(path)
 
 
 def remove_leftovers(path: Path | str) -> None:
@@ -137,10 +137,10 @@ def remove_leftovers(path: Path | str) -> None:
     ending = r"\.[0-9a-f]{12}\." + ("(tmp|old)" if target.exists() else "tmp")
     more = r"(\.checkpoint)?"
     leftover = re.compile(rf"\.?{re.escape(_hidden_stem(target))}{more}{ending}{more}({ending})?")
-    for place in target.parent.iterdir():
-        if leftover.fullmatch(place.name):
+    for candidate in target.parent.iterdir():
+        if leftover.fullmatch(candidate.name):
             with contextlib.suppress(OSError):
-                _remove(place)
+                _remove(candidate)
 
 
 def _hidden_stem(target: Path) -> str:
@@ -224,10 +224,10 @@ def _explain(error: BaseException, path: Path | str, temporary: Path, target: Pa
 
 def _sync_tree(folder: Path) -> None:
     """Flush every file in `folder`, and then the names."""
-    for place, _, names in os.walk(folder, topdown=False):
+    for copy, _, names in os.walk(folder, topdown=False):
         for name in names:
-            sync_file(os.path.join(place, name))
-        sync_folder(Path(place))
+            sync_file(os.path.join(copy, name))
+        sync_folder(Path(copy))
 
 
 def sync_file(path: Path | str) -> None:

@@ -85,16 +85,20 @@ def unfolded(
         if not blocks:
             continue
         fields = {n: encode_tensor(views[member], header, n) for n in sorted({b.tensor for b in blocks})}
-        own = {n: member_name(data) for n, data in fields.items()}
+        members = {n: member_name(data) for n, data in fields.items()}
         instances[member] = tuple(
             Instance(
-                object_name(b.name), b.name not in UNNAMED, own[b.tensor], np.array(b.object_to_field), b.tint
+                object_name(b.name),
+                b.name not in UNNAMED,
+                members[b.tensor],
+                np.array(b.object_to_field),
+                b.tint,
             )
             for b in blocks
         )
         del views[member], headers[member]
-        views |= {own[n]: data for n, data in fields.items()}
-        headers |= {own[n]: decode_header(data, member) for n, data in fields.items()}
+        views |= {members[n]: data for n, data in fields.items()}
+        headers |= {members[n]: decode_header(data, member) for n, data in fields.items()}
     if instances:
         scene = with_nodes(scene, instances)
     return Unfolded(scene, views, headers, instances)
@@ -111,8 +115,8 @@ def blocks_in(header: FieldHeader, names: set[str], writing: bool) -> list[Store
         matrices = np.array([block.object_to_field for block in blocks], np.float64)
     except (msgspec.ValidationError, OverflowError):
         return []
-    found = [ARRAY.fullmatch(name) for name in header.specs]
-    if not all(found) or any(int(match[1]) >= len(tensors) for match in found):
+    arrays = [ARRAY.fullmatch(name) for name in header.specs]
+    if not all(arrays) or any(int(match[1]) >= len(tensors) for match in arrays):
         return []
     if not blocks or any(block.tensor >= len(tensors) for block in blocks):
         return []
@@ -159,24 +163,24 @@ def coded_entry(spec: CodedSpec) -> dict:
 def with_nodes(scene: SceneGraph, instances: dict[str, tuple[Instance, ...]]) -> SceneGraph:
     """The scene with a node for each instance of the fields that its nodes name, and a history that tells of
     the others alone."""
-    taken = {node.name for node, _, _ in scene.walk() if node.field not in instances}
+    used_names = {node.name for node, _, _ in scene.walk() if node.field not in instances}
     background = {n["name"] for n in distilled(scene.history).values() if n.get("background")}
     members: dict[str, str] = {}
     """Of the objects."""
 
     def placed(node: Node, within: np.ndarray) -> list[Node]:
-        own, names = instances[node.field], {}
-        for i, one in sorted(enumerate(own), key=lambda pair: not pair[1].is_object):
-            names[i] = free_name(one.name, taken, node.name)
+        new_nodes, names = instances[node.field], {}
+        for i, one in sorted(enumerate(new_nodes), key=lambda pair: not pair[1].is_object):
+            names[i] = free_name(one.name, used_names, node.name)
             if one.is_object:
                 members[names[i]] = one.member
-        found = []
-        for i, one in enumerate(own):
-            place, tint = placement_of(within @ one.object_to_field), {"tint": list(one.tint)}
+        placed_nodes = []
+        for i, one in enumerate(new_nodes):
+            placement, tint = placement_of(within @ one.object_to_field), {"tint": list(one.tint)}
             behind = node.background or one.name in background
             tint = {} if one.tint == WHITE else tint
-            found.append(Node(names[i], one.member, None, place, behind, (), {}, tint))
-        return found
+            placed_nodes.append(Node(names[i], one.member, None, placement, behind, (), {}, tint))
+        return placed_nodes
 
     def nodes_for(node: Node) -> list[Node]:
         children = [one for child in node.children for one in nodes_for(child)]
@@ -185,37 +189,37 @@ def with_nodes(scene: SceneGraph, instances: dict[str, tuple[Instance, ...]]) ->
         several = scene.composition != RULE and len(instances[node.field]) > 1
         if not (node.showing or node.extras or children or several):
             return placed(node, node.node_to_parent)
-        taken.add(node.name)  # what it says holds for all of them
-        own = (*placed(node, np.eye(4)), *children)
+        used_names.add(node.name)  # what it says holds for all of them
+        new_nodes = (*placed(node, np.eye(4)), *children)
         rule = RULE if several else node.composition
-        return [replace(node, field=None, background=False, children=own, composition=rule)]
+        return [replace(node, field=None, background=False, children=new_nodes, composition=rule)]
 
     nodes = tuple(one for node in scene.nodes for one in nodes_for(node))
-    return replace(scene, nodes=nodes, history=told_by_graph(scene.history, members))
+    return replace(scene, nodes=nodes, history=without_placements(scene.history, members))
 
 
-def told_by_graph(history: tuple[dict, ...], members: dict[str, str]) -> tuple[dict, ...]:
+def without_placements(history: tuple[dict, ...], members: dict[str, str]) -> tuple[dict, ...]:
     """A history without placements of objects that are nodes, by name, but with what these were made of."""
     known: dict[str, dict] = {}
-    return tuple(_told_by_graph(entry, members, known) for entry in history)
+    return tuple(_without_placements(entry, members, known) for entry in history)
 
 
-def _told_by_graph(entry: dict, members: dict[str, str], known: dict[str, dict]) -> dict:
+def _without_placements(entry: dict, members: dict[str, str], known: dict[str, dict]) -> dict:
     names, inside, sources = [], [], {}
     for node in listed(entry.get("nodes")):
         name = node.get("name") if isinstance(node, dict) else None
-        own = [one for one in members if belongs(one, {name})] if isinstance(name, str) else []
-        if not own:
+        known_members = [one for one in members if belongs(one, {name})] if isinstance(name, str) else []
+        if not known_members:
             inside.append(node)
             continue
         names.append(name)
         made_of = {} if node.get("kept") else {key: node[key] for key in ("source", "sha256") if key in node}
-        for part in own if "field" in node and (made_of or node.get("kept")) else ():
+        for part in known_members if "field" in node and (made_of or node.get("kept")) else ():
             instance = {} if part == name else {"instance": part.removeprefix(f"{name}/")}
-            told = {"field": node["field"], **made_of, **instance}
-            if known.setdefault(members[part], told) is told and told["field"] != members[part]:
-                sources[members[part]] = told
+            changed = {"field": node["field"], **made_of, **instance}
+            if known.setdefault(members[part], changed) is changed and changed["field"] != members[part]:
+                sources[members[part]] = changed
     if not names:
         return entry
-    told = {key: value for key, value in entry.items() if key != "nodes"} | {"objects": names}
-    return told | ({"nodes": inside} if inside else {}) | ({"sources": sources} if sources else {})
+    changed = {key: value for key, value in entry.items() if key != "nodes"} | {"objects": names}
+    return changed | ({"nodes": inside} if inside else {}) | ({"sources": sources} if sources else {})

@@ -13,7 +13,7 @@ import numpy as np
 from formats.archive import MAGIC, parse_archive, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
 from formats.blocks import Instance, Unfolded, unfolded
-from formats.contents import objects_in, world_aabb
+from formats.camera_set import read_camera_set
 from formats.errors import (
     BadHeader,
     BadSchema,
@@ -22,8 +22,8 @@ from formats.errors import (
     MissingMember,
     UnknownMember,
 )
-from formats.inputs import open_input
 from formats.nodes import WHITE
+from formats.object_summary import objects_in, world_aabb
 from formats.records import (
     FieldHeader,
     FieldRecord,
@@ -34,7 +34,7 @@ from formats.records import (
     member_name,
     sha256_of_bytes,
 )
-from formats.rig import read_rig
+from formats.safe_input import open_input
 from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, make_node, parse_scene, read_scene
 
 SCENE = "scene.json"
@@ -152,10 +152,10 @@ class BundleWriter:
     def _with_parts_apart(self, record: FieldRecord, precision: str) -> FieldRecord:
         arrays, parts = dict(record.arrays), {}
         for part in record.metadata[SHARED]:
-            own = {
+            remaining = {
                 n.removeprefix(f"{part}."): arrays.pop(n) for n in record.arrays if n.startswith(f"{part}.")
             }
-            parts[part] = self.add_field(FieldRecord(PART, own), precision)
+            parts[part] = self.add_field(FieldRecord(PART, remaining), precision)
         return FieldRecord(record.kind, arrays, record.metadata | {SHARED: parts})
 
     def copy_field(self, bundle: FieldSet | Path | str, member: str) -> str:
@@ -227,9 +227,9 @@ def read_headers(path: Path | str, *, verify: bool = True) -> tuple[SceneGraph, 
     return bundle.scene, bundle.headers
 
 
-def _take_part(record: FieldRecord, part: str, found: FieldRecord) -> None:
+def _take_part(record: FieldRecord, part: str, shared: FieldRecord) -> None:
     """Give a field the arrays of a part that it shares, as PART.NAME."""
-    record.arrays.update({f"{part}.{key}": array for key, array in found.arrays.items()})
+    record.arrays.update({f"{part}.{key}": array for key, array in shared.arrays.items()})
 
 
 def shared_members(
@@ -255,7 +255,7 @@ def read_summary(path: Path | str) -> dict:
     """What `info` reports of a bundle or a plain scene.json, JSON-able; arrays are checked by CRC-32 alone.
 
     Boxes are (6,) lists: `aabb` in the object's frame, `world_aabb` the box around its eight placed corners.
-    `objects` are what a fused field was made of (formats/contents.py); a plain scene has nodes alone.
+    `objects` are what a fused field was made of (formats/object_summary.py); a plain scene has nodes alone.
     """
     if _is_json(path):
         return summary_of(read_scene(path), str(path), _size(path))
@@ -379,7 +379,7 @@ def _scene_summary(scene: SceneGraph, headers: dict[str, FieldHeader]) -> dict:
         "generator": scene.generator,
         "composition": scene.composition,
         "framing": scene.framing and list(scene.framing),
-        "cameras": scene.cameras and read_rig(scene.cameras).summary(),
+        "cameras": scene.cameras and read_camera_set(scene.cameras).summary(),
         "nodes": nodes,
         "objects": objects_in(scene, headers),
         "history": list(scene.history),

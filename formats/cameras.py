@@ -12,11 +12,11 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 from formats.errors import BadIntrinsics, BadJson, BadSchema, LimitExceeded, NoViews, UnsupportedCamera
-from formats.foreign import foreign_json
 from formats.images import MAX_SIDE, read_image_header
-from formats.inputs import decoded, read_input
 from formats.names import distinct_names
+from formats.other_files import foreign_json
 from formats.photos import find_photo, split_ending
+from formats.safe_input import decoded, read_input
 from formats.views import View, checked_pose
 
 MAX_JSON = 256 * 2**20
@@ -74,8 +74,8 @@ def read_document(path: Path, most: int = MAX_VALUES) -> dict:
     except ValueError as error:
         raise BadJson(f"{path}: not JSON: {error}{_cure(error)}") from error
     if not isinstance(document, dict):
-        found = f"{path}: found a JSON {type(document).__name__}, expected an object with frames"
-        raise foreign_json(path) or BadSchema(found)
+        problem = f"{path}: found a JSON {type(document).__name__}, expected an object with frames"
+        raise foreign_json(path) or BadSchema(problem)
     return document
 
 
@@ -227,16 +227,16 @@ def checked_focal(pixels: float, where: str) -> float:
 
 
 def _number(sources: tuple[dict, ...], key: str, where: str, default: float | None) -> float | None:
-    found = next((source[key] for source in sources if source.get(key) is not None), default)
-    if found is None:
+    number = next((source[key] for source in sources if source.get(key) is not None), default)
+    if number is None:
         return None
-    if isinstance(found, str):
-        raise BadIntrinsics(f"{where}: {key} is the text {found[:40]!r}, expected a number without quotes")
-    if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) <= MOST_PIXELS:
+    if isinstance(number, str):
+        raise BadIntrinsics(f"{where}: {key} is the text {number[:40]!r}, expected a number without quotes")
+    if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= MOST_PIXELS:
         raise BadIntrinsics(
-            f"{where}: {key} is {str(found)[:40]}, expected a finite number up to {MOST_PIXELS:g}"
+            f"{where}: {key} is {str(number)[:40]}, expected a finite number up to {MOST_PIXELS:g}"
         )
-    return float(found)
+    return float(number)
 
 
 def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ...]]:
@@ -246,22 +246,22 @@ def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ..
     where it divides.
     """
     model = str(next((source["camera_model"] for source in sources if "camera_model" in source), "")).upper()
-    said = {key: _number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
+    numbers = {key: _number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
     if model in FISHEYE or any(source.get("is_fisheye") for source in sources):
-        if said["p1"] or said["p2"]:
+        if numbers["p1"] or numbers["p2"]:
             raise UnsupportedCamera(
                 f"{where}: a fisheye with p1 or p2, expected k1 to k4; undistort the photos"
             )
-        return True, tuple(said[key] for key in ("k1", "k2", "k3", "k4"))
+        return True, tuple(numbers[key] for key in ("k1", "k2", "k3", "k4"))
     if model not in PERSPECTIVE | {RATIONAL}:
         raise UnsupportedCamera(
             f"{where}: a camera with {model[:40]}, expected a pinhole or a fisheye with OpenCV's distortion; "
             "undistort the photos first"
         )
-    plain = tuple(said[key] for key in BENDS)
-    if model == RATIONAL or said["k5"] or said["k6"]:
-        return False, (*plain, 0.0, *(said[key] for key in RATIONAL_BENDS))
-    return False, (*plain, said["k4"]) if said["k4"] else plain
+    plain = tuple(numbers[key] for key in BENDS)
+    if model == RATIONAL or numbers["k5"] or numbers["k6"]:
+        return False, (*plain, 0.0, *(numbers[key] for key in RATIONAL_BENDS))
+    return False, (*plain, numbers["k4"]) if numbers["k4"] else plain
 
 
 # --- camera_path.json ---------------------------------------------------------------------------------------

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.capture_frame import default_box, scene_frame, shown_box
 from formats.errors import NoViews, printable
-from formats.frame import default_box, scene_frame, shown_box
 from formats.masks import with_masks_beside
 from formats.photos import (
     alike_turned,
 )
-from formats.points import Points
+from formats.points import SparsePoints
 from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
 from formats.transforms import (
-    Part,
+    SplitPart,
 )
 from formats.upright import upward_doubt
 from formats.views import LEAST_VIEWS, Capture, View
@@ -24,10 +24,10 @@ from formats.views import LEAST_VIEWS, Capture, View
 def capture_of(
     path: Path,
     kind: str,
-    train: Part,
-    test: Part,
+    train: SplitPart,
+    test: SplitPart,
     stated: np.ndarray | None,
-    points: Points | None = None,
+    points: SparsePoints | None = None,
     notes: tuple[str, ...] = (),
 ) -> Capture:
     """The capture in `path`, of some kind, of views to learn from and views to measure with; `stated` (6,) is
@@ -46,18 +46,18 @@ def capture_of(
     first_test = _left(masked.views, seen.views, first_test)
     poses = np.array([view.camera_to_world for view in seen.views])
     frame, box, opaque = None, stated, not seen.outlines
-    said = [sideways, *masked.notes, *seen.notes]
+    all_notes = [sideways, *masked.notes, *seen.notes]
     if opaque:
         seen = by_ground(seen.views)
-        said += seen.notes
+        all_notes += seen.notes
     if not seen.outlines:
         frame, box = _surroundings(seen.views, poses, points)
     elif not opaque or box is None:
         box = outline_box(seen, AMISS_ON_WHITE if opaque else AMISS)
     cut_out = outline_box(masked) if masked.outlines else None
     if frame is not None and len(seen.views) >= LEAST_VIEWS:
-        said.append(upward_doubt(poses))
-    notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in said if note))
+        all_notes.append(upward_doubt(poses))
+    notes = (*train.notes, *test.notes, *notes, *beside, *(f"{path}: {note}" for note in all_notes if note))
     notes = (*notes, *_off_centre(path, seen.views), *_smaller(path, seen.views))
     notes = tuple(dict.fromkeys(map(printable, notes)))  # they have names from the file
     parts = seen.views[:first_test], seen.views[first_test:]
@@ -91,7 +91,7 @@ def _smaller(path: Path, views: tuple[View, ...]) -> Iterator[str]:
         )
 
 
-def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: Points | None) -> tuple:
+def _surroundings(views: tuple[View, ...], poses: np.ndarray, points: SparsePoints | None) -> tuple:
     """The frame of photos that show a subject and all around it, and a box large enough for that."""
     depths = [math.sqrt(view.near * view.far) for view in views if view.near and view.far]
     frame = scene_frame(poses, float(np.median(depths)) if depths else None)

@@ -19,11 +19,11 @@ from formats.atomic import atomic_writer
 from formats.cameras import frame_names, read_cameras, read_document
 from formats.capture_of import capture_of
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
-from formats.foreign import is_json, not_a_capture, other_cameras
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
 from formats.matching import PHOTO_FOLDERS, gone, match_photos
 from formats.meshes import is_mesh, mesh_capture
+from formats.other_files import is_json, not_a_capture, other_cameras
 from formats.photos import (
     Folder,
     chosen_copy,
@@ -43,7 +43,7 @@ from formats.photos import (
 from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
 from formats.transforms import (
     BLENDER_FILE,
-    Part,
+    SplitPart,
     read_part,
     read_splits,
     sparse_points,
@@ -100,13 +100,13 @@ def _has_poses(path: Path) -> bool:
 
 def _captures_below(path: Path) -> list[Path]:
     """Folders with poses in a folder without any, up to LEVELS deep and none inside another, by path."""
-    found, level = [], [path]
+    captures, level = [], [path]
     for _ in range(LEVELS):
         inner = [folder for above in level for folder in folders(above)][:MAX_FOLDERS]
         level = []
         for folder in inner:
-            (found if _has_poses(folder) else level).append(folder)
-    return sorted(found, key=lambda folder: natural(str(folder)))
+            (captures if _has_poses(folder) else level).append(folder)
+    return sorted(captures, key=lambda folder: natural(str(folder)))
 
 
 def poses_elsewhere(path: Path) -> str | None:
@@ -122,8 +122,8 @@ def poses_elsewhere(path: Path) -> str | None:
             continue
         if is_capture(file):
             return f"{path}: {file.name} has poses, which are not used; give that file"
-        if (found := other_cameras(file)) is not None:
-            return f"{path}: {file.name}, {found.what}, is not used; {found.cure}"
+        if (other := other_cameras(file)) is not None:
+            return f"{path}: {file.name}, {other.what}, is not used; {other.cure}"
     return None
 
 
@@ -219,9 +219,9 @@ def _read_blender(
         try:
             parts.append(read_part(test, downscale))
         except NoViews as error:
-            parts.append(Part())
+            parts.append(SplitPart())
             notes = (f"{error}; none are held out by it",)
-    parts = [*parts, Part()] if train else [Part(), *parts]
+    parts = [*parts, SplitPart()] if train else [SplitPart(), *parts]
     stated = stated_aabb(first, read_document(first))
     return capture_of(path, "blender", *parts[:2], stated=stated, notes=notes)
 
@@ -260,7 +260,7 @@ def _read_model(
     part = _read_listed(
         model.folder, base, images, lambda image, size: (image.where, image.view), downscale, homes
     )
-    return capture_of(path, kind, part, Part(), None, model.points, tuple(notes))
+    return capture_of(path, kind, part, SplitPart(), None, model.points, tuple(notes))
 
 
 def _read_listed(
@@ -270,7 +270,7 @@ def _read_listed(
     camera: Callable[[object, tuple[int, int]], tuple[str, View]],
     downscale: int | None,
     homes: Sequence[str] = ("",),
-) -> Part:
+) -> SplitPart:
     """The photos of names, with what stands for each; `camera` makes of this and the photo's size how errors
     name it, and its view. `where` lists them, and the photos lie in one of `homes` in `base`."""
     matched = match_photos(where, base, [file for file, _ in listed], downscale, homes)
@@ -279,22 +279,22 @@ def _read_listed(
         raise MissingFile(
             f"{where}: names {len(listed)} photos such as {named}, but none of them is there: {matched.hint}"
         )
-    found = sorted((item for item in listed if item[0] in matched.photos), key=lambda item: natural(item[0]))
-    names = frame_names([{"file_path": file} for file, _ in found])
+    items = sorted((item for item in listed if item[0] in matched.photos), key=lambda item: natural(item[0]))
+    names = frame_names([{"file_path": file} for file, _ in items])
 
     def read(numbered: tuple[int, tuple]) -> View:
         i, (file, item) = numbered
-        photo, place = matched.photos[file]
+        photo, folder = matched.photos[file]
         header = read_image_header(photo)
-        said, view = camera(item, header[:2])
+        camera_where, view = camera(item, header[:2])
         view = replace(view, name=names[i])
-        return on_photo(view, photo, header, said, reduction=place.reduction(header, downscale))
+        return on_photo(view, photo, header, camera_where, reduction=folder.reduction(header, downscale))
 
     views, broken = read_sound(
-        where, list(enumerate(found)), read, lambda item: str(matched.photos[item[1][0]][0])
+        where, list(enumerate(items)), read, lambda item: str(matched.photos[item[1][0]][0])
     )
     notes = (*matched.notes, *broken, *repair_notes(where, views))
-    return Part(tuple(views), matched.missing, notes)
+    return SplitPart(tuple(views), matched.missing, notes)
 
 
 def _other_models(path: Path, folder: Path) -> list[str]:
@@ -312,38 +312,38 @@ def _other_models(path: Path, folder: Path) -> list[str]:
 def _read_llff(path: Path, downscale: int | None) -> Capture:
     rows = llff.read_poses_bounds(path)
     images = path.parent / "images"
-    place = _counted(images, len(rows), downscale)
-    if place is None:
-        counts = [(place.path.name, len(pictures(place.path))) for place in copies(images)]
-        found = ", ".join(f"{count} in {name}" for name, count in counts)
+    folder = _counted(images, len(rows), downscale)
+    if folder is None:
+        counts = [(folder.path.name, len(pictures(folder.path))) for folder in copies(images)]
+        counted = ", ".join(f"{count} in {name}" for name, count in counts)
         raise BadModel(
-            f"{path}: has {len(rows)} poses, one per photo by the order of names, but there are {found}; "
+            f"{path}: has {len(rows)} poses, one per photo by the order of names, but there are {counted}; "
             "restore all photos, or estimate the poses again"
         )
-    photos = pictures(place.path)
+    photos = pictures(folder.path)
     sound = [(i, photo) for i, photo in enumerate(photos) if photo.stat().st_size]
 
     def read(item: tuple[int, Path]) -> View:
         i, photo = item
         where, header = f"{path}: row {i} ({photo.name})", read_image_header(photo)
         view = replace(llff.row_view(where, rows[i]), name=photo.stem)
-        return on_photo(view, photo, header, where, reduction=place.reduction(header, downscale))
+        return on_photo(view, photo, header, where, reduction=folder.reduction(header, downscale))
 
     views, broken = read_sound(path, sound, read, lambda item: item[1].name)
     order = (
-        f"{path}: has no names, so its {len(rows)} rows go with the photos of {place.path.name} by the order "
-        f"of their names, {photos[0].name} to {photos[-1].name}"
+        f"{path}: has no names, so its {len(rows)} rows go with the photos of {folder.path.name} by the "
+        f"order of their names, {photos[0].name} to {photos[-1].name}"
     )
     empty = tuple(photo.name for photo in photos if not photo.stat().st_size)
     notes = (order, *(f"{path}: {note}" for note in gone(empty)), *broken, *repair_notes(path, views))
-    part = Part(tuple(views), empty, notes)
-    return capture_of(path, "llff", part, Part(), None)
+    part = SplitPart(tuple(views), empty, notes)
+    return capture_of(path, "llff", part, SplitPart(), None)
 
 
 def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
     """The folder out of `copies` to read photos from whose names say nothing: it has so many."""
-    listed = [(place, pictures(place.path)) for place in copies(images)]
-    return chosen_copy([(place, files[0]) for place, files in listed if len(files) == count > 0], downscale)
+    listed = [(folder, pictures(folder.path)) for folder in copies(images)]
+    return chosen_copy([(folder, files[0]) for folder, files in listed if len(files) == count > 0], downscale)
 
 
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
@@ -354,7 +354,7 @@ def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None
     photos, poses = polycam.FOLDERS[0]
     lost = images.name != photos and (images.parent / poses).is_dir()
     uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
-    return capture_of(path, "polycam", part, Part(), None, notes=tuple(uncorrected))
+    return capture_of(path, "polycam", part, SplitPart(), None, notes=tuple(uncorrected))
 
 
 def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Capture:
@@ -369,7 +369,7 @@ def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Cap
             downscale,
         )
         if part
-        else Part()
+        else SplitPart()
         for part in names
     ]
     notes += [f"{path}: {unused}"] if unused else []

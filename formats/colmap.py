@@ -15,7 +15,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from formats.cameras import MOST_PIXELS, checked_focal, checked_size
-from formats.colmap_points import Listed, binary_points, text_points
+from formats.capture_frame import depth_range
+from formats.colmap_points import ListedPoints, binary_points, text_points
 from formats.colmap_text import check_count, number, numbered_lines, pose_number
 from formats.errors import (
     BadIntrinsics,
@@ -25,13 +26,12 @@ from formats.errors import (
     ResourceError,
     UnsupportedCamera,
 )
-from formats.frame import depth_range
 from formats.frame_list import once, read_sound
-from formats.inputs import open_input, read_input
 from formats.matching import stem_key
 from formats.photos import folders
-from formats.points import MAX_POINTS, Points, points_notes
+from formats.points import MAX_POINTS, SparsePoints, points_notes
 from formats.rotations import matrices
+from formats.safe_input import open_input, read_input
 from formats.views import FARTHEST, View
 
 MAX_CAMERAS_BYTES = 64 * 2**20
@@ -97,7 +97,7 @@ class Model:
 
     folder: Path
     images: tuple[Image, ...]
-    points: Points | None
+    points: SparsePoints | None
     notes: tuple[str, ...] = ()
     """What of the model is not used, and why."""
 
@@ -157,11 +157,11 @@ def read_model(folder: Path, most_points: int = MAX_POINTS) -> Model:
     if not listed:
         raise BadModel(f"{folder}: its images file is empty; export the model again")
     try:
-        known, notes = _points(folder, most_points), []
+        points, notes = _points(folder, most_points), []
     except ResourceError:
         raise
     except FormatError as error:
-        known, notes = None, [f"{error}; the model is read without its points"]
+        points, notes = None, [f"{error}; the model is read without its points"]
 
     def read(listing: tuple) -> Image:
         where, name, quaternion, translation, camera, seen = listing
@@ -171,16 +171,16 @@ def read_model(folder: Path, most_points: int = MAX_POINTS) -> Model:
             )
         pose = _pose(quaternion, translation, where)
         view = replace(cameras[camera], camera_to_world=pose)
-        if known is not None:
-            found = known.found(seen)
-            near, far = depth_range(pose, known.points.positions[found])
-            view = replace(view, near=near, far=far, seen=known.sure(found))
+        if points is not None:
+            indices = points.found(seen)
+            near, far = depth_range(pose, points.points.positions[indices])
+            view = replace(view, near=near, far=far, seen=points.sure(indices))
         return Image(name, where, view)
 
     listed, repeated = once(folder, listed, _listed_name, lambda item: (*item[2], *item[3]))
     images, broken = read_sound(folder, listed, read, _listed_name)
-    notes = (*repeated, *broken, *notes, *points_notes(folder, known and known.points))
-    return Model(folder, tuple(images), known and known.points, notes)
+    notes = (*repeated, *broken, *notes, *points_notes(folder, points and points.points))
+    return Model(folder, tuple(images), points and points.points, notes)
 
 
 def _listed_name(listing: tuple) -> str:
@@ -191,7 +191,7 @@ def _images(folder: Path) -> list[tuple]:
     return _read(folder, "images", {"bin": _binary_images, "txt": _text_images}, MAX_BYTES)
 
 
-def read_points(folder: Path, most: int = MAX_POINTS) -> tuple[Points | None, dict[str, np.ndarray]]:
+def read_points(folder: Path, most: int = MAX_POINTS) -> tuple[SparsePoints | None, dict[str, np.ndarray]]:
     """The points alone, at most so many, None where the model has none; and, by the `stem_key` of each
     photo's file, which of them were found in it (View.seen). Photos that share a stem are left out."""
     known = _points(folder, most)
@@ -202,7 +202,7 @@ def read_points(folder: Path, most: int = MAX_POINTS) -> tuple[Points | None, di
     return known.points, {stem: known.sure(known.found(ids)) for stem, ids in named if stems[stem] == 1}
 
 
-def _points(folder: Path, most: int) -> Listed | None:
+def _points(folder: Path, most: int) -> ListedPoints | None:
     if not _has(folder, "points3D"):
         return None
     parsers = {"bin": partial(binary_points, most), "txt": partial(text_points, most)}
@@ -251,17 +251,17 @@ def _camera(where: str, model: str, width: int, height: int, numbers) -> View:
         raise BadIntrinsics(
             f"{where}: a parameter is not a number below {MOST_PIXELS:g}; export the model again"
         )
-    said = dict(zip(names, map(float, numbers), strict=True))
-    fl_x, fl_y = (said.get(key, said.get("f", 0.0)) for key in ("fx", "fy"))
+    parameters = dict(zip(names, map(float, numbers), strict=True))
+    fl_x, fl_y = (parameters.get(key, parameters.get("f", 0.0)) for key in ("fx", "fy"))
     for focal in (fl_x, fl_y):
         checked_focal(focal, where)
     checked_size(width, height, where)
     fisheye = "FISHEYE" in model
     keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2", "k4", "d1", "d2", "d3")
-    bends = tuple(said.get(key, 0.0) for key in keys)
+    bends = tuple(parameters.get(key, 0.0) for key in keys)
     if not fisheye and not any(bends[5:]):
         bends = bends[:5]
-    return View("", np.eye(4), fl_x, fl_y, said["cx"], said["cy"], width, height, bends, fisheye)
+    return View("", np.eye(4), fl_x, fl_y, parameters["cx"], parameters["cy"], width, height, bends, fisheye)
 
 
 def _known(where: str, model: str) -> str:
@@ -311,7 +311,7 @@ def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
     """(where, name, quaternion, translation, camera, ids of the points it saw) of each image."""
     (count,) = struct.unpack_from("<Q", data)
     check_count(path, count, len(data), SMALLEST_IMAGE)
-    at, found = 8, []
+    at, listings = 8, []
     for _ in range(count):
         image, *numbers, camera = struct.unpack_from("<I7dI", data, at)
         end = data.find(b"\0", at + 64, at + 64 + MAX_NAME)
@@ -325,14 +325,14 @@ def _binary_images(path: Path, data: bytes) -> Iterator[tuple]:
         seen = np.frombuffer(data, "<u8", 3 * observed, at)[2::3]
         at += 24 * observed
         where = f"{path}: image {image} ({name})"
-        found.append((where, name, numbers[:4], numbers[4:], camera, seen[seen != NO_POINT]))
-    return found
+        listings.append((where, name, numbers[:4], numbers[4:], camera, seen[seen != NO_POINT]))
+    return listings
 
 
 def _text_images(path: Path, data: bytes) -> list[tuple]:
     """As `_binary_images`; the second line of an image holds x, y and point of each observation. It may be
     empty, or be missing where the poses were not found by COLMAP."""
-    found, lines = [], deque(numbered_lines(path, data))
+    listings, lines = [], deque(numbered_lines(path, data))
     while lines:
         line, text = lines.popleft()
         if not text:
@@ -356,8 +356,8 @@ def _text_images(path: Path, data: bytes) -> list[tuple]:
                     f"{path}: line {line}: expected x, y and a point's id again and again"
                 ) from None
         where = f"{path}: image {image} ({name})"
-        found.append((where, name, numbers[:4], numbers[4:], camera, seen[seen >= 0].astype(np.uint64)))
-    return found
+        listings.append((where, name, numbers[:4], numbers[4:], camera, seen[seen >= 0].astype(np.uint64)))
+    return listings
 
 
 def _is_image(text: str) -> bool:

@@ -11,7 +11,7 @@ from formats.colmap_text import check_count, number, numbered_lines
 from formats.errors import (
     BadModel,
 )
-from formats.points import Points, stride
+from formats.points import SparsePoints, stride
 
 MOST_ERROR = 1.5
 """Pixels of the photos that were compared. A point that lies farther, on average, from where photos show it
@@ -19,12 +19,12 @@ says nothing of them."""
 
 
 @dataclass(frozen=True, eq=False)
-class Listed:
+class ListedPoints:
     """The points of a model as its files name them."""
 
     ids: np.ndarray
     """(N,) uint64, rising."""
-    points: Points
+    points: SparsePoints
     errors: np.ndarray
     """(N,) float64, pixels."""
 
@@ -33,16 +33,16 @@ class Listed:
         at = np.minimum(np.searchsorted(self.ids, seen), max(len(self.ids) - 1, 0))
         return np.unique(at[self.ids[at] == seen]) if len(self.ids) else np.empty(0, np.int64)
 
-    def sure(self, found: np.ndarray) -> np.ndarray:
+    def sure(self, indices: np.ndarray) -> np.ndarray:
         """Those of `found` that lie where photos show them."""
-        return found[self.errors[found] <= MOST_ERROR]
+        return indices[self.errors[indices] <= MOST_ERROR]
 
 
 HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 """A point before its track, each entry of which has 8 bytes."""
 
 
-def binary_points(most: int, path: Path, data: bytes, block: int = 1 << 16) -> Listed:
+def binary_points(most: int, path: Path, data: bytes, block: int = 1 << 16) -> ListedPoints:
     """At most so many points; of `block` of them at a time the bytes are gathered."""
     (count,) = struct.unpack_from("<Q", data)
     check_count(path, count, len(data), HEAD.itemsize)
@@ -68,7 +68,7 @@ def _gather(data: bytes, starts: list[int], heads: np.ndarray) -> None:
     heads[len(heads) - len(starts) :] = np.frombuffer(data, np.uint8)[rows].view(HEAD)[:, 0]
 
 
-def text_points(most: int, path: Path, data: bytes) -> Listed:
+def text_points(most: int, path: Path, data: bytes) -> ListedPoints:
     step, rows, ids = stride(data.count(b"\n"), most), [], []
     numbered = (item for item in numbered_lines(path, data) if item[1])
     for line, text in islice(numbered, 0, None, step):
@@ -86,10 +86,10 @@ def text_points(most: int, path: Path, data: bytes) -> Listed:
 
 def _sorted_points(
     ids: np.ndarray, positions: np.ndarray, colours: np.ndarray, errors: np.ndarray, step: int
-) -> Listed:
+) -> ListedPoints:
     """(N,), (N, 3), (N, 3) and (N,) numbers of every `step`-th point of a file."""
     order = np.argsort(ids)
     order = order[(np.abs(positions[order]) < 1e30).all(1)]
     colours = np.clip(colours[order], 0, 255).astype(np.uint8)
-    points = Points(positions[order], colours, step, len(ids) - len(order))
-    return Listed(ids[order], points, errors[order])
+    points = SparsePoints(positions[order], colours, step, len(ids) - len(order))
+    return ListedPoints(ids[order], points, errors[order])

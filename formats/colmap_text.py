@@ -8,7 +8,7 @@ from pathlib import Path
 from formats.errors import (
     BadModel,
 )
-from formats.inputs import decoded
+from formats.safe_input import decoded
 
 LINE_ENDS = re.compile(r"\r\n?|\n")
 

@@ -53,8 +53,10 @@ class Embedding:
             return node
         target = resolve_source(path, node.source, self.allow_outside)
         inner = self.bundle(target).scene
-        own = tuple(self.node(child, target, f"{node.name}/", inner.composition) for child in inner.nodes)
-        return in_place_of(node, own, rule, inner.composition)
+        child_nodes = tuple(
+            self.node(child, target, f"{node.name}/", inner.composition) for child in inner.nodes
+        )
+        return in_place_of(node, child_nodes, rule, inner.composition)
 
     def member(self, bundle: OpenBundle, member: str) -> str:
         """The member of the writer that holds a bundle's field."""
@@ -76,8 +78,8 @@ def in_place_of(node: Node, nodes: tuple[Node, ...], rule: str, own_rule: str) -
             if at_rest:
                 return replace(node, source=None, field=only.field)
             if "crop" not in node.showing:  # it lies in the node's own frame
-                place = placement_of(node.node_to_parent @ only.node_to_parent)
-                return replace(node, source=None, field=only.field, placement=place)
+                placement = placement_of(node.node_to_parent @ only.node_to_parent)
+                return replace(node, source=None, field=only.field, placement=placement)
     if node.background:
         nodes = tuple(replace(one, background=True) for one in nodes)
     if own_rule != rule and node.children:

@@ -19,17 +19,17 @@ def depth_of(picture: Path) -> Path:
 def distinct(names: Sequence[str], endings: Sequence[str] = ("",)) -> list[str]:
     """The names, or others like them, so that no two, each with every one of the endings, are the same to a
     file system that knows no case, or that writes an accented letter in one of two ways."""
-    taken: set[str] = set()
-    found = []
+    used: set[str] = set()
+    unique = []
     for name in names:
         short = os.fsencode(name)[:LONGEST_BYTES].decode("utf-8", "ignore")
         chosen, count = short, 1
-        while taken & (own := {folded(chosen + ending) for ending in endings}):
+        while used & (spellings := {folded(chosen + ending) for ending in endings}):
             count += 1
             chosen = f"{short}-{count}"
-        taken |= own
-        found.append(chosen)
-    return found
+        used |= spellings
+        unique.append(chosen)
+    return unique
 
 
 def folded(name: str) -> str:

@@ -23,18 +23,18 @@ def once(
 ) -> tuple[list[Frame], list[str]]:
     """The frames without those that repeat the photo and the pose (hashable) of one before, and a note on
     these."""
-    known, kept, repeated = set(), [], []
+    known, sound, repeated = set(), [], []
     for frame in frames:
-        said = (file_of(frame), pose_of(frame))
-        if said in known:
-            repeated.append(said[0])
+        count = (file_of(frame), pose_of(frame))
+        if count in known:
+            repeated.append(count[0])
         else:
-            known.add(said)
-            kept.append(frame)
+            known.add(count)
+            sound.append(frame)
     if not repeated:
-        return kept, []
-    said = counted(len(repeated), "frame is", "frames are")
-    return kept, [f"{where}: {said} listed again, such as {repeated[0]}, and read once"]
+        return sound, []
+    count = counted(len(repeated), "frame is", "frames are")
+    return sound, [f"{where}: {count} listed again, such as {repeated[0]}, and read once"]
 
 
 def read_sound(

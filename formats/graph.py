@@ -23,20 +23,20 @@ def belongs(name: str, names: Container[str]) -> bool:
 
 def chosen(scene: SceneGraph, names: Container[str]) -> list[Node]:
     """The topmost nodes that go by some names."""
-    found: list[Node] = []
-    changed(scene, names, lambda node, _: found.append(node) or (node,))
-    return found
+    nodes: list[Node] = []
+    changed(scene, names, lambda node, _: nodes.append(node) or (node,))
+    return nodes
 
 
 def leaf_names(nodes: Iterable[Node]) -> set[str]:
     """Names of those nodes, of some and of those in them, that hold a field or a source."""
-    found, stack = set(), list(nodes)
+    names, stack = set(), list(nodes)
     while stack:
         node = stack.pop()
         stack += node.children
         if node.field is not None or node.source is not None:
-            found.add(node.name)
-    return found
+            names.add(node.name)
+    return names
 
 
 def changed(scene: SceneGraph, names: Container[str], becoming: Becoming) -> SceneGraph:
@@ -76,8 +76,8 @@ def _changed(scene: SceneGraph, goes: Callable[[str], bool], becoming: Becoming)
     def after(node: Node, parent: np.ndarray) -> tuple[Node, ...]:
         if goes(node.name):
             return becoming(node, parent)
-        own = parent @ node.node_to_parent
-        children = tuple(one for child in node.children for one in after(child, own))
+        node_to_world = parent @ node.node_to_parent
+        children = tuple(one for child in node.children for one in after(child, node_to_world))
         if node.children and not children and node.field is None and node.source is None:
             return ()
         return (node if children == node.children else replace(node, children=children),)
@@ -157,16 +157,16 @@ def placement_of(matrix: np.ndarray) -> dict:
     return words | ({} if unit == 1 else {"scale": [unit] * 3})
 
 
-def free_name(wanted: str, taken: set[str], otherwise: str = "object") -> str:
+def free_name(base: str, names: set[str], otherwise: str = "object") -> str:
     """A name that no node has, which is taken from now on: the wanted one, where a node may be called so, or
     it with a number."""
     try:
-        check_name(wanted)
+        check_name(base)
     except FormatError:
-        wanted = otherwise
-    found, number = wanted, 1
-    while found in taken:
+        base = otherwise
+    name, number = base, 1
+    while name in names:
         number += 1
-        found = f"{wanted}-{number}"
-    taken.add(found)
-    return found
+        name = f"{base}-{number}"
+    names.add(name)
+    return name

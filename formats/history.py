@@ -64,11 +64,11 @@ def distilled(history: Iterable[dict]) -> dict[str, dict]:
 
 def sources(history: Iterable[dict]) -> dict[str, dict]:
     """What each member of the bundle was made of, where entries tell."""
-    found: dict[str, dict] = {}
+    by_member: dict[str, dict] = {}
     for entry in history:
-        told = entry.get("sources")
-        found |= told if isinstance(told, dict) else {}
-    return found
+        entries = entry.get("sources")
+        by_member |= entries if isinstance(entries, dict) else {}
+    return by_member
 
 
 def check_history(scene: SceneGraph, path: str) -> None:
@@ -77,11 +77,11 @@ def check_history(scene: SceneGraph, path: str) -> None:
     for entry in scene.history:
         try:
             msgspec.convert(entry.get("names", []), list[str])
-            told = list(msgspec.convert(entry.get("sources", {}), dict[str, Source]).values())
+            entries = list(msgspec.convert(entry.get("sources", {}), dict[str, Source]).values())
             for node in msgspec.convert(entry.get("nodes", []), list[DistilledNode]):
                 check_affine(np.array(node.object_to_world), f"'{node.name}'")
-                told.append(node)
-            if not all(one.source.isprintable() for one in told):
+                entries.append(node)
+            if not all(one.source.isprintable() for one in entries):
                 raise ValueError("a source that is no path")
         except (ValueError, FormatError) as error:
             raise BadSchema(f"{path}: its history is malformed ({error}); fuse the scene again") from error
@@ -96,10 +96,10 @@ def summed_up(history: tuple[dict, ...], members: Container[str]) -> tuple[dict,
     early, late = history[:-KEPT], history[-KEPT:]
     first = early[0] if early[0].get("event") == "fused" else {"event": "edited"}
     edits = sum(entry.get("edits", 0) + 1 for entry in early) - 1
-    told = {key: value for key, value in first.items() if key not in ("names", "objects")}
-    told |= {"nodes": list(distilled(early).values()), "edits": edits}
+    rest = {key: value for key, value in first.items() if key not in ("names", "objects")}
+    rest |= {"nodes": list(distilled(early).values()), "edits": edits}
     made_of = {member: one for member, one in sources(early).items() if member in members}
-    return (told | ({"sources": made_of} if made_of else {}), *late)
+    return (rest | ({"sources": made_of} if made_of else {}), *late)
 
 
 def listed(values: object) -> list:
@@ -110,12 +110,12 @@ def listed(values: object) -> list:
 def names_of(entry: dict) -> list[str]:
     """The objects that an entry tells of."""
     nodes = [node.get("name") for node in listed(entry.get("nodes")) if isinstance(node, dict)]
-    said = [name for key in ("names", "objects") for name in listed(entry.get(key))]
-    return [name for name in dict.fromkeys([*said, *nodes]) if isinstance(name, str)]
+    names = [name for key in ("names", "objects") for name in listed(entry.get(key))]
+    return [name for name in dict.fromkeys([*names, *nodes]) if isinstance(name, str)]
 
 
 def psnr_of(entry: dict) -> float | None:
     """The dB that an edit or a fuse reached, as its entry says."""
-    said = entry.get("psnr")
-    said = said.get("stored", said.get("psnr")) if isinstance(said, dict) else said
-    return float(said) if isinstance(said, int | float) else None
+    psnr = entry.get("psnr")
+    psnr = psnr.get("stored", psnr.get("psnr")) if isinstance(psnr, dict) else psnr
+    return float(psnr) if isinstance(psnr, int | float) else None

@@ -13,9 +13,9 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, MixedSizes
-from formats.foreign import HEAD, identify
-from formats.inputs import open_input
+from formats.other_files import HEAD, identify
 from formats.png import png_writer
+from formats.safe_input import open_input
 
 FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "BMP", "TGA", "TIFF", "PPM", "GIF", "AVIF", "HEIF")
 """What Pillow may open, by its names; others start programs (EPS) or are no photos. HEIF needs `[heif]`."""
@@ -93,8 +93,8 @@ def read_image(
         if out is None:
             out = np.empty((*shape, 4), np.uint8)
         elif out.shape[:2] != shape:
-            found, expected = (f"{w}x{h}" for h, w in (shape, out.shape[:2]))
-            raise MixedSizes(f"{path} is {found} now, expected {expected}; read it again")
+            actual, expected = (f"{w}x{h}" for h, w in (shape, out.shape[:2]))
+            raise MixedSizes(f"{path} is {actual} now, expected {expected}; read it again")
         stored = as_stored(out, orientation)
         rows = max(1, at_once // (image.width * reduction))
         for row in range(0, high, rows):
@@ -177,10 +177,10 @@ def read_focal(path: Path | str) -> float | None:
     `read_image`."""
     with _opened(path) as image:
         try:
-            said = float(image.getexif().get_ifd(EXIF_PART).get(EXIF_FOCAL_35MM, 0))
+            focal = float(image.getexif().get_ifd(EXIF_PART).get(EXIF_FOCAL_35MM, 0))
         except DECODING_ERRORS:  # broken metadata
             return None
-    return said / DIAGONAL_35MM if 1 <= said <= 10_000 else None
+    return focal / DIAGONAL_35MM if 1 <= focal <= 10_000 else None
 
 
 def write_smaller(path: Path | str, smaller: Path, longest: int) -> tuple[int, int]:
@@ -239,10 +239,10 @@ def _eight_bits(image):
 
 def _orientation(image) -> int:
     try:
-        found = image.getexif().get(EXIF_ORIENTATION)
+        value = image.getexif().get(EXIF_ORIENTATION)
     except DECODING_ERRORS:  # broken metadata; the pixels may be intact
         return 1
-    return found if isinstance(found, int) and 1 <= found <= 8 else 1
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 @contextmanager
@@ -297,13 +297,13 @@ def _unidentified(error: Exception) -> bool:
 
 def _unread(path: Path | str, head: bytes) -> FormatError:
     """The error for a file that is no picture of a known format."""
-    found = identify(head, Path(path).suffix)
-    if found is None or not found.extra and found.kind in ("photo", "heif"):
+    other = identify(head, Path(path).suffix)
+    if other is None or not other.extra and other.kind in ("photo", "heif"):
         return BadImage(
             f"{path}: the picture cannot be decoded (damaged, or in no known format); replace or remove it"
         )
-    kind = MissingExtra if found.extra else BadImage
-    return kind(f"{path}: is {found.what}, which is not read as a photo; {found.cure}")
+    kind = MissingExtra if other.extra else BadImage
+    return kind(f"{path}: is {other.what}, which is not read as a photo; {other.cure}")
 
 
 def _check_header(image, path: Path | str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from formats.cameras import checked_focal, checked_size
 from formats.errors import BadIntrinsics, BadModel, BadPose
-from formats.inputs import read_input
+from formats.safe_input import read_input
 from formats.views import FARTHEST, View, checked_pose
 
 NAME = "poses_bounds.npy"

@@ -76,9 +76,9 @@ def _acquire(lock, waiting: Callable[[str], None] | None, path: Path | str) -> N
 def temporary_folder(prefix: str) -> Iterator[Path]:
     """A new folder for temporary files, which ends with the block. Those of this prefix that this user's
     killed processes left are removed."""
-    for place in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
-        if _abandoned(place):
-            shutil.rmtree(place, ignore_errors=True)
+    for path in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
+        if _abandoned(path):
+            shutil.rmtree(path, ignore_errors=True)
     new = Path(tempfile.mkdtemp(prefix="fusedrf-new-"))
     folder = new.with_name(new.name.replace("fusedrf-new-", prefix))
     unfinished.add(folder)
@@ -96,8 +96,8 @@ def _abandoned(folder: Path) -> bool:
         status = folder.lstat()
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
             return False
-        with _locked(folder) as held:
-            return held
+        with _locked(folder) as is_locked:
+            return is_locked
     except OSError:
         return False
 
@@ -110,10 +110,10 @@ def _locked(folder: Path) -> Iterator[bool]:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        held = True
+        is_locked = True
     except OSError:
-        held = False
+        is_locked = False
     try:
-        yield held
+        yield is_locked
     finally:
         os.close(descriptor)

@@ -25,19 +25,23 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
     photos = [view for view in views if view.image_path is not None]
     if not photos or any(view.mask_path for view in views):
         return tuple(views), ()
-    shelves: dict[Path, _Shelf] = {}
+    shelves: dict[Path, _PictureFolder] = {}
     around = {view.image_path.parent: _places(view.image_path, root) for view in photos}
-    found, used, unused, arrays = [], {}, {}, {}
+    masked_views, used, unused, arrays = [], {}, {}, {}
     for view in views:
         mask = None
-        for place in around[view.image_path.parent] if view.image_path else ():
-            shelf = shelves.get(place.folder) or shelves.setdefault(place.folder, _Shelf.of(place.folder))
-            mask = shelf.mask_of(view.image_path, place.inner, own=place.folder == view.image_path.parent)
+        for folder in around[view.image_path.parent] if view.image_path else ():
+            shelf = shelves.get(folder.folder) or shelves.setdefault(
+                folder.folder, _PictureFolder.of(folder.folder)
+            )
+            mask = shelf.mask_of(
+                view.image_path, folder.inner, is_own_folder=folder.folder == view.image_path.parent
+            )
             if mask is not None:
                 break
-            if place.folder != view.image_path.parent:
-                (unused if shelf.files else arrays)[place.folder] = len(shelf.files) or shelf.arrays
-        found.append(view if mask is None else with_mask(view, mask))
+            if folder.folder != view.image_path.parent:
+                (unused if shelf.files else arrays)[folder.folder] = len(shelf.files) or shelf.arrays
+        masked_views.append(view if mask is None else with_mask(view, mask))
         if mask is not None:
             used[mask.parent] = used.get(mask.parent, 0) + 1
     notes = [f"{at}: its masks of {count} of {len(views)} photos are used" for at, count in used.items()]
@@ -53,20 +57,20 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
         for at, count in unused.items()
         if not used
     ]
-    return tuple(found), tuple(notes)
+    return tuple(masked_views), tuple(notes)
 
 
 @dataclass(frozen=True)
-class _Place:
+class _MaskFolder:
     """A folder in which the mask of a photo may be, below `inner` where photos lie in folders too."""
 
     folder: Path
     inner: Path
 
 
-def _places(photo: Path, root: Path) -> list[_Place]:
+def _places(photo: Path, root: Path) -> list[_MaskFolder]:
     """Where the mask of a photo may be, the likeliest first."""
-    parent, places = photo.parent, []
+    parent, folders = photo.parent, []
     for above in (parent, *parent.parents[:2]):
         inside = above == root or above.is_relative_to(root)
         below = photo.relative_to(above).parts[:-1]
@@ -74,17 +78,17 @@ def _places(photo: Path, root: Path) -> list[_Place]:
             break
         copy = below[0].rpartition("_")[2] if below else ""
         names = [*(f"{name}_{copy}" for name in FOLDERS if copy.isdecimal()), *FOLDERS]
-        places += [_Place(folder, Path(*below[1:])) for folder in _named_so(above, names)]
+        folders += [_MaskFolder(folder, Path(*below[1:])) for folder in _named_so(above, names)]
         if above == root or not below and not inside:
             break
-    return [*places, _Place(parent, Path())]
+    return [*folders, _MaskFolder(parent, Path())]
 
 
 def _named_so(folder: Path, names: Sequence[str]) -> list[Path]:
     """The folders in a folder that have one of the names, in any case, in the order of the names."""
     with os.scandir(folder) as entries:
-        found = [entry.name for entry in entries if entry.name.casefold() in names and entry.is_dir()]
-    return [folder / name for name in sorted(found, key=lambda name: names.index(name.casefold()))]
+        unique = [entry.name for entry in entries if entry.name.casefold() in names and entry.is_dir()]
+    return [folder / name for name in sorted(unique, key=lambda name: names.index(name.casefold()))]
 
 
 def _of_photos(name: str) -> bool:
@@ -93,7 +97,7 @@ def _of_photos(name: str) -> bool:
 
 
 @dataclass(frozen=True)
-class _Shelf:
+class _PictureFolder:
     """The pictures of a folder and of those in it, by the folder below it and the name without its ending."""
 
     files: dict[tuple[Path, str], Path]
@@ -101,7 +105,7 @@ class _Shelf:
     """Files of numpy among them, which are not read."""
 
     @classmethod
-    def of(cls, folder: Path) -> "_Shelf":
+    def of(cls, folder: Path) -> "_PictureFolder":
         """Hidden files are no masks."""
         nested = [folder] + [entry for entry in sorted(folder.iterdir()) if entry.is_dir()]
         files = [file for at in nested for file in sorted(at.iterdir()) if not file.name.startswith(".")]
@@ -109,14 +113,14 @@ class _Shelf:
         named = {(file.parent.relative_to(folder), _key(file.stem)): file for file in pictures}
         return cls(named, sum(file.suffix.lower() in (".npy", ".npz") for file in files))
 
-    def mask_of(self, photo: Path, inner: Path, own: bool) -> Path | None:
+    def mask_of(self, photo: Path, inner: Path, is_own_folder: bool) -> Path | None:
         """A photo's mask; `own`: this is the photo's own folder, where a mask has a name that says so."""
-        names = [] if own else [photo.name, photo.stem]
+        names = [] if is_own_folder else [photo.name, photo.stem]
         names += [name.format(base) for name in NAMED for base in (photo.stem, photo.name)]
         folders = (inner, Path()) if inner.parts else (inner,)
         keys = ((folder, _key(name)) for folder in folders for name in names)
-        found = (self.files.get(key) for key in keys)
-        return next((file for file in found if file is not None and file != photo), None)
+        candidates = (self.files.get(key) for key in keys)
+        return next((file for file in candidates if file is not None and file != photo), None)
 
 
 def _key(name: str) -> str:

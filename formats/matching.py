@@ -40,7 +40,7 @@ NAMED = 5
 
 
 @dataclass(frozen=True)
-class Matched:
+class MatchedPhotos:
     """Photos of paths that were asked for."""
 
     photos: dict[str, tuple[Path, Folder]]
@@ -58,7 +58,7 @@ def match_photos(
     files: Iterable[str],
     downscale: int | None,
     homes: Sequence[str] = ("",),
-) -> Matched:
+) -> MatchedPhotos:
     """The photos of `files`: paths with forward slashes, from a folder of `homes` in `base`, the one that
     holds the most of them. Notes begin with `where`, which states the paths.
 
@@ -72,20 +72,24 @@ def match_photos(
         tries.append((paths, *_as_written(listings, base, paths)))
         if all(tries[-1][1].values()):
             break
-    paths, found, ambiguous = max(tries, key=lambda item: sum(map(bool, item[1].values())))
+    paths, photos_of, ambiguous = max(tries, key=lambda item: sum(map(bool, item[1].values())))
     moved = {}
     # Of a folder that is there some photos may be gone: those are not elsewhere.
-    there = {rooted(paths[file])[0] for file in files if found[file] or file in ambiguous}
+    there = {rooted(paths[file])[0] for file in files if photos_of[file] or file in ambiguous}
     if lost := {file: paths[file] for file in files if rooted(paths[file])[0] not in there}:
-        taken = {photo for several in found.values() for photo in several.values()}
-        moved, unclear = _elsewhere(base, lost, taken)
+        used = {photo for several in photos_of.values() for photo in several.values()}
+        moved, unclear = _elsewhere(base, lost, used)
         again, more = _as_written(listings, base, moved)
-        found, ambiguous = found | again, ambiguous | unclear | more
+        photos_of, ambiguous = photos_of | again, ambiguous | unclear | more
     photos, notes = {}, []
-    for root, group in _groups({file: moved.get(file, paths[file]) for file in files if found[file]}).items():
-        places = listings.copies(base / root)
-        folder, note = _folder(places, [found[file] for file in group], downscale)
-        photos |= {file: (found[file][folder.path], folder) for file in group if folder.path in found[file]}
+    for root, group in _groups(
+        {file: moved.get(file, paths[file]) for file in files if photos_of[file]}
+    ).items():
+        folders = listings.copies(base / root)
+        folder, note = _folder(folders, [photos_of[file] for file in group], downscale)
+        photos |= {
+            file: (photos_of[file][folder.path], folder) for file in group if folder.path in photos_of[file]
+        }
         notes += [note] if note else []
     missing = tuple(file for file in files if file not in photos)
     notes += _how(base, photos, moved)
@@ -93,7 +97,7 @@ def match_photos(
         notes.append(unclear)
     notes += gone([file for file in missing if file not in ambiguous])
     hint = "" if photos else unclear or _instead(base)
-    return Matched(photos, missing, tuple(f"{where}: {note}" for note in notes), hint)
+    return MatchedPhotos(photos, missing, tuple(f"{where}: {note}" for note in notes), hint)
 
 
 def find_file(base: Path, file: str) -> Path | None:
@@ -138,7 +142,7 @@ class Listings:
                     named[plain].append(Folder(folder.parent / entry.name, int(factor)))
             self._copies[folder.parent] = dict(named)
         beside = self._copies[folder.parent].get(folder.name, [])
-        return [Folder(folder), *sorted(beside, key=lambda place: place.factor)]
+        return [Folder(folder), *sorted(beside, key=lambda copy: copy.factor)]
 
     def of(self, folder: Path) -> dict[str, list[str]]:
         """Names of a folder's pictures by `stem_key`; hidden and empty files are none."""
@@ -179,10 +183,10 @@ def _entries(folder: Path) -> Iterator[os.DirEntry]:
     """What lies in a folder, but hidden files; nothing where it is none."""
     try:
         with os.scandir(folder) as entries:
-            found = [entry for entry in entries if not is_hidden(entry.name)]
+            visible = [entry for entry in entries if not is_hidden(entry.name)]
     except (OSError, ValueError):
-        found = []
-    yield from sorted(found, key=lambda entry: entry.name)
+        visible = []
+    yield from sorted(visible, key=lambda entry: entry.name)
 
 
 # --- where the paths say ------------------------------------------------------------------------------------
@@ -193,21 +197,21 @@ def _as_written(
 ) -> tuple[dict[str, dict[Path, Path]], dict[str, list[Path]]]:
     """Of paths from `base`, by file: the photo in each folder of copies, by that folder; and files for which
     photos lie there that suit them equally well."""
-    found, ambiguous = {file: {} for file in files}, {}
+    photos_of, ambiguous = {file: {} for file in files}, {}
     for root, group in _groups(files).items():
         home = base / root
         # Beside the capture itself lie other captures, not copies of it.
-        for place in listings.copies(home) if home != base else [Folder(home)]:
+        for copy in listings.copies(home) if home != base else [Folder(home)]:
             suited = {}
             for file in group:
                 inner = PurePosixPath(rooted(files[file])[1])
-                folder = place.path / inner.parent
+                folder = copy.path / inner.parent
                 suited[file] = [(rank, folder / name) for rank, name in listings.find(folder, inner.name)]
             claims, unclear = _claims(suited)
             ambiguous |= unclear
             for file, photo in claims.items():
-                found[file][place.path] = photo
-    return found, {file: photos for file, photos in ambiguous.items() if not found[file]}
+                photos_of[file][copy.path] = photo
+    return photos_of, {file: photos for file, photos in ambiguous.items() if not photos_of[file]}
 
 
 def _groups(files: dict[str, str]) -> dict[str, list[str]]:
@@ -231,30 +235,35 @@ def _claims(suited: dict[str, list[tuple]]) -> tuple[dict[str, Path], dict[str, 
                 best[1].append(file)
     claims, unclear = {}, {}
     for file, photos in suited.items():
-        own = [photo for rank, photo in photos if rank == least[photo][0]]
-        if len(own) == 1 and len(least[own[0]][1]) == 1:
-            claims[file] = own[0]
-        elif own:
-            unclear[file] = own
+        claimed = [photo for rank, photo in photos if rank == least[photo][0]]
+        if len(claimed) == 1 and len(least[claimed[0]][1]) == 1:
+            claims[file] = claimed[0]
+        elif claimed:
+            unclear[file] = claimed
     return claims, unclear
 
 
 def _folder(
-    places: list[Folder], found: Sequence[dict[Path, Path]], downscale: int | None
+    folders: list[Folder], photos_by_folder: Sequence[dict[Path, Path]], downscale: int | None
 ) -> tuple[Folder, str | None]:
     """The folder to read photos from, out of one and its copies: one that has as many of them as any; and a
-    sentence where it is a copy, or where a copy lacks some. `found` are the photos by folder."""
-    held = [(place, [photos[place.path] for photos in found if place.path in photos]) for place in places]
-    held = [(place, photos) for place, photos in held if photos]
-    most = max(len(photos) for _, photos in held)
-    chosen = chosen_copy([(place, photos[0]) for place, photos in held if len(photos) == most], downscale)
-    wanted = chosen_copy([(place, photos[0]) for place, photos in held], downscale)
+    sentence where it is a copy, or where a copy lacks some. `photos_by_folder` are the photos by folder."""
+    candidates = [
+        (folder, [photos[folder.path] for photos in photos_by_folder if folder.path in photos])
+        for folder in folders
+    ]
+    candidates = [(folder, photos) for folder, photos in candidates if photos]
+    most = max(len(photos) for _, photos in candidates)
+    chosen = chosen_copy(
+        [(folder, photos[0]) for folder, photos in candidates if len(photos) == most], downscale
+    )
+    best = chosen_copy([(folder, photos[0]) for folder, photos in candidates], downscale)
     if chosen.factor > 1:
-        return chosen, f"photos are read from {chosen.path.name} instead of {places[0].path.name}"
-    if wanted.path != chosen.path:
-        count = next(len(photos) for place, photos in held if place.path == wanted.path)
+        return chosen, f"photos are read from {chosen.path.name} instead of {folders[0].path.name}"
+    if best.path != chosen.path:
+        count = next(len(photos) for folder, photos in candidates if folder.path == best.path)
         return chosen, (
-            f"{wanted.path.name} has {count} of {most} photos and is not used; they are read from "
+            f"{best.path.name} has {count} of {most} photos and is not used; they are read from "
             f"{chosen.path.name}"
         )
     return chosen, None
@@ -264,7 +273,7 @@ def _folder(
 
 
 def _elsewhere(
-    base: Path, files: dict[str, str], taken: set[Path]
+    base: Path, files: dict[str, str], used: set[Path]
 ) -> tuple[dict[str, str], dict[str, list[Path]]]:
     """For files whose paths do not lead to their photos, the paths from `base` at which photos below it lie
     whose names suit them; and those for which photos of several folders do.
@@ -274,7 +283,7 @@ def _elsewhere(
     """
     beside, inside = defaultdict(set), defaultdict(set)
     for photo, folders in _tree(base):
-        if base.joinpath(*photo) not in taken:
+        if base.joinpath(*photo) not in used:
             stem, named = stem_key(photo[-1]), tuple(map(key, folders))
             below = _below(named)
             beside[named, stem].add(folders)
@@ -304,10 +313,10 @@ def _suited(beside: dict, inside: dict, path: str) -> tuple[bool, set[tuple[str,
     stated = tuple(map(key, stated))
     for i in range(len(stated) + 1):
         for stem in (stem_key(name), key(name)):
-            if found := beside.get((stated[i:], stem)):
-                return False, found
-            if stated[i:] == _below(stated) and (found := inside.get((stated[i:], stem))):
-                return True, found
+            if folders := beside.get((stated[i:], stem)):
+                return False, folders
+            if stated[i:] == _below(stated) and (folders := inside.get((stated[i:], stem))):
+                return True, folders
     return False, set()
 
 
@@ -366,9 +375,9 @@ def _how(base: Path, photos: dict[str, tuple[Path, Folder]], moved: dict[str, st
         )
     renamed = [file for file, (photo, _) in photos.items() if file not in moved and _differs(file, photo)]
     if renamed:
-        said = counted(len(renamed), "photo has", "photos have")
+        count = counted(len(renamed), "photo has", "photos have")
         yield (
-            f"{said} another ending or other letters than the file says, such as "
+            f"{count} another ending or other letters than the file says, such as "
             f"{photos[renamed[0]][0].name} for {PurePosixPath(renamed[0]).name}"
         )
 
@@ -387,8 +396,8 @@ def _unclear(base: Path, ambiguous: dict[str, list[Path]]) -> str:
 
 def _instead(base: Path) -> str:
     """What lies in a folder in which no photo was found, and what to do, as the end of a sentence."""
-    held = sorted(("/".join(photo) for photo, _ in _tree(base)), key=natural)
-    there = f"holds {len(held)} others, such as {held[0]}" if held else "holds no photos"
+    listing = sorted(("/".join(photo) for photo, _ in _tree(base)), key=natural)
+    there = f"holds {len(listing)} others, such as {listing[0]}" if listing else "holds no photos"
     return f"{base} {there}; put the photos there under the names that the poses have"
 
 
@@ -397,8 +406,8 @@ def gone(missing: Sequence[str]) -> list[str]:
     if not missing:
         return []
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    said = counted(len(missing), "photo is not there or empty", "photos are not there or empty")
-    return [f"{said} and left out: {', '.join(missing[:NAMED])}{more}"]
+    count = counted(len(missing), "photo is not there or empty", "photos are not there or empty")
+    return [f"{count} and left out: {', '.join(missing[:NAMED])}{more}"]
 
 
 def _differs(file: str, photo: Path) -> bool:

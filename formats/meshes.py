@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh, FormatError
-from formats.foreign import not_a_mesh
-from formats.inputs import open_input
+from formats.other_files import not_a_mesh
 from formats.points import MAX_HEADER
+from formats.safe_input import open_input
 from formats.surfaces.gltf import read_gltf
 from formats.surfaces.obj import read_obj
 from formats.surfaces.off import read_off

@@ -14,11 +14,11 @@ def is_name(name: str) -> bool:
 
 def distinct_names(names: Iterable[str]) -> list[str]:
     """The names, or ones that are allowed and different where theirs are not: with the place in the list."""
-    found: dict[str, None] = {}
+    used: dict[str, None] = {}
     for number, name in enumerate(names):
         plain = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name)
         allowed = plain if is_name(plain) else f"{plain[:SHORT]}_{number:05d}"
-        while allowed in found:  # ends: each turn counts on
+        while allowed in used:  # ends: each turn counts on
             allowed, number = f"{plain[:SHORT]}_{number:05d}", number + 1
-        found[allowed] = None
-    return list(found)
+        used[allowed] = None
+    return list(used)

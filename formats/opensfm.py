@@ -15,10 +15,10 @@ from formats.cameras import MAX_JSON, checked_focal, checked_size
 from formats.colmap import Image, Model
 from formats.errors import BadIntrinsics, BadJson, BadModel, BadPose, FormatError, UnsupportedCamera
 from formats.frame_list import read_sound
-from formats.inputs import decoded, open_input, read_input
 from formats.photos import is_file
-from formats.points import MAX_POINTS, Points
+from formats.points import MAX_POINTS, SparsePoints
 from formats.rotations import matrices
+from formats.safe_input import decoded, open_input, read_input
 from formats.views import View, checked_pose
 
 NAME, PROJECT = "reconstruction.json", "opensfm"
@@ -31,8 +31,10 @@ HEAD = 1 << 16
 
 def reconstruction(path: Path) -> Path | None:
     """The file of a folder, or of its `opensfm`; None without one."""
-    places = (path / NAME, path / PROJECT / NAME)
-    return next((place for place in places if is_file(place) and is_reconstruction(place)), None)
+    paths = (path / NAME, path / PROJECT / NAME)
+    return next(
+        (candidate for candidate in paths if is_file(candidate) and is_reconstruction(candidate)), None
+    )
 
 
 def is_reconstruction(path: Path) -> bool:
@@ -54,8 +56,8 @@ def read_model(path: Path) -> Model:
         listed = json.loads(decoded(read_input(path, MAX_JSON)))
     except (ValueError, RecursionError) as error:
         raise BadJson(f"{path}: not JSON that can be read ({error}); export it again") from error
-    found = [part for part in listed if isinstance(part, dict) and isinstance(part.get("shots"), dict)]
-    largest = max(found, key=lambda part: len(part["shots"]), default={"shots": {}})
+    models = [part for part in listed if isinstance(part, dict) and isinstance(part.get("shots"), dict)]
+    largest = max(models, key=lambda part: len(part["shots"]), default={"shots": {}})
     shots, cameras = largest["shots"], largest.get("cameras")
     if not shots or not isinstance(cameras, dict):
         raise BadModel(f"{path}: holds no shots with their cameras; reconstruct again")
@@ -70,8 +72,8 @@ def read_model(path: Path) -> Model:
 
     images, broken = read_sound(path, list(shots), read, str)
     notes = list(broken)
-    if len(found) > 1:
-        others = ", ".join(str(len(part["shots"])) for part in found if part is not largest)
+    if len(models) > 1:
+        others = ", ".join(str(len(part["shots"])) for part in models if part is not largest)
         notes.append(f"{path}: the reconstruction of {len(shots)} photos is read, and not those of {others}")
     return Model(path, tuple(images), _points(largest.get("points")), tuple(notes))
 
@@ -91,22 +93,24 @@ def _view(where: str, camera: dict, shot: dict) -> View:
             f"{where}: a camera of the type {kind[:40]}, expected a pinhole or a fisheye; undistort them"
         )
     keys = ("width", "height", "focal", "focal_x", "focal_y", "c_x", "c_y", *BENDS, "k4")
-    said = {key: _number(where, camera, key) for key in keys}
-    width, height = checked_size(round(said["width"]), round(said["height"]), where)
+    numbers = {key: _number(where, camera, key) for key in keys}
+    width, height = checked_size(round(numbers["width"]), round(numbers["height"]), where)
     longer = max(width, height)
-    focals = [checked_focal(longer * (said[key] or said["focal"]), where) for key in ("focal_x", "focal_y")]
-    centre = width / 2 + longer * said["c_x"], height / 2 + longer * said["c_y"]
+    focals = [
+        checked_focal(longer * (numbers[key] or numbers["focal"]), where) for key in ("focal_x", "focal_y")
+    ]
+    centre = width / 2 + longer * numbers["c_x"], height / 2 + longer * numbers["c_y"]
     bends = ("k1", "k2", "k3", "k4") if kind in FISHEYES else BENDS
-    bends = tuple(said[key] for key in bends)
+    bends = tuple(numbers[key] for key in bends)
     return View("", pose, *focals, *centre, width, height, bends, kind in FISHEYES, repair=repair)
 
 
 def _number(where: str, camera: dict, key: str) -> float:
     """A number of a camera, 0 where it states none."""
-    found = _numbers([camera.get(key, 0.0)], 1)
-    if found is None:
+    number = _numbers([camera.get(key, 0.0)], 1)
+    if number is None:
         raise BadIntrinsics(f"{where}: the {key} of its camera is no number; reconstruct again")
-    return float(found[0])
+    return float(number[0])
 
 
 def _numbers(listed: object, count: int) -> np.ndarray | None:
@@ -118,7 +122,7 @@ def _numbers(listed: object, count: int) -> np.ndarray | None:
     return np.array(listed, np.float64)
 
 
-def _points(listed: object) -> Points | None:
+def _points(listed: object) -> SparsePoints | None:
     """Those of a reconstruction, without damaged ones."""
     if not isinstance(listed, Mapping):
         return None
@@ -131,4 +135,4 @@ def _points(listed: object) -> Points | None:
     if not rows:
         return None
     positions, colours = (np.array(column) for column in zip(*rows, strict=True))
-    return Points(positions, np.clip(colours, 0, 255).astype(np.uint8))
+    return SparsePoints(positions, np.clip(colours, 0, 255).astype(np.uint8))

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.camera_set import upward
 from formats.captures import is_capture, is_mesh, poses_elsewhere, read_capture
 from formats.errors import FormatError, NoPoses
-from formats.foreign import is_json, kind_of, not_a_capture
 from formats.images import read_focal, read_image_header
 from formats.meshes import mesh_facts
+from formats.other_files import is_json, kind_of, not_a_capture
 from formats.photos import has_pictures
 from formats.posing import photos_to_pose, whole_photos
-from formats.rig import upward
 from formats.views import Capture, View, check_parallax
 
 ROUNDING = 1e-12
@@ -104,7 +104,7 @@ def _sizes(sizes) -> list[dict]:
 
 def _lenses(views: Sequence[View]) -> list[dict]:
     """How many photos were taken through which lens, the most common first; focal lengths in pixels."""
-    found = Counter((v.fisheye, round(v.fl_x, 3), round(v.fl_y, 3), v.distortion) for v in views)
+    lenses = Counter((v.fisheye, round(v.fl_x, 3), round(v.fl_y, 3), v.distortion) for v in views)
     return [
         {
             "lens": LENSES[fisheye],
@@ -112,5 +112,5 @@ def _lenses(views: Sequence[View]) -> list[dict]:
             "distortion": list(bends) if any(bends) else None,
             "photos": n,
         }
-        for (fisheye, x, y, bends), n in found.most_common()
+        for (fisheye, x, y, bends), n in lenses.most_common()
     ]

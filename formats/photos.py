@@ -110,7 +110,7 @@ class Folder:
 def has_pictures(folder: Path) -> bool:
     """Whether pictures lie in the folder, in its `images`, or in reduced copies of those."""
     images = folder / "images"
-    return any(pictures(place.path) for place in (Folder(folder), *copies(images)))
+    return any(pictures(copy.path) for copy in (Folder(folder), *copies(images)))
 
 
 def pictures(folder: Path) -> list[Path]:
@@ -122,17 +122,17 @@ def pictures(folder: Path) -> list[Path]:
     stems = {file.stem for file in files if file.suffix.lower() not in HEIF}
     files = [file for file in files if file.suffix.lower() not in HEIF or file.stem not in stems]
     known = {COLOUR.sub("", file.stem) for file in files}
-    told = [MAP.fullmatch(file.stem) for file in files]
-    return [file for file, of in zip(files, told, strict=True) if of is None or of[1] not in known]
+    matches = [MAP.fullmatch(file.stem) for file in files]
+    return [file for file, of in zip(files, matches, strict=True) if of is None or of[1] not in known]
 
 
 def folders(path: Path) -> list[Path]:
     """The visible folders in a folder, in natural order; none where it cannot be read."""
     try:
-        found = [entry for entry in path.iterdir() if not is_hidden(entry.name) and entry.is_dir()]
+        entries = [entry for entry in path.iterdir() if not is_hidden(entry.name) and entry.is_dir()]
     except OSError:
         return []
-    return sorted(found, key=lambda entry: natural(entry.name))
+    return sorted(entries, key=lambda entry: natural(entry.name))
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
@@ -159,35 +159,35 @@ def is_file(path: Path) -> bool:
 def copies(folder: Path) -> list[Folder]:
     """`folder`, and the folders of smaller copies beside it, `folder_2` before `folder_8`."""
     try:
-        found = [place for place in folder.parent.glob(f"{_escaped(folder.name)}_*") if place.is_dir()]
+        folders = [copy for copy in folder.parent.glob(f"{_escaped(folder.name)}_*") if copy.is_dir()]
     except (OSError, ValueError):
-        found = []
-    numbered = [(place.name[len(folder.name) + 1 :], place) for place in found]
-    factors = sorted((int(n), place) for n, place in numbered if n.isdecimal() and int(n) > 0)
-    return [Folder(folder), *(Folder(place, factor) for factor, place in factors)]
+        folders = []
+    numbered = [(copy.name[len(folder.name) + 1 :], copy) for copy in folders]
+    factors = sorted((int(n), copy) for n, copy in numbered if n.isdecimal() and int(n) > 0)
+    return [Folder(folder), *(Folder(copy, factor) for factor, copy in factors)]
 
 
 def _escaped(name: str) -> str:
     return re.sub(r"([*?\[])", r"[\1]", name)
 
 
-def chosen_copy(places: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:
+def chosen_copy(folders: list[tuple[Folder, Path]], downscale: int | None) -> Folder | None:
     """Of folders in the order of their factors, each with one of its photos: the one with the largest photos
     of at most LONGEST a side, or else with the smallest; where `downscale` is given, the one with the
     smallest photos out of which that can be made, or else with the largest. Copies of another shape than the
     full-size photos are of others."""
-    places = [(place, photo) for place, photo in places if _of_one_shape(places[0], (place, photo))]
+    folders = [(folder, photo) for folder, photo in folders if _of_one_shape(folders[0], (folder, photo))]
     if downscale is not None:
-        whole = [place for place, _ in places if downscale % place.factor == 0]
-        return whole[-1] if whole else places[0][0] if places else None
-    for place, photo in places[:-1]:
+        divisors = [folder for folder, _ in folders if downscale % folder.factor == 0]
+        return divisors[-1] if divisors else folders[0][0] if folders else None
+    for folder, photo in folders[:-1]:
         try:
             header = read_image_header(photo)
         except FormatError:  # which its frame tells
             continue
         if max(header.width, header.height) <= LONGEST:
-            return place
-    return places[-1][0] if places else None
+            return folder
+    return folders[-1][0] if folders else None
 
 
 def _of_one_shape(whole: tuple[Folder, Path], other: tuple[Folder, Path]) -> bool:
@@ -248,14 +248,14 @@ def with_mask(view: View, mask: Path, where: str | None = None) -> View:
             "white where the photo counts"
         )
     header, size, photo = read_image_header(mask), (view.width, view.height), view.image_path
-    found = (header.width, header.height)
-    turns = [found, found[::-1]] if view.orientation >= 5 else [found]
+    actual = (header.width, header.height)
+    turns = [actual, actual[::-1]] if view.orientation >= 5 else [actual]
     slack = 1 + (view.reduction > 1) / min(size)  # what is cut off of a photo that is made smaller
     if min(_shape_error(sides, size) for sides in turns) > slack * (1 + MAX_ASPECT_ERROR):
         wide, high = (side * view.reduction for side in size)
         raise BadMask(
-            f"{where or photo}: the mask {mask} is {found[0]}x{found[1]}, but {photo.name} is {wide}x{high}; "
-            "make masks of the photo's size"
+            f"{where or photo}: the mask {mask} is {actual[0]}x{actual[1]}, but {photo.name} is "
+            f"{wide}x{high}; make masks of the photo's size"
         )
     return replace(view, mask_path=mask)
 
@@ -263,12 +263,12 @@ def with_mask(view: View, mask: Path, where: str | None = None) -> View:
 def alike_turned(views: Sequence[View]) -> tuple[tuple[View, ...], str | None]:
     """Views whose photos are all read as stored or all as their EXIF turns them, as those say whose shape
     tells it; and a sentence where nothing tells, but it matters."""
-    told = [view.orientation for view in views if view.exif >= 5 and view.width != view.height]
-    turned = sum(orientation != 1 for orientation in told)
+    orientations = [view.orientation for view in views if view.exif >= 5 and view.width != view.height]
+    turned = sum(orientation != 1 for orientation in orientations)
     open_ = [view for view in views if view.exif != 1 and (view.exif < 5 or view.width == view.height)]
-    if not open_ or 2 * turned < len(told):
+    if not open_ or 2 * turned < len(orientations):
         return tuple(views), None
-    if not told:
+    if not orientations:
         return tuple(views), (
             f"EXIF turns {len(open_)} of {len(views)} photos, such as {open_[0].image_path.name}, and their "
             "shape does not tell whether the poses are of them so: they are read as stored"
@@ -363,18 +363,18 @@ def load_ignored(view: View) -> np.ndarray | None:
     if view.mask_path is None:
         return None
     if view.mask_path == view.image_path:
-        kept = oriented(read_alpha(view.mask_path) >= OPAQUE, view.orientation)
+        mask = oriented(read_alpha(view.mask_path) >= OPAQUE, view.orientation)
     else:
-        kept = read_mask(view.mask_path) != view.mask_path.name.startswith(MOVING)
-        if not _same_shape(kept.shape[::-1], (view.width, view.height)) and view.orientation >= 5:
-            kept = oriented(kept, view.orientation)
-    high, wide = kept.shape
+        mask = read_mask(view.mask_path) != view.mask_path.name.startswith(MOVING)
+        if not _same_shape(mask.shape[::-1], (view.width, view.height)) and view.orientation >= 5:
+            mask = oriented(mask, view.orientation)
+    high, wide = mask.shape
     rows, columns = _sampled(high, view.height, view.reduction), _sampled(wide, view.width, view.reduction)
     if not _same_shape((wide, high), (view.width, view.height)) and view.reduction == 1:
         raise BadMask(
             f"{view.mask_path} is {wide}x{high} now, expected {view.width}x{view.height}; read it again"
         )
-    return ~kept[rows[:, None], columns]
+    return ~mask[rows[:, None], columns]
 
 
 def _sampled(stored: int, shown: int, reduction: int) -> np.ndarray:

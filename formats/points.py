@@ -11,7 +11,7 @@ import numpy as np
 
 from formats.atomic import atomic_writer
 from formats.errors import BadModel, counted
-from formats.inputs import read_input
+from formats.safe_input import read_input
 
 MAX_BYTES = 2**31
 MAX_POINTS = 5_000_000
@@ -39,7 +39,7 @@ ENDS = re.compile(rb"\nend_header\r?\n")
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class SparsePoints:
     """Points on surfaces, in world units; finite."""
 
     positions: np.ndarray
@@ -51,7 +51,7 @@ class Points:
     damaged: int = 0
     """Points of the file that are left out, since they are NaN, infinite or beyond 1e30."""
 
-    def moved(self, matrix: np.ndarray) -> "Points":
+    def moved(self, matrix: np.ndarray) -> "SparsePoints":
         """The same points behind an affine (3, 4) or (4, 4)."""
         return replace(self, positions=self.positions @ matrix[:3, :3].T + matrix[:3, 3])
 
@@ -61,7 +61,7 @@ def stride(count: int, most: int = MAX_POINTS) -> int:
     return max(1, -(-count // most))
 
 
-def points_notes(path: Path | str, points: Points | None) -> list[str]:
+def points_notes(path: Path | str, points: SparsePoints | None) -> list[str]:
     """Sentences where not all points of a file were read."""
     notes = []
     if points is not None and points.thinned > 1:
@@ -70,12 +70,12 @@ def points_notes(path: Path | str, points: Points | None) -> list[str]:
             f"{len(points.positions):,} in all"
         )
     if points is not None and points.damaged:
-        said = counted(points.damaged, "sparse point is", "sparse points are")
-        notes.append(f"{path}: {said} NaN, infinite or beyond 1e30, and left out")
+        count = counted(points.damaged, "sparse point is", "sparse points are")
+        notes.append(f"{path}: {count} NaN, infinite or beyond 1e30, and left out")
     return notes
 
 
-def read_ply_points(path: Path | str, most: int = MAX_POINTS) -> Points:
+def read_ply_points(path: Path | str, most: int = MAX_POINTS) -> SparsePoints:
     """The vertices of a .ply, text or binary, without those that are NaN, infinite or beyond 1e30; of more
     than `most` only some (`thinned`). Other elements are ignored.
 
@@ -102,10 +102,10 @@ def read_ply_points(path: Path | str, most: int = MAX_POINTS) -> Points:
     positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
     sound = (np.abs(positions) < 1e30).all(1)
     colours = _colours(columns, dict(fields))[sound]
-    return Points(positions[sound], colours, step, int((~sound).sum()))
+    return SparsePoints(positions[sound], colours, step, int((~sound).sum()))
 
 
-def write_ply_points(path: Path | str, points: Points) -> None:
+def write_ply_points(path: Path | str, points: SparsePoints) -> None:
     """A binary .ply of float32 positions and colours. Raises ResourceError."""
     kinds = [(axis, "<f4") for axis in "xyz"] + [(hue, "u1") for hue in ("red", "green", "blue")]
     table = np.empty(len(points.positions), kinds)

@@ -17,10 +17,10 @@ ROWS = (2, 0, 1)
 
 def keyframes(path: Path) -> tuple[Path, Path] | None:
     """The folders of photos and of cameras of an export, or of its `keyframes`; None if it is none."""
-    for place in (path / "keyframes", path):
+    for folder in (path / "keyframes", path):
         for photos, cameras in FOLDERS:
-            if (place / photos).is_dir() and camera_files(place / cameras):
-                return place / photos, place / cameras
+            if (folder / photos).is_dir() and camera_files(folder / cameras):
+                return folder / photos, folder / cameras
     return None
 
 

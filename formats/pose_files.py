@@ -17,8 +17,8 @@ import numpy as np
 
 from formats.cameras import MOST_PIXELS, checked_focal
 from formats.errors import BadIntrinsics, BadModel, BadPose, MissingFile
-from formats.inputs import decoded, read_input
 from formats.photos import is_file, is_hidden, natural
+from formats.safe_input import decoded, read_input
 from formats.views import View, checked_pose
 
 MAX_BYTES = 1 << 16
@@ -138,10 +138,10 @@ def read_box(files: PoseFiles) -> np.ndarray | None:
 
 def splits(names: Sequence[str]) -> tuple[list[str], list[str], str | None]:
     """Names of photos to learn from and to test with, and a sentence where some are in neither."""
-    found = {name: SPLIT.match(name) for name in names}
-    if not all(found.values()) or not any(match[1] == "0" for match in found.values()):
+    matches = {name: SPLIT.match(name) for name in names}
+    if not all(matches.values()) or not any(match[1] == "0" for match in matches.values()):
         return list(names), [], None
-    by_split = {part: [name for name, match in found.items() if match[1] == part] for part in "012"}
+    by_split = {part: [name for name, match in matches.items() if match[1] == part] for part in "012"}
     train, validating, test = by_split.values()
     if not (test and validating):
         return train, test or validating, None

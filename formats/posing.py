@@ -1,4 +1,4 @@
-"""Camera poses out of photos alone, by structure from motion (the `[capture]` extra, see `mapper.py`).
+"""Camera poses out of photos alone, by structure from motion (the `[capture]` extra, see `colmap_worker.py`).
 
 What comes out has z up, the focus of the cameras at the origin, and the first photo looking along +y. Its
 units are arbitrary, as photos do not tell how large things are: the cameras stand some DISTANCE from the
@@ -19,16 +19,16 @@ import numpy as np
 
 from formats import colmap
 from formats.atomic import atomic_folder
+from formats.capture_frame import scene_frame
 from formats.captures import write_cameras
+from formats.colmap_worker import MAX_SIDE
 from formats.errors import MissingExtra, MissingFile, NoPoses, NoViews, PosingFailed
-from formats.foreign import beside_photos, not_a_capture
-from formats.frame import scene_frame
 from formats.frame_list import read_sound
 from formats.images import Header, check_whole, decoded_at_once, read_focal, read_image_header, write_smaller
 from formats.locks import temporary_folder
-from formats.mapper import MAX_SIDE
+from formats.other_files import beside_photos, not_a_capture
 from formats.photos import copies, natural, pictures
-from formats.points import Points, write_ply_points
+from formats.points import SparsePoints, write_ply_points
 from formats.upright import vertical
 from formats.views import View
 
@@ -46,12 +46,12 @@ TEMPORARY = "fusedrf-poses-"
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosedPhotos:
     """Photos that found their pose."""
 
     views: tuple[View, ...]
     """For the photos as stored, whatever their EXIF orientation."""
-    points: Points
+    points: SparsePoints
     unposed: tuple[str, ...]
     """Names of the photos that did not find a pose."""
     plain: tuple[str, ...]
@@ -64,7 +64,7 @@ class Posed:
 
 
 def check_extra(folder: Path | str) -> None:
-    """MissingExtra where pycolmap is not installed. It is not imported: see `mapper.py`."""
+    """MissingExtra where pycolmap is not installed. It is not imported: see `colmap_worker.py`."""
     if find_spec("pycolmap") is None:
         raise MissingExtra(
             f"{folder}: to estimate where its photos were taken needs an extra: "
@@ -82,19 +82,19 @@ def photos_to_pose(folder: Path | str) -> list[Path]:
         raise MissingFile(f"{folder}: no such folder; give the folder that the photos lie in")
     if not folder.is_dir():
         raise not_a_capture(folder)
-    places = (folder, *(place.path for place in copies(folder / "images")))
-    found = max(map(pictures, places), key=len)  # one beside `images` is a thumbnail
-    if not found:
+    folders = (folder, *(copy.path for copy in copies(folder / "images")))
+    photos = max(map(pictures, folders), key=len)  # one beside `images` is a thumbnail
+    if not photos:
         raise not_a_capture(folder)
-    read_image_header(found[0])  # of a kind that is not read, it is named before any work
-    if len(found) < LEAST_PHOTOS:
+    read_image_header(photos[0])  # of a kind that is not read, it is named before any work
+    if len(photos) < LEAST_PHOTOS:
         beside = beside_photos(folder)
         more = f"; it holds {beside[0]} as well, {beside[1].what}: {beside[1].cure}" if beside else ""
         raise NoViews(
-            f"{folder}: holds {len(found)} photos, but where they were taken follows from {LEAST_PHOTOS} or "
+            f"{folder}: holds {len(photos)} photos, but where they were taken follows from {LEAST_PHOTOS} or "
             f"more that overlap; take more, from different places{more}"
         )
-    return sorted(found, key=lambda file: natural(file.name))
+    return sorted(photos, key=lambda file: natural(file.name))
 
 
 def whole_photos(folder: Path | str, photos: Sequence[Path]) -> tuple[list[Path], list[str]]:
@@ -107,7 +107,7 @@ def whole_photos(folder: Path | str, photos: Sequence[Path]) -> tuple[list[Path]
     return read_sound(folder, photos, read, str)
 
 
-def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress) -> Posed:
+def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress) -> PosedPhotos:
     """Where photos were taken. `progress` has `phase` and `advance` of fusedrf_cli/progress.py.
 
     The same photos and threads give the same poses. An interrupt leaves nothing behind. Raises BadImage,
@@ -116,10 +116,10 @@ def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress)
     check_extra(folder)
     with temporary_folder(TEMPORARY) as work:
         headers = _prepare(work, photos, threads, progress)
-        told = _run(folder, work, threads, progress)
-        counts = dict(zip(photos, told["features"], strict=True))
-        if not told["models"] or told["models"][0] < LEAST_PHOTOS:
-            raise NoPoses(_not_found(folder, counts, max(told["models"], default=0)))
+        report = _run(folder, work, threads, progress)
+        counts = dict(zip(photos, report["features"], strict=True))
+        if not report["models"] or report["models"][0] < LEAST_PHOTOS:
+            raise NoPoses(_not_found(folder, counts, max(report["models"], default=0)))
         model = colmap.read_model(work / "model")
     placed = {int(Path(image.name).stem): image.view for image in model.images}
     views = [
@@ -128,13 +128,13 @@ def estimate(folder: Path | str, photos: Sequence[Path], threads: int, progress)
     ]
     unposed = [photo for i, photo in enumerate(photos) if i not in placed]
     views, points = upright(views, model.points, [headers[i].orientation for i in sorted(placed)])
-    return Posed(
+    return PosedPhotos(
         views,
         points,
         tuple(photo.name for photo in unposed),
         tuple(photo.name for photo in unposed if counts[photo] < FEW_FEATURES),
-        tuple(told["models"]),
-        told["error"],
+        tuple(report["models"]),
+        report["error"],
     )
 
 
@@ -150,7 +150,7 @@ def _not_found(folder: Path | str, counts: dict[Path, int], placed: int) -> str:
     )
 
 
-def write_posed(folder: Path | str, posed: Posed, overwrite: bool, relative: bool) -> None:
+def write_posed(folder: Path | str, posed: PosedPhotos, overwrite: bool, relative: bool) -> None:
     """A capture that `read_capture` and nerfstudio read: CAMERAS, which names the photos where they lie, and
     POINTS. Paths are from `folder`, or whole unless `relative`. Raises OutputExists, ResourceError."""
     target = os.path.realpath(folder)
@@ -159,9 +159,9 @@ def write_posed(folder: Path | str, posed: Posed, overwrite: bool, relative: boo
     if relative:
         files = [_from(target, file) for file in files]
     more = {"ply_file_path": POINTS, "unposed": list(posed.unposed)}
-    with atomic_folder(folder, overwrite=overwrite) as place:
-        write_ply_points(place / POINTS, posed.points)
-        write_cameras(place / CAMERAS, posed.views, files, **more)
+    with atomic_folder(folder, overwrite=overwrite) as temporary:
+        write_ply_points(temporary / POINTS, posed.points)
+        write_cameras(temporary / CAMERAS, posed.views, files, **more)
 
 
 def _from(target: str, file: str) -> str:
@@ -175,7 +175,7 @@ def _from(target: str, file: str) -> str:
 
 
 def _prepare(work: Path, photos: Sequence[Path], threads: int, progress) -> list[Header]:
-    """Write a job for `mapper.py`, with the photos as PNG of at most MAX_SIDE; returns their headers.
+    """Write a job for `colmap_worker.py`, with the photos as PNG of at most MAX_SIDE; returns their headers.
 
     All are decoded here, so that broken ones are named at once and every kind that is read can be posed.
     """
@@ -202,42 +202,42 @@ def _prepare(work: Path, photos: Sequence[Path], threads: int, progress) -> list
 
 
 def _run(folder: Path | str, work: Path, threads: int, progress) -> dict:
-    """What `mapper.py` says last: features, models, error. It is ended whatever happens here."""
-    places = [str(Path(__file__).parents[1]), *filter(None, sys.path)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": str(threads)}
+    """What `colmap_worker.py` says last: features, models, error. It is ended whatever happens here."""
+    paths = [str(Path(__file__).parents[1]), *filter(None, sys.path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": str(threads)}
     with open(work / "log", "wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "formats.mapper", str(work)],
+            [sys.executable, "-P", "-m", "formats.colmap_worker", str(work)],
             stdin=subprocess.PIPE,  # which ends with this process
             stdout=subprocess.PIPE,
             stderr=log,
             env=environment,
             start_new_session=True,  # Ctrl-C comes here, and ends the other from here
         )
-    told = {}
+    report = {}
     with process:
         try:
             for line in process.stdout:
-                told = json.loads(line)
-                if "phase" in told:
-                    progress.phase(told["phase"], told["total"])
-                elif "done" in told:
-                    progress.advance(told["done"])
+                report = json.loads(line)
+                if "phase" in report:
+                    progress.phase(report["phase"], report["total"])
+                elif "done" in report:
+                    progress.advance(report["done"])
         finally:
-            if "features" not in told:
+            if "features" not in report:
                 process.kill()
-    if process.returncode or "features" not in told:
+    if process.returncode or "features" not in report:
         raise PosingFailed(_broken(folder, work / "log", process.returncode))
-    return told
+    return report
 
 
 def _broken(folder: Path | str, log: Path, code: int) -> str:
     """The sentence for a process that ended early; its log's last line may say why."""
     lines = log.read_text("utf-8", "replace").strip().splitlines()
-    said = f" ({lines[-1][:200]})" if lines else ""
+    last_line = f" ({lines[-1][:200]})" if lines else ""
     return (
-        f"{folder}: structure from motion broke down with code {code}{said}; try again with --threads 1, "
-        "which takes less memory, or give poses from another program"
+        f"{folder}: structure from motion broke down with code {code}{last_line}; try again with --threads "
+        "1, which takes less memory, or give poses from another program"
     )
 
 
@@ -245,8 +245,8 @@ def _broken(folder: Path | str, log: Path, code: int) -> str:
 
 
 def upright(
-    views: Sequence[View], points: Points, orientations: Sequence[int]
-) -> tuple[tuple[View, ...], Points]:
+    views: Sequence[View], points: SparsePoints, orientations: Sequence[int]
+) -> tuple[tuple[View, ...], SparsePoints]:
     """The same with z up, the focus at the origin, the cameras about DISTANCE from it, and the first looking
     along +y. `orientations` are the photos' (EXIF), which say where up is in them."""
     poses = np.array([view.camera_to_world for view in views])
@@ -258,7 +258,7 @@ def upright(
     scale = DISTANCE / frame.distance
     poses[:, :3, 3] = (poses[:, :3, 3] - frame.focus) * scale
     turned = tuple(replace(view, camera_to_world=pose) for view, pose in zip(views, poses, strict=True))
-    return turned, Points((positions - frame.focus) * scale, points.colours)
+    return turned, SparsePoints((positions - frame.focus) * scale, points.colours)
 
 
 def _level(poses: np.ndarray, orientations: Sequence[int]) -> np.ndarray:

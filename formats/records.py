@@ -19,8 +19,7 @@ from formats.errors import (
     NotFinite,
     TruncatedBundle,
 )
-from formats.inputs import parse_json
-from formats.quantised import (
+from formats.quantisation import (
     BLOCKS,
     LEVELS,
     MADE_AT_ONCE,
@@ -30,6 +29,7 @@ from formats.quantised import (
     quantised,
     scales_shape,
 )
+from formats.safe_input import parse_json
 
 KEY = "fusedrf"
 PLAIN, CODED, VERSION = 1, 2, 3  # of fields without coded arrays, with them, and that need what is in NEEDS
@@ -95,8 +95,8 @@ class FieldHeader:
     @property
     def arrays(self) -> dict[str, tuple[str, tuple[int, ...]]]:
         """How each array is stored ("int8", "float16", ...) and the shape that it decodes to, by name."""
-        found = {name: (str(self.specs[name].dtype), self.specs[name].shape) for name in self.plain}
-        return found | {name: (f"int{spec.bits}", spec.shape) for name, spec in self.coded.items()}
+        arrays = {name: (str(self.specs[name].dtype), self.specs[name].shape) for name in self.plain}
+        return arrays | {name: (f"int{spec.bits}", spec.shape) for name, spec in self.coded.items()}
 
     @property
     def plain(self) -> list[str]:
@@ -124,10 +124,10 @@ def encode_field(record: FieldRecord, precision: str = "float16") -> bytes:
     """Safetensors bytes of `record`; equal records give equal bytes.
 
     Floats are cast to `precision`, "float16" or "float32"; in "int8" and "int4" large arrays of two or three
-    dimensions are coded (formats/quantised.py), others cast to float16. Where there is an array NAME.runs of
-    whole numbers, it holds the lengths of runs of NAME's rows, and each is coded in blocks of its own. Bool
-    becomes uint8, other integers int32. Raises NotFinite (NaN, infinity, overflow in the cast), BadArray,
-    BadSchema, LimitExceeded.
+    dimensions are coded (formats/quantisation.py), others cast to float16. Where there is an array NAME.runs
+    of whole numbers, it holds the lengths of runs of NAME's rows, and each is coded in blocks of its own.
+    Bool becomes uint8, other integers int32. Raises NotFinite (NaN, infinity, overflow in the cast),
+    BadArray, BadSchema, LimitExceeded.
     """
     stored, coded = _stored_arrays(record.arrays, precision, f"field of kind {record.kind!r}")
     return encode_stored(record.kind, record.metadata, stored, coded)
@@ -200,10 +200,10 @@ def decode_field(data: bytes | memoryview, where: str) -> FieldRecord:
     for name, spec in header.coded.items():
         scales, codes = (mapped_array(data, header.specs[part]) for part in coded_parts(name))
         runs = arrays[runs_of(name)] if spec.runs else None
-        place = f"{where}: array {name!r}"
+        array_where = f"{where}: array {name!r}"
         if runs is not None:
-            _check_runs(runs, spec.shape[0], scales.shape[0], place)
-        arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, place, runs)
+            _check_runs(runs, spec.shape[0], scales.shape[0], array_where)
+        arrays[name] = dequantised(scales, codes, spec.bits, spec.shape, array_where, runs)
         give_back(data)
     return FieldRecord(header.kind, arrays, header.metadata)
 
@@ -226,26 +226,26 @@ def decode_header(data: bytes | memoryview, where: str, most: int = MAX_DECODED_
     specs = {name: _spec(name, entry, 8 + length, where) for name, entry in header.items()}
     _check_cover(specs, 8 + length, size, where)
     coded = {name: _coded_spec(name, entry, specs, where) for name, entry in coded.items()}
-    found = FieldHeader(kind, metadata, specs, coded, size)
-    if found.decoded_size > most:
+    field_header = FieldHeader(kind, metadata, specs, coded, size)
+    if field_header.decoded_size > most:
         raise LimitExceeded(
-            f"{where}: decodes to {found.decoded_size:,} bytes, but at most {most:,} are read"
+            f"{where}: decodes to {field_header.decoded_size:,} bytes, but at most {most:,} are read"
         )
-    return found
+    return field_header
 
 
 def reading_size(header: FieldHeader) -> int:
     """Bytes that reading a field takes beside its decoded arrays, at most: of the largest array what lies in
     the file, and what is made of that on the way."""
-    found = [0]
+    sizes = [0]
     for name in header.plain:
         spec = header.specs[name]
-        found.append((spec.stop - spec.start) + math.prod(spec.shape))
+        sizes.append((spec.stop - spec.start) + math.prod(spec.shape))
     for name, spec in header.coded.items():
         scales, codes = (header.specs[part] for part in coded_parts(name))
         widened = codes.stop - codes.start if spec.bits == 8 else 5 * (codes.stop - codes.start)
-        found.append(2 * (scales.stop - scales.start) + widened + MADE_AT_ONCE)
-    return max(found)
+        sizes.append(2 * (scales.stop - scales.start) + widened + MADE_AT_ONCE)
+    return max(sizes)
 
 
 def coded_parts(name: str) -> tuple[str, str]:
@@ -397,22 +397,23 @@ def _coded_spec(name: str, entry: object, specs: dict[str, ArraySpec], where: st
     if in_runs:
         least = _in_runs(name, shape, in_runs, scales, specs.get(runs_of(name)), where)
     if scales.dtype != DTYPES["F16"] or scales.shape != least:
-        found = f"{scales.dtype} {list(scales.shape)}"
-        raise BadArray(f"{where}: array {name!r} has scales {found}, expected float16 {list(least)}")
+        actual = f"{scales.dtype} {list(scales.shape)}"
+        raise BadArray(f"{where}: array {name!r} has scales {actual}, expected float16 {list(least)}")
     if codes.dtype != DTYPES["U8"] or len(codes.shape) != 1 or codes.shape[0] > code_bytes(numbers, bits):
-        found = f"{codes.dtype} {list(codes.shape)}"
+        actual = f"{codes.dtype} {list(codes.shape)}"
         raise BadArray(
-            f"{where}: array {name!r} has codes {found}, expected at most {code_bytes(numbers, bits):,} bytes"
+            f"{where}: array {name!r} has codes {actual}, expected at most "
+            f"{code_bytes(numbers, bits):,} bytes"
         )
     return CodedSpec(bits, tuple(shape), bool(in_runs))
 
 
 def _in_runs(
-    name: str, shape: list[int], said: object, scales: ArraySpec, runs: ArraySpec | None, where: str
+    name: str, shape: list[int], content: object, scales: ArraySpec, runs: ArraySpec | None, where: str
 ) -> tuple[int, ...]:
     """The scales' shape of an array whose rows lie in runs: at least one block in each, as far as a header
     can tell."""
-    if said is not True or len(shape) != 2:
+    if content is not True or len(shape) != 2:
         raise BadSchema(f"{where}: 'runs' of array {name!r} should be true, and the array of two sizes")
     if runs is None or runs.dtype not in (DTYPES["I32"], DTYPES["U8"]) or len(runs.shape) != 1:
         raise BadArray(f"{where}: array {name!r} lacks {runs_of(name)!r}, whole numbers in one dimension")

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from formats.atomic import atomic_writer, check_writable
+from formats.camera_set import FARTHEST, RigSchema, read_camera_set
 from formats.errors import (
     BadJson,
     BadSchema,
@@ -28,7 +29,6 @@ from formats.errors import (
     LimitExceeded,
     NewerVersion,
 )
-from formats.inputs import parse_json, read_input
 from formats.nodes import (
     MAX_NAME_BYTES,
     PLACEMENT_KEYS,
@@ -43,7 +43,7 @@ from formats.nodes import (
 from formats.nodes import (
     make_node as make_node,
 )
-from formats.rig import FARTHEST, RigSchema, read_rig
+from formats.safe_input import parse_json, read_input
 
 FORMAT = "rfpack"
 VERSION = "1.4"
@@ -127,7 +127,8 @@ class SceneGraph:
     framing: tuple[float, ...] | None = None
     """(6,) the box in the world that pictures show, xmin to zmax; without one they show all there is."""
     cameras: dict | None = None
-    """Of the capture that a field was learnt from, in the world, as `formats.rig.read_rig` takes them."""
+    """Of the capture that a field was learnt from, in the world, as `formats.camera_set.read_camera_set`
+    takes them."""
 
     def __post_init__(self):
         if self.composition not in ("max", "add"):
@@ -155,7 +156,7 @@ class SceneGraph:
 
     def leaves(self) -> list[Leaf]:
         """The nodes that hold a field or a source, in document order."""
-        found = []
+        leaves = []
         stack = [(node, node.node_to_parent, True, 1.0, WHITE, (), ()) for node in reversed(self.nodes)]
         while stack:
             node, object_to_world, visible, opacity, tint, crops, groups = stack.pop()
@@ -167,12 +168,12 @@ class SceneGraph:
                 crops = (*crops, Crop(tuple(node.showing["crop"]), np.eye(4)))
             if node.field is not None or node.source is not None:
                 placed = node.name, node.field, node.source, object_to_world, node.background
-                found.append(Leaf(*placed, visible, opacity, tint, crops, groups))
+                leaves.append(Leaf(*placed, visible, opacity, tint, crops, groups))
             for child in reversed(node.children):
-                own = tuple(crop.within(child.node_to_parent) for crop in crops)
-                shown = visible, opacity, tint, own, groups
+                all_crops = tuple(crop.in_frame_of(child.node_to_parent) for crop in crops)
+                shown = visible, opacity, tint, all_crops, groups
                 stack.append((child, object_to_world @ child.node_to_parent, *shown))
-        return found
+        return leaves
 
     @property
     def far(self) -> bool:
@@ -180,7 +181,7 @@ class SceneGraph:
         take."""
         if max(map(abs, self.framing or (0.0,))) >= NEAR_CAMERAS:
             return True
-        if self.cameras is not None and read_rig(self.cameras).reach >= NEAR_CAMERAS:
+        if self.cameras is not None and read_camera_set(self.cameras).reach >= NEAR_CAMERAS:
             return True
         placed = (matrix for node, _, world in self.walk() for matrix in (node.node_to_parent, world))
         return not all(within(matrix, NEAR_TRANSLATION, NEAR_SINGULAR_VALUES) for matrix in placed)
@@ -292,13 +293,13 @@ def _check_version(content: object, where: str) -> bool:
     """Whether a minor version newer than ours wrote `content`."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise BadSchema(f'{where}: not a scene graph; expected a JSON object with "format": "{FORMAT}"')
-    found = content.get("version")
-    match = re.fullmatch(r"([0-9]{1,4})\.([0-9]{1,4})", found) if isinstance(found, str) else None
+    version = content.get("version")
+    match = re.fullmatch(r"([0-9]{1,4})\.([0-9]{1,4})", version) if isinstance(version, str) else None
     if match is None:
-        raise BadSchema(f"{where}: version {found!r}, expected a string such as {VERSION!r}")
+        raise BadSchema(f"{where}: version {version!r}, expected a string such as {VERSION!r}")
     major, minor = _numbered(VERSION)
     if int(match[1]) != major:
-        raise NewerVersion(f"{where}: version {found}, but this fusedrf reads {major}.x; update fusedrf")
+        raise NewerVersion(f"{where}: version {version}, but this fusedrf reads {major}.x; update fusedrf")
     required = content.get("requires", [])
     if not isinstance(required, list) or any(word not in (FAR, RULES) for word in required):
         raise NewerVersion(
@@ -306,7 +307,7 @@ def _check_version(content: object, where: str) -> bool:
         )
     newer = int(match[2]) > minor
     if newer:
-        text = f"{where}: version {found} is newer than {VERSION}; what is new is ignored"
+        text = f"{where}: version {version} is newer than {VERSION}; what is new is ignored"
         warnings.warn(text, FormatWarning, 3)
     return newer
 
@@ -331,7 +332,7 @@ def _framing(content: dict) -> tuple[float, ...] | None:
 def _cameras(content: dict) -> dict | None:
     """The cameras as they stand in the file, once they are known to be readable."""
     if "cameras" in content:
-        read_rig(content["cameras"])
+        read_camera_set(content["cameras"])
     return content.get("cameras")
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from formats.frame import nearest_point
+from formats.capture_frame import nearest_point
 from formats.images import oriented, read_alpha, read_image
 from formats.photos import OPAQUE, decoded, decoders, load_ignored
 from formats.views import View
@@ -87,22 +87,22 @@ class Outline:
 
     @classmethod
     def of(
-        cls, kept: np.ndarray, scale: float, solid: np.ndarray | None = None, **shares: float
+        cls, mask: np.ndarray, scale: float, solid: np.ndarray | None = None, **shares: float
     ) -> "Outline":
-        """The outline of what is kept (H, W) of a photo, whose pixel is `scale` of the view's; `solid` is
+        """The outline of what is mask (H, W) of a photo, whose pixel is `scale` of the view's; `solid` is
         what of it is opaque."""
-        high, wide = kept.shape
-        rows, columns = np.flatnonzero(kept.any(1)), np.flatnonzero(kept.any(0))
-        middle = (kept if solid is None else solid)[
+        high, wide = mask.shape
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        middle = (mask if solid is None else solid)[
             high // 4 : high - high // 4, wide // 4 : wide - wide // 4
         ]
-        border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
+        border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
         box, filled = None, 0.0
         if len(rows):
             left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
             box = tuple(float(side) * scale for side in (left, top, right, bottom))
-            filled = float(kept[top:bottom, left:right].mean())
-        return cls(box, filled, *(float(part.mean()) for part in (kept, border, middle)), **shares)
+            filled = float(mask[top:bottom, left:right].mean())
+        return cls(box, filled, *(float(part.mean()) for part in (mask, border, middle)), **shares)
 
 
 def alpha_outline(view: View) -> Outline:
@@ -176,8 +176,8 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
     if not having:
         return Shown(views)
     looked_at = sampled(having)
-    found = outlines(looked_at, alpha_outline)
-    telling = [outline for outline in found if outline.box]  # others show nothing at all
+    all_outlines = outlines(looked_at, alpha_outline)
+    telling = [outline for outline in all_outlines if outline.box]  # others show nothing at all
     transparent = [outline for outline in telling if outline.clear >= TRANSPARENT]
     share = len(transparent) / max(len(telling), 1)
     name = having[0].image_path.name
@@ -202,12 +202,12 @@ def by_alpha(views: tuple[View, ...]) -> Shown:
         notes.append("colours of the photos were multiplied by their alpha, and are divided by it")
         having = [replace(view, premultiplied=True) for view in having]
     if share < 1:
-        whole = round((1 - share) * len(having))
+        n_full = round((1 - share) * len(having))
         notes.append(
-            f"{whole} of {len(views)} photos show no transparency where that cuts out the others: all that "
+            f"{n_full} of {len(views)} photos show no transparency where that cuts out the others: all that "
             "they show is learnt; cut them out too, or remove them"
         )
-    return Shown(tuple(having), tuple(looked_at), tuple(found), tuple(notes))
+    return Shown(tuple(having), tuple(looked_at), tuple(all_outlines), tuple(notes))
 
 
 def _premultiplied(views: Sequence[View]) -> bool:
@@ -225,38 +225,40 @@ def _premultiplied(views: Sequence[View]) -> bool:
 
 def _opaque(view: View, ignoring: bool) -> View:
     """A view whose alpha does not say where nothing is, but may say what to ignore."""
-    own = view.image_path if ignoring and view.alpha and view.mask_path is None else view.mask_path
-    return replace(view, alpha=False, mask_path=own)
+    path = view.image_path if ignoring and view.alpha and view.mask_path is None else view.mask_path
+    return replace(view, alpha=False, mask_path=path)
 
 
 def _is_frame(transparent: Sequence[Outline], views: Sequence[View]) -> bool:
     """Whether alpha leaves out what lies around all photos, as the corners that a lens does not show, or
     parts of what they show, and not what lies around an object."""
     keys = ("border", "middle", "soft")
-    border, middle, soft = (float(np.mean([getattr(found, key) for found in transparent])) for key in keys)
+    border, middle, soft = (
+        float(np.mean([getattr(outline, key) for outline in transparent])) for key in keys
+    )
     if border > BORDER_SHOWN or views[0].fisheye and _alike(transparent, views):
         return True
     around = border > BORDER_KEPT or soft > SOFT or _framed(transparent, views) or views[0].fisheye
     return middle > 0.995 and around
 
 
-def _alike(found: Sequence[Outline], views: Sequence[View]) -> bool:
+def _alike(outlines: Sequence[Outline], views: Sequence[View]) -> bool:
     """Whether all outlines have one and the same box, nearly."""
-    boxes = np.array([outline.box or (0.0,) * 4 for outline in found])
+    boxes = np.array([outline.box or (0.0,) * 4 for outline in outlines])
     sides = max(max(view.width, view.height) for view in views)
     return len(boxes) > 1 and float(np.ptp(boxes, axis=0).max()) <= 0.02 * sides
 
 
-def _framed(found: Sequence[Outline], views: Sequence[View]) -> bool:
+def _framed(outlines: Sequence[Outline], views: Sequence[View]) -> bool:
     """Whether all outlines are one rectangle, or the round picture of a lens, nearly."""
-    spans = [min(o.box[2] - o.box[0], o.box[3] - o.box[1]) if o.box else 0.0 for o in found]
+    spans = [min(o.box[2] - o.box[0], o.box[3] - o.box[1]) if o.box else 0.0 for o in outlines]
     shorter = min(min(view.width, view.height) for view in views)
-    return _alike(found, views) and (_filled(found) or min(spans) >= SPANNED * shorter)
+    return _alike(outlines, views) and (_filled(outlines) or min(spans) >= SPANNED * shorter)
 
 
-def _filled(found: Sequence[Outline]) -> bool:
+def _filled(outlines: Sequence[Outline]) -> bool:
     """Whether outlines are rectangles, nearly."""
-    return float(np.mean([outline.filled for outline in found])) > BARS
+    return float(np.mean([outline.filled for outline in outlines])) > BARS
 
 
 # --- grounds ------------------------------------------------------------------------------------------------
@@ -286,16 +288,16 @@ def by_ground(views: tuple[View, ...]) -> Shown:
     if not white:
         return Shown(views, notes=(surroundings,))
     looked_at = sampled(views)
-    found = outlines(looked_at, ground_outline)
-    free = float(np.mean([outline.border <= STRAY for outline in found]))
-    told = [outline for outline in found if outline.box]
-    if free < MOSTLY or not told or len(told) >= LEAST_WHOLE and _filled(told):
+    all_outlines = outlines(looked_at, ground_outline)
+    free = float(np.mean([outline.border <= STRAY for outline in all_outlines]))
+    boxed = [outline for outline in all_outlines if outline.box]
+    if free < MOSTLY or not boxed or len(boxed) >= LEAST_WHOLE and _filled(boxed):
         return Shown(views, notes=(surroundings,))
     note = (
         f"{'' if free > 0.9 else 'most '}photos show an object on white, which is taken as nothing, so that "
         "a box around it is learnt; --unbounded learns the white as well"
     )
-    return Shown(views, tuple(looked_at), tuple(found), (note,))
+    return Shown(views, tuple(looked_at), tuple(all_outlines), (note,))
 
 
 def _border_colours(view: View) -> np.ndarray:
@@ -317,18 +319,20 @@ def by_masks(views: tuple[View, ...]) -> Shown:
     if 2 * len(masked) < len(views):
         note = f"{bare} of {len(views)} photos have no mask and are used as they are"
         return Shown(views, notes=(note,) if masked else ())
-    found = outlines(masked, mask_outline)
-    seen = [outline for outline in found if outline.box]
+    all_outlines = outlines(masked, mask_outline)
+    seen = [outline for outline in all_outlines if outline.box]
     notes = []
-    if len(seen) < len(found):
-        notes.append(f"the masks of {len(found) - len(seen)} of {len(views)} photos exclude all of the photo")
+    if len(seen) < len(all_outlines):
+        notes.append(
+            f"the masks of {len(all_outlines) - len(seen)} of {len(views)} photos exclude all of the photo"
+        )
     cut_out = bool(seen) and float(np.mean([outline.border for outline in seen])) <= BORDER_KEPT
     if bare:
         what = "left out, since masks cut an object out of the others" if cut_out else "used as they are"
         notes.append(f"{bare} of {len(views)} photos have no mask and are {what}")
     if not cut_out:
         return Shown(views, notes=tuple(notes))
-    return Shown(masked, masked, tuple(found), tuple(notes))
+    return Shown(masked, masked, tuple(all_outlines), tuple(notes))
 
 
 # --- the box ------------------------------------------------------------------------------------------------
@@ -349,17 +353,17 @@ def _around(views: Sequence[View], boxes: Sequence[tuple]) -> np.ndarray:
     """(6,) cube that holds what the outlines show, as those tell that their photos do not cut off; without
     any, as far as the cameras."""
     sizes = np.array([(view.width, view.height) for view in views])
-    whole = (np.array(boxes)[:, :2] > 1).all(1) & (np.array(boxes)[:, 2:] < sizes - 1).all(1)
-    told = whole if whole.sum() >= LEAST_WHOLE else np.ones(len(views), bool)
-    eyes = np.array([view.camera_to_world[:3, 3] for view in views])[told]
-    corners = [view.corners(1.0, box) for view, box, tells in zip(views, boxes, told, strict=True) if tells]
+    inside = (np.array(boxes)[:, :2] > 1).all(1) & (np.array(boxes)[:, 2:] < sizes - 1).all(1)
+    usable = inside if inside.sum() >= LEAST_WHOLE else np.ones(len(views), bool)
+    eyes = np.array([view.camera_to_world[:3, 3] for view in views])[usable]
+    corners = [view.corners(1.0, box) for view, box, tells in zip(views, boxes, usable, strict=True) if tells]
     rays = np.array(corners) - eyes[:, None]
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     middles = rays.mean(1) / np.linalg.norm(rays.mean(1), axis=1, keepdims=True)
     centre = nearest_point(eyes, middles)
     away = np.linalg.norm(np.cross(centre - eyes[:, None], rays), axis=2).max(1)
     half = MARGIN * float(np.quantile(away, 1 - AMISS / 2))
-    if told is not whole:
+    if usable is not inside:
         half = max(half, float(np.median(np.linalg.norm(eyes - centre, axis=1))))
     return np.concatenate([centre - half, centre + half])
 
@@ -377,5 +381,5 @@ def _narrowed(box: np.ndarray, views: Sequence[View], boxes: Sequence[tuple], am
         seen += inside
         excluded += inside & (beside > slack)
     left = (seen > 0) & (excluded <= amiss * seen)
-    kept = steps[left & (seen >= RARELY * np.median(seen[left]))] if left.any() else steps
-    return np.concatenate([low + kept.min(0) * cell, low + (kept.max(0) + 1) * cell])
+    cells = steps[left & (seen >= RARELY * np.median(seen[left]))] if left.any() else steps
+    return np.concatenate([low + cells.min(0) * cell, low + (cells.max(0) + 1) * cell])

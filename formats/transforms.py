@@ -19,13 +19,13 @@ from formats.cameras import (
     read_frames,
     written_path,
 )
+from formats.capture_frame import depth_range
 from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError, counted
-from formats.frame import depth_range
 from formats.frame_list import once, read_sound, repair_notes
 from formats.images import Header, read_image_header
-from formats.matching import Matched, find_file, match_photos, stem_key
+from formats.matching import MatchedPhotos, find_file, match_photos, stem_key
 from formats.photos import natural, on_photo
-from formats.points import MAX_POINTS, Points, points_notes, read_ply_points
+from formats.points import MAX_POINTS, SparsePoints, points_notes, read_ply_points
 from formats.views import View
 
 BLENDER_FILE = re.compile(r"transforms_(train|val|test)\.json")
@@ -37,7 +37,7 @@ AGREEING = 0.95
 
 
 @dataclass(frozen=True)
-class Part:
+class SplitPart:
     """The views of one split, the missing photos, and notes on where photos are read from."""
 
     views: tuple[View, ...] = ()
@@ -45,14 +45,14 @@ class Part:
     notes: tuple[str, ...] = ()
 
 
-def read_part(path: Path, downscale: int | None) -> Part:
+def read_part(path: Path, downscale: int | None) -> SplitPart:
     """All frames of a file."""
     document = read_document(path)
     (part,) = _views(path, document, path.parent, [_frames(path, document)], downscale)
     return part
 
 
-def read_splits(path: Path, base: Path, downscale: int | None) -> tuple[dict, Part, Part]:
+def read_splits(path: Path, base: Path, downscale: int | None) -> tuple[dict, SplitPart, SplitPart]:
     """The document of a nerfstudio or instant-ngp file in a capture's folder `base` or below it, and its
     frames to train on and to test with."""
     document = read_document(path)
@@ -79,7 +79,7 @@ def _frames(path: Path, document: dict) -> list[Numbered]:
 
 def _views(
     path: Path, document: dict, base: Path, splits: Sequence[list[Numbered]], downscale: int | None
-) -> tuple[Part, ...]:
+) -> tuple[SplitPart, ...]:
     """Views of the frames of each split whose photo exists, their cameras scaled to what is read of it."""
     splits = [sorted(frames, key=lambda item: natural(_file(item))) for frames in splits]
     files = [_file(item) for part in splits for item in part]
@@ -99,15 +99,15 @@ def _views(
 
 
 def _part(
-    path: Path, document: dict, frames: list[Numbered], matched: Matched, downscale: int | None
-) -> Part:
+    path: Path, document: dict, frames: list[Numbered], matched: MatchedPhotos, downscale: int | None
+) -> SplitPart:
     def photo_of(item: Numbered) -> str:  # however its path is written
         return os.path.normpath(matched.photos[_file(item)][0])
 
-    found = [item for item in frames if _file(item) in matched.photos]
-    found, notes = once(path, found, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
+    items = [item for item in frames if _file(item) in matched.photos]
+    items, notes = once(path, items, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
     unsure = []
-    names = dict(zip((i for i, _ in found), frame_names([frame for _, frame in found]), strict=True))
+    names = dict(zip((i for i, _ in items), frame_names([frame for _, frame in items]), strict=True))
 
     def read(item: Numbered) -> View:
         (i, frame), where = item, frame_where(path, *item)
@@ -121,7 +121,7 @@ def _part(
         view = replace(view, seen=_stated_points(where, frame))
         return on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
 
-    views, broken = read_sound(path, found, read, photo_of)
+    views, broken = read_sound(path, items, read, photo_of)
     missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
     turned = [
         f"{path}: EXIF turns {counted(len(unsure), 'photo', 'photos')}, such as {name}, and without w and h "
@@ -129,7 +129,7 @@ def _part(
         for name in unsure[:1]
     ]
     notes = (*notes, *broken, *turned, *repair_notes(path, views))
-    return Part(tuple(views), missing, notes)
+    return SplitPart(tuple(views), missing, notes)
 
 
 def _unstated_size(header: Header, frame: dict, document: dict) -> tuple[tuple[int, int], bool]:
@@ -155,8 +155,8 @@ def _stated_points(where: str, frame: dict) -> np.ndarray | None:
     listed = frame.get("sparse_points")
     if listed is None:
         return None
-    whole = isinstance(listed, list) and all(type(i) is int and 0 <= i < MAX_POINTS for i in listed)
-    if not whole:
+    is_valid = isinstance(listed, list) and all(type(i) is int and 0 <= i < MAX_POINTS for i in listed)
+    if not is_valid:
         raise BadSchema(f"{where}: expected sparse_points to be a list of whole numbers, one for each point")
     return np.unique(np.array(listed, np.int64))
 
@@ -169,12 +169,12 @@ def _mask(path: Path, factor: int, frame: dict, where: str) -> Path | None:
     mask = PurePosixPath(written)
     copy = f"_{factor}" if factor > 1 else ""
     reduced = mask.parent.with_name(mask.parent.name + copy) / mask.name if mask.parent.name else mask
-    found = find_file(path.parent, str(reduced)) or find_file(path.parent, written)
-    if found is None:
+    mask_path = find_file(path.parent, str(reduced)) or find_file(path.parent, written)
+    if mask_path is None:
         raise MissingFile(
             f"{where}: its mask {path.parent / mask} does not exist; add it, or remove mask_path"
         )
-    return found
+    return mask_path
 
 
 def _split(
@@ -196,14 +196,14 @@ def _split(
         )
     notes = []
     if unused := [file for file, learnt, held in uses if not (learnt or held)]:
-        said = counted(len(unused), "frame is", "frames are")
-        notes.append(f"{path}: {said} in no list of file names that is used, such as {unused[0]}")
+        count = counted(len(unused), "frame is", "frames are")
+        notes.append(f"{path}: {count} in no list of file names that is used, such as {unused[0]}")
     if both := [file for file, learnt, held in uses if learnt and held]:
-        said = counted(len(both), "photo is", "photos are")
-        notes.append(f"{path}: {said} both learnt from and held out, such as {both[0]}")
+        count = counted(len(both), "photo is", "photos are")
+        notes.append(f"{path}: {count} both learnt from and held out, such as {both[0]}")
     if unknown := sorted(listed - set(files), key=natural):
-        said = counted(len(unknown), "name is", "names are")
-        notes.append(f"{path}: {said} of no frame in its lists of file names, such as {unknown[0]}")
+        count = counted(len(unknown), "name is", "names are")
+        notes.append(f"{path}: {count} of no frame in its lists of file names, such as {unknown[0]}")
     chosen = ([item for item, use in zip(frames, uses, strict=True) if use] for uses in (is_train, is_test))
     return *chosen, notes
 
@@ -242,7 +242,7 @@ def stated_aabb(path: Path, document: dict) -> np.ndarray | None:
 class Sparse:
     """What is known of a capture's sparse points."""
 
-    points: Points | None = None
+    points: SparsePoints | None = None
     """In the frame of the poses."""
     seen: Mapping[str, np.ndarray] | None = None
     """View.seen by the `stem_key` of each photo's file, where a model says it; None where the frames may."""
@@ -252,7 +252,7 @@ class Sparse:
         """Views with the depths between which they show the points, and with those found in their photos."""
         if self.points is None:
             return tuple(replace(view, seen=None) for view in views)
-        few, told = _sample(self.points), []
+        few, with_ranges = _sample(self.points), []
         for view in views:
             near, far = depth_range(view.camera_to_world, few[_seen(view, few)])
             seen = view.seen if self.seen is None else self.seen.get(_photo_key(view))
@@ -263,8 +263,8 @@ class Sparse:
                     f"{path}: {view.name} shows sparse point {seen.max()}, but there are "
                     f"{len(self.points.positions):,} of them; estimate the poses again"
                 )
-            told.append(replace(view, near=near, far=far, seen=seen))
-        return tuple(told)
+            with_ranges.append(replace(view, near=near, far=far, seen=seen))
+        return tuple(with_ranges)
 
 
 def _photo_key(view: View) -> str:
@@ -301,7 +301,9 @@ def sparse_points(path: Path, document: dict, views: tuple[View, ...], most: int
     return replace(sparse, notes=(*sparse.notes, *points_notes(ply or path, sparse.points)))
 
 
-def _placed(path: Path, document: dict, points: Points | None, views: tuple[View, ...]) -> Points | None:
+def _placed(
+    path: Path, document: dict, points: SparsePoints | None, views: tuple[View, ...]
+) -> SparsePoints | None:
     """Points in the frame of the poses; None where there are none. Depending on the version of nerfstudio the
     file holds points before or after the transform."""
     if points is None or not len(points.positions) or not views:
@@ -312,11 +314,11 @@ def _placed(path: Path, document: dict, points: Points | None, views: tuple[View
 
 def _agreeing(sparse: Sparse, views: tuple[View, ...]) -> Sparse:
     """Points without what a model says of photos that do not show them so: it is of others, or posed anew."""
-    found = [(view, sparse.seen.get(_photo_key(view))) for view in views]
-    found = [(view, seen) for view, seen in found if seen is not None and len(seen)]
-    if sparse.points is None or not found:
+    seen_by_view = [(view, sparse.seen.get(_photo_key(view))) for view in views]
+    seen_by_view = [(view, seen) for view, seen in seen_by_view if seen is not None and len(seen)]
+    if sparse.points is None or not seen_by_view:
         return replace(sparse, seen=None)
-    shown = np.concatenate([_seen(view, sparse.points.positions[seen]) for view, seen in found])
+    shown = np.concatenate([_seen(view, sparse.points.positions[seen]) for view, seen in seen_by_view])
     return sparse if shown.mean() > AGREEING else replace(sparse, seen=None)
 
 
@@ -334,7 +336,7 @@ def _applied(path: Path, document: dict) -> list[np.ndarray]:
     return [matrix * scale]
 
 
-def _sample(points: Points) -> np.ndarray:
+def _sample(points: SparsePoints) -> np.ndarray:
     return points.positions[:: max(1, len(points.positions) // MAX_PROJECTED)]
 
 
@@ -346,6 +348,6 @@ def _seen(view: View, positions: np.ndarray) -> np.ndarray:
     return (back < 0) & (abs(column * 2 / view.width - 1) <= 1) & (abs(row * 2 / view.height - 1) <= 1)
 
 
-def _seen_share(points: Points, views: tuple[View, ...]) -> float:
+def _seen_share(points: SparsePoints, views: tuple[View, ...]) -> float:
     few = _sample(points)[::10]
     return float(np.mean([_seen(view, few).mean() for view in views[:: max(1, len(views) // 20)]]))

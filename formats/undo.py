@@ -18,23 +18,23 @@ KEPT = 64
 CHECKSUM = re.compile(r"[0-9a-f]{64}")
 
 
-def past_of(bundle: Path | str) -> Path:
+def history_folder(bundle: Path | str) -> Path:
     """The folder of a bundle's earlier ones, which need not exist."""
     return Path(f"{bundle}.history")
 
 
-def check_past(bundle: Path | str, output: Path | str) -> None:
+def check_history_folder(bundle: Path | str, output: Path | str) -> None:
     """Before any work: a bundle and its earlier ones can be kept as what an output will have been. Raises
     ResourceError."""
-    folder = past_of(output)
+    folder = history_folder(output)
     if not os.path.lexists(folder):
         check_writable(folder, overwrite=False)
     elif not folder.is_dir():
         raise ResourceError(f"{folder}: no folder, and in the way; move it, or leave --undoable out")
     elif not os.access(folder, os.W_OK | os.X_OK):
         raise ResourceError(f"{folder}: cannot write in it; make it writable, or leave --undoable out")
-    place = folder if folder.is_dir() else folder.parent
-    if os.path.isfile(bundle) and os.stat(bundle).st_dev != os.stat(place).st_dev:  # no link will do
+    copy = folder if folder.is_dir() else folder.parent
+    if os.path.isfile(bundle) and os.stat(bundle).st_dev != os.stat(copy).st_dev:  # no link will do
         check_space(folder, os.path.getsize(bundle))
 
 
@@ -45,14 +45,14 @@ def keep(bundle: Path | str, output: Path | str, most: int = KEPT) -> str:
     Where the file system can, the bytes are shared with the bundle that is there. Raises ResourceError."""
     checksum = sha256_of(bundle)
     share(bundle, bundle, output)
-    folder = made(past_of(output))
+    folder = ensure_folder(history_folder(output))
     link(Path(bundle), folder / f"{checksum}.rfpack", checksum)
     prune(folder, [checksum, *chain(folder, bundle)], most)
     sync_folder(folder)
     return checksum
 
 
-def made(folder: Path) -> Path:
+def ensure_folder(folder: Path) -> Path:
     """A folder that is there, and on the disk."""
     if not folder.is_dir():
         folder.mkdir()
@@ -62,43 +62,43 @@ def made(folder: Path) -> Path:
 
 def chain(folder: Path, bundle: Path | str) -> list[str]:
     """The checksums of the bundles before one, the latest first, as far as they are in the folder."""
-    found, path = [], Path(bundle)
-    while len(found) < KEPT:
+    checksums, path = [], Path(bundle)
+    while len(checksums) < KEPT:
         try:
             checksum = before(read_headers(path)[0])
         except FormatError:
-            if not found:
+            if not checksums:
                 raise
             break  # it was damaged since it was kept
         path = folder / f"{checksum}.rfpack"
         if checksum is None or not path.is_file():
             break
-        found.append(checksum)
-    return found
+        checksums.append(checksum)
+    return checksums
 
 
-def prune(folder: Path, own: list[str], most: int) -> None:
-    """Remove bundles until at most so many are there: first those that are none of an output's `own`, which
-    come the latest first, and then its earliest. What this module did not put there is left alone: whatever
-    is not named by the checksum that it has."""
-    held = {path.stem for path in folder.glob("*.rfpack") if CHECKSUM.fullmatch(path.stem)}
-    paths = {checksum: folder / f"{checksum}.rfpack" for checksum in held}
-    others = sorted(held - set(own), key=lambda checksum: paths[checksum].lstat().st_mtime)
-    for checksum in [*others, *reversed([c for c in own if c in held])][: max(0, len(held) - most)]:
+def prune(folder: Path, newest: list[str], most: int) -> None:
+    """Remove bundles until at most so many are there: first those that are none of an output's `newest`,
+    which come the latest first, and then its earliest. What this module did not put there is left alone:
+    whatever is not named by the checksum that it has."""
+    stored = {path.stem for path in folder.glob("*.rfpack") if CHECKSUM.fullmatch(path.stem)}
+    paths = {checksum: folder / f"{checksum}.rfpack" for checksum in stored}
+    others = sorted(stored - set(newest), key=lambda checksum: paths[checksum].lstat().st_mtime)
+    for checksum in [*others, *reversed([c for c in newest if c in stored])][: max(0, len(stored) - most)]:
         path = paths[checksum]
         if path.is_file() and sha256_of(path) == checksum:
             path.unlink(missing_ok=True)
 
 
-def share(bundle: Path | str, held: Path | str, output: Path | str) -> None:
-    """Have the bundles before one, which were kept as what `held` was, as what an output was, too."""
-    own, other = past_of(held), past_of(output)
-    earlier = chain(own, bundle)
-    if not earlier or os.path.realpath(own) == os.path.realpath(other):
+def share(bundle: Path | str, kept_of: Path | str, output: Path | str) -> None:
+    """Have the bundles before one, which were kept as what `kept_of` was, as what an output was, too."""
+    source, other = history_folder(kept_of), history_folder(output)
+    earlier = chain(source, bundle)
+    if not earlier or os.path.realpath(source) == os.path.realpath(other):
         return
-    check_past(held, output)
+    check_history_folder(kept_of, output)
     for checksum in earlier:
-        link(own / f"{checksum}.rfpack", made(other) / f"{checksum}.rfpack", checksum)
+        link(source / f"{checksum}.rfpack", ensure_folder(other) / f"{checksum}.rfpack", checksum)
 
 
 def link(path: Path, target: Path, checksum: str) -> None:
@@ -124,8 +124,8 @@ def copy(path: Path, target: Path | str) -> int:
 
 def before(scene: SceneGraph) -> str | None:
     """The SHA-256 of the bundle that the last edit was done to, where it was kept."""
-    said = scene.history[-1].get("before") if scene.history else None
-    return said if isinstance(said, str) and CHECKSUM.fullmatch(said) else None
+    checksum = scene.history[-1].get("before") if scene.history else None
+    return checksum if isinstance(checksum, str) and CHECKSUM.fullmatch(checksum) else None
 
 
 def undo(bundle: Path | str, output: Path | str) -> dict:
@@ -143,11 +143,11 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
         raise BadSchema(
             f"{bundle}: what it was before its last edit was not kept; edit with --undoable to undo it"
         )
-    path = past_of(bundle) / f"{checksum}.rfpack"
+    path = history_folder(bundle) / f"{checksum}.rfpack"
     if not path.is_file() or sha256_of(path) != checksum:
         raise MissingFile(
             f"{path}: the bundle before the last edit is not there as it was; keep the folder "
-            f"{past_of(bundle).name} beside the bundle"
+            f"{history_folder(bundle).name} beside the bundle"
         )
     last = scene.history[-1]
     share(path, bundle, output)
@@ -157,7 +157,7 @@ def undo(bundle: Path | str, output: Path | str) -> dict:
         "bytes": size,
         "undone": last.get("event", "edited"),
         "objects": names_of(last),
-        "more": depth(past_of(output), output),
+        "more": depth(history_folder(output), output),
     }
 
 
@@ -181,4 +181,4 @@ def history(bundle: Path | str) -> dict:
         }
         for entry in scene.history
     ]
-    return {"path": str(bundle), "undoable": depth(past_of(bundle), bundle), "history": entries}
+    return {"path": str(bundle), "undoable": depth(history_folder(bundle), bundle), "history": entries}

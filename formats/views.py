@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.capture_frame import SceneFrame
 from formats.errors import BadPose, NoViews
-from formats.frame import SceneFrame
-from formats.points import Points
+from formats.points import SparsePoints
 
 LEAST_VIEWS = 3
 """Depth does not follow from fewer photos."""
@@ -161,7 +161,7 @@ class Capture:
     """(6,) the box of the object that the masks cut out, where they do."""
     missing: tuple[str, ...] = ()
     """Photos that are listed but do not exist; their frames are left out."""
-    points: Points | None = None
+    points: SparsePoints | None = None
     """Sparse points from structure from motion, where the capture has them."""
     frame: SceneFrame | None = None
     """The layout of the cameras, where the box follows from it."""
@@ -204,9 +204,9 @@ def check_parallax(capture: Capture) -> None:
     if capture.kind == "mesh":
         return
     if len(views) < LEAST_VIEWS:
-        held = f" beside {len(capture.test)} that only measure" if capture.test else ""
+        held_out = f" beside {len(capture.test)} that only measure" if capture.test else ""
         raise NoViews(
-            f"{capture.path}: has {len(views)} photos to learn from{held}, but depth follows only from "
+            f"{capture.path}: has {len(views)} photos to learn from{held_out}, but depth follows only from "
             f"{LEAST_VIEWS} or more; add photos from other places"
         )
     eyes = np.array([view.camera_to_world[:3, 3] for view in views])
@@ -258,10 +258,10 @@ def _rotation(axes: np.ndarray, where: str) -> tuple[np.ndarray, str]:
         unit = axes / lengths
         error = float(np.abs(unit.T @ unit - np.eye(3)).max())
     if not error <= ROUNDED:  # also NaN, of an axis without length
-        said = ", ".join(f"{length:.4g}" for length in lengths)
+        listing = ", ".join(f"{length:.4g}" for length in lengths)
         raise BadPose(
-            f"{where}: the camera pose is no rotation (column lengths {said}, {error:.2g} from orthonormal); "
-            "drop this frame or export the poses again"
+            f"{where}: the camera pose is no rotation (column lengths {listing}, {error:.2g} from "
+            "orthonormal); drop this frame or export the poses again"
         )
     if np.linalg.det(unit) < 0:
         raise BadPose(f"{where}: the camera pose is mirrored (determinant -1); check the exporter's axes")

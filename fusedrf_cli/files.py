@@ -40,10 +40,10 @@ SHOWING = ("crop", "opacity", "tint")
 def compose(request: ComposeRequest, progress) -> dict:
     """Write the scene graph of the inputs; their names are relative to its folder. The graph itself goes to
     stdout where the output is "-", and the report is empty then."""
-    inputs = [Input(path=given) if isinstance(given, str) else given for given in request.inputs]
-    summaries = [read_summary(given.path) for given in inputs]
+    inputs = [Input(path=entry) if isinstance(entry, str) else entry for entry in request.inputs]
+    summaries = [read_summary(entry.path) for entry in inputs]
     named = zip(inputs, _names(inputs), strict=True)
-    nodes = tuple(_node(given, name, request) for given, name in named)
+    nodes = tuple(_node(entry, name, request) for entry, name in named)
     scene = SceneGraph(nodes, request.composition, generator=f"fusedrf {__version__}")
     inline_scenes(scene, request.output, request.allow_outside)
     if request.output == STDIO:
@@ -61,25 +61,25 @@ def compose(request: ComposeRequest, progress) -> dict:
     }
 
 
-def _node(given: Input, name: str, request: ComposeRequest) -> Node:
-    source = _relative(given.path, request.output)
+def _node(entry: Input, name: str, request: ComposeRequest) -> Node:
+    source = _relative(entry.path, request.output)
     resolve_source(request.output, source, request.allow_outside)
-    showing = {key: value for key in SHOWING if (value := getattr(given, key)) is not None}
-    showing |= {"visible": False} if given.hidden else {}
-    background = given.background_node
-    return make_node(name, source=source, background=background, showing=showing, **given.words)
+    showing = {key: value for key in SHOWING if (value := getattr(entry, key)) is not None}
+    showing |= {"visible": False} if entry.hidden else {}
+    background = entry.background_node
+    return make_node(name, source=source, background=background, showing=showing, **entry.words)
 
 
 def _names(inputs: list[Input]) -> list[str]:
     """A name for each input: the one given, else the file's stem, numbered where that is taken."""
-    taken = {given.name for given in inputs if given.name is not None}
+    used = {entry.name for entry in inputs if entry.name is not None}
     names = []
-    for given in inputs:
-        stem, count, name = Path(given.path).stem, 1, given.name
+    for entry in inputs:
+        stem, count, name = Path(entry.path).stem, 1, entry.name
         while name is None:
             candidate = stem if count == 1 else f"{stem}-{count}"
-            name, count = (None if candidate in taken else candidate), count + 1
-        taken.add(name)
+            name, count = (None if candidate in used else candidate), count + 1
+        used.add(name)
         names.append(name)
     return names
 

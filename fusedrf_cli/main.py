@@ -77,8 +77,8 @@ def _sentence(error: BaseException) -> tuple[str, int]:
         case FusedRFError() | FormatError():
             return str(error), error.exit_code
         case KeyboardInterrupt() | click.Abort():
-            said = getattr(error, "sentence", None) or signals.remains or "interrupted"
-            return said, getattr(error, "exit_code", 130)
+            sentence = getattr(error, "sentence", None) or signals.remains or "interrupted"
+            return sentence, getattr(error, "exit_code", 130)
         case click.UsageError(ctx=click.Context() as ctx):
             return f"{error.format_message().rstrip('.')}; try '{ctx.command_path} --help'", error.exit_code
         case click.ClickException():

@@ -38,10 +38,10 @@ class _Text(click.ParamType):
 
 def _numbers(text: str, counts: tuple[int, ...]) -> tuple[float, ...]:
     """Finite numbers between commas, blanks or brackets; ValueError if not as many as one of `counts`."""
-    found = tuple(float(word) for word in _SEPARATORS.split(text) if word)
-    if len(found) not in counts or not all(map(math.isfinite, found)):
+    numbers = tuple(float(word) for word in _SEPARATORS.split(text) if word)
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise ValueError(text)
-    return found
+    return numbers
 
 
 class PositiveType(_Text):
@@ -328,5 +328,5 @@ class KindsType(KindType):
     def convert(self, value, param, ctx):
         if not isinstance(value, str):  # the default
             return value
-        asked = [super(KindsType, self).convert(name, param, ctx) for name in value.split(",")]
-        return tuple(name for name in self.names() if name in asked)
+        kinds = [super(KindsType, self).convert(name, param, ctx) for name in value.split(",")]
+        return tuple(name for name in self.names() if name in kinds)

@@ -242,8 +242,8 @@ def _warnings_to(progress: Progress) -> Iterator[None]:
     """Python's warnings as lines of progress: those of `formats` always, other libraries' with -v."""
 
     def show(message, category, *where) -> None:
-        tell = progress.warn if issubclass(category, FormatWarning) else progress.note
-        tell(str(message))
+        show_line = progress.warn if issubclass(category, FormatWarning) else progress.note
+        show_line(str(message))
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", FormatWarning)

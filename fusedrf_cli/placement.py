@@ -20,10 +20,10 @@ def node_words(
         "scale": scale,
         "matrix": matrix,
     }
-    given = {word: value for word, value in words.items() if value is not None}
-    if matrix is not None and len(given) > 1:
+    options = {word: value for word, value in words.items() if value is not None}
+    if matrix is not None and len(options) > 1:
         raise UsageProblem("--matrix replaces -t, -r and -s; leave out these, or leave out --matrix")
-    return given
+    return options
 
 
 def quaternion(degrees: Vector) -> tuple[float, float, float, float]:

@@ -80,7 +80,7 @@ def chart(points: Sequence, best: Sequence, composed: dict[str, float], title: s
     above.suptitle(title, parse_math=False)
     handles = kind_handles(points)
     above.legend(handles=handles, loc="outside upper right", ncols=len(handles), fontsize=config.font)
-    write_list(below, best, looks(points))
+    write_list(below, best, styles_of(points))
     figure.draw_without_rendering()  # places are final from here on
     for panel, cost in zip(panels, AXES, strict=True):
         number(panel, cost, points, best)
@@ -92,12 +92,12 @@ def draw_panel(panel, cost: str, points: Sequence) -> None:
     config = current(PlotConfig)
     from matplotlib import ticker
 
-    seen = looks(points)
+    styles = styles_of(points)
     for point in points:
-        colour, marker = seen[point.kind]
+        colour, marker = styles[point.kind]
         alpha = 1 if cost in point.frontier else config.pale
-        look = {"color": colour, "alpha": alpha, "markersize": 6, "markeredgewidth": 0}
-        panel.plot(getattr(point, cost), point.psnr, marker, **look)
+        style = {"color": colour, "alpha": alpha, "markersize": 6, "markeredgewidth": 0}
+        panel.plot(getattr(point, cost), point.psnr, marker, **style)
     line = sorted((getattr(p, cost), p.psnr) for p in points if cost in p.frontier)
     panel.plot(*zip(*line, strict=True), color="0.4", linewidth=1, zorder=0)
     values = [getattr(p, cost) for p in points]
@@ -106,10 +106,10 @@ def draw_panel(panel, cost: str, points: Sequence) -> None:
     panel.set_xlabel(AXES[cost])
     panel.margins(y=0.1)
     panel.grid(alpha=0.3)
-    tell = (lambda x, _: readable_size(x)) if cost == "bytes" else (lambda x, _: f"{x:g}")
+    format_cost = (lambda x, _: readable_size(x)) if cost == "bytes" else (lambda x, _: f"{x:g}")
     few = max(values) > config.few_ticks * min(values)
     panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if few else (1, 1.5, 2, 3, 4, 5, 6, 8)))
-    panel.xaxis.set_major_formatter(tell)
+    panel.xaxis.set_major_formatter(format_cost)
     panel.xaxis.set_minor_locator(ticker.NullLocator())
     panel.tick_params(labelsize=config.font)
 
@@ -135,11 +135,11 @@ def kind_handles(points: Sequence) -> list:
 
     return [
         Line2D([], [], color=colour, marker=marker, linestyle="", label=kind)
-        for kind, (colour, marker) in looks(points).items()
+        for kind, (colour, marker) in styles_of(points).items()
     ]
 
 
-def looks(points: Sequence) -> dict[str, tuple[str, str]]:
+def styles_of(points: Sequence) -> dict[str, tuple[str, str]]:
     """Colour and marker of the kinds of some points, by the kinds' names: told apart as far as there are
     looks."""
     return {kind: LOOKS[i % len(LOOKS)] for i, kind in enumerate(sorted({p.kind for p in points}))}
@@ -149,23 +149,25 @@ def number(panel, cost: str, points: Sequence, best: Sequence) -> None:
     """Write its number beside every point of a panel's frontier, where nothing else is."""
     config = current(PlotConfig)
     to_pixels, per_point = panel.transData.transform, panel.figure.dpi / 72
-    taken = [tuple(to_pixels((getattr(p, cost), p.psnr)) / per_point) for p in points]
+    positions = [tuple(to_pixels((getattr(p, cost), p.psnr)) / per_point) for p in points]
     for i, point in enumerate(best, 1):
         if cost not in point.frontier:
             continue
         x, y = to_pixels((getattr(point, cost), point.psnr)) / per_point
-        dx, dy = max(AROUND, key=lambda d: (clear((x + d[0], y + d[1]), taken), -abs(d[0]) - abs(d[1])))
-        taken.append((x + dx, y + dy))
+        dx, dy = max(AROUND, key=lambda d: (clear((x + d[0], y + d[1]), positions), -abs(d[0]) - abs(d[1])))
+        positions.append((x + dx, y + dy))
         where = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": config.font}
         panel.annotate(str(i), (getattr(point, cost), point.psnr), (dx, dy), **where)
 
 
-def clear(place: tuple[float, float], taken: Sequence[tuple[float, float]], enough: float = 9.0) -> float:
+def clear(
+    position: tuple[float, float], positions: Sequence[tuple[float, float]], enough: float = 9.0
+) -> float:
     """Distance in points to the nearest of the places taken; beyond enough it is all the same."""
-    return min(enough, min(((place[0] - x) ** 2 + (place[1] - y) ** 2) ** 0.5 for x, y in taken))
+    return min(enough, min(((position[0] - x) ** 2 + (position[1] - y) ** 2) ** 0.5 for x, y in positions))
 
 
-def write_list(figure, best: Sequence, seen: dict[str, tuple[str, str]]) -> None:
+def write_list(figure, best: Sequence, styles: dict[str, tuple[str, str]]) -> None:
     """What the numbers stand for: the flags, and what they give."""
     config = current(PlotConfig)
     longest = max(len(p.flags) for p in best)
@@ -174,7 +176,7 @@ def write_list(figure, best: Sequence, seen: dict[str, tuple[str, str]]) -> None
         f"{i:<4}{p.flags:{longest}}{p.psnr:8.2f}{p.ssim:8.4f}{readable_size(p.bytes):>9}{p.seconds:9.2f}{p.ms:11.1f}"
         for i, p in enumerate(best, 1)
     ]
-    colours = ["black", *(seen[p.kind][0] for p in best)]
+    colours = ["black", *(styles[p.kind][0] for p in best)]
     for row, (text, colour) in enumerate(zip([head, *rows], colours, strict=True)):
         y = 1 - (row + 0.5) / (len(rows) + 1.5)
         figure.text(0.05, y, text, family="monospace", fontsize=config.font + 0.5, color=colour, va="center")

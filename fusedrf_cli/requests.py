@@ -157,7 +157,7 @@ class AddRequest(EditRequest, Placing):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MendingRequest(Writing, Learning):
+class HoleRequest(Writing, Learning):
     """What becomes of the hole that an object leaves."""
 
     refit: str | None = None
@@ -167,7 +167,7 @@ class MendingRequest(Writing, Learning):
 
 
 @dataclass(frozen=True)
-class DeleteRequest(EditRequest, MendingRequest):
+class DeleteRequest(EditRequest, HoleRequest):
     """Objects to be taken out."""
 
     fused: str
@@ -285,7 +285,7 @@ class UndoRequest(Writing):
 
 
 @dataclass(frozen=True)
-class ExtractRequest(MendingRequest):
+class ExtractRequest(HoleRequest):
     """An object out of a field; what tells of it is in world units and pixels."""
 
     field: str

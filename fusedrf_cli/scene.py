@@ -32,7 +32,7 @@ def open_scene(path: str | Path, device: str = "cpu", allow_outside: bool = Fals
     Sources outside the scene's folder are refused unless allow_outside. Raises a `formats` error or
     InvalidInput, one sentence each, for a file that is missing or is not what it should be.
     """
-    return Scene(load_scene(str(path), allow_outside, place=device))
+    return Scene(load_scene(str(path), allow_outside, device=device))
 
 
 class Scene:
@@ -71,8 +71,8 @@ class Scene:
     @property
     def aabb(self) -> np.ndarray:
         """(6,) float64 box in the world outside of which nothing is."""
-        field, origin, _ = self._asked()
-        return placed_box(field.occupancy.subject, origin)
+        field, origin, _ = self._current_field()
+        return placed_box(field.occupancy.look_at_box, origin)
 
     def parameters(self) -> list[torch.Tensor]:
         """The numbers (P,) of each field, once, made to require gradients: what an optimiser is given."""
@@ -81,7 +81,7 @@ class Scene:
 
     def query(self, points: torch.Tensor, dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) per unit of length and rgb (N, 3) in [0, 1] at points (N, 3), along unit dirs (N, 3)."""
-        field, origin, poses = self._asked()
+        field, origin, poses = self._current_field()
         points, dirs, per_length = seen_from(origin, points, dirs)
         sigma, rgb = query(field, points, dirs, poses)
         return sigma if per_length is None else sigma * per_length.to(sigma), rgb
@@ -103,7 +103,7 @@ class Scene:
         of a field that fills all of space, where there is one. Where nothing needs a gradient this is many
         times faster.
         """
-        field, origin, poses = self._asked()
+        field, origin, poses = self._current_field()
         how = {"poses": poses, "origin": origin, "near": near, "step": step, "early_stop": early_stop}
         return render_rays(field, rays_o, rays_d, **how)
 
@@ -117,7 +117,7 @@ class Scene:
     ) -> Picture:
         """The view of a camera, from `pose` (4, 4), camera to world, where it is given in place of the
         camera's own; see `render_rays`."""
-        field, origin, poses = self._asked()
+        field, origin, poses = self._current_field()
         how = {"origin": origin, "step": step, "early_stop": early_stop}
         return render_image(field, camera, pose=pose, poses=poses, **how)
 
@@ -144,17 +144,17 @@ class Scene:
             pose[3] = [0, 0, 0, 1]
         return now
 
-    def _asked(self) -> tuple[RadianceField, np.ndarray, Poses | None]:
+    def _current_field(self) -> tuple[RadianceField, np.ndarray, Poses | None]:
         """The field that answers for the scene, where its frame lies in the world (a position (3,), or a
         placement (4, 4)), and those placements in its frame that need a gradient."""
         now = self._now()
         learnt = {name: pose for name, pose in self.placements.items() if pose.requires_grad}
         shown = {placed.name: placed for placed in self._loaded.placed}
-        (name, place), *others = now.items()
+        (name, placement), *others = now.items()
         alone = not others and not learnt and shown[name].as_it_is
-        moved = np.array_equal(place[:3, :3], np.eye(3))
+        moved = np.array_equal(placement[:3, :3], np.eye(3))
         if alone and (moved or self.fields[name].occupancy.space is not bounded):
-            return self.fields[name], short_origin(place), None
+            return self.fields[name], short_origin(placement), None
         known = self._composed and {p.name: p.object_to_world for p in self._composed[0]}
         if not known or any(not np.array_equal(known[name], pose) for name, pose in now.items()):
             placed = [

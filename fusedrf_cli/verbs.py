@@ -38,12 +38,16 @@ def verb(name: str, request: type, does: str = "", module: str = "bridge") -> Ca
         *words: Any, progress: NullProgress | None = None, settings: Sequence = (), **options: Any
     ) -> dict:
         options = {EARLIER.get(name, name): value for name, value in options.items()}
-        asked = checked(request, signature.bind(*words, **options).arguments)
+        checked_request = checked(request, signature.bind(*words, **options).arguments)
         progress = progress or NullProgress()
-        held = held_outputs(asked, progress) if isinstance(asked, Writing) else contextlib.nullcontext()
+        held = (
+            locked_outputs(checked_request, progress)
+            if isinstance(checked_request, Writing)
+            else contextlib.nullcontext()
+        )
         with held, using(*settings):
             work = getattr(importlib.import_module(f"fusedrf_cli.{module}"), does or name)
-            report = work(asked, progress)
+            report = work(checked_request, progress)
         return report and {**report, "warnings": report.get("warnings", progress.warnings)}
 
     how = {"progress": None, "settings": ()}
@@ -73,33 +77,33 @@ def _plain(value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def held_outputs(asked: Writing, progress: NullProgress) -> Iterator[None]:
+def locked_outputs(request: Writing, progress: NullProgress) -> Iterator[None]:
     """A block in which nobody else writes the outputs. An output that is in the way, cannot be written, or is
     being written is refused before any work, and so are those beside it. An edit in place waits instead, and
     reads only then: no edit is lost."""
-    if asked.stdout and asked.output == STDIO:
+    if request.stdout and request.output == STDIO:
         yield
         return
     from formats.atomic import check_writable
     from formats.locks import output_lock
 
-    others = asked.beside()
-    outputs = {asked.output: asked.folders} | others
+    others = request.beside()
+    outputs = {request.output: request.folders} | others
     if len({os.path.realpath(path) for path in outputs}) <= len(others):
-        raise UsageProblem(f"{asked.output}: two outputs go there; give them different names")
-    edited = getattr(asked, "fused", None)
-    in_place = edited is not None and os.path.realpath(edited) == os.path.realpath(asked.output)
-    check_all = functools.partial(_check_all, check_writable, outputs, asked.overwrite)
+        raise UsageProblem(f"{request.output}: two outputs go there; give them different names")
+    edited = getattr(request, "fused", None)
+    in_place = edited is not None and os.path.realpath(edited) == os.path.realpath(request.output)
+    check_all = functools.partial(_check_all, check_writable, outputs, request.overwrite)
     with contextlib.ExitStack() as locks:
         check_all()
         for path in outputs:
-            waiting = progress.tell if in_place and path == asked.output else None
+            waiting = progress.tell if in_place and path == request.output else None
             locks.enter_context(output_lock(path, waiting))
         check_all()  # one may have come while we waited
-        if isinstance(asked, EditRequest) and asked.undoable:
-            from formats.undo import check_past
+        if isinstance(request, EditRequest) and request.undoable:
+            from formats.undo import check_history_folder
 
-            check_past(edited, asked.output)
+            check_history_folder(edited, request.output)
         yield
 
 

@@ -26,9 +26,9 @@ def kinds(work: Work) -> dict[str, str]:
     scene = four_objects(work)
     held, rows = course(scene, current(QualityConfig).size), []
     for kind in current(FusedConfig).kinds:
-        for rgb in ("--no-rgb", "--rgb"):
+        for rgb in ("--no-finetune", "--finetune"):
             found, seconds = fused(held, scene, kind, rgb)
-            rows.append({"kind": kind, "rgb": rgb == "--rgb"} | found | {"seconds": seconds})
+            rows.append({"kind": kind, "rgb": rgb == "--finetune"} | found | {"seconds": seconds})
             write_csv(work.out / "kinds.csv", rows)
     return {
         "points": listed({r["kind"]: r["psnr"] for r in rows if not r["rgb"]}),

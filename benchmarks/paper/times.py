@@ -39,7 +39,7 @@ class TimesConfig:
     """Pixels a side of the pictures compared."""
 
 
-DISTILLED = {"background": (), "scratch": ("--from-scratch", "--no-rgb")}
+DISTILLED = {"background": (), "scratch": ("--from-scratch", "--no-finetune")}
 
 
 def times(work: Work) -> dict[str, str]:
@@ -48,22 +48,22 @@ def times(work: Work) -> dict[str, str]:
     scene = four_objects(work)
     held, rows = course(scene, config.compared), []
 
-    def note(way: str, path: Path, seconds: float) -> None:
-        rows.append({"way": way, "seconds": seconds, "psnr": held.quality(path)["psnr"]})
+    def note(storage: str, path: Path, seconds: float) -> None:
+        rows.append({"way": storage, "seconds": seconds, "psnr": held.quality(path)["psnr"]})
         write_csv(work.out / "times.csv", rows)
         figures.times(rows, config.wanted, work.out / "times.svg")
 
-    for way, path, seconds in chain(fusings(scene), trainings(scene, held.box)):  # all write one path
-        note(way, path, seconds)
+    for storage, path, seconds in chain(fusings(scene), trainings(scene, held.box)):  # all write one path
+        note(storage, path, seconds)
     retraining = seconds_to(rows, "retraining")
     limit = max(r["seconds"] for r in rows if r["way"] == "retraining")
-    ways = [way for way in dict.fromkeys(r["way"] for r in rows) if way != "retraining"]
+    ways = [storage for storage in dict.fromkeys(r["way"] for r in rows) if storage != "retraining"]
     ratios = []
-    for way in ways:
-        found = seconds_to(rows, way)
+    for storage in ways:
+        found = seconds_to(rows, storage)
         if found is not None:
             more = f"{retraining / found:.0f}×" if retraining else f"more than {limit / found:.0f}×"
-            ratios.append(f"{way} {more}")
+            ratios.append(f"{storage} {more}")
     best = max(r["psnr"] for r in rows if r["way"] == "retraining")
     missed = "" if retraining else f"; retraining is at {best:.1f} dB after {limit:.0f} s"
     return {"time": (", ".join(ratios) or f"none reached {config.wanted:g} dB") + missed}
@@ -77,9 +77,9 @@ def fusings(scene: Path):
     for kind in current(FusedConfig).kinds:
         if kind != "vm" and kind not in SIZES:
             yield kind, *fuse(scene, "--kind", kind)
-    for way, words in DISTILLED.items():
+    for storage, words in DISTILLED.items():
         for budget in current(TimesConfig).fusing:
-            yield way, *fuse(scene, "--kind", "vm", "--time-budget", str(budget), *words)
+            yield storage, *fuse(scene, "--kind", "vm", "--time-budget", str(budget), *words)
 
 
 def fuse(scene: Path, *words: str) -> tuple[Path, float]:
@@ -118,12 +118,12 @@ def photograph(scene: Path, box: np.ndarray, folder: Path) -> None:
     write_capture(folder, views, np.stack([to_pixels(shot, None) for shot in shots]), "train")
 
 
-def seconds_to(rows: list[dict], way: str) -> float | None:
+def seconds_to(rows: list[dict], storage: str) -> float | None:
     """Seconds after which a way is at `wanted`, between two of its points by a straight line over the
     logarithm of time; None where it never is.
     """
     config = current(TimesConfig)
-    found = [(r["seconds"], r["psnr"]) for r in rows if r["way"] == way]
+    found = [(r["seconds"], r["psnr"]) for r in rows if r["way"] == storage]
     before = None
     for seconds, psnr in sorted(found):
         if psnr >= config.wanted:

@@ -96,7 +96,7 @@ def peak_of(scene: Path, size: int) -> int:
     return json.loads(done.stdout)["memory"]["peak_bytes"]
 
 
-def kept_rows(path: Path, key: str, measured: set[str]) -> list[dict]:
+def stored_rows(path: Path, key: str, measured: set[str]) -> list[dict]:
     """Rows that are in a file, if it is there, but for those whose `key` is among what was measured anew."""
     if not path.exists():
         return []

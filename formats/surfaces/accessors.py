@@ -9,7 +9,7 @@ import numpy as np
 
 from formats.errors import BadMesh, FormatError, LimitExceeded, MissingExtra
 from formats.surfaces import gltf_schema as schema
-from formats.surfaces.beside import Beside
+from formats.surfaces.named_files import Beside
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -123,13 +123,13 @@ class Buffers:
         if accessor.buffer_view is None:
             if accessor.count > max(FREE_ELEMENTS, self.size):
                 raise LimitExceeded(f"{where} counts {accessor.count:,} elements, but has no bytes for them")
-            found = np.broadcast_to(np.zeros((), kind), (accessor.count, width))
+            table = np.broadcast_to(np.zeros((), kind), (accessor.count, width))
         else:
             stride = self.item("buffer_views", accessor.buffer_view).byte_stride
-            found = self._table(
+            table = self._table(
                 accessor.buffer_view, accessor.byte_offset, stride, accessor.count, width, kind, where
             )
-        return found if accessor.sparse is None else self._patched(found, accessor.sparse, where)
+        return table if accessor.sparse is None else self._patched(table, accessor.sparse, where)
 
     def _table(self, view, offset, stride, count, width, kind, where) -> np.ndarray:
         data, size = self.view(view), width * kind.itemsize
@@ -149,15 +149,15 @@ class Buffers:
         if sparse.count > len(base) or sparse.indices.component_type not in (5121, 5123, 5125):
             raise BadMesh(f"{where} replaces {sparse.count:,} of its {len(base):,} elements; export it again")
         part, kind = sparse.indices, np.dtype(COMPONENTS[sparse.indices.component_type])
-        places = self._table(part.buffer_view, part.byte_offset, 0, sparse.count, 1, kind, where)[:, 0]
+        indices = self._table(part.buffer_view, part.byte_offset, 0, sparse.count, 1, kind, where)[:, 0]
         part = sparse.values
         values = self._table(
             part.buffer_view, part.byte_offset, 0, sparse.count, base.shape[1], base.dtype, where
         )
-        if len(places) and places.max() >= len(base):
+        if len(indices) and indices.max() >= len(base):
             raise BadMesh(f"{where} replaces an element that it does not have; export the file again")
         patched = base.copy()
-        patched[places] = values
+        patched[indices] = values
         return patched
 
     def numbers(

@@ -22,13 +22,13 @@ def draco_arrays(data: bytes, names: dict[str, int], where: str) -> dict[str, np
     try:
         mesh = DracoPy.decode(data)
         by_id = {entry["unique_id"]: np.asarray(entry["data"]) for entry in mesh.attributes}
-        found = {name: by_id[number] for name, number in names.items() if number in by_id}
-        found["indices"] = np.asarray(mesh.faces)
+        attributes = {name: by_id[number] for name, number in names.items() if number in by_id}
+        attributes["indices"] = np.asarray(mesh.faces)
     except Exception as error:  # the library raises errors of any class on broken data
         raise BadMesh(f"{where}: {DRACO} cannot be decoded ({error}); export the mesh again") from error
-    if len({len(rows) for name, rows in found.items() if name != "indices"}) != 1:
+    if len({len(rows) for name, rows in attributes.items() if name != "indices"}) != 1:
         raise BadMesh(f"{where}: {DRACO} lacks its attributes; export the mesh again")
-    return found
+    return attributes
 
 
 def _check_draco(data: bytes, where: str) -> None:

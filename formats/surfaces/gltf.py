@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh, LimitExceeded, MissingExtra
-from formats.inputs import read_input
 from formats.rotations import matrices
+from formats.safe_input import read_input
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import MESHOPT, Buffers, normalised
-from formats.surfaces.beside import Beside
 from formats.surfaces.draco import DRACO, draco_arrays
 from formats.surfaces.gltf_materials import (
     GLOSSINESS,
@@ -26,6 +25,7 @@ from formats.surfaces.gltf_materials import (
     Materials,
     Slot,
 )
+from formats.surfaces.named_files import Beside
 from formats.surfaces.surface import (
     Notes,
     Paint,
@@ -112,9 +112,9 @@ def _check_extensions(document: schema.Document, path: Path | str, notes: Notes)
         raise BadMesh(
             f"{path}: requires {listed(required)}, which is not known here; export the mesh without it"
         )
-    places = [document, *document.nodes, *document.meshes]
-    places += [primitive for mesh in document.meshes for primitive in mesh.primitives]
-    there = [name for place in places for name in place.extensions]
+    owners = [document, *document.nodes, *document.meshes]
+    owners += [primitive for mesh in document.meshes for primitive in mesh.primitives]
+    there = [name for owner in owners for name in owner.extensions]
     if used := unknown(dict.fromkeys([*document.extensions_used, *document.extensions_required, *there])):
         notes.add(f"uses {listed(used)}, which is not shown")
 
@@ -132,12 +132,12 @@ class _Reader:
 
     def surfaces(self) -> list[Surface]:
         self.worlds, order = self._worlds()
-        shown, found = self._shown(order), []
+        shown, surfaces = self._shown(order), []
         for index in shown:
             if self.document.nodes[index].mesh is not None:
-                found += self._node(index)
+                surfaces += self._node(index)
         self._tell(shown)
-        return [surface for surface in found if len(surface.faces)]
+        return [surface for surface in surfaces if len(surface.faces)]
 
     def _tell(self, shown: list[int]) -> None:
         document = self.document
@@ -218,7 +218,7 @@ class _Reader:
         mesh = self.buffers.item("meshes", node.mesh)
         weights = mesh.weights if node.weights is None else node.weights
         worlds = self._instances(node, self.worlds[index])
-        found = []
+        surfaces = []
         for number, primitive in enumerate(mesh.primitives):
             where = f"{self.path}: mesh {mesh.name[:60] or node.mesh!r}, primitive {number}"
             if primitive.mode not in (TRIANGLES, STRIP, FAN):
@@ -229,8 +229,8 @@ class _Reader:
                 shape = self.shapes[node.mesh, number] = _Shape(self, primitive, where)
             self.triangles += len(shape.faces) * len(worlds)
             check_budget(self.path, self.triangles, self.buffers.size)
-            found += shape.placed(worlds, weights, node.skin)
-        return found
+            surfaces += shape.placed(worlds, weights, node.skin)
+        return surfaces
 
     def _instances(self, node: schema.Node, world: np.ndarray) -> list[np.ndarray]:
         if INSTANCING not in node.extensions:

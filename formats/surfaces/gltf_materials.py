@@ -35,7 +35,7 @@ class Slot(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Appearance:
     """What of a material is shown."""
 
     base: Slot
@@ -45,7 +45,7 @@ class Look:
     single_sided: bool
 
 
-PLAIN = Look(Slot(np.ones(4, np.float32), None, 0, None), None, None, False, True)
+PLAIN = Appearance(Slot(np.ones(4, np.float32), None, 0, None), None, None, False, True)
 """Where a primitive has no material: glTF's default, white."""
 
 
@@ -54,13 +54,13 @@ class Materials:
 
     def __init__(self, document: schema.Document, buffers: Buffers, notes: Notes):
         self.document, self.buffers, self.notes = document, buffers, notes
-        self.looks: dict[int, Look] = {}
+        self.looks: dict[int, Appearance] = {}
         self.pictures: dict[int, np.ndarray | None] = {}
         self.used: set[int] = set()
         """Of the document's images, those that are shown."""
         self.share = share_of(len(document.images), notes)
 
-    def look(self, index: int | None) -> Look:
+    def look(self, index: int | None) -> Appearance:
         """What material `index` shows. Raises BadMesh."""
         if index is None:
             return PLAIN
@@ -68,7 +68,7 @@ class Materials:
             self.looks[index] = self._look(self.buffers.item("materials", index), index)
         return self.looks[index]
 
-    def _look(self, material: schema.Material, index: int) -> Look:
+    def _look(self, material: schema.Material, index: int) -> Appearance:
         name = f"material {material.name[:60]!r}" if material.name else f"material {index}"
         self._tell_unused(material, name)
         metallic = material.pbr_metallic_roughness
@@ -83,7 +83,7 @@ class Materials:
             self.notes.add(f"the unknown alphaMode {material.alpha_mode[:20]!r} is shown as OPAQUE", name)
         cutoff = material.alpha_cutoff if material.alpha_mode == "MASK" else None
         blend = material.alpha_mode == "BLEND"
-        return Look(base, self._glow(material, name), cutoff, blend, not material.double_sided)
+        return Appearance(base, self._glow(material, name), cutoff, blend, not material.double_sided)
 
     def _glow(self, material: schema.Material, name: str) -> Slot | None:
         strength = 1.0
@@ -155,8 +155,8 @@ class Materials:
             return b"", label
         if is_data(image.uri):
             return data_uri(image.uri, label), label
-        data, found = self.buffers.beside.read(image.uri, uri=True)
-        return data, found.name
+        data, path = self.buffers.beside.read(image.uri, uri=True)
+        return data, path.name
 
     # --- notes ----------------------------------------------------------------------------------------------
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from formats.errors import FormatError
-from formats.surfaces.beside import Beside
 from formats.surfaces.lines import lines_of
+from formats.surfaces.named_files import Beside
 from formats.surfaces.pictures import read_picture, share_of
 from formats.surfaces.surface import Notes, Paint, Texture, listed, opaque
 
@@ -80,7 +80,7 @@ class Material:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Appearance:
     """What of a material is shown."""
 
     paint: Paint
@@ -94,17 +94,17 @@ class Look:
 
 def parse_mtl(data: bytes, notes: Notes, file: str) -> dict[str, Material]:
     """Materials by name; of several of one name the first."""
-    found, current = {}, None
+    materials, current = {}, None
     for line in lines_of(data):
         word, _, rest = line.partition(" ")
         word, rest = word.lower(), rest.strip()
         if word == "newmtl":
-            check_repeated(found.get(current and current.name), current, notes)
+            check_repeated(materials.get(current and current.name), current, notes)
             current = Material(rest)
-            found.setdefault(rest, current)
-            if len(found) > MAX_MATERIALS:
+            materials.setdefault(rest, current)
+            if len(materials) > MAX_MATERIALS:
                 notes.add(f"{file} has more than {MAX_MATERIALS:,} materials, the rest is left out")
-                return found
+                return materials
         elif current is None:
             notes.add(f"{file}: {word} before its first newmtl belongs to no material")
         else:
@@ -112,8 +112,8 @@ def parse_mtl(data: bytes, notes: Notes, file: str) -> dict[str, Material]:
                 _set(current, word, rest)
             except ValueError:
                 notes.add(f"{file}: {word} {rest[:40]!r} of material {current.name[:60]!r} is not understood")
-    check_repeated(found.get(current and current.name), current, notes)
-    return found
+    check_repeated(materials.get(current and current.name), current, notes)
+    return materials
 
 
 def check_repeated(first: Material | None, other: Material | None, notes: Notes) -> None:
@@ -164,23 +164,23 @@ def _map(rest: str) -> Map:
     return Map(rest.strip().strip('"'), options)
 
 
-class Looks:
+class Appearances:
     """What materials show; each picture is read once."""
 
     def __init__(self, materials: dict[str, Material], beside: Beside, notes: Notes):
         self.materials, self.beside, self.notes = materials, beside, notes
         self.pictures: dict[str, np.ndarray | None] = {}
-        self.looks: dict[str, Look] = {}
+        self.looks: dict[str, Appearance] = {}
         maps = [item for material in materials.values() for item in material.maps.items()]
         named = {m.name for word, m in maps if word in SHOWN}
         self.share = share_of(len(named), notes)
 
-    def look(self, name: str) -> Look:
+    def look(self, name: str) -> Appearance:
         if name not in self.looks:
             self.looks[name] = self._look(self.materials[name])
         return self.looks[name]
 
-    def _look(self, material: Material) -> Look:
+    def _look(self, material: Material) -> Appearance:
         called = f"material {material.name[:60]!r}"
         maps = material.maps
         base, placed = material.base, material.placed
@@ -202,7 +202,7 @@ class Looks:
             )
             texture = replace(texture, pixels=opaque(texture.pixels))
         factor = np.array([*colour, np.clip(material.alpha, 0, 1)], np.float32)
-        return Look(
+        return Appearance(
             Paint(factor, texture, coverage=coverage),
             self._glow(material, called),
             material.alpha < 1 or coverage is not None,
@@ -230,18 +230,18 @@ class Looks:
         self.notes.add("glows, which is added to its colour", called)
         return Paint(np.array([*np.clip(ke, 0, 1000), 1], np.float32), texture)
 
-    def _texture(self, wanted: Map | None, called: str) -> Texture | None:
-        if wanted is None:
+    def _texture(self, picture: Map | None, called: str) -> Texture | None:
+        if picture is None:
             return None
-        if wanted.name not in self.pictures:
+        if picture.name not in self.pictures:
             try:
-                data, found = self.beside.read(wanted.name)
-                self.pictures[wanted.name] = read_picture(data, found.name, self.share, self.notes)
+                data, path = self.beside.read(picture.name)
+                self.pictures[picture.name] = read_picture(data, path.name, self.share, self.notes)
             except FormatError as error:
-                self.pictures[wanted.name] = None
+                self.pictures[picture.name] = None
                 self.notes.add(f"has a texture that is not shown: {error}", called)
-        pixels = self.pictures[wanted.name]
-        wrap = "clamp" if wanted.options.get("-clamp", ["off"])[0].lower() == "on" else "repeat"
+        pixels = self.pictures[picture.name]
+        wrap = "clamp" if picture.options.get("-clamp", ["off"])[0].lower() == "on" else "repeat"
         return None if pixels is None else Texture(pixels, (wrap, wrap))
 
     def _tell_unused(self, material: Material, base: Map | None, called: str) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh, FormatError
-from formats.inputs import read_input
-from formats.surfaces.beside import Beside
+from formats.safe_input import read_input
 from formats.surfaces.lines import lines_of, numbers_in, western, without_comment
-from formats.surfaces.mtl import FIRST_TILE, TILES_ACROSS, Looks, Material, check_repeated, parse_mtl
+from formats.surfaces.mtl import FIRST_TILE, TILES_ACROSS, Appearances, Material, check_repeated, parse_mtl
+from formats.surfaces.named_files import Beside
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
     Notes,
@@ -107,13 +107,13 @@ class _Text:
         if not self.tokens:
             return
         so_far = np.array(self.relative)
-        found = _numbers(self.tokens)
-        found = np.where(found > 0, found - 1, np.where(found < 0, so_far + found, -1))
-        if (found[:, 0] < 0).any():
+        numbers = _numbers(self.tokens)
+        numbers = np.where(numbers > 0, numbers - 1, np.where(numbers < 0, so_far + numbers, -1))
+        if (numbers[:, 0] < 0).any():
             raise BadMesh(
                 f"{self.path}: a face refers to a vertex that does not exist; export the mesh again"
             )
-        self.corners.append(np.minimum(found, 2**31 - 1).astype(np.int32))
+        self.corners.append(np.minimum(numbers, 2**31 - 1).astype(np.int32))
         self.tokens, self.relative = [], []
 
 
@@ -190,23 +190,25 @@ def _surfaces(text: _Text, path: Path | str, n_bytes: int, painted: bytes, notes
         colours = _polypaint(painted, len(positions), notes)
     corners = np.concatenate(text.corners)
     check_indices(path, corners[:, 0], len(positions))
-    places, polygon = triangulated(counts, corners[:, 0], positions)
+    corner_indices, polygon = triangulated(counts, corners[:, 0], positions)
     beside = Beside(path)
     materials = _materials(text, beside, path, notes)
     names = _chosen(text, materials, notes)
     for name, material in [(n, materials[m]) for n, m in names.items() if m is not None]:
         if material.tiled:
             _cut_into_tiles(name, material, text, used, (counts, corners, uvs), materials, names)
-    looks, found = Looks(materials, beside, notes), []
+    looks, surfaces = Appearances(materials, beside, notes), []
     for name, index in text.materials.items():
-        own = places[used[polygon] == index]
-        if len(own):
-            found.append(_surface(corners[own], positions, uvs, colours, names[name], looks, notes))
+        corner_rows = corner_indices[used[polygon] == index]
+        if len(corner_rows):
+            surfaces.append(
+                _surface(corners[corner_rows], positions, uvs, colours, names[name], looks, notes)
+            )
     looks.tell_unused()
-    return found
+    return surfaces
 
 
-def _surface(corners, positions, uvs, colours, name: str | None, looks: Looks, notes: Notes) -> Surface:
+def _surface(corners, positions, uvs, colours, name: str | None, looks: Appearances, notes: Notes) -> Surface:
     """Of faces (F, 3, 2): vertex and coordinate, -1 for none."""
     look = None if name is None else looks.look(name)
     textured = look is not None and any(
@@ -216,8 +218,8 @@ def _surface(corners, positions, uvs, colours, name: str | None, looks: Looks, n
         for picture in (paint.texture, paint.coverage)
     )
     keys = corners.reshape(-1, 2).astype(np.int64)
-    whole = keys[:, 0] * (len(uvs) + 2) + keys[:, 1] + 1 if textured else keys[:, 0]
-    _, first, faces = np.unique(whole, return_index=True, return_inverse=True)
+    key = keys[:, 0] * (len(uvs) + 2) + keys[:, 1] + 1 if textured else keys[:, 0]
+    _, first, faces = np.unique(key, return_index=True, return_inverse=True)
     vertex, coordinate = keys[first].T
     rest = {"faces": faces.reshape(-1, 3).astype(np.int32)}
     if look is not None:
@@ -271,7 +273,7 @@ def _chosen(text: _Text, materials: dict[str, Material], notes: Notes) -> dict[s
         else:
             alike = folded.get(_key(name), folded.get(_key(without_comment(name))))
             chosen[name] = name if name in materials else alike
-    lost = [name for name, found in chosen.items() if name is not None and found is None]
+    lost = [name for name, material in chosen.items() if name is not None and material is None]
     if lost:
         notes.add(f"materials that no library holds: {listed(lost)}; their faces are shown white")
     return chosen
@@ -281,10 +283,10 @@ def _cut_into_tiles(name, material: Material, text: _Text, used, faces, material
     """Give the faces of each tile of the coordinates (<UDIM>: 1001 and on, ten across) a material of its
     own; `used`, `materials` and `names` are changed."""
     counts, corners, uvs = faces
-    own = np.flatnonzero(used == text.materials[name])
-    if not len(own):
+    chosen_faces = np.flatnonzero(used == text.materials[name])
+    if not len(chosen_faces):
         return
-    first = corners[(np.cumsum(counts) - counts)[own][:, None] + np.arange(3), 1]
+    first = corners[(np.cumsum(counts) - counts)[chosen_faces][:, None] + np.arange(3), 1]
     uv = np.vstack([uvs, np.zeros(2)])[np.where((first < 0) | (first >= len(uvs)), len(uvs), first)].mean(1)
     uv = np.nan_to_num(uv * material.placed.numbers("-s", 1) + material.placed.numbers("-o", 0))
     across, up = np.clip(np.floor(uv), 0, [TILES_ACROSS - 1, 99]).astype(int).T
@@ -293,7 +295,7 @@ def _cut_into_tiles(name, material: Material, text: _Text, used, faces, material
         cut = material.tile(int(tile))
         materials[cut.name] = cut
         names[cut.name] = cut.name
-        used[own[tiles == tile]] = text.materials.setdefault(cut.name, len(text.materials))
+        used[chosen_faces[tiles == tile]] = text.materials.setdefault(cut.name, len(text.materials))
     materials.pop(material.name, None)
 
 
@@ -305,25 +307,25 @@ def _key(name: str) -> str:
 def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> list[tuple[bytes, str]]:
     """The files of one `mtllib`: one name that may hold spaces, or several; quotes are dropped. Where none is
     there, the library that is called as the mesh is."""
-    found, lost = [], []
+    paths, lost = [], []
     plain = without_comment(named)
     for names in ([named.strip('"')], [plain], plain.replace('"', " ").split()) if named else []:
         lost = []
         for name in names:
             try:
                 data, file = beside.read(name)
-                found.append((data, file.name))
+                paths.append((data, file.name))
             except FormatError as error:
                 lost.append(f"the library of materials {name!r} is not read: {error}")
-        if found:
+        if paths:
             break
     for sentence in lost:
         notes.add(sentence)
-    if not found:
+    if not paths:
         try:
             data, file = beside.read(Path(path).with_suffix(".mtl").name)
         except FormatError:
             return []
         notes.add(f"{file.name} is taken for its materials")
-        found.append((data, file.name))
-    return found
+        paths.append((data, file.name))
+    return paths

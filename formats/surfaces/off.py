@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh
-from formats.inputs import read_input
+from formats.safe_input import read_input
 from formats.surfaces.lines import numbers_in
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import Notes, Surface, check_budget, check_indices, sound_colours
@@ -51,8 +51,8 @@ def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     corners = numbers[np.repeat(starts + 1, counts) + within].astype(np.int64)
     check_budget(path, int(np.maximum(counts - 2, 0).sum()), len(data))
     check_indices(path, corners, len(positions))
-    places, polygon = triangulated(counts, corners, positions)
-    faces = corners[places].astype(np.int32).reshape(-1, 3)
+    corner_indices, polygon = triangulated(counts, corners, positions)
+    faces = corners[corner_indices].astype(np.int32).reshape(-1, 3)
     face_colours = None if face_colours is None else face_colours[polygon]
     return [Surface(positions, faces, colours=colours, face_colours=face_colours)]
 
@@ -88,12 +88,12 @@ def _colours(numbers, starts, skipped, widths, lines: list[str], notes: Notes) -
     if not coloured.any():
         return None
     colours = np.ones((len(widths), 3))
-    places = starts + skipped
-    found = numbers[places[coloured, None] + np.arange(3)]
+    offsets = starts + skipped
+    rgb = numbers[offsets[coloured, None] + np.arange(3)]
     first = int(np.argmax(coloured))
     words = lines[first].split()[skipped[first] : skipped[first] + widths[first]]
-    most = 255 if all(word.isdecimal() for word in words) or found.max(initial=0) > 1 else 1
-    colours[coloured] = found / most
-    if (numbers[places[widths == 4] + 3] < most).any():
+    most = 255 if all(word.isdecimal() for word in words) or rgb.max(initial=0) > 1 else 1
+    colours[coloured] = rgb / most
+    if (numbers[offsets[widths == 4] + 3] < most).any():
         notes.add("the transparency of its colours is not shown")
     return sound_colours(colours)

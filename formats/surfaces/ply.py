@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh, FormatError
-from formats.inputs import read_input
 from formats.points import MAX_HEADER, TYPES
-from formats.surfaces.beside import Beside
+from formats.safe_input import read_input
 from formats.surfaces.lines import numbers_in
+from formats.surfaces.named_files import Beside
 from formats.surfaces.pictures import read_picture, share_of
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
@@ -157,18 +157,18 @@ class _Binary:
         if element.count * record.itemsize > len(self.data) - self.at:
             return None
         rows = np.frombuffer(self.data, record, element.count, self.at)
-        found = {}
+        columns = {}
         for number, each in enumerate(element.properties):
             column = rows[f"p{number}"]
             if each.counted:
                 if (rows[f"n{number}"] != lengths[each.name]).any():
                     return None
                 counts = np.full(element.count, lengths[each.name])
-                found[each.name] = _List(counts, np.ascontiguousarray(column).reshape(-1))
+                columns[each.name] = _List(counts, np.ascontiguousarray(column).reshape(-1))
             else:
-                found[each.name] = column
+                columns[each.name] = column
         self.at += element.count * record.itemsize
-        return found
+        return columns
 
     def _count(self, each: _Property, at: int) -> int:
         kind = np.dtype(self.order + each.counted)
@@ -187,9 +187,9 @@ class _Binary:
         data, order, at = self.data, self.order, self.at
         sizes = [np.dtype(each.kind).itemsize for each in element.properties]
         count_kinds = [each.counted and np.dtype(order + each.counted) for each in element.properties]
-        places = range(len(element.properties))
+        property_order = range(len(element.properties))
         for _ in range(element.count):
-            for i in places:
+            for i in property_order:
                 length = 1
                 if count_kinds[i]:
                     length = self._count(element.properties[i], at)
@@ -200,11 +200,11 @@ class _Binary:
                     raise BadMesh(f"{self.path}: ends within {element.name[:40]!r}; copy or export it again")
                 parts[i].append(data[at:stop])
                 at = stop
-        self.at, found = at, {}
+        self.at, columns = at, {}
         for i, each in enumerate(element.properties):
             values = np.frombuffer(b"".join(parts[i]), order + each.kind)
-            found[each.name] = _List(np.array(counts[i], int), values) if each.counted else values
-        return found
+            columns[each.name] = _List(np.array(counts[i], int), values) if each.counted else values
+        return columns
 
 
 class _Text:
@@ -234,28 +234,28 @@ class _Text:
             ) from error
 
     def _columns(self, element: _Element, rows: list[str]) -> dict:
-        found, places = {}, np.zeros(len(rows), int)
+        columns, offsets = {}, np.zeros(len(rows), int)
         widths = np.array([len(row.split()) for row in rows], int)
         flat = numbers_in(" ".join(rows))
         if len(flat) != widths.sum():
             raise ValueError("words that are no numbers")
         starts = np.cumsum(widths) - widths
         for each in element.properties:
-            if (places >= widths).any():
+            if (offsets >= widths).any():
                 raise ValueError("too few numbers")
-            values = flat[starts + places]
-            places = places + 1
+            values = flat[starts + offsets]
+            offsets = offsets + 1
             if not each.counted:
-                found[each.name] = _as_stored(values, each.kind)
+                columns[each.name] = _as_stored(values, each.kind)
                 continue
             counts = values.astype(int)
-            if (counts < 0).any() or (counts != values).any() or (places + counts > widths).any():
+            if (counts < 0).any() or (counts != values).any() or (offsets + counts > widths).any():
                 raise ValueError("a list is longer than its line")
             within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-            taken = flat[np.repeat(starts + places, counts) + within]
-            found[each.name] = _List(counts, _as_stored(taken, each.kind))
-            places = places + counts
-        return found
+            row_values = flat[np.repeat(starts + offsets, counts) + within]
+            columns[each.name] = _List(counts, _as_stored(row_values, each.kind))
+            offsets = offsets + counts
+        return columns
 
 
 def _as_stored(values: np.ndarray, kind: str) -> np.ndarray:
@@ -276,7 +276,7 @@ def _surfaces(path, read: dict[str, dict], textures: list[str], n_bytes: int, no
     if not set(AXES) <= set(vertices):
         raise BadMesh(f"{path}: its vertices lack x, y or z; export the mesh again")
     positions = np.stack([vertices[axis].astype(np.float64) for axis in AXES], 1)
-    colours, found = _colours(vertices, notes), []
+    colours, surfaces = _colours(vertices, notes), []
     _tell_unused(read, notes)
     for name, cut in (("face", _polygons), ("tristrips", _strips)):
         faces = read.get(name, {})
@@ -284,21 +284,23 @@ def _surfaces(path, read: dict[str, dict], textures: list[str], n_bytes: int, no
         if lists is None:
             continue
         values = _whole(path, lists.values)
-        corners, polygon, places = cut(path, _List(lists.counts, values), positions, n_bytes)
+        corners, polygon, corner_indices = cut(path, _List(lists.counts, values), positions, n_bytes)
         if not len(corners):
             continue
         rest = _one_colour(colours, _colours(faces, notes), polygon, notes)
-        uv = _coordinates(path, vertices, faces, lists, places, corners, notes)
+        uv = _coordinates(path, vertices, faces, lists, corner_indices, corners, notes)
         if uv is not None and textures:
             numbers = _numbers_of(faces, polygon)
-            found += _textured(path, positions, corners, uv, numbers, textures, rest, notes)
+            surfaces += _textured(path, positions, corners, uv, numbers, textures, rest, notes)
             continue
         if textures:
             notes.add(f"its pictures are not shown, since it has no coordinates: {listed(textures)}")
         elif uv is not None:
             notes.add("has coordinates for a picture, but names none (comment TextureFile)")
-        found.append(Surface(positions.copy() if found else positions, corners.astype(np.int32), **rest))
-    return found
+        surfaces.append(
+            Surface(positions.copy() if surfaces else positions, corners.astype(np.int32), **rest)
+        )
+    return surfaces
 
 
 def _tell_unused(read: dict[str, dict], notes: Notes) -> None:
@@ -317,8 +319,8 @@ def _polygons(path, lists: _List, positions, n_bytes: int) -> tuple[np.ndarray, 
     """(F, 3) vertices of triangles, which polygon each is of, and places of its corners in the lists."""
     check_budget(path, int(np.maximum(lists.counts - 2, 0).sum()), n_bytes)
     check_indices(path, lists.values, len(positions))
-    places, polygon = triangulated(lists.counts, lists.values, positions)
-    return lists.values[places], polygon, places
+    corner_indices, polygon = triangulated(lists.counts, lists.values, positions)
+    return lists.values[corner_indices], polygon, corner_indices
 
 
 def _one_colour(colours, face_colours, polygon, notes: Notes) -> dict:
@@ -334,7 +336,7 @@ def _one_colour(colours, face_colours, polygon, notes: Notes) -> dict:
 
 def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Notes) -> list[Surface]:
     """A surface for each picture; every corner becomes a vertex of its own."""
-    beside, share, found = Beside(path), share_of(len(textures), notes), []
+    beside, share, surfaces = Beside(path), share_of(len(textures), notes), []
     numbers = np.where((numbers >= 0) & (numbers < len(textures)), numbers, 0)
     pictures: dict[int, np.ndarray] = {}
     for number in np.unique(numbers):
@@ -346,27 +348,27 @@ def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Note
     if pictures and (rest["colours"] is not None or rest["face_colours"] is not None):
         notes.add("colours of vertices and faces are not used where there is a picture")
     for number in np.unique(numbers):
-        own = numbers == number
-        flat = corners[own].reshape(-1)
+        chosen = numbers == number
+        flat = corners[chosen].reshape(-1)
         faces = np.arange(len(flat), dtype=np.int32).reshape(-1, 3)
         if number in pictures:
             texture = Texture(opaque(pictures[number]))
-            paint = laid(Paint(np.ones(4, np.float32), texture), uv[own].reshape(-1, 2))
-            found.append(Surface(positions[flat], faces, paint))
+            paint = laid(Paint(np.ones(4, np.float32), texture), uv[chosen].reshape(-1, 2))
+            surfaces.append(Surface(positions[flat], faces, paint))
             continue
         colours, face_colours = rest["colours"], rest["face_colours"]
         colours = None if colours is None else colours[flat]
-        face_colours = None if face_colours is None else face_colours[own]
-        found.append(Surface(positions[flat], faces, colours=colours, face_colours=face_colours))
-    return found
+        face_colours = None if face_colours is None else face_colours[chosen]
+        surfaces.append(Surface(positions[flat], faces, colours=colours, face_colours=face_colours))
+    return surfaces
 
 
-def _coordinates(path, vertices, faces, lists, places, corners, notes) -> np.ndarray | None:
+def _coordinates(path, vertices, faces, lists, corner_indices, corners, notes) -> np.ndarray | None:
     """(F, 3, 2) of the corners of triangles, v down: each corner's own (MeshLab's `texcoord`), else its
     vertex's."""
     wedges = faces.get("texcoord")
-    if isinstance(wedges, _List) and places is not None and (wedges.counts == 2 * lists.counts).all():
-        uv = wedges.values.astype(np.float64).reshape(-1, 2)[places]
+    if isinstance(wedges, _List) and corner_indices is not None and (wedges.counts == 2 * lists.counts).all():
+        uv = wedges.values.astype(np.float64).reshape(-1, 2)[corner_indices]
     else:
         if isinstance(wedges, _List) and len(wedges.values):
             notes.add("coordinates of corners that are not two a corner are not used")
@@ -394,10 +396,10 @@ def _colours(columns: dict, notes: Notes) -> np.ndarray | None:
         if (alpha < (np.iinfo(alpha.dtype).max if alpha.dtype.kind in "ui" else 1)).any():
             notes.add("the transparency of its colours is not shown")
     values = [columns[name] for name in names]
-    whole = values[0].dtype.kind in "ui"
+    is_integer = values[0].dtype.kind in "ui"
     rgb = np.stack([value.astype(np.float64) for value in values], 1)
     largest = np.nanmax(rgb, initial=0)
-    if whole:  # wide integers hold colours of 8 or 16 bits
+    if is_integer:  # wide integers hold colours of 8 or 16 bits
         width = values[0].dtype.itemsize
         most = 255 if width == 1 or width > 2 and largest < 256 else 65535
     else:

@@ -27,11 +27,13 @@ def triangulated(
         return fans, polygon
     looks = iter(range(MAX_LOOKS))
     for index in _concave(counts, starts, corners, positions, fans, polygon):
-        own = np.arange(starts[index], starts[index] + counts[index])
+        corner_indices = np.arange(starts[index], starts[index] + counts[index])
         if counts[index] > MAX_CORNERS:
             continue
         first = int(np.searchsorted(polygon, index))
-        fans[first : first + len(own) - 2] = own[_ears(positions[corners[own]], looks)]
+        fans[first : first + len(corner_indices) - 2] = corner_indices[
+            _ears(positions[corners[corner_indices]], looks)
+        ]
     return fans, polygon
 
 
@@ -40,11 +42,11 @@ def _concave(counts, starts, corners, positions, fans, polygon) -> np.ndarray:
     a, b, c = (positions[corners[fans[:, corner]]] for corner in range(3))
     with np.errstate(over="ignore", invalid="ignore"):
         normals = np.cross(b - a, c - a)
-        whole = np.zeros((len(counts), 3))
-        np.add.at(whole, polygon, normals)
-        turned = (normals * whole[polygon]).sum(1) < 0
-    found = np.unique(polygon[turned])
-    return found[np.isfinite(whole[found]).all(1)]
+        plane_normals = np.zeros((len(counts), 3))
+        np.add.at(plane_normals, polygon, normals)
+        turned = (normals * plane_normals[polygon]).sum(1) < 0
+    concave = np.unique(polygon[turned])
+    return concave[np.isfinite(plane_normals[concave]).all(1)]
 
 
 def _ears(points: np.ndarray, looks: Iterator[int]) -> np.ndarray:
@@ -53,12 +55,12 @@ def _ears(points: np.ndarray, looks: Iterator[int]) -> np.ndarray:
     normal = np.cross(centred, np.roll(centred, -1, 0)).sum(0)
     drop = int(np.abs(normal).argmax())
     flat = centred[:, [(drop + 1) % 3, (drop + 2) % 3]] * [np.sign(normal[drop]) or 1, 1]
-    left, found = list(range(len(points))), []
+    left, ears = list(range(len(points))), []
     while len(left) > 3:
         ear = next((k for k, _ in zip(range(len(left)), looks, strict=False) if _is_ear(flat, left, k)), 0)
-        found.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
+        ears.append([left[ear - 1], left[ear], left[(ear + 1) % len(left)]])
         del left[ear]
-    return np.array([*found, left])
+    return np.array([*ears, left])
 
 
 def _is_ear(flat: np.ndarray, left: list[int], k: int) -> bool:

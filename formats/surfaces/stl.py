@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import BadMesh
-from formats.inputs import read_input
+from formats.safe_input import read_input
 from formats.surfaces.surface import Notes, Surface, check_budget, sound_colours
 
 MAX_FILE = 2**31
@@ -55,8 +55,8 @@ def _colours(header: bytes, more: np.ndarray, notes: Notes) -> np.ndarray | None
     five = (more[:, None] >> np.array([0, 5, 10], np.uint16) & 31) / 31
     at = header.find(MAGICS)
     if at >= 0 and len(header) >= at + 9:
-        whole = np.frombuffer(header, np.uint8, 3, at + len(MAGICS)) / 255
-        return sound_colours(np.where(((more & FLAG) > 0)[:, None] | (not more.any()), whole, five))
+        base = np.frombuffer(header, np.uint8, 3, at + len(MAGICS)) / 255
+        return sound_colours(np.where(((more & FLAG) > 0)[:, None] | (not more.any()), base, five))
     if not more.any():
         return None
     if not (more & FLAG).any():
@@ -66,8 +66,8 @@ def _colours(header: bytes, more: np.ndarray, notes: Notes) -> np.ndarray | None
 
 
 def _text(data: bytes, path: Path | str) -> np.ndarray:
-    found = [number for match in VERTEX.finditer(data) for number in match.groups()]
+    numbers = [number for match in VERTEX.finditer(data) for number in match.groups()]
     try:
-        return np.array(found[: len(found) // 9 * 9], np.float64).reshape(-1, 3, 3)
+        return np.array(numbers[: len(numbers) // 9 * 9], np.float64).reshape(-1, 3, 3)
     except ValueError as error:
         raise BadMesh(f"{path}: holds {error}; export the mesh again") from error

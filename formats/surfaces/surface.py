@@ -31,11 +31,11 @@ class Notes:
 
     def sentences(self) -> tuple[str, ...]:
         """Led by the file's name."""
-        told = []
+        sentences = []
         for sentence, subjects in self._subjects.items():
             about = f"{listed(subjects)}: " if subjects else ""
-            told.append(printable(f"{self.path}: {about}{sentence}"))
-        return tuple(told)
+            sentences.append(printable(f"{self.path}: {about}{sentence}"))
+        return tuple(sentences)
 
 
 def listed(names: Iterable[str]) -> str:

@@ -164,8 +164,10 @@ def _shade(mesh: Mesh, face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.nda
     owner = _owners(mesh, face)
     colours = np.empty((len(face), 4), np.float32)
     for index in np.unique(owner):
-        own = owner == index
-        colours[own] = _shown(mesh.surfaces[index], face[own] - mesh.first_faces[index], weights[own])
+        chosen_faces = owner == index
+        colours[chosen_faces] = _shown(
+            mesh.surfaces[index], face[chosen_faces] - mesh.first_faces[index], weights[chosen_faces]
+        )
     return colours
 
 
@@ -211,7 +213,7 @@ def texels(texture: Texture, uv: np.ndarray, linear: bool, reach: np.ndarray | N
     the texels that lie within `reach` (2, 2), where that is given."""
     size = np.array(texture.pixels.shape[1::-1])
     flat = texture.pixels.reshape(-1, 4)
-    place = uv.astype(np.float64) * size
+    position = uv.astype(np.float64) * size
     levels = np.arange(256, dtype=np.float32) / 255
     table = _decoded(levels) if linear else levels
     if reach is not None:
@@ -223,13 +225,13 @@ def texels(texture: Texture, uv: np.ndarray, linear: bool, reach: np.ndarray | N
         column, row = (
             _wrapped(inside[:, axis].astype(np.int64), size[axis], texture.wrap[axis]) for axis in (0, 1)
         )
-        found = flat[row * size[0] + column]
-        return np.concatenate([table[found[:, :3]], levels[found[:, 3:]]], 1)
+        values = flat[row * size[0] + column]
+        return np.concatenate([table[values[:, :3]], levels[values[:, 3:]]], 1)
 
     if texture.nearest:
-        return at(np.floor(place))
-    corner = np.floor(place - 0.5)
-    right, down = (place - 0.5 - corner).astype(np.float32).T
+        return at(np.floor(position))
+    corner = np.floor(position - 0.5)
+    right, down = (position - 0.5 - corner).astype(np.float32).T
     mixed = np.zeros((len(uv), 4), np.float32)
     for x, weight_x in ((0, 1 - right), (1, right)):
         for y, weight_y in ((0, 1 - down), (1, down)):

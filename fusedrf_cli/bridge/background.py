@@ -9,13 +9,13 @@ import numpy as np
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.detail import Detail, extent
+from fusedrf_cli.engine.composition.resolution_report import ResolutionReport, extent
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.builder import BuildRequest
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import StudentRequest
 from fusedrf_cli.engine.settings import current
 
 
@@ -60,39 +60,43 @@ class Background:
         return f"'{self.placed.name}' as it is"
 
     @property
-    def detail(self) -> Detail:
+    def detail(self) -> ResolutionReport:
         """That it is held as it is."""
         p = self.placed
-        return Detail(p.name, p.condition, 0.0, p.voxel_size, p.voxel_size, extent(p) / p.voxel_size)
+        return ResolutionReport(
+            p.name, p.condition, 0.0, p.voxel_size, p.voxel_size, extent(p) / p.voxel_size
+        )
 
 
-def kept_background(kind: Kind, scene: ComposedField, asked: StudentRequest) -> Background | None:
+def background_for(kind: Kind, scene: ComposedField, request: BuildRequest) -> Background | None:
     """What a learnt field of a kind stands beside: the only unbounded field of a scene by `max`. None of any
     other scene, where numbers are not to be taken over, and where it would take too much of the file."""
     around = [p for p in scene.placed if p.unbounded]
     others = [p for p in scene.placed if not p.unbounded]
-    if asked.from_scratch or scene.rule != "max" or len(around) != 1 or not others:
+    if request.from_scratch or scene.rule != "max" or len(around) != 1 or not others:
         return None
     if not kind.beside_background or isinstance(around[0].field, ComposedField):
         return None
     turn = turn_of(others)
     back = np.linalg.inv(turn)
     objects = ComposedField([replace(p, object_to_world=back @ p.object_to_world) for p in others])
-    for field, precision, size in ways_to_store(around[0].field, asked):
-        if size <= current(BackgroundConfig).most_of_file * (asked.limit - asked.overhead):
+    for field, precision, size in storage_options(around[0].field, request):
+        if size <= current(BackgroundConfig).most_of_file * (request.limit - request.overhead):
             return Background(replace(around[0], field=field), precision, size, turn, objects)
     return None
 
 
-def ways_to_store(field: StoredField, asked: StudentRequest) -> Iterator[tuple[StoredField, str | None, int]]:
+def storage_options(
+    field: StoredField, request: BuildRequest
+) -> Iterator[tuple[StoredField, str | None, int]]:
     """A field, the precision that it is stored in, and its bytes: as its source has it, then in fewer bits
     each time."""
-    own = asked.stored_bytes.get(id(field))
-    if asked.precision is None and own is not None:
+    own = request.stored_bytes.get(id(field))
+    if request.precision is None and own is not None:
         yield field, None, own
     trimmed = registry.kind(field.kind).trimmed(opened(field).to("cpu"))
-    for precision in (asked.precision,) if asked.precision else PRECISIONS:
-        yield trimmed, precision, asked.sizes.exactly(trimmed, precision)
+    for precision in (request.precision,) if request.precision else PRECISIONS:
+        yield trimmed, precision, request.sizes.exactly(trimmed, precision)
 
 
 def turn_of(objects: list[Placed]) -> np.ndarray:
@@ -103,10 +107,10 @@ def turn_of(objects: list[Placed]) -> np.ndarray:
     texels = np.array([(extent(p) / p.voxel_size) ** 2 for p in objects])
     alike = np.array([[np.abs(a - b).max() < config.alike for a in turns] for b in turns])
     ranked = [(float(f"{n:.6g}"), turn.tolist()) for n, turn in zip(alike @ texels, turns, strict=True)]
-    found, most = np.eye(4), np.array(max(ranked)[1])
+    rotation, most = np.eye(4), np.array(max(ranked)[1])
     if np.abs(most - np.eye(3)).max() >= config.alike:
-        found[:3, :3] = most
-    return found
+        rotation[:3, :3] = most
+    return rotation
 
 
 def turned_only(linear: np.ndarray) -> np.ndarray:

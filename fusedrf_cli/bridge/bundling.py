@@ -16,7 +16,7 @@ from formats.records import FieldRecord
 from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
-from fusedrf_cli.bridge.making import Kept
+from fusedrf_cli.bridge.building import BestTrial
 from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
 from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -70,7 +70,7 @@ class FusedBundle:
             cameras=self.cameras,
         )
 
-    def write(self, output: str, made: Kept, background: Background | None, entry: dict) -> int:
+    def write(self, output: str, made: BestTrial, background: Background | None, entry: dict) -> int:
         """Write what was made as a bundle; its bytes. entry: of its history, but for what it was made of."""
         writer = BundleWriter()
         how = self.of_learnt(writer, made, background) if self.learnt else self.of_instances(writer, made)
@@ -85,9 +85,9 @@ class FusedBundle:
         writer.write(output, self.scene(graph, entry), overwrite=self.request.overwrite)
         return Path(output).stat().st_size
 
-    def of_learnt(self, writer: BundleWriter, made: Kept, background: Background | None) -> SceneGraph:
+    def of_learnt(self, writer: BundleWriter, made: BestTrial, background: Background | None) -> SceneGraph:
         """The graph of what was learnt, and of a background that stays."""
-        precision = made.tried.way.precision
+        precision = made.trial.storage.precision
         if background is None:
             return SceneGraph((self.learnt_node(add(writer, made.field, precision)),))
         source = self.background_source
@@ -101,10 +101,10 @@ class FusedBundle:
         leaf = next(leaf for leaf, f in self.leaves if f is source)
         at = placement_of(leaf.object_to_world)
         node = Node(name, own, None, at, True, showing=showing_of(stays))
-        place = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
-        return SceneGraph((node, Node(LEARNT, member, None, place)))
+        device = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
+        return SceneGraph((node, Node(LEARNT, member, None, device)))
 
-    def of_instances(self, writer: BundleWriter, made: Kept) -> SceneGraph:
+    def of_instances(self, writer: BundleWriter, made: BestTrial) -> SceneGraph:
         """The scene's graph with the fields that were made of its own."""
         result = made.field
         fields = distinct_fields(result) if isinstance(result, ComposedField) else [result]
@@ -120,7 +120,7 @@ class FusedBundle:
             if id(field) not in members:
                 unchanged = field is source.placed.field
                 precision = source.bundle.headers[source.member].precision if unchanged else None
-                members[id(field)] = add(writer, opened(field), precision or made.tried.way.precision)
+                members[id(field)] = add(writer, opened(field), precision or made.trial.storage.precision)
             return members[id(field)]
 
         named = iter([member(leaf, source) for leaf, source in self.leaves])
@@ -141,17 +141,17 @@ class FusedBundle:
         """What the members of a graph were made of that are not those of their sources."""
         placed = [leaf for leaf in graph.leaves() if not self.learnt or leaf.name != LEARNT]
         own = self.loaded.fields if not self.learnt else [self.background_source for _ in placed]
-        found: dict[str, dict] = {}
+        by_member: dict[str, dict] = {}
         for leaf, f in zip(placed, own, strict=True):
             if leaf.field == f.member or f.cropped:
                 continue
-            told = {"field": f.member}
+            entry = {"field": f.member}
             if f.member not in self.kept:
                 folder = Path(self.request.output).resolve().parent
-                told["source"] = os.path.relpath(f.bundle.path.resolve(), folder)
-                told["sha256"] = f.bundle.sha256
-            found.setdefault(leaf.field, told)
-        return found
+                entry["source"] = os.path.relpath(f.bundle.path.resolve(), folder)
+                entry["sha256"] = f.bundle.sha256
+            by_member.setdefault(leaf.field, entry)
+        return by_member
 
 
 def add(writer: BundleWriter, field: StoredField, precision: str) -> str:

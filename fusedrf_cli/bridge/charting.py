@@ -14,21 +14,21 @@ import numpy as np
 from formats.atomic import atomic_folder, temporary_sibling
 from formats.errors import ResourceError
 from fusedrf_cli import plots
+from fusedrf_cli.bridge.evaluation_views import evaluation_views_of
+from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.fusing import fuse, source_bytes
-from fusedrf_cli.bridge.ladders import flags_of
-from fusedrf_cli.bridge.looks import looks_of
 from fusedrf_cli.bridge.memory import Memory, measured, sources
 from fusedrf_cli.bridge.pictures import WHITE
 from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable
-from fusedrf_cli.bridge.running import checkpoint_path, engine
+from fusedrf_cli.bridge.runtime import checkpoint_path, engine
 from fusedrf_cli.bridge.scene import load_scene, unusable_kind
-from fusedrf_cli.bridge.shelf import Shelf
-from fusedrf_cli.bridge.sources import as_it_is
+from fusedrf_cli.bridge.sources import scene_as_stored
+from fusedrf_cli.bridge.sweep_flags import flags_of
 from fusedrf_cli.engine.composition.composite import Composite
-from fusedrf_cli.engine.distillation.judging import JudgingConfig
+from fusedrf_cli.engine.distillation.evaluation import EvaluatorConfig
 from fusedrf_cli.engine.fields.occupancy import placed_box
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.ladders import Ladder, Rung
+from fusedrf_cli.engine.kinds.sweeps import Sweep, SweepPoint
 from fusedrf_cli.engine.rendering.cameras import Camera, framing_camera, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -43,7 +43,7 @@ class ChartConfig:
     """How fused fields are compared, and in which order they are tried."""
 
     views: int = 8
-    held_out: tuple[int, int] = (JudgingConfig.judged_seed, 2)
+    held_out: tuple[int, int] = (EvaluatorConfig.judged_seed, 2)
     """A pair seeds a stream that no single number, as of --seed, does."""
     rounds: int = 5
     """Of frames, all fields taking turns."""
@@ -108,20 +108,23 @@ class Benchmark:
         memory: Memory,
         size: tuple[int, int],
         allow_outside: bool = False,
-        place: str = "cpu",
+        device: str = "cpu",
         box: np.ndarray | None = None,
     ):
         """Render the scene as composed, by default from where the scene and its objects were photographed;
         given a box (6,) of the world, from all around that."""
         chart = current(ChartConfig)
-        config = current(JudgingConfig)
-        loaded = load_scene(scene, allow_outside, memory, place)
+        config = current(EvaluatorConfig)
+        loaded = load_scene(scene, allow_outside, memory, device)
         needed = sources(loaded.sizes) | frame_memory(None, *size) | measured(*size)
         composed = composite_of(loaded, memory, needed)
         needed |= frame_memory(composed, *size)
         if box is None:
-            cameras = [look.camera for look in looks_of(loaded, composed, chart.views, size, chart.held_out)]
-            box = placed_box(composed.occupancy.subject, composed.origin)
+            cameras = [
+                look.camera
+                for look in evaluation_views_of(loaded, composed, chart.views, size, chart.held_out)
+            ]
+            box = placed_box(composed.occupancy.look_at_box, composed.origin)
         else:
             cameras = scattered(box, chart.views, *size, seed=chart.held_out)
         needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * chart.per_pixel_kept
@@ -129,7 +132,7 @@ class Benchmark:
         shots = [render_image(composed, c, origin=composed.origin) for c in cameras]
         truth, seen = [shot.over(WHITE) for shot in shots], [shot.opacity > config.covered for shot in shots]
         total = source_bytes(loaded)
-        return cls(scene, memory, size, allow_outside, place, box, cameras, truth, seen, total)
+        return cls(scene, memory, size, allow_outside, device, box, cameras, truth, seen, total)
 
     @property
     def covered_share(self) -> float:
@@ -138,34 +141,34 @@ class Benchmark:
 
     def quality(self, bundle: Path) -> dict[str, float]:
         """Mean `psnr` and `ssim` of a fused bundle, and `covered`, the PSNR of the pixels that are."""
-        render, origin = renderable(load_scene(str(bundle), budget=self.memory, place=self.place))
+        render, origin = renderable(load_scene(str(bundle), budget=self.memory, device=self.device))
         shots = [render_image(render, c, origin=origin).over(WHITE) for c in self.cameras]
         pairs = list(zip(shots, self.truth, strict=True))
         inside = [psnr(a[m], b[m]) for (a, b), m in zip(pairs, self.covered, strict=True) if m.any()]
-        found = {"psnr": [psnr(*p) for p in pairs], "ssim": [ssim(*p) for p in pairs], "covered": inside}
-        return {name: float(np.mean(values)) if values else np.nan for name, values in found.items()}
+        measures = {"psnr": [psnr(*p) for p in pairs], "ssim": [ssim(*p) for p in pairs], "covered": inside}
+        return {name: float(np.mean(values)) if values else np.nan for name, values in measures.items()}
 
     def frame_times(self, bundles: Sequence[Path], advance: Callable[[int], None]) -> list[float]:
         """Median milliseconds of a frame of the scene as composed, and of every fused bundle: all take
         turns, so that what else the machine does meets them alike.
         """
         camera = framing_camera(self.box, 0.9, 0.45, *self.size)
-        loaded = load_scene(self.scene, self.allow_outside, self.memory, self.place)
+        loaded = load_scene(self.scene, self.allow_outside, self.memory, self.device)
         needed = frame_memory(None, *self.size)
         composed = composite_of(loaded, self.memory, needed)
         needed |= sources(loaded.resident) if isinstance(composed, Composite) else {}
-        shelf = Shelf(self.memory.room(needed | frame_memory(composed, *self.size)))
+        field_cache = FieldCache(self.memory.room(needed | frame_memory(composed, *self.size)))
         sizes = [sum(load_scene(str(path), budget=self.memory).sizes) for path in bundles]
         seconds = [[] for _ in range(1 + len(bundles))]
         for done in range(1 + current(ChartConfig).rounds):  # the first warms up
             seconds[0].append(frame_seconds(composed, camera, composed.origin))
             for i, (path, size) in enumerate(zip(bundles, sizes, strict=True), 1):
-                found = shelf.take(
-                    str(path), size, lambda path=path: renderable(load_scene(str(path), place=self.place))
+                source_field = field_cache.take(
+                    str(path), size, lambda path=path: renderable(load_scene(str(path), device=self.device))
                 )
-                seconds[i].append(frame_seconds(found[0], camera, found[1]))
+                seconds[i].append(frame_seconds(source_field[0], camera, source_field[1]))
             advance(done + 1)
-        return [1000 * statistics.median(taken[1:]) for taken in seconds]
+        return [1000 * statistics.median(times[1:]) for times in seconds]
 
 
 def frame_seconds(render, camera, origin: np.ndarray) -> float:
@@ -182,15 +185,15 @@ def chart(request: ChartRequest, progress) -> dict:
     """
     plots.check()
     output, budget, size = request.output, request.budget, request.size
-    with engine(request.device, request.threads, progress) as place, scratch(output) as paths:
+    with engine(request.device, request.threads, progress) as device, scratch(output) as paths:
         progress.phase("the scene as composed", None)
         benchmark = Benchmark.prepare(
-            request.scene, Memory(request.memory), size, request.allow_outside, place
+            request.scene, Memory(request.memory), size, request.allow_outside, device
         )
         run = Charting(benchmark, paths, request, progress)
         progress.phase("fusing", budget)
         try:
-            waiting = {kind: registry.kind(kind).ladders(request.least_psnr) for kind in request.kinds}
+            waiting = {kind: registry.kind(kind).sweeps(request.least_psnr) for kind in request.kinds}
         except ValueError as error:
             raise unusable_kind(error) from error
         with run.kept():
@@ -226,27 +229,27 @@ def scratch(output: str) -> Iterator[Iterator[Path]]:
     """Names for bundles beside the output, which are removed at the end: sources are found from there by the
     same paths as from a bundle that a person puts there, so that the bytes are the same.
     """
-    target, made = Path(os.path.realpath(output)), []
+    target, paths = Path(os.path.realpath(output)), []
 
     def names() -> Iterator[Path]:
         while True:
-            made.append(temporary_sibling(target))
-            yield made[-1]
+            paths.append(temporary_sibling(target))
+            yield paths[-1]
 
     try:
         yield names()
     finally:
-        for path in made:
+        for path in paths:
             path.unlink(missing_ok=True)
             checkpoint_path(str(path)).unlink(missing_ok=True)
 
 
 @dataclass(eq=False)
-class Climber:
+class SweepRun:
     """How far one ladder was climbed."""
 
-    ladder: Ladder
-    rung: Rung
+    sweep: Sweep
+    sweep_point: SweepPoint
     """The next one."""
     points: list[Point] = field(default_factory=list)
 
@@ -254,18 +257,18 @@ class Climber:
         """Take what the rung gave, if anything; whether there is another one."""
         self.points += [point] if point is not None else []
         with contextlib.suppress(StopIteration):
-            self.rung = self.ladder.send(point and (point.bytes, point.psnr))
+            self.sweep_point = self.sweep.send(point and (point.bytes, point.psnr))
             return True
         return False
 
-    def behind(self, found: Iterable[Point]) -> bool:
+    def behind(self, others: Iterable[Point]) -> bool:
         """Whether its last point is well surpassed by another one with no more bytes. It may overtake at
         smaller sizes, so that it only waits.
         """
         config = current(ChartConfig)
         last = self.points[-1] if self.points else None
         return last is not None and any(
-            p.bytes <= last.bytes and p.psnr >= last.psnr + config.behind for p in found
+            p.bytes <= last.bytes and p.psnr >= last.psnr + config.behind for p in others
         )
 
 
@@ -286,67 +289,71 @@ class Charting:
         try:
             yield
         except (Interrupted, OSError, ResourceError) as error:
-            said = "nothing was written"
+            outcome = "nothing was written"
             if self.points:
                 output = self.request.output
                 composed = {"ms": float("nan"), "bytes": self.benchmark.source_bytes}
                 with atomic_folder(output, overwrite=self.request.overwrite) as folder:
                     write_csv(folder / "chart.csv", self.points, composed)
-                said = f"the {len(self.points)} points found so far are in {Path(output) / 'chart.csv'}"
+                outcome = f"the {len(self.points)} points found so far are in {Path(output) / 'chart.csv'}"
             if isinstance(error, Interrupted):
-                error.sentence = f"interrupted; {said}"  # and no checkpoint is left to go on from
+                error.sentence = f"interrupted; {outcome}"  # and no checkpoint is left to go on from
             else:
-                self.progress.warn(said)
+                self.progress.warn(outcome)
             raise
 
-    def climb(self, waiting: dict[str, dict[str, list[Ladder]]], budget: float) -> int:
+    def climb(self, waiting: dict[str, dict[str, list[Sweep]]], budget: float) -> int:
         """Try rung after rung of the ladders of every kind, in their groups, until the seconds are spent:
         next comes the group that has had the least time, of which one counts for `lagging` where other groups
         surpass all of it, and of its ladders one that is not behind, with the fewest rungs. Returns how many
         ladders were left off.
         """
-        climbers = {
-            (kind, name): [Climber(ladder, next(ladder)) for ladder in found]
+        runs = {
+            (kind, name): [SweepRun(sweep, next(sweep)) for sweep in members]
             for kind, groups in waiting.items()
-            for name, found in groups.items()
+            for name, members in groups.items()
         }
-        started, spent = time.monotonic(), dict.fromkeys(climbers, 0.0)
-        while any(climbers.values()) and (now := time.monotonic() - started) < budget:
+        started, spent = time.monotonic(), dict.fromkeys(runs, 0.0)
+        while any(runs.values()) and (now := time.monotonic() - started) < budget:
             self.progress.advance(now)
             due = {
-                g: current(ChartConfig).lagging * spent[g] if self.lags(found) else spent[g]
-                for g, found in climbers.items()
-                if found
+                g: current(ChartConfig).lagging * spent[g] if self.lags(members) else spent[g]
+                for g, members in runs.items()
+                if members
             }
             group = min(due, key=due.get)
-            own = [p for c in climbers[group] for p in c.points]
-            climber = min(climbers[group], key=lambda c: (c.behind(own), len(c.points)))
-            point = self.try_rung(group, climber.rung)
-            if not climber.climb(point):
-                climbers[group].remove(climber)
+            swept = [p for c in runs[group] for p in c.points]
+            run = min(runs[group], key=lambda c: (c.behind(swept), len(c.points)))
+            point = self.try_point(group, run.sweep_point)
+            if not run.climb(point):
+                runs[group].remove(run)
             spent[group] += time.monotonic() - started - now
-            climbers = {g: found for g, found in climbers.items() if g[0] not in self.refused}
+            runs = {g: members for g, members in runs.items() if g[0] not in self.refused}
         if not self.points:
             raise next(iter(self.refused.values()), UsageProblem(NOTHING_TRIED))
-        return sum(map(len, climbers.values()))
+        return sum(map(len, runs.values()))
 
-    def lags(self, climbers: list[Climber]) -> bool:
+    def lags(self, runs: list[SweepRun]) -> bool:
         """Whether every ladder of a group is behind the points that there are."""
-        return all(climber.behind(self.points) for climber in climbers)
+        return all(run.behind(self.points) for run in runs)
 
-    def try_rung(self, group: tuple[str, str], rung: Rung) -> Point | None:
+    def try_point(self, group: tuple[str, str], sweep_point: SweepPoint) -> Point | None:
         """The point of a rung, or None and a warning where the scene cannot be fused so; group is the kind,
         and a name of what loads the same kernels.
         """
-        kind, path, own = group[0], next(self.paths), self.request
-        flags = flags_of(kind, rung, own.seed)
-        same = {name: getattr(own, name) for name in ("memory", "allow_outside", "seed", "device", "threads")}
-        wanted = FuseRequest(own.scene, str(path), kind=kind, overwrite=True, **same, **asdict(rung))
+        kind, path, request = group[0], next(self.paths), self.request
+        flags = flags_of(kind, sweep_point, request.seed)
+        same = {
+            name: getattr(request, name) for name in ("memory", "allow_outside", "seed", "device", "threads")
+        }
+        fuse_request = FuseRequest(
+            request.scene, str(path), kind=kind, overwrite=True, **same, **asdict(sweep_point)
+        )
         try:
             if group not in self.warm:  # the first of a group also loads kernels, so the second one counts
-                self.fuse(wanted)
+                self.fuse(fuse_request)
                 self.warm.add(group)
-            report, warnings = self.fuse(wanted)
+            report, warnings = self.fuse(fuse_request)
         except FusedRFError as error:
             if isinstance(error, InvalidInput):  # this scene never becomes that kind
                 self.refused[kind] = error
@@ -361,10 +368,12 @@ class Charting:
         self.progress.note(f"{point.flags}: {point.psnr:.2f} dB, {point.bytes:,} bytes")
         return point
 
-    def fuse(self, wanted: FuseRequest) -> tuple[dict, list[str]]:
+    def fuse(self, fuse_request: FuseRequest) -> tuple[dict, list[str]]:
         """A fuse's report, and what it warned of."""
-        heard = NullProgress()
-        return fuse(wanted, heard, as_it_is, lambda output, write: write(output)), heard.warnings
+        progress = NullProgress()
+        return fuse(
+            fuse_request, progress, scene_as_stored, lambda output, write: write(output)
+        ), progress.warnings
 
 
 def mark_frontiers(points: list[Point]) -> None:

@@ -6,7 +6,7 @@ from formats.bundle import OpenBundle, is_bundle
 from fusedrf_cli.bridge.evaluating import evaluate
 from fusedrf_cli.bridge.fusing import fuse
 from fusedrf_cli.bridge.scene import unusable_kind
-from fusedrf_cli.bridge.sources import as_it_is
+from fusedrf_cli.bridge.sources import scene_as_stored
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ConvertRequest, EvaluateRequest, FuseRequest
@@ -17,17 +17,17 @@ def convert(request: ConvertRequest, progress) -> dict:
     against its source on views that nothing was learnt from."""
     before = kinds_of(request.field)
     try:
-        wanted = registry.kind(request.kind)
+        target_kind = registry.kind(request.kind)
     except ValueError as error:
         raise unusable_kind(error) from error
-    if wanted.field is None:
+    if target_kind.field is None:
         raise UsageProblem(f"--kind {request.kind} is a way of fusing and no kind of field; choose another")
     same = [field.name for field in fields(FuseRequest) if hasattr(request, field.name)]
     words = {name: getattr(request, name) for name in same}
     fused = fuse(
         FuseRequest(scene=request.field, from_scratch=True, **words),
         progress,
-        load=as_it_is,
+        load=scene_as_stored,
     )
     progress.phase("comparing", None)
     compared = evaluate(

@@ -76,7 +76,7 @@ class Whole:
             | {"its cells": config.cells_bytes},
             advice="take an object out of a smaller field",
         )
-        loaded.shelf.resize(sum(loaded.sizes))
+        loaded.field_cache.resize(sum(loaded.sizes))
         whole = cls(draft, loaded, field, origin)
         for leaf, placed in whole.nodes:
             own = make_field(draft.bundle.field(leaf.field), path) if leaf.crops else placed.field
@@ -105,32 +105,32 @@ class Whole:
 
     def composed(self, fields: Fields) -> RadianceField | None:
         """What some fields show, in the frame; None where that is nothing."""
-        found, groups = [], []
+        parts, groups = [], []
         for (leaf, placed), source in zip(self.nodes, self.loaded.fields, strict=True):
             part = fields.get(leaf.name)
             if part is not None and part is not self.raw[leaf.name]:
                 part = part_shown(part, leaf, self.path)
                 placed = part and replace(placed, field=part)
             if part is not None:
-                found.append(placed)
+                parts.append(placed)
                 groups.append(source.groups)
-        if not found:
+        if not parts:
             return None
         if len(self.nodes) == 1 and self.loaded.lone() is not None:
-            return opened(found[0].field)
+            return opened(parts[0].field)
         rule = self.loaded.composition
-        return as_composite(ComposedField(grouped(found, groups, rule), rule, origin=self.origin))
+        return as_composite(ComposedField(grouped(parts, groups, rule), rule, origin=self.origin))
 
     def named(self, names: Container[str]) -> tuple[Fields, Fields]:
         """The fields of nodes of some names, and all others."""
-        found = {key: one for key, one in self.raw.items() if key in names}
-        return found, {key: one for key, one in self.raw.items() if key not in names}
+        fields_named = {key: one for key, one in self.raw.items() if key in names}
+        return fields_named, {key: one for key, one in self.raw.items() if key not in names}
 
     @property
     def precision(self) -> str:
         """The most exact one of its fields."""
-        told = {self.draft.bundle.headers[leaf.field].precision for leaf, _ in self.nodes}
-        return max(told, key=BYTES_PER_NUMBER.get)
+        precisions = {self.draft.bundle.headers[leaf.field].precision for leaf, _ in self.nodes}
+        return max(precisions, key=BYTES_PER_NUMBER.get)
 
 
 # -- cutting -------------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ class Whole:
 def cut(whole: Whole, selection: Selection, both: bool, touched: Container[str]) -> tuple[Fields, Fields]:
     """A selected object out of nodes of some names, and what is left. Without `both` nothing need be known of
     what is left."""
-    found, rest = {}, dict(whole.raw)
+    objects, rest = {}, dict(whole.raw)
     around = selection.object.tight_aabb(1)
     for leaf, _ in whole.nodes:
         if leaf.name not in touched:
@@ -148,7 +148,9 @@ def cut(whole: Whole, selection: Selection, both: bool, touched: Container[str])
         kind, own = registry.kind(raw.kind), selection.seen_from(matrix)
         try:
             part = kind.cut_out(raw, own)
-            inside = len(whole.nodes) > 1 and holds(around, transformed_aabb(raw.occupancy.subject, matrix))
+            inside = len(whole.nodes) > 1 and holds(
+                around, transformed_aabb(raw.occupancy.look_at_box, matrix)
+            )
             left = kind.cut_away(raw, own) if part is not None and (both or inside) else raw
         except ValueError as error:
             raise InvalidInput(f"{whole.path}: node '{leaf.name}': {error}") from error
@@ -156,23 +158,23 @@ def cut(whole: Whole, selection: Selection, both: bool, touched: Container[str])
             continue
         if left is None:
             del rest[leaf.name]
-            found[leaf.name] = raw
+            objects[leaf.name] = raw
         else:
-            rest[leaf.name], found[leaf.name] = left, part
-    return found, rest
+            rest[leaf.name], objects[leaf.name] = left, part
+    return objects, rest
 
 
 def nodes_of(whole: Whole, selection: Selection) -> set[str]:
     """The nodes in whose occupied cells more than a share (CellConfig.aside) of an object's cells lie: it is
     none of those that it merely touches."""
     points = selection.lattice.points[selection.chosen & selection.lattice.dense]
-    found = set()
+    names = set()
     for leaf, placed in whole.nodes:
         inverse = np.linalg.inv(whole.object_to_frame(leaf))
         own = occupied_at(placed.field, points @ inverse[:3, :3].T + inverse[:3, 3])
         if own.mean() > current(CellConfig).aside:
-            found.add(leaf.name)
-    return found
+            names.add(leaf.name)
+    return names
 
 
 def holds(box: np.ndarray, other: np.ndarray) -> bool:
@@ -192,7 +194,7 @@ def cut_with_hidden(
     it before (`shown`, (M,); `least` where it is seen at all). Such is in a field by chance, and behind it
     lies more of it."""
     config = current(CuttingConfig)
-    found, rest = cut(whole, selection, True, touched)
+    objects, rest = cut(whole, selection, True, touched)
     gone = selection.with_islands()  # of photos: what hangs in the air is an error
     if (gone.chosen != selection.chosen).any():
         rest = cut(whole, gone, True, touched)[1]
@@ -206,4 +208,4 @@ def cut_with_hidden(
             break
         gone = gone.joined(revealed)
         rest = cut(whole, gone, True, touched)[1]
-    return found, rest
+    return objects, rest

@@ -12,18 +12,26 @@ from formats.graph import belongs, placement_of, with_field, without
 from formats.nodes import Leaf, Node
 from fusedrf_cli.bridge.distilled import holders_in, inside
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit
-from fusedrf_cli.bridge.mending import LEARNT, Frame, Teacher, hole_of, learnt_from, learnt_surfaces, up_of
+from fusedrf_cli.bridge.inpainting import (
+    LEARNT,
+    Frame,
+    Teacher,
+    learnt_from,
+    learnt_surfaces,
+    smooth_patches,
+    up_of,
+)
 from fusedrf_cli.bridge.rendering import renderable
-from fusedrf_cli.bridge.running import engine
-from fusedrf_cli.bridge.scene import load_found, make_field, showing_of
-from fusedrf_cli.bridge.sources import Elsewhere, leaf_of, source_of
+from fusedrf_cli.bridge.runtime import engine
+from fusedrf_cli.bridge.scene import load_fields, make_field, showing_of
+from fusedrf_cli.bridge.sources import SourceFolder, leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
-from fusedrf_cli.engine.composition.detail import extent
+from fusedrf_cli.engine.composition.resolution_report import extent
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing, placement, seen_box
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.splitting import SplittingConfig
+from fusedrf_cli.engine.kinds.field_cutting import FieldCuttingConfig
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import DeleteRequest
@@ -36,8 +44,8 @@ EMPTIED = "cells of the field that it was distilled into emptied, and filled by 
 def delete(request: DeleteRequest, progress) -> dict:
     """Take objects out of a bundle. What an object hid in a field that it was distilled into is taken from
     the remaining sources where these are known, else from photos or left empty."""
-    with engine(request.device, request.threads, progress) as place:
-        edit = Edit(request, progress, place)
+    with engine(request.device, request.threads, progress) as device:
+        edit = Edit(request, progress, device)
         draft = edit.draft
         for name in request.names:
             draft.check(name)
@@ -54,8 +62,8 @@ def delete(request: DeleteRequest, progress) -> dict:
         hole = deletion.mend(request) if request.fill or not deletion.restored else None
         entry = {"names": list(request.names), "restored": deletion.restored}
         how = EMPTIED if deletion.inside else SAME_BITS
-        said = edit.done("deleted", [], [], (), entry, deletion.boxes, how)
-        return said | {"restored": deletion.restored, "hole": hole, "seconds": {}} | deletion.told
+        report = edit.done("deleted", [], [], (), entry, deletion.boxes, how)
+        return report | {"restored": deletion.restored, "hole": hole, "seconds": {}} | deletion.told
 
 
 def nothing_left(path: str, names: Sequence[str]) -> InvalidInput:
@@ -112,8 +120,8 @@ class Deletion:
 
     def holders(self, box: np.ndarray) -> list[Leaf]:
         """Of `holders_in` those that reach into a box (6,) of the world."""
-        own = holders_in(self.draft.graph)
-        return [leaf for leaf in own if self.placed(leaf).reaches(box)] or own[:1]
+        unnamed = holders_in(self.draft.graph)
+        return [leaf for leaf in unnamed if self.placed(leaf).reaches(box)] or unnamed[:1]
 
     def placed(self, leaf: Leaf) -> Placed:
         """A node's field in the world, as it is stored."""
@@ -154,39 +162,41 @@ class Deletion:
         """The other objects that were distilled, as far as they reach into a box (6,) of the world, and the
         precisions that they are stored in: from inside the bundle or from their files. None, with a warning,
         where one of them is not found as it was."""
-        found, draft = [], self.draft
+        sources_left, draft = [], self.draft
         for name, node in draft.inside.items():
             if name in self.names:
                 continue
-            own = source_of(node, leaf_of(node), draft.bundle, Elsewhere(None), self.allow_outside)
-            if not own and (node.get("background") or meet(np.asarray(node["aabb"]), box)):
+            sources = source_of(node, leaf_of(node), draft.bundle, SourceFolder(None), self.allow_outside)
+            if not sources and (node.get("background") or boxes_overlap(np.asarray(node["aabb"]), box)):
                 self.progress.warn(
                     f"the source of '{name}' is gone, has changed, or lies outside of the folder"
                 )
                 return None
-            for leaf, file, member in own:
-                one = load_found(file.path, draft.graph, [(leaf, file, member)], None).placed[0]
+            for leaf, file, member in sources:
+                one = load_fields(file.path, draft.graph, [(leaf, file, member)], None).placed[0]
                 if one.reaches(box):
-                    found.append((replace(one, field=opened(one.field)), file.headers[member].precision))
-        return found
+                    sources_left.append(
+                        (replace(one, field=opened(one.field)), file.headers[member].precision)
+                    )
+        return sources_left
 
     def from_photos(self, request: DeleteRequest, leaf: Leaf) -> list[tuple[Placed, str]]:
         """What photos show, learnt in the frame of a node's field."""
         edit, one = self.edit, self.placed(leaf)
         frame = Frame(self.draft.path, self.draft.graph, one.field, one.object_to_world)
-        learnt, self.told = learnt_from(request, frame, None, edit.memory, self.draft.place, self.progress)
+        field, self.told = learnt_from(request, frame, None, edit.memory, self.draft.device, self.progress)
         precision = self.draft.fields.headers[leaf.field].precision
-        return [(Placed(LEARNT, learnt, one.object_to_world), precision)]
+        return [(Placed(LEARNT, field, one.object_to_world), precision)]
 
     def mend(self, request: DeleteRequest) -> dict:
         """What the report says of the hole that is left, which is filled where that was asked for."""
         rest, origin = renderable(self.draft.after())
         at = placement(origin)
         box = seen_box(enclosing(self.boxes), at)
-        surfaces, unseen = hole_of(rest, box, up_of(self.draft.graph, at))
+        surfaces, unseen = smooth_patches(rest, box, up_of(self.draft.graph, at))
         if request.fill and surfaces:
             self.progress.phase("filling", None)
-            teach = Teacher(request, request.finetune, self.draft.place, self.progress, len(surfaces))
+            teach = Teacher(request, request.finetune, self.draft.device, self.progress, len(surfaces))
             for one in learnt_surfaces(surfaces, teach):
                 self.draft.add_node(one.name, one.field, at @ one.object_to_world, self.precision)
         return {"unseen": round(unseen, 3), "filled": bool(request.fill and surfaces)}
@@ -194,16 +204,18 @@ class Deletion:
     @property
     def precision(self) -> str:
         """In which most of the bundle's fields are stored."""
-        told = [header.precision for header in self.draft.bundle.headers.values() if header.kind != PART]
-        return max(told, key=told.count)
+        precisions = [
+            header.precision for header in self.draft.bundle.headers.values() if header.kind != PART
+        ]
+        return max(precisions, key=precisions.count)
 
 
 def released(deletion: Deletion, name: str, new_name: str) -> Node:
     """An object that was distilled as a node of another name: with the numbers of its source where that is
     found, else with those that the field has in its box."""
-    draft, told = deletion.draft, deletion.draft.inside[name]
-    leaf = replace(leaf_of(told), name=new_name)
-    own = source_of(told, leaf, draft.bundle, Elsewhere(None), deletion.allow_outside)
+    draft, entry = deletion.draft, deletion.draft.inside[name]
+    leaf = replace(leaf_of(entry), name=new_name)
+    own = source_of(entry, leaf, draft.bundle, SourceFolder(None), deletion.allow_outside)
     nodes = []
     for part, file, member in own:
         draft.writer.copy_field(file, member)
@@ -214,7 +226,7 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
             f"the source of '{name}' is gone, has changed, or lies outside of the folder: what its box holds "
             "of the field is taken for it"
         )
-        box = np.asarray(told["aabb"], np.float64)
+        box = np.asarray(entry["aabb"], np.float64)
         for number, holder in enumerate(deletion.holders(box)):
             one = deletion.placed(holder)
             grown = box + side_of(one) * np.repeat([-1, 1], 3)
@@ -229,11 +241,11 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
     return replace(nodes[0], name=new_name) if len(nodes) == 1 else Node(new_name, children=tuple(nodes))
 
 
-def meet(one: np.ndarray, other: np.ndarray) -> bool:
+def boxes_overlap(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two boxes (6,) have anything in common."""
     return bool((one[:3] <= other[3:]).all() and (other[:3] <= one[3:]).all())
 
 
 def side_of(one: Placed) -> float:
     """The side in the world of the cells in which a field is cropped."""
-    return max(one.voxel_size, extent(one) / current(SplittingConfig).cut)
+    return max(one.voxel_size, extent(one) / current(FieldCuttingConfig).cut)

@@ -7,10 +7,10 @@ from formats.bundle import OpenBundle
 from formats.graph import belongs
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.scene import make_field
-from fusedrf_cli.bridge.sources import Elsewhere, leaf_of, source_of
+from fusedrf_cli.bridge.sources import SourceFolder, leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import occupied_at
-from fusedrf_cli.engine.kinds.splitting import CORNERS
+from fusedrf_cli.engine.kinds.field_cutting import CORNERS
 
 
 def holders_in(graph: SceneGraph) -> list[Leaf]:
@@ -23,11 +23,11 @@ class DistilledShape:
     """Where an object is that was distilled into a field with others: in the occupied cells of its source, or
     where that is not found in its box."""
 
-    def __init__(self, told: dict, bundle: OpenBundle, beside: float):
-        """told: what the history says of it; beside: how far from that, in the world, it may reach, since the
-        field is coarser."""
-        self.box, self.beside = np.asarray(told["aabb"], np.float64), beside
-        own = source_of(told, leaf_of(told), bundle, Elsewhere(None), False)
+    def __init__(self, entry: dict, bundle: OpenBundle, beside: float):
+        """entry: what the history says of it; beside: how far from that, in the world, it may reach, since
+        the field is coarser."""
+        self.box, self.beside = np.asarray(entry["aabb"], np.float64), beside
+        own = source_of(entry, leaf_of(entry), bundle, SourceFolder(None), False)
         self.placed = [
             Placed(leaf.name, make_field(file.field(member), str(file.path)), leaf.object_to_world)
             for leaf, file, member in own

@@ -26,7 +26,7 @@ from formats.scene import Node
 from formats.undo import keep
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.running import written_somewhere
+from fusedrf_cli.bridge.runtime import written_somewhere
 from fusedrf_cli.bridge.scene import LoadedScene, load_bundle
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import enclosing
@@ -44,11 +44,11 @@ SAME_BITS = "an edit of the scene graph: all fields keep their bits"
 class Draft:
     """A bundle that is being edited: its graph as it is to be, and the fields that come to those it has."""
 
-    def __init__(self, path: str, memory: Memory | None = None, place: str = "cpu"):
+    def __init__(self, path: str, memory: Memory | None = None, device: str = "cpu"):
         """InvalidInput where there is no bundle at the path, BadSchema where its history is malformed."""
         if not is_bundle(path):
             raise InvalidInput(f"{path}: not a bundle; fuse the scene to a .rfpack first")
-        self.path, self.memory, self.place = path, memory, place
+        self.path, self.memory, self.device = path, memory, device
         self.bundle = OpenBundle(path)
         check_history(self.bundle.scene, path)
         self.graph, self.writer = self.bundle.scene, BundleWriter()
@@ -56,7 +56,7 @@ class Draft:
     @cached_property
     def before(self) -> LoadedScene:
         """The scene as it was; its fields are read when they are asked."""
-        return load_bundle(self.bundle, self.bundle.scene, self.memory, self.place)
+        return load_bundle(self.bundle, self.bundle.scene, self.memory, self.device)
 
     @property
     def fields(self) -> FieldSet:
@@ -65,7 +65,7 @@ class Draft:
 
     def after(self) -> LoadedScene:
         """The scene as it is to be."""
-        return load_bundle(self.fields, self.graph, self.memory, self.place)
+        return load_bundle(self.fields, self.graph, self.memory, self.device)
 
     def put(self, field: StoredField, precision: str) -> str:
         """The member that a field is stored as."""
@@ -152,11 +152,11 @@ def box_of(scene: LoadedScene, names: set[str]) -> np.ndarray | None:
 class Edit:
     """One edit, from reading to its report."""
 
-    def __init__(self, request: EditRequest, progress, place: str = "cpu"):
+    def __init__(self, request: EditRequest, progress, device: str = "cpu"):
         self.started, self.request, self.progress = time.monotonic(), request, progress
         progress.phase("reading", None)
         self.memory = Memory(request.memory)
-        self.draft = Draft(request.fused, self.memory, place)
+        self.draft = Draft(request.fused, self.memory, device)
 
     def done(
         self,
@@ -171,11 +171,11 @@ class Edit:
         """Write the bundle, whose history tells of what was done to objects, and report it. What was touched
         are nodes as they are now, others, by name, as they were, and boxes (6,) in the world."""
         draft, entry, boxes = self.draft, entry or {}, list(boxes)
-        found = [
+        placements = [
             box_of(draft.after(), leaf_names(nodes)) if nodes else None,
             draft.box(before) if before else None,
         ]
-        boxes += [box for box in found if box is not None]
+        boxes += [box for box in placements if box is not None]
         entry = {"event": event} | ({"objects": objects} if objects else {}) | entry
         size = draft.write(self.request, entry, isinstance(self.request, Learning))
         names = objects or entry.get("names", [])

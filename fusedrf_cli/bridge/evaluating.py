@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from formats.captures import is_capture, read_capture
-from fusedrf_cli.bridge.looks import looks_of
+from fusedrf_cli.bridge.evaluation_views import evaluation_views_of
 from fusedrf_cli.bridge.memory import Memory, measured, sources
 from fusedrf_cli.bridge.pictures import WHITE, camera_of, likeness, truth_of
-from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable, tell_of_work
-from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.rendering import composite_of, frame_memory, renderable, warn_of_work
+from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.bridge.scene import load_scene
-from fusedrf_cli.engine.distillation.judging import JudgingConfig
+from fusedrf_cli.engine.distillation.evaluation import EvaluatorConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.rendering.metrics import SSIM_WINDOW, psnr
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -27,7 +27,7 @@ class EvaluationConfig:
 
     views: int = 8
     size: tuple[int, int] = (400, 400)
-    seed: tuple[int, int] = (JudgingConfig.judged_seed, 1)
+    seed: tuple[int, int] = (EvaluatorConfig.judged_seed, 1)
     """A stream of their own."""
 
 
@@ -36,14 +36,14 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
     another scene on seeded views that fusing never uses.
     """
     bundle, against, allow_outside = request.bundle, request.against, request.allow_outside
-    with engine(request.device, request.threads, progress) as place:
+    with engine(request.device, request.threads, progress) as device:
         progress.phase("reading", None)
         budget = Memory(request.memory)
-        loaded = load_scene(bundle, allow_outside, budget, place)
+        loaded = load_scene(bundle, allow_outside, budget, device)
         pairs = (
             capture_pairs(against, request.split, request.size)
             if is_capture(against)
-            else scene_pairs(against, request.size, allow_outside, budget, place)
+            else scene_pairs(against, request.size, allow_outside, budget, device)
         )
         views = []
         for i, (pair, total) in enumerate(pairs):
@@ -53,7 +53,7 @@ def evaluate(request: EvaluateRequest, progress) -> dict:
                 field, origin = renderable(loaded, budget, frame_memory(None, *side) | measured(*side))
                 needed = frame_memory(field, *side) | measured(*side)
                 budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
-                tell_of_work(bundle, field, total * side[0] * side[1], progress)
+                warn_of_work(bundle, field, total * side[0] * side[1], progress)
                 progress.phase("rendering", total)
                 if min(side) < SSIM_WINDOW:
                     progress.warn(
@@ -89,23 +89,23 @@ class Pair:
 
     def likeness(self, shot: np.ndarray) -> dict:
         """What the report says of a picture (H, W, 3)."""
-        said = likeness(shot, self.truth, self.kept)
+        measures = likeness(shot, self.truth, self.kept)
         if self.covered is not None and self.covered.any():
-            said["covered_psnr"] = psnr(shot[self.covered], self.truth[self.covered])
-            said["covered_share"] = float(self.covered.mean())
-        return said | ({"of": self.of} if self.of else {})
+            measures["covered_psnr"] = psnr(shot[self.covered], self.truth[self.covered])
+            measures["covered_share"] = float(self.covered.mean())
+        return measures | ({"of": self.of} if self.of else {})
 
 
 def of_objects(views: list[dict]) -> dict:
     """The mean PSNR of the pixels that a scene covers, and the object that is shown worst in a view of its
     own; nothing where views were compared with photos."""
     covered = [view["covered_psnr"] for view in views if "covered_psnr" in view]
-    said = {"covered": {"psnr": float(np.mean(covered))}} if covered else {}
+    measures = {"covered": {"psnr": float(np.mean(covered))}} if covered else {}
     objects = [(view["psnr"], view["of"]) for view in views if "of" in view]
     if objects:
         worst, name = min(objects)
-        said["worst_object"] = {"name": name, "psnr": worst}
-    return said
+        measures["worst_object"] = {"name": name, "psnr": worst}
+    return measures
 
 
 def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Iterator[tuple[Pair, int]]:
@@ -124,27 +124,27 @@ def capture_pairs(against: str, split: str, size: tuple[int, int] | None) -> Ite
             f"{against}: the photos are {views[0].width}x{views[0].height}; leave --size out to compare "
             "with them"
         )
-    found = False
+    is_evaluated = False
     for view in views:
-        truth, kept = truth_of(view)
-        if kept.any():
-            found = True
-            yield Pair(camera_of(view), truth, kept), len(views)
-    if not found:
+        truth, mask = truth_of(view)
+        if mask.any():
+            is_evaluated = True
+            yield Pair(camera_of(view), truth, mask), len(views)
+    if not is_evaluated:
         raise InvalidInput(f"{against}: the masks exclude every pixel; they are black where to ignore")
 
 
 def scene_pairs(
-    against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory, place: str
+    against: str, size: tuple[int, int] | None, allow_outside: bool, budget: Memory, device: str
 ) -> Iterator[tuple[Pair, int]]:
     """The same of another scene, as `render` draws it, from where it and its objects were photographed; every
     pixel counts."""
     evaluation = current(EvaluationConfig)
-    config = current(JudgingConfig)
-    loaded = load_scene(against, allow_outside, budget, place)
+    config = current(EvaluatorConfig)
+    loaded = load_scene(against, allow_outside, budget, device)
     size = size or evaluation.size
     field = composite_of(loaded, budget, frame_memory(None, *size) | measured(*size))
-    views = looks_of(loaded, field, evaluation.views, size, evaluation.seed)
+    views = evaluation_views_of(loaded, field, evaluation.views, size, evaluation.seed)
     needed = frame_memory(field, *size) | measured(*size)
     budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
     for look in views:

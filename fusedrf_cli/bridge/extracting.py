@@ -9,33 +9,33 @@ from pathlib import Path
 import numpy as np
 
 from formats.bundle import OpenBundle
+from formats.camera_set import CameraSet, read_camera_set
 from formats.errors import FormatError
 from formats.graph import chosen, leaf_names
-from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph
 from formats.views import View
 from fusedrf_cli.bridge.cutouts import Cutout, ObjectCutout, RestCutout
 from fusedrf_cli.bridge.cutting import Fields, Whole, cut, cut_with_hidden, nodes_of
 from fusedrf_cli.bridge.distilled import DistilledShape, holders_in
 from fusedrf_cli.bridge.fusing import fuse
+from fusedrf_cli.bridge.inpainting import Frame, fill_hole
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.mending import Frame, mended
 from fusedrf_cli.bridge.previews import check_preview, previews
 from fusedrf_cli.bridge.rendering import renderable
-from fusedrf_cli.bridge.running import engine, held_back, written_somewhere
+from fusedrf_cli.bridge.runtime import engine, without_interrupts, written_somewhere
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.bridge.selecting import (
+    ObjectCues,
     SelectingConfig,
-    Told,
+    cues_of,
     in_frame,
-    nothing,
-    rig_for,
+    nothing_selected,
     selected,
     small,
-    told_by,
+    views_by_name,
     watching,
 )
-from fusedrf_cli.bridge.sources import as_it_is
+from fusedrf_cli.bridge.sources import scene_as_stored
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement, squeezed
@@ -66,7 +66,7 @@ class ExtractingConfig:
 
 def extract(request: ExtractRequest, progress) -> dict:
     """Write an object of a bundle, or the bundle without it, as a bundle of its own."""
-    with engine(request.device, request.threads, progress) as place:
+    with engine(request.device, request.threads, progress) as device:
         started = time.monotonic()
         if (request.refit or request.fill) and not request.invert:
             raise UsageProblem("--refit and --fill mend what is left of the field; give --invert too")
@@ -74,38 +74,38 @@ def extract(request: ExtractRequest, progress) -> dict:
             check_preview(request)
         progress.phase("reading", None)
         memory = Memory(request.memory)
-        whole = Whole.read(request.field, memory)
-        rig = rig_for(request, whole)
+        pieces = Whole.read(request.field, memory)
+        named_views = views_by_name(request, pieces)
         progress.phase("choosing", None)
-        named = named_nodes(request, whole)
-        found, rest, figures = parted(request, whole, named, rig, progress)
-        shown = whole.composed(found)
-        box = placed_box(subject(shown), whole.origin)
-        left = whole.composed(rest) if request.invert or request.preview else None
+        named = named_nodes(request, pieces)
+        object_field, rest, figures = parted(request, pieces, named, named_views, progress)
+        shown = pieces.composed(object_field)
+        box = placed_box(subject(shown), pieces.origin)
+        left = pieces.composed(rest) if request.invert or request.preview else None
         if request.invert:
             if left is None:
                 raise InvalidInput(f"{request.field}: nothing is left beside the object; leave --invert out")
-            cutout = RestCutout(whole, rest, request.precision, request.name, named)
-            frame = Frame(whole.path, whole.scene, whole.field, whole.origin)
-            fillings, figures["hole"] = mended(request, frame, left, shown, memory, place, progress)
+            cutout = RestCutout(pieces, rest, request.precision, request.name, named)
+            frame = Frame(pieces.path, pieces.scene, pieces.field, pieces.origin)
+            fillings, figures["hole"] = fill_hole(request, frame, left, shown, memory, device, progress)
             for one in fillings:
                 cutout.add(one)
         else:
-            cameras = own_cameras(whole.scene, box)
+            cameras = own_cameras(pieces.scene, box)
             name = request.name or OBJECT
-            cutout = ObjectCutout(whole, found, request.precision, name, named, box, cameras)
+            cutout = ObjectCutout(pieces, object_field, request.precision, name, named, box, cameras)
         if request.max_size is not None:
             figures |= within_size(request, cutout, progress)
-        with held_back(request.output):
+        with without_interrupts(request.output):
             size = written_somewhere(request.output, lambda output: cutout.write(output, request.overwrite))
         if request.preview:
             pictured = {
-                "whole": (whole.field, whole.origin),
-                "object": (shown, whole.origin),
-                "rest": None if left is None else (left, whole.origin),
+                "whole": (pieces.field, pieces.origin),
+                "object": (shown, pieces.origin),
+                "rest": None if left is None else (left, pieces.origin),
             }
             pictured["rest" if request.invert else "object"] = renderable(load_scene(request.output))
-            figures["preview"] = previews(request, pictured, box, rig, progress)
+            figures["preview"] = previews(request, pictured, box, named_views, progress)
     return {
         "output": request.output,
         "bytes": size,
@@ -138,7 +138,7 @@ def named_nodes(request: ExtractRequest, whole: Whole) -> set[str]:
 
 
 def parted(
-    request: ExtractRequest, whole: Whole, named: set[str], rig: dict[str, View], progress
+    request: ExtractRequest, whole: Whole, named: set[str], named_views: dict[str, View], progress
 ) -> tuple[Fields, Fields, dict]:
     """The object's fields, those that are left, and what the report says of how it was chosen; named: its
     nodes, where it is those. InvalidInput where there is no such object."""
@@ -147,15 +147,15 @@ def parted(
     extracting = current(ExtractingConfig)
     config = current(SelectingConfig)
     by_name = request.name is not None
-    told = told_by_name(request.name, whole) if by_name else told_by(request, whole, rig, progress)
-    selection = selected(whole.field, told)
+    cues = cues_by_name(request.name, whole) if by_name else cues_of(request, whole, named_views, progress)
+    selection = selected(whole.field, cues)
     cameras = watching(whole)
     shown = shown_by(whole.field, selection.lattice, cameras)
     well = extracting.seen * well_shown(selection, shown)
     selection = selection.without(shown < well)
     if not selection.shows:
-        raise InvalidInput(f"{request.field}: {nothing(request)}")
-    if selection.sure < extracting.unsure and told.is_guess:
+        raise InvalidInput(f"{request.field}: {nothing_selected(request)}")
+    if selection.sure < extracting.unsure and cues.is_guess:
         progress.warn(
             f"what tells of the object agrees by {selection.sure:.0%} only; look at --preview, and "
             "give more masks or points"
@@ -164,27 +164,29 @@ def parted(
     touched = set(whole.raw)
     if by_name:
         touched = {leaf.name for leaf in holders_in(whole.scene)}
-    elif told.is_guess and len(touched) > 1:
+    elif cues.is_guess and len(touched) > 1:
         touched = nodes_of(whole, selection)
     if request.invert and cameras:
-        found, rest = cut_with_hidden(whole, selection, shown, well, cameras, touched)
+        objects, rest = cut_with_hidden(whole, selection, shown, well, cameras, touched)
     else:
-        found, rest = cut(whole, selection, bool(request.invert or request.preview), touched)
-    object_shown = whole.composed(found)
+        objects, rest = cut(whole, selection, bool(request.invert or request.preview), touched)
+    object_shown = whole.composed(objects)
     if object_shown is None:
-        raise InvalidInput(f"{request.field}: {nothing(request)}")
-    share = seen_share([in_frame(small(view, config.seen_side), whole) for view in some(rig)], object_shown)
-    return found, rest, {"sure": round(selection.sure, 3), "seen": share}
+        raise InvalidInput(f"{request.field}: {nothing_selected(request)}")
+    share = seen_share(
+        [in_frame(small(view, config.seen_side), whole) for view in some(named_views)], object_shown
+    )
+    return objects, rest, {"sure": round(selection.sure, 3), "seen": share}
 
 
-def told_by_name(name: str, whole: Whole) -> Told:
+def cues_by_name(name: str, whole: Whole) -> ObjectCues:
     """What tells of an object that was distilled into a field with others: where it stood, and the cells of
     its source; of what they stood in, that it is none of them."""
     inside, origin = whole.draft.inside, placement(whole.origin)
     background = bool(inside[name].get("background"))
     beside = 0.5 * whole.field.voxel_size * squeezed(origin)
-    told = [node for key, node in inside.items() if (key != name) == background]
-    shapes = [DistilledShape(node, whole.draft.bundle, beside) for node in told]
+    named = [node for key, node in inside.items() if (key != name) == background]
+    shapes = [DistilledShape(node, whole.draft.bundle, beside) for node in named]
 
     def holds(points: np.ndarray) -> np.ndarray:
         at, found = points @ origin[:3, :3].T + origin[:3, 3], np.zeros(len(points), bool)
@@ -193,37 +195,39 @@ def told_by_name(name: str, whole: Whole) -> Told:
         return found != background
 
     none = np.zeros((0, 3))
-    return Told(holds, [], [], none, none, touches=True)
+    return ObjectCues(holds, [], [], none, none, touches=True)
 
 
 def subject(field: RadianceField) -> np.ndarray:
     """(6,) the box of its frame that views of a field look at."""
-    return field.subject if isinstance(field, ComposedField) else field.occupancy.subject
+    return field.look_at_box if isinstance(field, ComposedField) else field.occupancy.look_at_box
 
 
 # -- what was seen of it -------------------------------------------------------------------------------------
 
 
-def some(rig: dict[str, View]) -> list[View]:
+def some(named_views: dict[str, View]) -> list[View]:
     """At most 60 views, evenly spaced."""
-    views = list(rig.values())
+    views = list(named_views.values())
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, 60).astype(int))] if views else []
 
 
-def seen_share(own: list[Camera], found: RadianceField) -> float | None:
+def seen_share(capture_views: list[Camera], object_field: RadianceField) -> float | None:
     """Of the object's cells that some view around it shows, the share that cameras of the frame show; None
     where there are none."""
     extracting = current(ExtractingConfig)
     config = current(SelectingConfig)
-    if not own:
+    if not capture_views:
         return None
     lens = framing_lens(config.seen_side, config.seen_side)
     around = [
-        replace(framing(subject(found), lens, azimuth, elevation).camera(lens), name="")
+        replace(framing(subject(object_field), lens, azimuth, elevation).camera(lens), name="")
         for elevation in (-0.6, 0.0, 0.6, 1.2)
         for azimuth in np.arange(6) * np.pi / 3
     ]
-    shown, all_round = (weighed(found, cameras) > extracting.seen_from for cameras in (own, around))
+    shown, all_round = (
+        weighed(object_field, cameras) > extracting.seen_from for cameras in (capture_views, around)
+    )
     total = int(all_round.sum())
     return round(float((shown & all_round).sum() / total), 3) if total else None
 
@@ -242,11 +246,11 @@ def own_cameras(scene: SceneGraph, box: np.ndarray) -> dict | None:
     """The cameras that photographed an object in a box (6,) of the world, as of one that stands free."""
     if scene.cameras is None:
         return None
-    rig: Rig = read_rig(scene.cameras)
+    camera_set: CameraSet = read_camera_set(scene.cameras)
     focus = (box[:3] + box[3:]) / 2
-    distance = float(np.median(np.linalg.norm(rig.poses[:, :3, 3] - focus, axis=1)))
+    distance = float(np.median(np.linalg.norm(camera_set.poses[:, :3, 3] - focus, axis=1)))
     try:
-        return replace(rig, focus=focus, distance=distance, surroundings=False).content()
+        return replace(camera_set, focus=focus, distance=distance, surroundings=False).content()
     except FormatError:
         return None
 
@@ -271,7 +275,7 @@ def within_size(request: ExtractRequest, cutout: Cutout, progress) -> dict:
                 seed=request.seed, device=request.device, threads=request.threads,
             ),
             progress,
-            load=as_it_is,
+            load=scene_as_stored,
         )  # fmt: skip
         cutout.take(OpenBundle(smaller))
     return {name: fused[name] for name in ("psnr", "chosen") if name in fused}

@@ -17,12 +17,12 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import SLOTS_AT_ONCE, Composite
-from fusedrf_cli.engine.distillation.finish import RayLesson
+from fusedrf_cli.engine.distillation.finetune import FinetuneRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.distillation.teacher import points_kept
+from fusedrf_cli.engine.distillation.teacher import expected_points
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
-from fusedrf_cli.engine.kinds.student import DistilConfig, Plan, Student
+from fusedrf_cli.engine.kinds.builder import DistilConfig, DistilledBuilder, Plan
 from fusedrf_cli.engine.rendering.volume import RenderConfig
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import ResourceProblem
@@ -122,17 +122,17 @@ def peak() -> int:
 
 def available() -> int:
     """What can be had without swapping, by the system's own estimate, within a control group's limit."""
-    found = psutil.virtual_memory().available
+    free = psutil.virtual_memory().available
     for folder, most, used in (
         ("/sys/fs/cgroup", "memory.max", "memory.current"),
         ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
     ):
         try:
-            limit, taken = (Path(folder, name).read_text().strip() for name in (most, used))
-            found = min(found, max(0, int(limit) - int(taken)))
+            limit, used_bytes = (Path(folder, name).read_text().strip() for name in (most, used))
+            free = min(free, max(0, int(limit) - int(used_bytes)))
         except (OSError, ValueError):  # no such group, or "max": no limit
             continue
-    return found
+    return free
 
 
 def sources(sizes: list[int], room: float = float("inf"), copies: float = 0.0) -> dict[str, float]:
@@ -211,56 +211,61 @@ def teaching(settings: DistilConfig, points: int) -> dict[str, float]:
     return {"the teachers' answers": settings.rays * config.per_ray + points * config.per_point}
 
 
-def lesson(rays: int) -> dict[str, float]:
+def distil_config(rays: int) -> dict[str, float]:
     """Rays to learn from, and what they show."""
     return {"rays to learn from": rays * current(MemoryConfig).per_ray}
 
 
 def stages(
-    student: Student, scene: ComposedField, request: FuseRequest, teacher: RadianceField
+    builder: DistilledBuilder, scene: ComposedField, request: FuseRequest, teacher: RadianceField
 ) -> list[tuple[float, dict[str, float]]]:
     """The stages of fusing a scene: making a student, measuring it, learning from a teacher. Each is so many
     copies of the largest source, and bytes by what they are for."""
-    needs = student.needs()
+    needs = builder.needs()
     numbers, learnt, grids = needs.numbers, needs.numbers - needs.settled, ownership(scene.aabb)
-    settings = student.lesson_of(learnt, request.time_budget) or DistilConfig()
-    if student.lesson is None:
-        taught = lesson(RayLesson.config.rays)
+    settings = builder.distil_config_for(learnt, request.time_budget) or DistilConfig()
+    if builder.distil_config is None:
+        taught = distil_config(FinetuneRays.config.rays)
     else:
         points = needs.points
         if points is None:
-            step = 0.5 * student.largest().voxel
-            sampler = RaySampler.of(student.scene, student.request.views)
-            points = points_kept(teacher, sampler, settings.rays, step, request.seed)
+            step = 0.5 * builder.largest().voxel
+            sampler = RaySampler.of(builder.scene, builder.request.views)
+            points = expected_points(teacher, sampler, settings.rays, step, request.seed)
         taught = teaching(settings, points)
     # kept beside what learns: the field as it was made, and the numbers that its pictures have to surpass
-    kept = (not student.learnt) + (student.lesson is not None and request.finetune)
+    copies = (not builder.learnt) + (builder.distil_config is not None and request.finetune)
     learns = (
-        learning(learnt, torch.get_num_threads()) | {"its starts": kept * learnt * FLOAT} | taught | grids
-        if learning_is_asked(student, request)
+        learning(learnt, torch.get_num_threads()) | {"its starts": copies * learnt * FLOAT} | taught | grids
+        if will_learn(builder, request)
         else {}
     )
     if learns and request.target_psnr is not None:
         learns["the best so far"] = numbers * FLOAT
-    making = needs.making | (taught | picture(256, 256, composed=True) if student.learnt else {})
+    making = needs.making | (taught | picture(256, 256, composed=True) if builder.learnt else {})
     return [
         (needs.copies, result(numbers, measured=False) | making | grids),
-        (0.0, result(numbers) | grids | judged()),
+        (0.0, result(numbers) | grids | evaluation_memory()),
         (0.0, learns | {"what does not learn": needs.settled * FLOAT} if learns else {}),
     ]
 
 
-def asking_in_waves(student: Student, scene: ComposedField) -> dict[str, float]:
+def asking_in_waves(builder: DistilledBuilder, scene: ComposedField) -> dict[str, float]:
     """Rays that a made student learns from, while they are asked of sources that are read one by one."""
-    made = result(student.needs().numbers, measured=False)
-    return made | lesson(RayLesson.config.rays) | ownership(scene.aabb) | picture(256, 256, composed=True)
+    finished = result(builder.needs().numbers, measured=False)
+    return (
+        finished
+        | distil_config(FinetuneRays.config.rays)
+        | ownership(scene.aabb)
+        | picture(256, 256, composed=True)
+    )
 
 
-def learning_is_asked(student: Student, request: FuseRequest) -> bool:
+def will_learn(builder: DistilledBuilder, request: FuseRequest) -> bool:
     """Whether anything is going to be learnt."""
-    return student.learnt or request.finetune
+    return builder.learnt or request.finetune
 
 
-def judged() -> dict[str, float]:
+def evaluation_memory() -> dict[str, float]:
     """Looking at a scene to measure; some views are filled by one of its objects."""
     return picture(DistilConfig.view_size, DistilConfig.view_size, composed=True)

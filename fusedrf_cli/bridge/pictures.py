@@ -38,8 +38,8 @@ def truth_of(view: View) -> tuple[np.ndarray, np.ndarray]:
     return photo, np.ones(photo.shape[:2], bool) if ignored is None else ~ignored
 
 
-def likeness(shot: np.ndarray, truth: np.ndarray, kept: np.ndarray) -> dict[str, float]:
+def likeness(shot: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float]:
     """PSNR in dB and SSIM of a picture (H, W, 3) in the pixels that are kept, (H, W) bool, of which there is
     at least one."""
-    same = np.where(kept[..., None], shot, truth)  # windows that reach over the edge see no difference
-    return {"psnr": psnr(shot[kept], truth[kept]), "ssim": ssim(same, truth, kept)}
+    same = np.where(mask[..., None], shot, truth)  # windows that reach over the edge see no difference
+    return {"psnr": psnr(shot[mask], truth[mask]), "ssim": ssim(same, truth, mask)}

@@ -20,7 +20,7 @@ from formats.photos import has_pictures
 from formats.posing import (
     CAMERAS,
     TEMPORARY,
-    Posed,
+    PosedPhotos,
     check_extra,
     estimate,
     photos_to_pose,
@@ -29,7 +29,7 @@ from formats.posing import (
 )
 from formats.views import Capture
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.running import available_cores, written_somewhere
+from fusedrf_cli.bridge.runtime import available_cores, written_somewhere
 from fusedrf_cli.requests import PoseRequest
 
 WORLD = (
@@ -109,7 +109,7 @@ def _stamp(photo: Path) -> tuple[int, int]:
     return status.st_size, status.st_mtime_ns
 
 
-def _keep(posed: Posed, folder: Path) -> Path:
+def _keep(posed: PosedPhotos, folder: Path) -> Path:
     """Write poses to the cache, or where that cannot be written to a folder that ends with the process."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

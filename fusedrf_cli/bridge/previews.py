@@ -58,11 +58,15 @@ def check_preview(request: ExtractRequest) -> None:
 
 
 def previews(
-    request: ExtractRequest, shown: dict[str, Shown | None], box: np.ndarray, rig: dict[str, View], progress
+    request: ExtractRequest,
+    shown: dict[str, Shown | None],
+    box: np.ndarray,
+    camera_set: dict[str, View],
+    progress,
 ) -> list[str]:
     """Write pictures of a few views of the "object" in its box (6,), in the world, of the "rest", and of the
     "whole" with the object marked."""
-    views = [small(view, current(PreviewConfig).shown) for view in shown_views(request, rig)]
+    views = [small(view, current(PreviewConfig).shown) for view in shown_views(request, camera_set)]
     cameras = [camera_of(view) for view in views] or [framed(box)]
     progress.phase("previews", len(cameras))
     files, folder = [], Path(request.preview)
@@ -77,12 +81,12 @@ def previews(
     return files
 
 
-def shown_views(request: ExtractRequest, rig: dict[str, View]) -> list[View]:
+def shown_views(request: ExtractRequest, camera_set: dict[str, View]) -> list[View]:
     """The views that were masked or pointed at, else some of all."""
     config = current(PreviewConfig)
     stems = {path.stem for path in pictures(Path(request.masks))} if request.masks else set()
     stems |= {name for name, *_ in request.points}
-    named = [view for name, view in rig.items() if name in stems] or list(rig.values())
+    named = [view for name, view in camera_set.items() if name in stems] or list(camera_set.values())
     return (
         [named[i] for i in np.unique(np.linspace(0, len(named) - 1, config.previews).astype(int))]
         if named
@@ -113,7 +117,7 @@ def pictures_of(shown: dict[str, Shown | None], camera: Camera) -> dict[str, np.
     hidden = (by_itself.depth > whole.depth * config.before) & (np.abs(marked - own).mean(-1) > config.alike)
     before = (by_itself.opacity > 0.5) & ~hidden
     marked[before] = 0.5 * marked[before] + 0.5 * MARKED
-    found = {"object": to_pixels(by_itself, None), "marked": np.rint(255 * marked).astype(np.uint8)}
+    pictures = {"object": to_pixels(by_itself, None), "marked": np.rint(255 * marked).astype(np.uint8)}
     if shown["rest"] is not None:
-        found["rest"] = to_pixels(shot("rest"), (1.0, 1.0, 1.0))
-    return found
+        pictures["rest"] = to_pixels(shot("rest"), (1.0, 1.0, 1.0))
+    return pictures

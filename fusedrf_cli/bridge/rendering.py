@@ -11,10 +11,10 @@ import numpy as np
 
 from formats.atomic import atomic_folder
 from formats.filenames import DEPTH, depth_of, distinct
-from formats.films import FILMS, check_film, write_film
 from formats.png import depth_png_writer, png_writer
+from formats.video import FILMS, check_film, write_film
 from fusedrf_cli.bridge.memory import Memory, picture, segments, sources
-from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.bridge.scene import LoadedScene, load_scene
 from fusedrf_cli.bridge.views import choose_views
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -52,10 +52,10 @@ def render(request: RenderRequest, progress) -> dict:
         check_film(output)
         if request.depth or request.background is None:
             raise UsageProblem("a film has neither depth nor transparency; render to a folder instead")
-    with engine(request.device, request.threads, progress) as place:
+    with engine(request.device, request.threads, progress) as device:
         progress.phase("reading", None)
         budget = Memory(request.memory)
-        loaded = load_scene(request.scene, request.allow_outside, budget, place)
+        loaded = load_scene(request.scene, request.allow_outside, budget, device)
         field, origin = reference(loaded)
         views = choose_views(request, loaded, field, origin)
         if suffix in FILMS:
@@ -67,11 +67,11 @@ def render(request: RenderRequest, progress) -> dict:
         if not request.reference:
             field, origin = renderable(loaded, budget, picture_memory(None, views, suffix in FILMS))
         needed = picture_memory(field, views, suffix in FILMS)
-        held = isinstance(field, Composite)
-        loaded.shelf.resize(sum(loaded.sizes) if held else budget.room(needed))
-        advice = "use --reference" if held else "give a smaller --size"
-        budget.expect(sources(loaded.resident, loaded.shelf.room) | needed, advice=advice)
-        tell_of_work(request.scene, field, rays_of(views), progress)
+        is_composite = isinstance(field, Composite)
+        loaded.field_cache.resize(sum(loaded.sizes) if is_composite else budget.room(needed))
+        advice = "use --reference" if is_composite else "give a smaller --size"
+        budget.expect(sources(loaded.resident, loaded.field_cache.room) | needed, advice=advice)
+        warn_of_work(request.scene, field, rays_of(views), progress)
         progress.phase("rendering", len(views))
         how = {"origin": origin, "near": request.near, "far": request.far}
         shooting = _Shooting(field, how, request.background, request.depth, progress)
@@ -107,7 +107,7 @@ def frame_memory(field, width: int, height: int) -> dict[str, float]:
     return needed | (segments(width * height) if held else {})
 
 
-def tell_of_work(scene: str, field, rays: int, progress) -> None:
+def warn_of_work(scene: str, field, rays: int, progress) -> None:
     """A warning where so many rays through a field may take much longer than people expect."""
     config = current(WorkConfig)
     sampled = field.fields if isinstance(field, Composite) else [field]
@@ -151,7 +151,7 @@ def composite_of(
     composed = loaded.composed()
     if budget is not None and budget.room(sources(loaded.resident) | needed) < 0:
         return composed
-    loaded.shelf.resize(sum(loaded.sizes))
+    loaded.field_cache.resize(sum(loaded.sizes))
     return as_composite(composed)
 
 

@@ -6,7 +6,7 @@ from formats.graph import changed, chosen, moved, with_nodes
 from formats.scene import Node
 from fusedrf_cli.bridge.deleting import EMPTIED, Deletion
 from fusedrf_cli.bridge.editing import Edit, brought
-from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import ReplaceRequest
 

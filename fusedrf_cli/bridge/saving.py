@@ -10,7 +10,7 @@ from formats.graph import placement_of, shown
 from formats.records import FieldRecord
 from formats.scene import Node, SceneGraph
 from fusedrf_cli import __version__
-from fusedrf_cli.bridge.rigs import kept_cameras
+from fusedrf_cli.bridge.capture_cameras import result_cameras
 from fusedrf_cli.bridge.scene import LoadedScene, showing_of
 from fusedrf_cli.engine.fields.base import StoredField
 
@@ -51,7 +51,7 @@ def save_scene(
         f"fusedrf {__version__}",
         extras=scene.graph.extras,
         framing=scene.graph.framing,
-        cameras=kept_cameras(scene),
+        cameras=result_cameras(scene),
     )
     writer.write(output, writer.unfolded(graph), overwrite=overwrite)
     return Path(output).stat().st_size

@@ -18,11 +18,11 @@ from formats.records import FieldRecord, as_stored, reading_size
 from formats.scene import MAX_SCENE_BYTES, SceneGraph, dump_scene, make_node, parse_scene
 from formats.sources import expand_scene, inline_scenes, resolve_source
 from fusedrf_cli import __version__
+from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory, sources
-from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.composition.affine import WHITE, Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.base import FieldNeeds, StoredField
+from fusedrf_cli.engine.fields.base import FieldMemory, StoredField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.fields.streamed import StreamedField, opened
 from fusedrf_cli.engine.kinds import registry
@@ -45,7 +45,7 @@ class SourceField:
     bundle: OpenBundle
     """That it was read from."""
     member: str
-    needs: FieldNeeds
+    needs: FieldMemory
     whole: bool = True
     """Whether it is shown as the bundle has it."""
     cropped: bool = False
@@ -60,7 +60,7 @@ FoundField = tuple[Leaf, OpenBundle, str]
 
 
 @dataclass(frozen=True)
-class PlacedRig:
+class PlacedCameraSet:
     """Cameras that a source of a scene keeps."""
 
     name: str
@@ -80,8 +80,8 @@ class LoadedScene:
     composition: str
     graph: SceneGraph
     path: Path | None
-    shelf: Shelf
-    rigs: tuple[PlacedRig, ...] = ()
+    field_cache: FieldCache
+    camera_sets: tuple[PlacedCameraSet, ...] = ()
     """Of its sources."""
     bundle: OpenBundle | None = None
     """That the graph was read from; None: a scene.json."""
@@ -119,23 +119,23 @@ class LoadedScene:
 def grouped(placed: Sequence[Placed], groups: Sequence[tuple], rule: str, depth: int = 0) -> list[Placed]:
     """Placed fields, in groups of nodes, as what is composed by a rule: groups of another rule are fields of
     their own, placed where their frames lie."""
-    found, start = [], 0
+    members, start = [], 0
     while start < len(placed):
         group = groups[start][depth] if len(groups[start]) > depth else None
         end = start + 1
         while group is not None and end < len(placed) and groups[end][depth : depth + 1] == (group,):
             end += 1
         if group is None:
-            found.append(placed[start])
+            members.append(placed[start])
         else:
-            own = grouped(placed[start:end], groups[start:end], group[1], depth + 1)
-            if group[1] == rule or len(own) == 1:
-                found += own
+            subgroup = grouped(placed[start:end], groups[start:end], group[1], depth + 1)
+            if group[1] == rule or len(subgroup) == 1:
+                members += subgroup
             else:
-                inner = ComposedField(own, group[1])
-                found.append(Placed(group[0], inner, placement(inner.origin)))
+                inner = ComposedField(subgroup, group[1])
+                members.append(Placed(group[0], inner, placement(inner.origin)))
         start = end
-    return found
+    return members
 
 
 def make_field(record: FieldRecord, where: str) -> StoredField:
@@ -181,16 +181,16 @@ def note_options(request: FuseRequest, loaded: LoadedScene, progress) -> None:
         progress.warn(f"{option} does not apply to fields of kind {', '.join(others)}: they keep theirs")
 
 
-def needs_of(bundle: OpenBundle, member: str) -> FieldNeeds:
+def needs_of(bundle: OpenBundle, member: str) -> FieldMemory:
     """What a field of a bundle needs of memory, told by its header before it is read. InvalidInput where that
     makes no field."""
     header = bundle.headers[member]
     shapes = {name: shape for name, (_, shape) in header.arrays.items()}
     try:
         kind = registry.kind(header.kind)
-        needs = kind.field_needs(header.metadata, shapes, partial(bundle.array, member))
+        needs = kind.field_memory(header.metadata, shapes, partial(bundle.array, member))
     except MALFORMED:  # reading the field says what is wrong
-        needs = FieldNeeds(header.decoded_size, 0)
+        needs = FieldMemory(header.decoded_size, 0)
     shared = shared_members(member, header, bundle.headers, str(bundle.path)).values()
     parts = [header, *(bundle.headers[name] for name in shared)]
     decoding = max(map(reading_size, parts)) - needs.resident  # before anything is made of the arrays
@@ -199,9 +199,9 @@ def needs_of(bundle: OpenBundle, member: str) -> FieldNeeds:
 
 
 def load_scene(
-    path: str, allow_outside: bool = False, budget: Memory | None = None, place: str = "cpu"
+    path: str, allow_outside: bool = False, budget: Memory | None = None, device: str = "cpu"
 ) -> LoadedScene:
-    """Read a bundle, a scene.json or '-' with all fields it places, on the device `place`; equal members
+    """Read a bundle, a scene.json or '-' with all fields it places, on the device `device`; equal members
     become one field.
 
     Of the fields, as many stay in memory as the budget has room for; others are read again when asked. Raises
@@ -212,73 +212,76 @@ def load_scene(
         graph = inline_scenes(
             parse_scene(sys.stdin.buffer.read(MAX_SCENE_BYTES + 1), "standard input"), where, allow_outside
         )
-        return _Loader(where, budget, place).load(graph, allow_outside)
+        return _Loader(where, budget, device).load(graph, allow_outside)
     if is_bundle(path):
         bundle = OpenBundle(path)
-        return _Loader(Path(path), budget, place).load(bundle.scene, allow_outside, bundle)
-    return _Loader(Path(path), budget, place).load(expand_scene(path, allow_outside), allow_outside)
+        return _Loader(Path(path), budget, device).load(bundle.scene, allow_outside, bundle)
+    return _Loader(Path(path), budget, device).load(expand_scene(path, allow_outside), allow_outside)
 
 
 def load_bundle(
-    bundle: OpenBundle, graph: SceneGraph, budget: Memory | None = None, place: str = "cpu"
+    bundle: OpenBundle, graph: SceneGraph, budget: Memory | None = None, device: str = "cpu"
 ) -> LoadedScene:
     """As `load_scene`, of a bundle that is open, by its graph or another one over its fields."""
-    return _Loader(bundle.path, budget, place).load(graph, False, bundle)
+    return _Loader(bundle.path, budget, device).load(graph, False, bundle)
 
 
-def load_found(
-    path: Path, graph: SceneGraph, found: Sequence[FoundField], budget: Memory | None, place: str = "cpu"
+def load_fields(
+    path: Path, graph: SceneGraph, fields: Sequence[FoundField], budget: Memory | None, device: str = "cpu"
 ) -> LoadedScene:
     """As `load_scene`, of fields that were found already."""
-    return _Loader(path, budget, place).read(graph, found)
+    return _Loader(path, budget, device).read(graph, fields)
 
 
 class _Loader:
     """Finds the fields of one scene; every bundle is opened once, and read from that version to the end."""
 
-    def __init__(self, path: Path, budget: Memory | None, place: str):
-        self.path, self.budget, self.shelf, self.place = path, budget, Shelf(), place
+    def __init__(self, path: Path, budget: Memory | None, device: str):
+        self.path, self.budget, self.field_cache, self.device = path, budget, FieldCache(), device
         self.bundles: dict[Path, OpenBundle] = {}
         self.fields: dict[str, StreamedField] = {}
-        self.rigs: list[PlacedRig] = []
+        self.camera_sets: list[PlacedCameraSet] = []
 
     def load(self, graph: SceneGraph, allow_outside: bool, bundle: OpenBundle | None = None) -> LoadedScene:
-        found = []
+        fields = []
         leaves = graph.leaves()
         for leaf in leaves:
             if not leaf.visible:
                 continue
             if leaf.field is not None:
-                found.append((leaf, bundle, leaf.field))
+                fields.append((leaf, bundle, leaf.field))
             elif leaf.source is not None:
-                found += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
-        if not found and leaves:
+                fields += self.sources(leaf, resolve_source(self.path, leaf.source, allow_outside))
+        if not fields and leaves:
             raise InvalidInput(f'{self.path}: nothing of the scene is visible; remove a "visible": false')
-        if not found:
+        if not fields:
             raise InvalidInput(f"{self.path}: the scene places no field; add a node with a 'source'")
-        return self.read(graph, found, bundle)
+        return self.read(graph, fields, bundle)
 
     def read(
-        self, graph: SceneGraph, found: Sequence[FoundField], bundle: OpenBundle | None = None
+        self, graph: SceneGraph, field_list: Sequence[FoundField], bundle: OpenBundle | None = None
     ) -> LoadedScene:
         """A scene of fields, within the budget."""
-        needs = {(bundle, member): needs_of(bundle, member) for _, bundle, member in found}
+        needs = {(bundle, member): needs_of(bundle, member) for _, bundle, member in field_list}
         if self.budget is not None:
             sizes = {
                 key_of(leaf, member): as_shown_needs(needs[b, member], leaf).resident
-                for leaf, b, member in found
+                for leaf, b, member in field_list
             }
             reading = {"a source while it is read": max(each.reading for each in needs.values())}
-            if copied := sum(one.copied for one in {id(one): one for _, one, _ in found}.values()):
+            if copied := sum(one.copied for one in {id(one): one for _, one, _ in field_list}.values()):
                 reading["fields of a bundle of an earlier version"] = copied
-            self.shelf.resize(self.budget.room(reading))
+            self.field_cache.resize(self.budget.room(reading))
             self.budget.expect(
-                sources([*sizes.values()], self.shelf.room) | reading, advice="use smaller sources"
+                sources([*sizes.values()], self.field_cache.room) | reading, advice="use smaller sources"
             )
         fields = tuple(
-            self.source(leaf, b, member, as_shown_needs(needs[b, member], leaf)) for leaf, b, member in found
+            self.source(leaf, b, member, as_shown_needs(needs[b, member], leaf))
+            for leaf, b, member in field_list
         )
-        return LoadedScene(fields, graph.composition, graph, self.path, self.shelf, tuple(self.rigs), bundle)
+        return LoadedScene(
+            fields, graph.composition, graph, self.path, self.field_cache, tuple(self.camera_sets), bundle
+        )
 
     def sources(self, leaf, path: Path) -> list[FoundField]:
         """The arguments of `source` for the fields of the bundle that a leaf names."""
@@ -297,7 +300,9 @@ class _Loader:
                 "source"
             )
         if scene.cameras is not None:
-            self.rigs.append(PlacedRig(leaf.name, leaf.background, scene.cameras, leaf.object_to_world))
+            self.camera_sets.append(
+                PlacedCameraSet(leaf.name, leaf.background, scene.cameras, leaf.object_to_world)
+            )
         named = [leaf.name] if len(inner) == 1 else [f"{leaf.name}/{node.name}" for node in inner]
         if len(inner) > 1:
             leaf = replace(leaf, groups=(*leaf.groups, (leaf.name, scene.composition)))
@@ -306,15 +311,15 @@ class _Loader:
             for name, node in zip(named, inner, strict=True)
         ]
 
-    def source(self, leaf: Leaf, bundle: OpenBundle, member: str, needs: FieldNeeds) -> SourceField:
+    def source(self, leaf: Leaf, bundle: OpenBundle, member: str, needs: FieldMemory) -> SourceField:
         """leaf: where the field lies, under which name, and what is shown of it."""
         where, key = f"{bundle.path}: node '{leaf.name}'", key_of(leaf, member)
 
         def read():
-            return cropped(make_field(bundle.field(member), where), leaf, where).to(self.place)
+            return cropped(make_field(bundle.field(member), where), leaf, where).to(self.device)
 
         if key not in self.fields:
-            self.fields[key] = StreamedField(lambda: self.shelf.take(key, needs.held, read))
+            self.fields[key] = StreamedField(lambda: self.field_cache.take(key, needs.held, read))
         try:
             check_affine(leaf.object_to_world, f"node '{leaf.name}' in the world")
             placed = Placed(leaf.name, self.fields[key], leaf.object_to_world, leaf.opacity, leaf.tint)
@@ -331,7 +336,7 @@ def key_of(leaf: Leaf, member: str) -> str:
     return f"{member} {leaf.crops}" if leaf.crops else member
 
 
-def as_shown_needs(needs: FieldNeeds, leaf: Leaf) -> FieldNeeds:
+def as_shown_needs(needs: FieldMemory, leaf: Leaf) -> FieldMemory:
     """What a leaf's field needs: what is cropped is a copy of some of it."""
     return replace(needs, unwritten=0) if leaf.crops else needs
 
@@ -368,7 +373,7 @@ def _volume(source: SourceField) -> tuple[bool, float]:
     return placed.unbounded, float(np.prod(placed.aabb[3:] - placed.aabb[:3]))
 
 
-def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list[dict]:
+def history_nodes(scene: LoadedScene, output: str, kept_members: Container[str]) -> list[dict]:
     """What a history entry says of every source: name, placement, box, path from the output's folder,
     checksum, kept member.
     """
@@ -380,7 +385,7 @@ def history_nodes(scene: LoadedScene, output: str, kept: Container[str]) -> list
             "aabb": f.placed.aabb.tolist(),
             "field": f.member,
             "background": f.background,
-            "kept": f.member in kept and f.whole,
+            "kept": f.member in kept_members and f.whole,
         }
         if f.whole:  # an edit reads it again as it is
             node |= {"source": os.path.relpath(f.bundle.path.resolve(), folder), "sha256": f.bundle.sha256}
@@ -402,7 +407,7 @@ def write_field(
     overwrite: bool,
     origin: np.ndarray | None = None,
     about: SceneGraph = SceneGraph(()),
-    kept: Mapping[str, OpenBundle] = MappingProxyType({}),
+    kept_sources: Mapping[str, OpenBundle] = MappingProxyType({}),
 ) -> int:
     """Write one field, and kept sources (members and the bundles they are in) byte for byte, as a bundle; its
     node is placed at `origin`: a position (3,), or a placement (4, 4). Of a field that holds several objects
@@ -411,7 +416,7 @@ def write_field(
     writer = BundleWriter()
     member = writer.add_field(FieldRecord(field.kind, *field.state()), precision)
     graph = writer.unfolded(graph_of(member, name, origin, about))
-    for kept_member, bundle in kept.items():
+    for kept_member, bundle in kept_sources.items():
         writer.copy_field(bundle, kept_member)
     writer.write(output, graph, overwrite=overwrite)
     return Path(output).stat().st_size

@@ -6,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
+from formats.camera_set import read_camera_set
 from formats.captures import read_cameras
+from formats.closed_meshes import Hull
 from formats.errors import BadMask
-from formats.hulls import Hull
 from formats.images import read_mask
 from formats.photos import pictures
-from formats.rig import read_rig
 from formats.views import View
 from fusedrf_cli.bridge.cutting import Whole
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placement
 from fusedrf_cli.engine.rendering.cameras import Camera
-from fusedrf_cli.engine.selection.cells import CellConfig, Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellConfig, CellGrid, Selection
 from fusedrf_cli.engine.selection.growing import chosen_by_points
-from fusedrf_cli.engine.selection.voting import Look, chosen_by_masks
+from fusedrf_cli.engine.selection.voting import MaskedView, chosen_by_masks
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import ExtractRequest
@@ -43,13 +43,13 @@ class SelectingConfig:
 
 
 @dataclass(frozen=True)
-class Told:
+class ObjectCues:
     """What tells of the object, in the field's frame."""
 
     shapes: Callable[[np.ndarray], np.ndarray] | None
     """Which points (N, 3) may be its, (N,) bool; None: all."""
-    masks: list[Look]
-    pointed: list[Look]
+    masks: list[MaskedView]
+    pointed: list[MaskedView]
     inside: np.ndarray
     """(K, 3) points on it."""
     outside: np.ndarray
@@ -66,36 +66,36 @@ class Told:
 # -- what tells of it ----------------------------------------------------------------------------------------
 
 
-def rig_for(request: ExtractRequest, fused: Whole) -> dict[str, View]:
+def views_by_name(request: ExtractRequest, fused: Whole) -> dict[str, View]:
     """The views that masks and points are of, by name."""
     if request.cameras is not None:
         return {view.name: view for view in read_cameras(request.cameras)}
     if fused.scene.cameras is None:
         return {}
-    rig = read_rig(fused.scene.cameras)
-    return {view.name: view for view in rig.test + rig.train}
+    camera_set = read_camera_set(fused.scene.cameras)
+    return {view.name: view for view in camera_set.test + camera_set.train}
 
 
-def told_by(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress) -> Told:
+def cues_of(request: ExtractRequest, fused: Whole, camera_set: dict[str, View], progress) -> ObjectCues:
     """What a request says, read and checked."""
     if not (request.masks or request.points or request.boxes or request.spheres or request.mesh):
         raise UsageProblem("say which object: --masks, --points, --box, --sphere, --mesh or --name")
-    if (request.masks or request.points) and not rig:
+    if (request.masks or request.points) and not camera_set:
         raise InvalidInput(
             f"{request.field}: it keeps no cameras that masks or points could be of; give --cameras"
         )
-    masks = masked(request, fused, rig, progress) if request.masks else []
-    pointed = [pointed_at(one, request, fused, rig) for one in request.points]
+    masks = masked_views(request, fused, camera_set, progress) if request.masks else []
+    pointed = [pointed_at(one, request, fused, camera_set) for one in request.points]
     if pointed and not masks and not any(shows for *_, shows in request.points):
         raise UsageProblem("--points: none of them shows the object; give one without ,out")
-    places = {True: [], False: []}
+    points = {True: [], False: []}
     for look, (view, column, row, shows) in zip(pointed, request.points, strict=True):
-        places[shows].append(surface_at(fused.field, look, f"--points {view}:{column:g},{row:g}"))
-    own, other = (np.array(places[shows]).reshape(-1, 3) for shows in (True, False))
-    return Told(within(request, fused), masks, pointed, own, other)
+        points[shows].append(surface_at(fused.field, look, f"--points {view}:{column:g},{row:g}"))
+    inside, outside = (np.array(points[shows]).reshape(-1, 3) for shows in (True, False))
+    return ObjectCues(in_shapes(request, fused), masks, pointed, inside, outside)
 
 
-def within(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.ndarray] | None:
+def in_shapes(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.ndarray] | None:
     """Which points of the frame lie in the shapes: in any of the boxes, if there are some, in any of the
     spheres, and in the mesh."""
     hull = Hull(request.mesh) if request.mesh else None
@@ -106,46 +106,48 @@ def within(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.n
 
     def holds(points: np.ndarray) -> np.ndarray:
         at = points @ origin[:3, :3].T + origin[:3, 3]
-        found = np.ones(len(at), bool)
+        inside = np.ones(len(at), bool)
         if len(boxes):
-            found &= np.any([((at >= b[:3]) & (at <= b[3:])).all(1) for b in boxes], 0)
+            inside &= np.any([((at >= b[:3]) & (at <= b[3:])).all(1) for b in boxes], 0)
         if len(spheres):
-            found &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
-        return found & hull.contains(at) if hull else found
+            inside &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
+        return inside & hull.contains(at) if hull else inside
 
     return holds
 
 
-def masked(request: ExtractRequest, fused: Whole, rig: dict[str, View], progress) -> list[Look]:
+def masked_views(
+    request: ExtractRequest, fused: Whole, camera_set: dict[str, View], progress
+) -> list[MaskedView]:
     """The masks of a folder, each with the view that is named as it."""
     files = pictures(Path(request.masks))
     if not files:
         raise InvalidInput(
             f"{request.masks}: no folder of pictures; give one of masks, each named as the view that it masks"
         )
-    pairs = [(path, rig.get(path.stem) or rig.get(Path(path.stem).stem)) for path in files]
-    known = [(path, view) for path, view in pairs if view is not None]
-    if not known:
-        names = ", ".join(list(rig)[:3])
+    pairs = [(path, camera_set.get(path.stem) or camera_set.get(Path(path.stem).stem)) for path in files]
+    matched = [(path, view) for path, view in pairs if view is not None]
+    if not matched:
+        names = ", ".join(list(camera_set)[:3])
         raise InvalidInput(
             f"{request.masks}: none of its {len(files)} pictures is named as a view; the views are {names}, "
-            f"… ({len(rig)} in all)"
+            f"… ({len(camera_set)} in all)"
         )
-    if len(known) < len(files):
+    if len(matched) < len(files):
         progress.warn(
-            f"{request.masks}: {len(files) - len(known)} pictures are named as no view, and left out"
+            f"{request.masks}: {len(files) - len(matched)} pictures are named as no view, and left out"
         )
-    found = [looked_at(view, path, fused) for path, view in known]
-    shares = [look.inside.mean() for look in found]
+    masks = [masked_view(view, path, fused) for path, view in matched]
+    shares = [look.inside.mean() for look in masks]
     if not any(shares) or min(shares) == 1:
         raise BadMask(
             f"{request.masks}: the masks are {'black' if not any(shares) else 'white'} all over; paint the "
             "object white and all else black"
         )
-    return found
+    return masks
 
 
-def looked_at(view: View, path: Path, fused: Whole) -> Look:
+def masked_view(view: View, path: Path, fused: Whole) -> MaskedView:
     """A mask and its view, at most `longest` pixels a side. Raises BadMask where their shapes differ."""
     mask = read_mask(path)
     high, wide = mask.shape
@@ -157,7 +159,7 @@ def looked_at(view: View, path: Path, fused: Whole) -> Look:
     smaller = small(view, current(SelectingConfig).longest)
     rows = ((np.arange(smaller.height) + 0.5) * high / smaller.height).astype(int)
     columns = ((np.arange(smaller.width) + 0.5) * wide / smaller.width).astype(int)
-    return Look(in_frame(smaller, fused), mask[np.ix_(rows, columns)])
+    return MaskedView(in_frame(smaller, fused), mask[np.ix_(rows, columns)])
 
 
 def small(view: View, longest: int) -> View:
@@ -173,16 +175,18 @@ def in_frame(view: View, fused: Whole) -> Camera:
     return camera_of(view).seen_from(placement(fused.origin))
 
 
-def pointed_at(point: tuple, request: ExtractRequest, fused: Whole, rig: dict[str, View]) -> Look:
+def pointed_at(
+    point: tuple, request: ExtractRequest, fused: Whole, camera_set: dict[str, View]
+) -> MaskedView:
     """The pixels around a point, which say whether they show the object."""
     config = current(SelectingConfig)
     name, column, row, shows = point
-    if name not in rig:
-        names = ", ".join(list(rig)[:3])
+    if name not in camera_set:
+        names = ", ".join(list(camera_set)[:3])
         raise InvalidInput(
-            f"{request.field}: there is no view '{name}'; the views are {names}, … ({len(rig)} in all)"
+            f"{request.field}: there is no view '{name}'; the views are {names}, … ({len(camera_set)} in all)"
         )
-    view = rig[name]
+    view = camera_set[name]
     if column >= view.width or row >= view.height:
         raise UsageProblem(
             f"--points: {column:g},{row:g} lies outside of the view '{name}' of {view.width}x{view.height} "
@@ -192,10 +196,10 @@ def pointed_at(point: tuple, request: ExtractRequest, fused: Whole, rig: dict[st
     x, y = column * smaller.width / view.width, row * smaller.height / view.height
     away = np.hypot(np.arange(smaller.width) + 0.5 - x, (np.arange(smaller.height) + 0.5 - y)[:, None])
     near = away <= max(config.radius, away.min() + 1e-9)
-    return Look(in_frame(smaller, fused), near & shows, near)
+    return MaskedView(in_frame(smaller, fused), near & shows, near)
 
 
-def surface_at(field: RadianceField, look: Look, what: str) -> np.ndarray:
+def surface_at(field: RadianceField, look: MaskedView, what: str) -> np.ndarray:
     """(3,) the point of the frame that the middle of a pointed look shows; InvalidInput where there is
     nothing."""
     rays_o, rays_d = look.camera.rays()
@@ -204,15 +208,15 @@ def surface_at(field: RadianceField, look: Look, what: str) -> np.ndarray:
         raise InvalidInput(f"{what}: there is nothing to be seen; point at what shows")
     chosen = look.counted.ravel()
     middle = np.median(away[np.isfinite(away)])
-    way = rays_d[chosen].mean(0)
-    return rays_o[chosen][0] + middle * way / np.linalg.norm(way)
+    direction = rays_d[chosen].mean(0)
+    return rays_o[chosen][0] + middle * direction / np.linalg.norm(direction)
 
 
 def watching(fused: Whole) -> list[Camera]:
     """Cameras of the capture, in the field's frame, that tell what of it was ever seen; of a field that
     keeps none, none."""
     config = current(SelectingConfig)
-    views = [] if fused.scene.cameras is None else read_rig(fused.scene.cameras).views
+    views = [] if fused.scene.cameras is None else read_camera_set(fused.scene.cameras).views
     chosen = np.unique(np.linspace(0, len(views) - 1, config.watching).astype(int)) if views else []
     return [in_frame(small(views[i], config.seen_side), fused) for i in chosen]
 
@@ -220,36 +224,38 @@ def watching(fused: Whole) -> list[Camera]:
 # -- choosing ------------------------------------------------------------------------------------------------
 
 
-def selected(field: RadianceField, told: Told) -> Selection:
+def selected(field: RadianceField, cues: ObjectCues) -> Selection:
     """The object in two looks: at all of the field in coarse cells, and at the box that it lies in. Where it
-    touches other matter colours correct what masks say."""
+    touches other density colours correct what masks say."""
     config = current(CellConfig)
-    found = choice(Lattice.over(field, field.occupancy.aabb, config.coarse), told)
-    if not found.shows:
-        return found
-    held = found.lattice.grid.marked(found.lattice.spread(found.chosen & found.lattice.dense))
-    fine = choice(Lattice.over(field, held.tight_aabb(current(SelectingConfig).around), config.fine), told)
-    return fine.without_foreign() if told.masks or told.touches else fine
+    selection = selection_by_cues(CellGrid.over(field, field.occupancy.aabb, config.coarse), cues)
+    if not selection.shows:
+        return selection
+    grid = selection.lattice.grid.marked(selection.lattice.spread(selection.chosen & selection.lattice.dense))
+    fine = selection_by_cues(
+        CellGrid.over(field, grid.tight_aabb(current(SelectingConfig).around), config.fine), cues
+    )
+    return fine.without_foreign() if cues.masks or cues.touches else fine
 
 
-def choice(lattice: Lattice, told: Told) -> Selection:
+def selection_by_cues(lattice: CellGrid, cues: ObjectCues) -> Selection:
     """What masks, points or, without these, the shapes alone say, within the shapes."""
-    allowed = np.ones(len(lattice.points), bool) if told.shapes is None else told.shapes(lattice.points)
+    allowed = np.ones(len(lattice.points), bool) if cues.shapes is None else cues.shapes(lattice.points)
     if not allowed.any():
         return Selection(lattice, allowed)
     inner = lattice.kept(allowed)
-    if told.masks:
-        found = chosen_by_masks(inner, [*told.masks, *told.pointed])
-    elif len(told.inside):
-        found = chosen_by_points(inner, told.inside, told.outside, lattice.beside(allowed))
+    if cues.masks:
+        selection = chosen_by_masks(inner, [*cues.masks, *cues.pointed])
+    elif len(cues.inside):
+        selection = chosen_by_points(inner, cues.inside, cues.outside, lattice.beside(allowed))
     else:
-        found = Selection(inner, np.ones(len(inner.points), bool))
+        selection = Selection(inner, np.ones(len(inner.points), bool))
     chosen = allowed.copy()
-    chosen[allowed] = found.chosen
-    return Selection(lattice, chosen, found.sure)
+    chosen[allowed] = selection.chosen
+    return Selection(lattice, chosen, selection.sure)
 
 
-def nothing(request: ExtractRequest) -> str:
+def nothing_selected(request: ExtractRequest) -> str:
     """Why nothing was chosen."""
     if request.masks or request.points:
         return "what the masks or points show holds nothing of the field; look at it from those views"

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from formats.quantised import BLOCKS, code_bytes, is_coded
+from formats.quantisation import BLOCKS, code_bytes, is_coded
 from formats.records import BITS, BYTES_PER_NUMBER, FieldRecord, coded_bytes, encode_field
 from formats.scene import SceneGraph, dump_scene
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.kinds.student import Contents, Section
+from fusedrf_cli.engine.kinds.builder import Contents, Section
 from fusedrf_cli.engine.settings import current
 
 
@@ -30,7 +30,7 @@ class HeaderConfig:
 
 
 class BundleSizes:
-    """Bytes of a field in a bundle (engine/kinds/student.py: StoredSizes)."""
+    """Bytes of a field in a bundle (engine/kinds/builder.py: StoredSizes)."""
 
     def of(self, contents: Contents, precision: str) -> int:
         """At most so many bytes for a field of those contents."""
@@ -56,19 +56,19 @@ def section_bytes(section: Section, precision: str) -> int:
     most += current(HeaderConfig).per_coded
     if section.used is None or len(section.shape) != 3:
         return most
-    kept = section.shape[2] * kept_texels(section.used)
-    left_out = code_bytes(math.prod(section.shape), BITS[precision]) - code_bytes(kept, BITS[precision])
+    numbers = section.shape[2] * stored_texels(section.used)
+    left_out = code_bytes(math.prod(section.shape), BITS[precision]) - code_bytes(numbers, BITS[precision])
     return most - left_out
 
 
-def kept_texels(used: np.ndarray) -> int:
+def stored_texels(used: np.ndarray) -> int:
     """Texels in those blocks of a plane (na, nb) of which at least one is used: the others have no codes."""
-    held, sides = used, []
+    blocks, sides = used, []
     for axis, side in enumerate(BLOCKS[3][:2]):
         starts = np.arange(0, used.shape[axis], side)
-        held = np.logical_or.reduceat(held, starts, axis=axis)
+        blocks = np.logical_or.reduceat(blocks, starts, axis=axis)
         sides.append(np.diff(np.append(starts, used.shape[axis])))
-    return int(sides[0] @ held @ sides[1])
+    return int(sides[0] @ blocks @ sides[1])
 
 
 def graph_bytes(scene: SceneGraph) -> int:

@@ -15,46 +15,46 @@ from formats.history import check_history, distilled, sources
 from formats.nodes import WHITE, Leaf, Node
 from formats.scene import SceneGraph
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.scene import FoundField, LoadedScene, load_found, load_scene
+from fusedrf_cli.bridge.scene import FoundField, LoadedScene, load_fields, load_scene
 from fusedrf_cli.errors import InvalidInput, UsageProblem
 from fusedrf_cli.requests import FuseRequest
 
 
-def load_to_fuse(request: FuseRequest, memory: Memory, place: str, progress) -> LoadedScene:
+def load_to_fuse(request: FuseRequest, memory: Memory, device: str, progress) -> LoadedScene:
     """The scene that is to be fused: of a fused bundle its objects as they were before, where all of them are
     found; with a warning the bundle's own fields, where not. Raises InvalidInput where a folder was named
     that lacks one, UsageProblem where there is nothing to be found."""
     bundle = None if request.scene == "-" or not is_bundle(request.scene) else OpenBundle(request.scene)
     graph = None if bundle is None else bundle.scene
-    if graph is None or not was_fused(graph):
+    if graph is None or not is_fused(graph):
         if request.sources:
             raise UsageProblem(f"--sources applies to a fused bundle; {request.scene} tells of no sources")
-        return load_scene(request.scene, request.allow_outside, memory, place)
+        return load_scene(request.scene, request.allow_outside, memory, device)
     check_history(graph, request.scene)
-    anew, homes, missing = with_sources(bundle, Elsewhere(request.sources), request.allow_outside)
+    anew, homes, missing = with_sources(bundle, SourceFolder(request.sources), request.allow_outside)
     if not missing:
-        found = [(leaf, homes[leaf.field], leaf.field) for leaf in anew.leaves() if leaf.visible]
-        progress.tell(f"{request.scene} is fused anew from its {len(found)} sources")
-        return load_found(Path(request.scene), anew, found, memory, place)
-    told = f"{request.scene}: the source of '{missing[0]}' is not found as it was"
+        leaves = [(leaf, homes[leaf.field], leaf.field) for leaf in anew.leaves() if leaf.visible]
+        progress.tell(f"{request.scene} is fused anew from its {len(leaves)} sources")
+        return load_fields(Path(request.scene), anew, leaves, memory, device)
+    problem = f"{request.scene}: the source of '{missing[0]}' is not found as it was"
     if request.sources:
-        raise InvalidInput(f"{told}, neither where its history says nor in {request.sources}")
-    progress.warn(f"{told}: what is fused are the fields that it has; --sources DIR looks elsewhere")
-    return load_scene(request.scene, request.allow_outside, memory, place)
+        raise InvalidInput(f"{problem}, neither where its history says nor in {request.sources}")
+    progress.warn(f"{problem}: what is fused are the fields that it has; --sources DIR looks elsewhere")
+    return load_scene(request.scene, request.allow_outside, memory, device)
 
 
-def as_it_is(request: FuseRequest, memory: Memory, place: str, progress) -> LoadedScene:
+def scene_as_stored(request: FuseRequest, memory: Memory, device: str, progress) -> LoadedScene:
     """The scene or field that was named, whatever it was made of."""
-    return load_scene(request.scene, request.allow_outside, memory, place)
+    return load_scene(request.scene, request.allow_outside, memory, device)
 
 
-def was_fused(graph: SceneGraph) -> bool:
+def is_fused(graph: SceneGraph) -> bool:
     """Whether a bundle was made by `fuse`."""
     return bool(graph.history) and graph.history[0].get("event") == "fused"
 
 
 def with_sources(
-    bundle: OpenBundle, elsewhere: "Elsewhere", allow_outside: bool
+    bundle: OpenBundle, elsewhere: "SourceFolder", allow_outside: bool
 ) -> tuple[SceneGraph, dict[str, OpenBundle], list[str]]:
     """The scene of a fused bundle with the fields that it was made of, the bundle in which each member lies,
     and the names of objects of which no file is found. A node is its own source where its field is that of
@@ -62,8 +62,8 @@ def with_sources(
     scene, homes, missing = bundle.scene, {}, []
     made_of, inside = sources(scene.history), distilled(scene.history)
 
-    def placed(name: str, told: dict) -> tuple[Node, ...]:
-        own = source_of(told, Leaf(name, None, None, np.eye(4), False), bundle, elsewhere, allow_outside)
+    def placed(name: str, entry: dict) -> tuple[Node, ...]:
+        own = source_of(entry, Leaf(name, None, None, np.eye(4), False), bundle, elsewhere, allow_outside)
         missing.extend([] if own else [name])
         homes.update({member: file for _, file, member in own})
         alone = f"{name}/source" if len(own) == 1 else None
@@ -79,10 +79,10 @@ def with_sources(
         return in_place_of(replace(node, field=None), own, scene.composition, RULE) if own else node
 
     scene = with_leaves(scene, with_source)
-    for name, told in inside.items():
-        matrix = np.asarray(told["object_to_world"], np.float64)
-        node = Node(name, None, None, placement_of(matrix), bool(told.get("background")))
-        if own := placed(name, told):
+    for name, entry in inside.items():
+        matrix = np.asarray(entry["object_to_world"], np.float64)
+        node = Node(name, None, None, placement_of(matrix), bool(entry.get("background")))
+        if own := placed(name, entry):
             scene = with_nodes(scene, [in_place_of(node, own, scene.composition, RULE)])
     composition = scene.history[0].get("composition", "max") if inside else scene.composition
     return replace(scene, history=(), composition=composition), homes, missing
@@ -101,38 +101,40 @@ def leaf_of(node: dict) -> Leaf:
 
 
 def source_of(
-    told: dict, leaf: Leaf, bundle: OpenBundle, elsewhere: "Elsewhere", allow_outside: bool
+    info: dict, leaf: Leaf, bundle: OpenBundle, elsewhere: "SourceFolder", allow_outside: bool
 ) -> list[FoundField]:
     """The fields that a leaf of a bundle was made of, as its history tells: kept inside, or in a file that is
     as it was. Nothing where it is not found."""
-    kept = told.get("kept") or not told.get("sha256")
-    file = bundle if kept and bundle.placed(told.get("field", "")) else None
+    is_inside = info.get("kept") or not info.get("sha256")
+    file = bundle if is_inside and bundle.placed(info.get("field", "")) else None
     if file is None:
-        file = source_bundle(told, bundle.path, elsewhere, allow_outside)
-    parts = () if file is None else file.placed(told.get("field", ""))
-    if wanted := told.get("instance"):
-        parts = [part for part in parts if part.name == wanted]
-    found = []
+        file = source_bundle(info, bundle.path, elsewhere, allow_outside)
+    parts = () if file is None else file.placed(info.get("field", ""))
+    if instance := info.get("instance"):
+        parts = [part for part in parts if part.name == instance]
+    leaves = []
     for part in parts:
         name = leaf.name if len(parts) == 1 else f"{leaf.name}/{part.name}"
         inner = Leaf(name, part.member, None, part.object_to_field, False, tint=part.tint)
-        at_rest = bool(wanted)  # the leaf stands where that part stood
+        at_rest = bool(instance)  # the leaf stands where that part stood
         inner = replace(inner, object_to_world=np.eye(4), tint=(1.0, 1.0, 1.0)) if at_rest else inner
-        found.append((inner.inside(leaf), file, part.member))
-    return found
+        leaves.append((inner.inside(leaf), file, part.member))
+    return leaves
 
 
-def source_bundle(told: dict, path: Path, elsewhere: "Elsewhere", allow_outside: bool) -> OpenBundle | None:
+def source_bundle(
+    info: dict, path: Path, elsewhere: "SourceFolder", allow_outside: bool
+) -> OpenBundle | None:
     """The bundle that a history names by its checksum: where it was, else in the folder given."""
-    if not told.get("sha256"):
+    if not info.get("sha256"):
         return None
     folder = path.resolve().parent
-    named = (folder / told.get("source", "")).resolve()
+    named = (folder / info.get("source", "")).resolve()
     may_be_read = allow_outside or named.is_relative_to(folder)
-    if may_be_read and (bundle := unchanged(named, told["sha256"])):
+    if may_be_read and (bundle := unchanged(named, info["sha256"])):
         return bundle
-    file = elsewhere.find(told["sha256"])
-    return None if file is None else unchanged(file, told["sha256"])
+    file = elsewhere.find(info["sha256"])
+    return None if file is None else unchanged(file, info["sha256"])
 
 
 def unchanged(path: Path, sha256: str) -> OpenBundle | None:
@@ -143,7 +145,7 @@ def unchanged(path: Path, sha256: str) -> OpenBundle | None:
     return bundle if bundle.sha256 == sha256 else None
 
 
-class Elsewhere:
+class SourceFolder:
     """The bundles of a folder and of those in it, by checksum, each read once and only when it is needed."""
 
     def __init__(self, folder: str | None):
@@ -153,9 +155,9 @@ class Elsewhere:
     def find(self, sha256: str) -> Path | None:
         """The file of a checksum."""
         for path in self.left if sha256 not in self.known else ():
-            found = sha256_of(path)
-            self.known[found] = path
-            if found == sha256:
+            checksum = sha256_of(path)
+            self.known[checksum] = path
+            if checksum == sha256:
                 break
         return self.known.get(sha256)
 

@@ -13,35 +13,35 @@ from formats.meshes import mesh_capture
 from formats.photos import loading_bytes
 from formats.scene import SceneGraph
 from formats.views import Capture, check_parallax
-from fusedrf_cli.bridge.depths import known_points
-from fusedrf_cli.bridge.extent import Extent, check_flatness, extent_of
-from fusedrf_cli.bridge.heldout import measure, warn_of_holdout
+from fusedrf_cli.bridge.capture_cameras import cameras_of_capture
+from fusedrf_cli.bridge.depth_supervision import known_points
+from fusedrf_cli.bridge.holdout_evaluation import measure, warn_of_holdout
 from fusedrf_cli.bridge.memory import Memory, decoding, fitting, photos
 from fusedrf_cli.bridge.pictures import camera_of
+from fusedrf_cli.bridge.pose_refinement import aligned, moved, with_poses
 from fusedrf_cli.bridge.posing import posed_capture
-from fusedrf_cli.bridge.refined import aligned, moved, with_poses
-from fusedrf_cli.bridge.rigs import cameras_of_capture
-from fusedrf_cli.bridge.running import (
+from fusedrf_cli.bridge.runtime import (
     check_checkpoint,
     checkpoint_mismatch,
     checkpoint_path,
     engine,
-    held_back,
     load_checkpoint,
     resumable,
     take_up,
+    without_interrupts,
     written_somewhere,
 )
 from fusedrf_cli.bridge.scene import check_graph, refuse_options, stored, unusable_kind, write_field
+from fusedrf_cli.bridge.scene_bounds import SceneBounds, check_flatness, scene_bounds_of
 from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, camera_bytes, section_bytes
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
-from fusedrf_cli.engine.distillation.pixels import Pictures
-from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.distillation.ray_dataset import Pictures
+from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.builder import BuilderConfig, Plan, Section, StorageSetting
 from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.student import Plan, Section, StudentConfig, Way
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces.unbounded import REACH
 from fusedrf_cli.errors import InvalidInput, QualityNotReached, UsageProblem
@@ -50,7 +50,7 @@ from fusedrf_cli.requests import TrainRequest
 
 
 @dataclass(frozen=True)
-class Presets:
+class TrainPresets:
     """How a TrainConfig follows from the quality, the time and the bytes that are asked for."""
 
     draft: TrainConfig = TrainConfig(longest=128, steps=1500, samples=1 << 15)
@@ -78,7 +78,7 @@ class Presets:
     largest_unbounded: int = 95_000_000
     """Bytes, stored as its kind is by default, where no size is asked for: voxels of all of space, as fine as
     planes are, would take a hundred times those of the planes."""
-    hashed: Hashed = Hashed((2 * REACH / 256, 2 * REACH / 512, 2 * REACH / 1024), 1 << 20)
+    hashed: HashGrid = HashGrid((2 * REACH / 256, 2 * REACH / 512, 2 * REACH / 1024), 1 << 20)
     """What the texels of an unbounded scene cannot tell apart. The first level is coarser than they are:
     after as many steps a park shows 0.4 dB more with it than without; one more, of 128, takes half a dB."""
     hashed_from: float = 360.0
@@ -108,42 +108,44 @@ class Presets:
 
 def train(request: TrainRequest, progress) -> dict:
     """Fit one field to a capture and write it; with `holdout` every N-th view only measures."""
-    with engine(request.device, request.threads, progress) as place:
+    with engine(request.device, request.threads, progress) as device:
         memory = Memory(request.memory)
         check_checkpoint(request.output, request.resume, request.overwrite)
         saved = load_checkpoint(request.output, "train") if request.resume else None
         kind = trained_kind(request)
         progress.phase("reading", None)
         capture = read_views(request, progress)
-        cut_out = cuts_out(request, capture)
-        extent = extent_of(request, capture, cut_out)
-        check_flatness(extent)
-        suits = current(Presets).unbounded_precision if extent.unbounded else "float16"
+        cut_out = masks_object(request, capture)
+        bounds = scene_bounds_of(request, capture, cut_out)
+        check_flatness(bounds)
+        suits = current(TrainPresets).unbounded_precision if bounds.unbounded else "float16"
         request = replace(request, precision=request.precision or suits)
-        kept = cameras_of_capture(capture, cut_out, progress)
-        check_graph(request.output, Path(request.output).stem, extent.origin, SceneGraph((), cameras=kept))
-        settings = fit_settings(request, kind, capture, extent, place, camera_bytes(kept))
-        plan = kind.untrained(extent.box, settings.longest, settings.way)
-        check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(kept))
+        camera_content = cameras_of_capture(capture, cut_out, progress)
+        check_graph(
+            request.output, Path(request.output).stem, bounds.origin, SceneGraph((), cameras=camera_content)
+        )
+        settings = fit_settings(request, kind, capture, bounds, device, camera_bytes(camera_content))
+        plan = kind.untrained(bounds.box, settings.longest, settings.storage)
+        check_space(request.output, bytes_of(plan, request.precision) + camera_bytes(camera_content))
         memory.expect(
             loading(capture),
             fit_memory(capture, plan, settings),
             advice="use a smaller --max-size, fewer or smaller photos, or a lower --quality",
         )
-        cameras = [extent.camera(camera_of(v)) for v in capture.train]
+        cameras = [bounds.camera(camera_of(v)) for v in capture.train]
         pictures = pictures_of(request, capture)
-        known = known_points(capture, extent)
+        depth_points = known_points(capture, bounds)
         name = Path(request.source).resolve().stem
-        run = FitRun.start(cameras, pictures, extent.box, settings, name, extent.cells, known)
+        run = FitRun.start(cameras, pictures, bounds.box, settings, name, bounds.cells, depth_points)
         if saved:
             if saved[1].get("kind") != kind.name:
                 raise checkpoint_mismatch(request.output)
             take_up(run, saved, request.output)
         field, seconds = _run(run, request.output, progress)
-        with held_back(request.output):  # what was learnt comes before what is found out about it
+        with without_interrupts(request.output):  # what was learnt comes before what is found out about it
             if settings.poses:
-                capture = with_poses(capture, extent, run.pool.poses)
-                kept = cameras_of_capture(capture, cut_out, progress)
+                capture = with_poses(capture, bounds, run.pool.poses)
+                camera_content = cameras_of_capture(capture, cut_out, progress)
             size = written_somewhere(
                 request.output,
                 lambda output: write_field(
@@ -152,8 +154,8 @@ def train(request: TrainRequest, progress) -> dict:
                     Path(request.output).stem,
                     precision=request.precision,
                     overwrite=request.overwrite,
-                    origin=extent.origin,
-                    about=SceneGraph((), cameras=kept),
+                    origin=bounds.origin,
+                    about=SceneGraph((), cameras=camera_content),
                 ),
             )
             checkpoint_path(request.output).unlink(missing_ok=True)
@@ -161,9 +163,9 @@ def train(request: TrainRequest, progress) -> dict:
         measured = None
         if request.holdout:
             written = stored(field, request.precision)
-            measured = measure(written, capture, pictures, extent.origin, run.psnr)
+            measured = measure(written, capture, pictures, bounds.origin, run.psnr)
             if settings.poses:
-                measured["aligned"] = aligned(written, capture, extent, settings.near, request.seed)
+                measured["aligned"] = aligned(written, capture, bounds, settings.near, request.seed)
             if capture.kind != "mesh":
                 warn_of_holdout(request.output, measured, progress)
     report = {
@@ -172,7 +174,7 @@ def train(request: TrainRequest, progress) -> dict:
         "kind": field.kind,
         "views": len(capture.train),
         "capture": capture.summary(),
-        **extent.report(),
+        **bounds.report(),
         "steps": run.steps,
         **kind.describe(field),
         "seconds": {"training": seconds},
@@ -180,7 +182,7 @@ def train(request: TrainRequest, progress) -> dict:
         "holdout": measured,
         "depths_of_points": run.keypoints and len(run.keypoints.points),
         "exposure": exposure(run),
-        "poses": moved(run, cameras, extent) if settings.poses else None,
+        "poses": moved(run, cameras, bounds) if settings.poses else None,
         "memory": memory.report(),
         **run.guard.figures(),
     }
@@ -236,7 +238,7 @@ def read_views(request: TrainRequest, progress) -> Capture:
     return capture
 
 
-def cuts_out(request: TrainRequest, capture: Capture) -> bool:
+def masks_object(request: TrainRequest, capture: Capture) -> bool:
     """Whether masks cut an object out of its photos: what they exclude is to be transparent, or they keep so
     little of the photos' borders that the rest is learnt from pixels of the object alone."""
     transparent = request.masks == "alpha" and any(view.mask_path for view in capture.train)
@@ -251,26 +253,26 @@ def pictures_of(request: TrainRequest, capture: Capture) -> Pictures:
     return Pictures(loaded.pixels, loaded.ignored)
 
 
-def paced(seconds: float | None, place: str) -> float | None:
+def scaled_budget(seconds: float | None, device: str) -> float | None:
     """Seconds of two cores that a time budget at a place to compute counts as."""
-    return seconds and seconds * (current(Presets).gpu_pace if place == "cuda" else 1)
+    return seconds and seconds * (current(TrainPresets).gpu_pace if device == "cuda" else 1)
 
 
-def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: str) -> TrainConfig:
+def quality_of(request: TrainRequest, capture: Capture, bounds: SceneBounds, device: str) -> TrainConfig:
     """The settings of the asked quality, or, of an object, of the one that the time budget is enough for; the
     best of an object has texels as fine as the photos' pixels ask for, and fewer but larger steps."""
-    presets = current(Presets)
+    presets = current(TrainPresets)
     name = request.quality or "normal"
-    budget = paced(request.time_budget, place)
-    if request.quality is None and budget and not extent.unbounded:
+    budget = scaled_budget(request.time_budget, device)
+    if request.quality is None and budget and not bounds.unbounded:
         name = next(name for name, seconds in presets.patient if budget >= seconds)
     settings = getattr(presets, name)
-    if place == "cuda":
+    if device == "cuda":
         settings = replace(settings, samples=settings.samples * presets.gpu_samples)
-    if name != "best" or extent.unbounded:
+    if name != "best" or bounds.unbounded:
         return settings
-    centre, side = (extent.box[:3] + extent.box[3:]) / 2, (extent.box[3:] - extent.box[:3]).max()
-    cameras = [extent.camera(camera_of(view)) for view in capture.train]
+    centre, side = (bounds.box[:3] + bounds.box[3:]) / 2, (bounds.box[3:] - bounds.box[:3]).max()
+    cameras = [bounds.camera(camera_of(view)) for view in capture.train]
     away = [np.linalg.norm(camera.camera_to_world[:3, 3] - centre) for camera in cameras]
     pixels = np.median([c.fl_x * side / max(d, side / 2) for c, d in zip(cameras, away, strict=True)])
     longest = int(np.clip(round(presets.texels_per_pixel * pixels), settings.longest, presets.finest_object))
@@ -279,63 +281,63 @@ def quality_of(request: TrainRequest, capture: Capture, extent: Extent, place: s
 
 def with_larger_steps(settings: TrainConfig) -> TrainConfig:
     """More samples in a step, in as many fewer steps."""
-    more = current(Presets).more_samples
+    more = current(TrainPresets).more_samples
     return replace(settings, steps=settings.steps // more, samples=settings.samples * more)
 
 
 def fit_settings(
-    request: TrainRequest, kind: Kind, capture: Capture, extent: Extent, place: str, besides: int = 0
+    request: TrainRequest, kind: Kind, capture: Capture, bounds: SceneBounds, device: str, besides: int = 0
 ) -> TrainConfig:
     """How to fit; UsageProblem where not even the coarsest field is as small as asked, with `besides` more
     bytes in its bundle."""
     settings = replace(
-        quality_of(request, capture, extent, place),
+        quality_of(request, capture, bounds, device),
         kind=kind.name,
-        way=Way(request.precision, request.ranks, request.sh_degree),
+        storage=StorageSetting(request.precision, request.ranks, request.sh_degree),
         seed=request.seed,
         time_budget=request.time_budget,
         target_psnr=request.target_psnr,
-        opacity_weight=0.0 if capture.opaque and not cuts_out(request, capture) else 0.1,
-        near=extent.near,
-        unbounded=extent.unbounded,
-        exposure=extent.unbounded and capture.opaque,
+        opacity_weight=0.0 if capture.opaque and not masks_object(request, capture) else 0.1,
+        near=bounds.near,
+        unbounded=bounds.unbounded,
+        exposure=bounds.unbounded and capture.opaque,
         smooth=capture.opaque,
         poses=request.refine_poses,
-        device=place,
+        device=device,
     )
     room = request.max_size and max(1, request.max_size - besides)
-    if extent.unbounded:
-        settings = of_place(settings, kind, extent.box, room)
-    if request.max_size or not extent.unbounded:
-        longest = fitting_longest(kind, extent.box, settings, room, request.precision)
+    if bounds.unbounded:
+        settings = settings_of_part(settings, kind, bounds.box, room)
+    if request.max_size or not bounds.unbounded:
+        longest = fitting_longest(kind, bounds.box, settings, room, request.precision)
     else:  # however its numbers are stored
-        most = current(Presets).largest_unbounded
-        longest = fitting_longest(kind, extent.box, settings, most, kind.faithful)
-    plan = kind.untrained(extent.box, longest, settings.way)
+        most = current(TrainPresets).largest_unbounded
+        longest = fitting_longest(kind, bounds.box, settings, most, kind.faithful)
+    plan = kind.untrained(bounds.box, longest, settings.storage)
     check_size(bytes_of(plan, request.precision) + besides, request.max_size)
     return replace(settings, longest=longest)
 
 
-def of_place(settings: TrainConfig, kind: Kind, box: np.ndarray, room: int | None) -> TrainConfig:
+def settings_of_part(settings: TrainConfig, kind: Kind, box: np.ndarray, room: int | None) -> TrainConfig:
     """The settings of a field over a part (6,) of unbounded space, of at most `room` bytes: what has time to
     learn it, and the room, gets a hashed detail where its kind can have one, and others more texels the
     longer they learn."""
-    presets = current(Presets)
-    budget = paced(settings.time_budget, settings.device)
-    takes = section_bytes(Section("detail", presets.hashed.shape), settings.way.precision)
+    presets = current(TrainPresets)
+    budget = scaled_budget(settings.time_budget, settings.device)
+    takes = section_bytes(Section("detail", presets.hashed.shape), settings.storage.precision)
     fits = room is None or takes <= presets.hashed_share * room
     patient = budget is None or budget >= presets.hashed_from
     if kind.hashes and fits and patient and settings.steps >= presets.hashed_steps:
-        longest = texels_of_place(box, presets.hashed_texels * settings.longest)
-        way = replace(settings.way, hashed=presets.hashed)
-        settings = replace(settings, longest=longest, way=way)
+        longest = texels_of_part(box, presets.hashed_texels * settings.longest)
+        storage = replace(settings.storage, hashed=presets.hashed)
+        settings = replace(settings, longest=longest, storage=storage)
         return with_larger_steps(settings) if budget or settings.steps > presets.hashed_steps else settings
     patience = max(1.0, (budget or 0) / presets.more_texels_from)
     more = presets.unbounded_texels * min(presets.most_texels, patience**presets.more_texels_power)
-    return replace(settings, longest=texels_of_place(box, more * settings.longest))
+    return replace(settings, longest=texels_of_part(box, more * settings.longest))
 
 
-def texels_of_place(box: np.ndarray, longest: float) -> int:
+def texels_of_part(box: np.ndarray, longest: float) -> int:
     """Texels on the longest side of a part (6,) of unbounded space: planes over it have as many as those over
     all of space that have so many a side."""
     a, b, c = box[3:] - box[:3]
@@ -367,7 +369,7 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     with resumable(output, run.checkpoint, lambda: run.held, progress) as uninterrupted:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
     run.forget()
-    warn_of_numbers(run.guard.figures(), progress)
+    warn_of_nonfinite(run.guard.figures(), progress)
     if not run.found_matter:
         progress.warn(
             f"{output}: no matter was found, so that all of the box was kept; look at the photos' alpha, "
@@ -376,8 +378,8 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     return field, time.monotonic() - started
 
 
-def warn_of_numbers(figures: dict[str, int], progress) -> None:
-    """Say that steps were not finite, where some were (`Guard.figures`)."""
+def warn_of_nonfinite(figures: dict[str, int], progress) -> None:
+    """Say that steps were not finite, where some were (`NanGuard.figures`)."""
     if figures:
         progress.warn(
             f"{figures['skipped_steps']} steps were not finite and were skipped; returned "
@@ -394,10 +396,10 @@ def fitting_longest(
     longest = settings.longest
     while (
         max_size
-        and longest > current(StudentConfig).least_texels
-        and bytes_of(kind.untrained(box, longest, settings.way), precision) > max_size
+        and longest > current(BuilderConfig).least_texels
+        and bytes_of(kind.untrained(box, longest, settings.storage), precision) > max_size
     ):
-        longest -= current(Presets).fewer_texels
+        longest -= current(TrainPresets).fewer_texels
     return longest
 
 

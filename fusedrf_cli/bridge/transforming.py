@@ -7,7 +7,7 @@ from formats.graph import changed, chosen, moved, renamed, shown, with_nodes
 from formats.scene import Node
 from fusedrf_cli.bridge.deleting import EMPTIED, Deletion, released
 from fusedrf_cli.bridge.editing import SAME_BITS, Edit, brought
-from fusedrf_cli.bridge.running import engine
+from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.errors import InvalidInput
 from fusedrf_cli.requests import AddRequest, ArrangeRequest, ShowRequest
 
@@ -112,6 +112,6 @@ def renamed_inside(edit: Edit, name: str, new_name: str) -> dict:
 
 def about(matrix: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """(4, 4) that scales and turns about a point (3,) as `matrix` does about the origin, and then moves."""
-    found = matrix.copy()
-    found[:3, 3] += centre - matrix[:3, :3] @ centre
-    return found
+    moved = matrix.copy()
+    moved[:3, 3] += centre - matrix[:3, :3] @ centre
+    return moved

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from formats.camera_set import FARTHEST, CameraSet
 from formats.captures import read_cameras
-from formats.rig import FARTHEST, Rig
 from formats.views import NO_DISTORTION, View
+from fusedrf_cli.bridge.capture_cameras import camera_set_of, chosen_camera_set, view_box_in_frame
 from fusedrf_cli.bridge.pictures import camera_of
-from fusedrf_cli.bridge.rigs import chosen_rig, framed_box, rig_of
 from fusedrf_cli.bridge.scene import LoadedScene
 from fusedrf_cli.engine.rendering.cameras import UP, Camera, Outlook, azimuth_of, framing, framing_lens
 from fusedrf_cli.engine.settings import current
@@ -35,41 +35,41 @@ def choose_views(request: RenderRequest, scene: LoadedScene, field, origin: np.n
     one that frames everything. The field is the scene's, its frame lies at `origin` (see `render_image`)."""
     if request.cameras or request.path:
         return [camera_of(view) for view in read_cameras(request.cameras or request.path, request.size)]
-    rig, up = rig_of(scene), upward(request, scene)
+    camera_set, up = camera_set_of(scene), upward(request, scene)
     if request.views:
-        return [camera_of(sized(view, request.size)) for view in captured(request, scene, rig)]
-    if rig is not None and rig.surroundings:
-        photo = camera_of(sized(rig.typical, request.size))
+        return [camera_of(sized(view, request.size)) for view in captured(request, scene, camera_set)]
+    if camera_set is not None and camera_set.surroundings:
+        photo = camera_of(sized(camera_set.typical, request.size))
         if request.orbit is None and not aimed(request):
             return [photo]
-        lens, outlook = pinhole(photo), standing(rig, up)
+        lens, outlook = pinhole(photo), standing(camera_set, up)
     else:
         lens = framing_lens(*(request.size or current(ViewConfig).default_size))
-        outlook = replace(framing(framed_box(scene, field, origin), lens), up=up)
+        outlook = replace(framing(view_box_in_frame(scene, field, origin), lens), up=up)
     outlook = turned(outlook, request)
     if request.orbit is None:
         return [outlook.camera(lens)]
-    photographed = rig is not None and rig.surroundings and request.view_from is None
-    return outlook.orbit(lens, request.orbit, arc_of(rig, up) if photographed else None)
+    photographed = camera_set is not None and camera_set.surroundings and request.view_from is None
+    return outlook.orbit(lens, request.orbit, arc_of(camera_set, up) if photographed else None)
 
 
 def aimed(request: RenderRequest) -> bool:
     """Whether the view is to be other than the default one."""
-    asked = (request.look_at, request.view_from, request.up)
-    return any(word is not None for word in asked) or request.zoom != 1
+    options = (request.look_at, request.view_from, request.up)
+    return any(word is not None for word in options) or request.zoom != 1
 
 
 def upward(request: RenderRequest, scene: LoadedScene) -> np.ndarray:
-    """(3,) unit vector: which way of the world is up. As was asked for, or as photos of a place were held;
-    for anything else +z, but where the photos of one object were held quite otherwise."""
+    """(3,) unit vector: which way of the world is up. As was asked for, or as photos of an unbounded scene
+    were held; for anything else +z, but where the photos of one object were held quite otherwise."""
     if request.up is not None:
         up = np.array(request.up) / np.abs(request.up).max()
         return up / np.linalg.norm(up)
-    rig = rig_of(scene)
-    if rig is None or rig.surroundings:
-        return UP if rig is None else rig.up
-    own = scene.graph.cameras is not None and scene.graph.framing is None
-    return rig.up if own and rig.up @ UP < current(ViewConfig).leaning else UP
+    camera_set = camera_set_of(scene)
+    if camera_set is None or camera_set.surroundings:
+        return UP if camera_set is None else camera_set.up
+    has_own_cameras = scene.graph.cameras is not None and scene.graph.framing is None
+    return camera_set.up if has_own_cameras and camera_set.up @ UP < current(ViewConfig).leaning else UP
 
 
 def turned(outlook: Outlook, request: RenderRequest) -> Outlook:
@@ -99,18 +99,20 @@ def sized(view: View, size: tuple[int, int] | None) -> View:
     return view.reframed(*size) if size else view
 
 
-def standing(rig: Rig, up: np.ndarray) -> Outlook:
+def standing(camera_set: CameraSet, up: np.ndarray) -> Outlook:
     """The outlook on the focus of a rig from the median distance of its cameras and their height along `up`,
     a unit vector (3,), and from the side of the typical one."""
-    eye = rig.typical.camera_to_world[:3, 3]
-    elevation = float(np.arcsin(np.clip(rig.height(up) / rig.distance, -1, 1)))
-    return Outlook(rig.focus, rig.distance, azimuth_of(eye - rig.focus, up), elevation, up)
+    eye = camera_set.typical.camera_to_world[:3, 3]
+    elevation = float(np.arcsin(np.clip(camera_set.height(up) / camera_set.distance, -1, 1)))
+    return Outlook(
+        camera_set.focus, camera_set.distance, azimuth_of(eye - camera_set.focus, up), elevation, up
+    )
 
 
-def arc_of(rig: Rig, up: np.ndarray) -> tuple[float, float] | None:
+def arc_of(camera_set: CameraSet, up: np.ndarray) -> tuple[float, float] | None:
     """The azimuths about `up` between which the cameras of a rig stand around its focus, the second the
-    larger; None where they stand all around. What no camera saw of a place is fog."""
-    around = np.sort([azimuth_of(eye - rig.focus, up) for eye in rig.poses[:, :3, 3]])
+    larger; None where they stand all around. What no camera saw of an unbounded scene is floaters."""
+    around = np.sort([azimuth_of(eye - camera_set.focus, up) for eye in camera_set.poses[:, :3, 3]])
     gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
     widest = int(gaps.argmax())
     if gaps[widest] < current(ViewConfig).one_sided:
@@ -125,38 +127,40 @@ def pinhole(camera: Camera) -> Camera:
     return replace(camera, **centre, distortion=NO_DISTORTION, fisheye=False, name="view")
 
 
-def captured(request: RenderRequest, scene: LoadedScene, rig: Rig | None) -> tuple[View, ...]:
+def captured(request: RenderRequest, scene: LoadedScene, camera_set: CameraSet | None) -> tuple[View, ...]:
     """The views of --views, each with a name of its own; InvalidInput where the scene keeps none."""
-    if rig is None:
+    if camera_set is None:
         raise InvalidInput(f"{request.scene}: {why_no_cameras(scene)}")
-    if request.views == "heldout" and not rig.test:
+    if request.views == "heldout" and not camera_set.test:
         raise InvalidInput(
-            f"{request.scene}: none of its {len(rig.views)} cameras was held out; give --views capture, or "
-            "train with --holdout N"
+            f"{request.scene}: none of its {len(camera_set.views)} cameras was held out; give --views "
+            "capture, or train with --holdout N"
         )
     if request.views == "heldout":
-        return rig.test
-    taken = {view.name for view in rig.train}
-    return rig.train + tuple(replace(view, name=free_name(view.name, taken)) for view in rig.test)
+        return camera_set.test
+    names = {view.name for view in camera_set.train}
+    return camera_set.train + tuple(
+        replace(view, name=free_name(view.name, names)) for view in camera_set.test
+    )
 
 
-def free_name(name: str, taken: set[str]) -> str:
+def free_name(name: str, names: set[str]) -> str:
     """A name that no other picture has, which is taken from now on: the photos that are held out may be named
     as those that are not."""
-    while name in taken:
+    while name in names:
         name = f"{name}_heldout"
-    taken.add(name)
+    names.add(name)
     return name
 
 
 def why_no_cameras(scene: LoadedScene) -> str:
     """Why --views has none to take, and what helps."""
-    if (source := chosen_rig(scene.rigs)) is not None:
+    if (source := chosen_camera_set(scene.camera_sets)) is not None:
         return (
             f"the cameras of '{source.name}' cannot follow a placement that stretches, shears or mirrors it; "
             "give --cameras"
         )
-    if scene.rigs:
-        names = ", ".join(f"'{rig.name}'" for rig in scene.rigs)
+    if scene.camera_sets:
+        names = ", ".join(f"'{camera_set.name}'" for camera_set in scene.camera_sets)
         return f"{names} each keep cameras; mark one of them by --background-node, or give --cameras"
     return "keeps no cameras of a capture; train it again from its photos, or give --cameras"

@@ -12,10 +12,10 @@ import torch
 
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm_mlp.field import FEATURE_DEGREE, VMMLPField, VMMLPShape, weight_shapes
 from tests.analytic.fields import NOISE_NODES, SHIFT, AnalyticField, Tint
@@ -26,9 +26,9 @@ Y0, Y1 = 0.28209479177387814, 0.4886025119029199  # constants of the first two S
 CELLS = 4  # of the occupancy, per axis
 
 
-def way_of(shape: VMShape) -> Way:
+def way_of(shape: VMShape) -> StorageSetting:
     """The way in which a student has a shape."""
-    return Way(ranks=(shape.density_rank, shape.colour_rank), sh_degree=shape.sh_degree)
+    return StorageSetting(ranks=(shape.density_rank, shape.colour_rank), sh_degree=shape.sh_degree)
 
 
 class NotExportable(ValueError):
@@ -132,10 +132,10 @@ def sparse_field(field: AnalyticField, resolution: tuple[int, int, int] = (NOISE
     top = (box[3:] - box[:3]) / voxels * SIDE
     tree = BrickTree.of(box[:3], top, counts, np.zeros(len(at), np.uint8), at, mask)
     degree = {0: 1, 5: 2, 12: 3}[tint.bands.shape[1]]
-    sparse = SparseField(SparseShape(degree), Lattice(tree, SIDE), told.scale)
-    x, y, z = sparse.fine.places.T
+    sparse = SparseField(SparseShape(degree), VertexLattice(tree, SIDE), told.scale)
+    x, y, z = sparse.fine.positions.T
     sparse.rows[:, 0] = torch.from_numpy(SHIFT + sum((a(x) * b(y) * c(z) for a, b, c in told.terms), 0 * x))
-    level = np.asarray(tint.level) + sparse.fine.places @ tint.slope.T
+    level = np.asarray(tint.level) + sparse.fine.positions @ tint.slope.T
     sparse.rows[:, 1:] = torch.from_numpy(level / Y0)
     bands = np.concatenate([tint.facing[:, [1, 2, 0]] / (np.array([-1, 1, -1]) * Y1), tint.bands], 1)
     sparse.bands[:] = torch.from_numpy(bands.ravel())

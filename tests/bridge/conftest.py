@@ -17,21 +17,21 @@ from formats.captures import write_capture
 from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from formats.views import View
-from fusedrf_cli.bridge.looks import LookConfig
-from fusedrf_cli.bridge.making import MakingConfig
-from fusedrf_cli.bridge.mending import MendingConfig
+from fusedrf_cli.bridge.building import BuildingConfig
+from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
+from fusedrf_cli.bridge.inpainting import InpaintingConfig
 from fusedrf_cli.bridge.scene import write_field
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
-from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
+from fusedrf_cli.engine.distillation.finetune import FinetuneConfig, FinetuneRays
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds import instances
-from fusedrf_cli.engine.kinds.asked import AskedStudent
-from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
-from fusedrf_cli.engine.kinds.student import DistilConfig, Student
+from fusedrf_cli.engine.kinds.builder import DistilConfig, DistilledBuilder
+from fusedrf_cli.engine.kinds.resampled import ResampledBuilder
+from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
+from fusedrf_cli.engine.kinds.vm.builder import VMConfig
 from fusedrf_cli.engine.kinds.vm.field import VMField
-from fusedrf_cli.engine.kinds.vm.students import VMConfig
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
 from fusedrf_cli.engine.settings import using
@@ -104,23 +104,25 @@ def write_views(folder: Path, field=None, at=(0.0, 0.0, 0.0), side: int = 24, ar
 DRAFT = TrainConfig(longest=24, steps=60, samples=1 << 13, steps_to_show=1)
 TINY = (
     OccupancyConfig(scene_cells=48),
-    LookConfig(whole=2, most_objects=0),
-    MakingConfig(views=2),
+    EvaluationViewConfig(whole=2, most_objects=0),
+    BuildingConfig(views=2),
     VMConfig(SHAPE),
-    MendingConfig(settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),
-    Presets(DRAFT, DRAFT, DRAFT, DRAFT),
+    InpaintingConfig(settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),
+    TrainPresets(DRAFT, DRAFT, DRAFT, DRAFT),
 )
 """Coarse grids, few steps, and few pictures to judge by."""
 
 
 def make_tiny(patch: pytest.MonkeyPatch) -> None:
     """Few steps, small pictures: what is tested here is the way, not the quality."""
-    patch.setattr(Student, "lesson", TinySettings())
-    patch.setattr(part("making"), "DistilConfig", TinySettings)  # for students that are not taught
-    for made in (SparseStudent, AskedStudent):
-        patch.setattr(made, "lesson", replace(made.lesson, points_per_step=1 << 13, views=2, view_size=32))
-    patch.setattr(instances.InstancesStudent, "ranks", (None,))  # others would be compiled
-    patch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
+    patch.setattr(DistilledBuilder, "distil_config", TinySettings())
+    patch.setattr(part("building"), "DistilConfig", TinySettings)  # for students that are not taught
+    for made in (SparseBuilder, ResampledBuilder):
+        patch.setattr(
+            made, "distil_config", replace(made.distil_config, points_per_step=1 << 13, views=2, view_size=32)
+        )
+    patch.setattr(instances.InstancesBuilder, "ranks", (None,))  # others would be compiled
+    patch.setattr(FinetuneRays, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
 
 
 @pytest.fixture(scope="module", autouse=True)

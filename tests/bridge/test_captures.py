@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from formats.images import read_image, write_png
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from tests.formats.test_captures import looking_at
 from tests.formats.test_readers import binary_model
@@ -18,7 +18,7 @@ DRAFT = ("--quality", "draft")
 def short(in_force):
     """Steps, not seconds, decide, so that a busy machine changes nothing."""
     settings = TrainConfig(longest=16, steps=300, samples=1 << 12)
-    in_force(Presets(draft=settings))
+    in_force(TrainPresets(draft=settings))
 
 
 def eyes(count: int) -> list[np.ndarray]:

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from fusedrf_cli import plots
-from fusedrf_cli.bridge.ladders import flags_of, in_words
+from fusedrf_cli.bridge.sweep_flags import flags_of, in_words
 from fusedrf_cli.commands.fuse import command as fuse_command
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.instances import InstancesConfig
-from fusedrf_cli.engine.kinds.ladders import Rung, by_sizes, readable_floor, shrinking
+from fusedrf_cli.engine.kinds.sweeps import SweepPoint, by_sizes, readable_floor, shrinking
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.errors import InvalidInput, ResourceProblem
 from fusedrf_cli.option_types import BytesType
@@ -36,8 +36,8 @@ def charted(shop, tmp_path_factory):
     folder = shutil.copytree(shop, tmp_path_factory.mktemp("charted") / "shop")
     module, made = part("charting"), []
     one = ("float16",)
-    ladder = InstancesConfig(ladder_precisions=one, ladder_finished=one, ladder_ranks=(None,))
-    with pytest.MonkeyPatch.context() as patch, using(ladder):
+    sweep = InstancesConfig(ladder_precisions=one, ladder_finished=one, ladder_ranks=(None,))
+    with pytest.MonkeyPatch.context() as patch, using(sweep):
 
         def noted(*words):
             report = fuse(*words)
@@ -55,7 +55,7 @@ def test_a_label_is_the_flags_that_give_the_point(charted, report, folder):
     """All of them, to the byte."""
     _, said, made = charted
     assert 3 <= len(said["points"]) == said["tried"]
-    assert {"--no-rgb" in p["flags"] for p in said["points"]} == {True, False}
+    assert {"--no-finetune" in p["flags"] for p in said["points"]} == {True, False}
     for point in said["points"]:
         report("fuse", "scene.json", "-o", "again.rfpack", "-w", *point["flags"].split())
         assert (folder / "again.rfpack").read_bytes() in made
@@ -182,7 +182,7 @@ def climbing(
         return {"bytes": int(size), "total_seconds": seconds[kind]}
 
     monkeypatch.setattr(module, "fuse", fuse)
-    waiting = {k: {k: [shrinking(Rung(), 0)]} for k in seconds}
+    waiting = {k: {k: [shrinking(SweepPoint(), 0)]} for k in seconds}
     return lambda budget: (run.climb(waiting, budget), run.points, heard.warnings)
 
 
@@ -201,9 +201,9 @@ def test_a_kind_that_others_surpass_gets_a_third_of_the_time(monkeypatch):
 def test_a_ladder_that_is_surpassed_waits_and_is_not_forgotten():
     """The second one's first rung shows 2 dB less than the other in more bytes, its next ones are as good."""
     chart = part("charting")
-    ahead, slow, new = (chart.Climber(shrinking(Rung(), 30), Rung()) for _ in range(3))
-    for climber, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
-        climber.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
+    ahead, slow, new = (chart.SweepRun(shrinking(SweepPoint(), 30), SweepPoint()) for _ in range(3))
+    for run, psnr, size in ((ahead, 50, 9), (slow, 48, 10), (ahead, 47, 6)):
+        run.points.append(point(psnr=psnr, bytes=size, seconds=1.0))
     found = [*ahead.points, *slow.points]
     assert slow.behind(found) and not ahead.behind(found)
     slow.points.append(point(psnr=46.9, bytes=6, seconds=1.0))
@@ -228,28 +228,28 @@ def test_where_nothing_fits_the_reason_is_told(monkeypatch):
 # --- ladders ------------------------------------------------------------------------------------------------
 
 
-def climbed(ladder, give) -> list[Rung]:
+def climbed(sweep, give) -> list[SweepPoint]:
     """All rungs of a ladder, where give(rung) is (bytes, PSNR) or None."""
-    rungs = [next(ladder)]
+    rungs = [next(sweep)]
     while True:
         try:
-            rungs.append(ladder.send(give(rungs[-1])))
+            rungs.append(sweep.send(give(rungs[-1])))
         except StopIteration:
             return rungs
 
 
 def test_a_ladder_shrinks_until_quality_is_lost():
     psnrs = iter((50.0, 45.0, 40.0, 29.0))
-    rungs = climbed(shrinking(Rung(), 30), lambda rung: (18_400_000, next(psnrs)))
+    rungs = climbed(shrinking(SweepPoint(), 30), lambda sweep_point: (18_400_000, next(psnrs)))
     assert [r.max_size for r in rungs] == [None, 12_000_000, 8_000_000, 5_300_000]
-    assert climbed(shrinking(Rung(), 30), lambda rung: None) == [Rung()]
-    assert climbed(shrinking(Rung(), 30), lambda rung: (400_000, 99.0))[-1].max_size == 48_000
+    assert climbed(shrinking(SweepPoint(), 30), lambda sweep_point: None) == [SweepPoint()]
+    assert climbed(shrinking(SweepPoint(), 30), lambda sweep_point: (400_000, 99.0))[-1].max_size == 48_000
 
 
 def test_a_distilled_ladder_goes_on_past_what_does_not_fit():
-    rungs = climbed(by_sizes(), lambda rung: None)
+    rungs = climbed(by_sizes(), lambda sweep_point: None)
     assert len(rungs) == len(set(rungs)) == 24
-    assert all(rung.time_budget is None for rung in rungs[-6:])
+    assert all(sweep_point.time_budget is None for sweep_point in rungs[-6:])
 
 
 @pytest.mark.parametrize("size", [1, 9, 10, 99, 100, 51_234, 949_999, 999_999, 1_000_000, 12_345_678.9])
@@ -261,11 +261,11 @@ def test_sizes_are_rounded_down_to_what_the_flag_reads_back(size):
 
 @pytest.mark.parametrize("kind", registry.names())
 def test_the_flags_of_a_rung_are_its_keywords(kind):
-    for ladder in itertools.chain(*registry.kind(kind).ladders(30).values()):
-        rung = next(ladder)
-        line = ["-", "-o", "-", *flags_of(kind, rung, seed=7).split()]
+    for sweep in itertools.chain(*registry.kind(kind).sweeps(30).values()):
+        sweep_point = next(sweep)
+        line = ["-", "-o", "-", *flags_of(kind, sweep_point, seed=7).split()]
         words = fuse_command.make_context("fuse", line).params
-        assert {name: words[name] for name in asdict(rung)} == asdict(rung)
+        assert {name: words[name] for name in asdict(sweep_point)} == asdict(sweep_point)
         assert (words["kind"], words["seed"]) == (kind, 7)
 
 

@@ -20,7 +20,7 @@ def sent(monkeypatch) -> list[tuple[str, str]]:
     """(kind, device) of every field that is asked to go somewhere; none does."""
     found = []
     monkeypatch.setattr(
-        ComputedField, "to", lambda self, place: found.append((self.kind, str(place))) or self
+        ComputedField, "to", lambda self, device: found.append((self.kind, str(device))) or self
     )
 
     return found
@@ -30,5 +30,5 @@ def sent(monkeypatch) -> list[tuple[str, str]]:
 def test_every_kind_is_asked_where_it_should_be(tmp_path, sent, kind):
     path = str(tmp_path / "one.rfpack")
     write_field(path, STORED[kind], "one", precision="float16", overwrite=False)
-    opened(load_scene(path, place="cuda").placed[0].field)
+    opened(load_scene(path, device="cuda").placed[0].field)
     assert (kind, "cuda") in sent

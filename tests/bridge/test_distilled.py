@@ -10,8 +10,8 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.bridge.conftest import FIELDS, PLACES, done
 from tests.bridge.test_edit import blues, covered
 
-VM = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
-SPARSE = ("--kind", "sparse", "--no-rgb", "--max-size", "600kB")
+VM = ("--kind", "vm", "--no-finetune", "--max-size", "400kB")
+SPARSE = ("--kind", "sparse", "--no-finetune", "--max-size", "600kB")
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_it_moves_as_a_node_of_the_numbers_of_its_source(report, picture, folder
     (leaf,) = [leaf for leaf in scene.leaves() if leaf.name == "blue"]
     assert leaf.field in read_bundle(folder / "blue.rfpack").fields
     np.testing.assert_allclose(leaf.object_to_world[:3, 3], np.add(PLACES["blue"], (0, 0, 0.5)))
-    report("delete", "vm.rfpack", "blue", "--no-rgb", "-o", "less.rfpack")
+    report("delete", "vm.rfpack", "blue", "--no-finetune", "-o", "less.rfpack")
     words = ("--name", "blue", "-t", "0.7,0,0.5", "-o", "wanted.rfpack")
     report("add", "less.rfpack", "blue.rfpack", *words)
     assert psnr(picture("moved.rfpack"), picture("wanted.rfpack")) > 50
@@ -99,7 +99,7 @@ def test_its_name_is_changed_in_the_history_alone(report, run, folder):
     assert was.fields.keys() == now.fields.keys() and was.scene.nodes == now.scene.nodes
     assert [part["name"] for part in report("info", "named.rfpack")["objects"]] == ["floor", "red", "azure"]
     assert run("move", "named.rfpack", "blue", "-t", "1,0,0", "-o", "x.rfpack").exit_code == 3
-    report("delete", "named.rfpack", "azure", "--no-rgb", "-o", "less.rfpack")
+    report("delete", "named.rfpack", "azure", "--no-finetune", "-o", "less.rfpack")
 
 
 def test_info_lists_them_under_the_node_of_their_field(report, run):

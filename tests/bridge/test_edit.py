@@ -10,7 +10,7 @@ from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.bridge.conftest import FIELDS, PLACES, done, write_views
 
-VM = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
+VM = ("--kind", "vm", "--no-finetune", "--max-size", "400kB")
 AT = ("--name", "blue", "-t", "0.7,0,0")
 
 
@@ -90,7 +90,7 @@ def test_a_distilled_object_is_cut_out_and_the_rest_learnt_again(report, picture
         for name in FIELDS:
             (folder / f"{name}.rfpack").unlink()
     before = picture(bundle)
-    said = report("delete", bundle, "blue", "-o", "less.rfpack", "--no-rgb")
+    said = report("delete", bundle, "blue", "-o", "less.rfpack", "--no-finetune")
     assert (
         said["warnings"] == [] and read_bundle(folder / "less.rfpack").scene.history[-1]["restored"] is True
     )
@@ -102,7 +102,7 @@ def test_a_distilled_object_is_cut_out_and_the_rest_learnt_again(report, picture
 def test_without_its_sources_a_hole_stays_and_is_said(report, picture, folder):
     gone, wanted, before = covered("blue", -0.1), picture("pair.json"), picture("vm.rfpack")
     (folder / "floor.rfpack").write_bytes(b"another file")
-    said = report("delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
+    said = report("delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-finetune")
     assert any("the source of 'floor' is gone, has changed" in w for w in said["warnings"])
     assert read_bundle(folder / "less.rfpack").scene.history[-1]["restored"] is False
     after = picture("less.rfpack")
@@ -112,9 +112,9 @@ def test_without_its_sources_a_hole_stays_and_is_said(report, picture, folder):
 def test_sources_outside_are_read_only_where_allowed(report, folder):
     (folder / "inner").mkdir()
     report("fuse", "scene.json", "-o", "inner/vm.rfpack", *VM)
-    said = report("delete", "inner/vm.rfpack", "blue", "-o", "a.rfpack", "--no-rgb")
+    said = report("delete", "inner/vm.rfpack", "blue", "-o", "a.rfpack", "--no-finetune")
     assert said["warnings"]
-    said = report("delete", "inner/vm.rfpack", "blue", "-o", "b.rfpack", "--no-rgb", "--allow-outside")
+    said = report("delete", "inner/vm.rfpack", "blue", "-o", "b.rfpack", "--no-finetune", "--allow-outside")
     assert not said["warnings"]
 
 
@@ -155,7 +155,7 @@ def test_photos_of_the_place_show_what_an_object_hid(report, picture, folder):
     gone, wanted, before = covered("blue", -0.1), picture("pair.json"), picture("vm.rfpack")
     write_views(folder / "place", FIELDS["floor"], PLACES["floor"], 48, 16)
     (folder / "floor.rfpack").write_bytes(b"another file")
-    words = ("--refit", "place", "--time-budget", "4", "--no-rgb")
+    words = ("--refit", "place", "--time-budget", "4", "--no-finetune")
     said = report("delete", "vm.rfpack", "blue", *words, "-o", "less.rfpack")
     assert said["restored"] is True and said["photos"] == 32
     after, away = picture("less.rfpack"), ~covered("blue", 0.3)

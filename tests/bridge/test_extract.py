@@ -8,10 +8,10 @@ import pytest
 import trimesh
 
 from formats.bundle import read_bundle
+from formats.camera_set import read_camera_set
 from formats.captures import read_capture
 from formats.images import write_png
 from formats.photos import load_photos
-from formats.rig import read_rig
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.scene import load_scene
@@ -55,7 +55,7 @@ def fused(shop, tmp_path_factory):
             f"{kind}.rfpack",
             "--kind",
             kind,
-            "--no-rgb",
+            "--no-finetune",
             "--max-size",
             size,
         )
@@ -103,9 +103,9 @@ def iou(folder, bundle: str) -> float:
 
 @pytest.mark.parametrize("kind", ["blocks", "vm", "sparse", "dense"])
 @pytest.mark.parametrize("way", WAYS)
-def test_the_object_is_it_and_with_the_rest_it_is_the_field(report, folder, kind, way):
-    said = report("extract", f"{kind}.rfpack", *WAYS[way], "-o", "object.rfpack")
-    report("extract", f"{kind}.rfpack", *WAYS[way], "--invert", "-o", "rest.rfpack")
+def test_the_object_is_it_and_with_the_rest_it_is_the_field(report, folder, kind, storage):
+    said = report("extract", f"{kind}.rfpack", *WAYS[storage], "-o", "object.rfpack")
+    report("extract", f"{kind}.rfpack", *WAYS[storage], "--invert", "-o", "rest.rfpack")
     assert iou(folder, "object.rfpack") > (0.9 if kind == "blocks" else 0.8)  # learnt, and coarse
     assert said["sure"] > 0.8 and said["kind"] == ("vm" if kind == "blocks" else kind)
     np.testing.assert_allclose(said["box"], [-0.8, -0.3, -0.3, -0.2, 0.3, 0.3], atol=0.13)
@@ -152,7 +152,7 @@ def test_the_object_keeps_its_cameras_and_stands_free(report, folder):
     report("train", "photos", "-o", "trained.rfpack", "--holdout", "4")
     report("extract", "trained.rfpack", "--box", "-1,-1,-1,0.02,1,1", "-o", "half.rfpack")
     scene = read_bundle(folder / "half.rfpack").scene
-    assert scene.cameras is not None and not read_rig(scene.cameras).surroundings
+    assert scene.cameras is not None and not read_camera_set(scene.cameras).surroundings
     assert scene.framing[3] < 0.1
 
 
@@ -257,7 +257,7 @@ def test_photos_do_not_teach_what_they_do_not_show(tmp_path):
     write_views(tmp_path / "red")
     capture = read_capture(tmp_path / "red", None)
     cameras = [camera_of(view) for view in capture.train]
-    pictures = part("mending").without(FIELDS["red"], capture, cameras, NullProgress())
+    pictures = part("inpainting").without(FIELDS["red"], capture, cameras, NullProgress())
     shown = load_photos(capture.train).pixels[:, 3] > 8
     assert shown.mean() > 0.1 and pictures.ignored[shown].all() and not pictures.ignored.all()
 

@@ -130,7 +130,7 @@ def test_scenes_and_what_is_made_of_them_show_the_same(worlds, name):
     here, there = worlds("ordinary"), worlds(name)
     bundles = ("pair", "three", "moved", "less", "alone", "two", "cut")
     for scene in ("scene.json", *(f"{bundle}.rfpack" for bundle in bundles)):
-        views = (("--orbit", "2"), ("--from", "30,20", "--zoom", "1.5"))
+        views = (("--orbit", "2"), ("--view-from", "30,20", "--zoom", "1.5"))
         for words in views:
             one, other = here.pictures(scene, *words, *SIDE), there.pictures(scene, *words, *SIDE)
             assert psnr(one, other) >= 60 and one.std() > 0.05

@@ -10,14 +10,14 @@ from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.engine.rendering.metrics import PSNR_CAP, psnr
 from tests.bridge.conftest import done, part, write_scene_of
 
-VM = ("--kind", "vm", "--no-rgb", "--max-size", "300kB")
+VM = ("--kind", "vm", "--no-finetune", "--max-size", "300kB")
 
 
 def test_a_scene_becomes_blocks_that_look_the_same(report, folder, picture):
     said = report("fuse", "scene.json", "-o", "fused.rfpack")
     assert said["kind"] == "blocks" and said["psnr"]["before_rgb"] == PSNR_CAP
     assert said["bytes"] == (folder / "fused.rfpack").stat().st_size
-    for how in ((), ("--naive",)):
+    for how in ((), ("--reference",)):
         assert psnr(picture("fused.rfpack", *how), picture("scene.json", *how)) == PSNR_CAP
     scene = read_bundle(folder / "fused.rfpack").scene
     (entry,) = scene.history
@@ -53,7 +53,7 @@ def test_the_file_is_no_larger_than_asked(report, folder, kind):
     whole = report("fuse", "pair.json", "-o", "whole.rfpack")["bytes"]
     limit = {"blocks": 10_000 + whole // 2, "vm": 70_000 + whole // 3}[kind]
     said = report(
-        "fuse", "pair.json", "-o", "less.rfpack", "--kind", kind, "--no-rgb", "--max-size", str(limit)
+        "fuse", "pair.json", "-o", "less.rfpack", "--kind", kind, "--no-finetune", "--max-size", str(limit)
     )
     assert said["bytes"] <= limit and (kind == "vm" or said["bytes"] < whole)
 
@@ -93,7 +93,7 @@ def test_a_target_takes_the_fewest_bytes_that_reach_it(report, folder, picture):
 
 
 def test_what_cannot_be_reached_gives_the_best_there_is(run, folder):
-    result = run("fuse", "pair.json", "-o", "best.rfpack", "--target-psnr", "150", "--no-rgb", "--json")
+    result = run("fuse", "pair.json", "-o", "best.rfpack", "--target-psnr", "150", "--no-finetune", "--json")
     assert result.exit_code == 7 and json.loads(result.stdout)["psnr"]["before_rgb"] > 40
 
 
@@ -101,7 +101,7 @@ def test_what_is_asked_for_is_kept(report):
     """All in one command, since other ranks and degrees are compiled."""
     asked = {"--precision": "int8", "--ranks": "8,8", "--sh-degree": "0"}
     words = [word for pair in asked.items() for word in pair]
-    said = report("fuse", "pair.json", "-o", "asked.rfpack", "--no-rgb", *words)
+    said = report("fuse", "pair.json", "-o", "asked.rfpack", "--no-finetune", *words)
     flags = said["chosen"]["flags"].split()
     assert {flag: flags[flags.index(flag) + 1] for flag in asked} == asked
 
@@ -118,7 +118,7 @@ def test_a_stretched_object_is_warned_of(report, folder):
 
 @pytest.mark.parametrize("kind", ["blocks", "vm"])
 def test_a_size_that_nothing_fits_is_refused(run, folder, kind):
-    result = run("fuse", "pair.json", "-o", "no.rfpack", "--kind", kind, "--no-rgb", "--max-size", "12")
+    result = run("fuse", "pair.json", "-o", "no.rfpack", "--kind", kind, "--no-finetune", "--max-size", "12")
     assert result.exit_code == 2 and "--max-size is too small" in result.stderr
     assert not (folder / "no.rfpack").exists()
 
@@ -164,7 +164,7 @@ def test_an_interrupt_after_the_choice_leaves_the_output(report, run, folder, mo
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(part("making").Maker, "verdict", stop)
+        patch.setattr(part("building").Maker, "evaluate", stop)
         result = run("fuse", "pair.json", *VM, "-o", "fused.rfpack")
     assert result.exit_code == 130 and "fused.rfpack is written whole" in result.stderr
     assert report("eval", "fused.rfpack", "--against", "pair.json", "--size", "16x16")
@@ -178,7 +178,7 @@ def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
         patch.setattr("fusedrf_cli.engine.distillation.distill.ask", stop)
         assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM).exit_code == 130
     assert not (folder / "fused.rfpack").exists() and (folder / "fused.rfpack.checkpoint").exists()
-    for other in (("--max-size", "80kB"), ("--seed", "5"), ("--rgb",), ("--from-scratch",)):
+    for other in (("--max-size", "80kB"), ("--seed", "5"), ("--finetune",), ("--from-scratch",)):
         wrong = run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume", *other)
         assert wrong.exit_code == 3 and "other settings" in wrong.stderr, other
     assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM, "--resume").exit_code == 0

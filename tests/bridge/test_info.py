@@ -5,7 +5,7 @@ import pytest
 
 from tests.bridge.conftest import PLACES
 
-SMALL = ("--seed", "0", "--no-rgb")
+SMALL = ("--seed", "0", "--no-finetune")
 
 
 def place(part: dict) -> list[float]:

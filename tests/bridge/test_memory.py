@@ -20,16 +20,16 @@ from formats.bundle import OpenBundle, single_field_bundle
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge import memory, training
+from fusedrf_cli.bridge.field_cache import FieldCache
 from fusedrf_cli.bridge.memory import Memory
-from fusedrf_cli.bridge.running import load_checkpoint, save_checkpoint
+from fusedrf_cli.bridge.runtime import load_checkpoint, save_checkpoint
 from fusedrf_cli.bridge.scene import load_scene, needs_of, write_field
-from fusedrf_cli.bridge.shelf import Shelf
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.kinds.vm_mlp.field import untrained
 from fusedrf_cli.engine.rendering.volume import render_rays
@@ -124,10 +124,10 @@ def test_what_is_free_heeds_a_control_group(monkeypatch):
 def test_sources_that_do_not_fit_are_read_again(report, folder, picture):
     """The picture of a scene is the same with room for one field as with room for all."""
     loaded = load_scene(str(folder / "scene.json"))
-    loaded.shelf.resize(max(loaded.sizes))
+    loaded.field_cache.resize(max(loaded.sizes))
     reads = []
-    take = loaded.shelf.take
-    loaded.shelf.take = lambda key, size, read: take(key, size, lambda: reads.append(key) or read())
+    take = loaded.field_cache.take
+    loaded.field_cache.take = lambda key, size, read: take(key, size, lambda: reads.append(key) or read())
     rays = np.tile([[0.0, 0, 5.0]], (3, 1)), np.tile([[0.0, 0, -1.0]], (3, 1))
     found = render_rays(loaded.composed(), *rays)
     assert len(reads) > 3
@@ -135,13 +135,13 @@ def test_sources_that_do_not_fit_are_read_again(report, folder, picture):
 
 
 def test_a_shelf_keeps_what_was_asked_for_last():
-    shelf, reads = Shelf(10), []
+    field_cache, reads = FieldCache(10), []
     for key in "abacab":
-        shelf.take(key, 5, lambda key=key: reads.append(key) or key)
+        field_cache.take(key, 5, lambda key=key: reads.append(key) or key)
     assert "".join(reads) == "abcb"
-    shelf.resize(0)
-    shelf.take("z", 50, lambda: "z")
-    assert shelf.take("z", 50, lambda: pytest.fail("read again")) == "z"
+    field_cache.resize(0)
+    field_cache.take("z", 50, lambda: "z")
+    assert field_cache.take("z", 50, lambda: pytest.fail("read again")) == "z"
 
 
 # -- few bytes that say many numbers -------------------------------------------------------------------------
@@ -199,7 +199,7 @@ def bricks(path: Path, side: int, level: int = 0) -> Path:
     counts = tuple(at.max(0) + 1)
     masks = np.ones((len(at), 4, 4, 4), bool)
     tree = BrickTree.of(np.zeros(3), 1 / side, counts, np.full(len(at), level, np.uint8), at << level, masks)
-    field = SparseField(SparseShape(), Lattice(tree, 4), 1.0)
+    field = SparseField(SparseShape(), VertexLattice(tree, 4), 1.0)
     single_field_bundle(FieldRecord("sparse", *field.state()), "sparse", precision="int8").write(path)
     return path
 

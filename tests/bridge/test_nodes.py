@@ -79,7 +79,7 @@ def test_fields_of_four_kinds_stand_in_one_bundle_as_they_were(folder, run, repo
 @pytest.mark.parametrize("verb", EDITS)
 def test_an_edit_changes_the_graph_alone_and_is_undone_to_the_bit(folder, report, verb):
     before = (folder / "four.rfpack").read_bytes()
-    said = report(verb, "four.rfpack", *EDITS[verb], "-o", "four.rfpack", "-w", "--keep-history")
+    said = report(verb, "four.rfpack", *EDITS[verb], "-o", "four.rfpack", "-w", "--undoable")
     assert said["touched"]["how"].startswith("an edit of the scene graph")
     assert members(folder / "four.rfpack") <= set().union(*(members(folder / f"{k}.rfpack") for k in MAKERS))
     told = report("history", "four.rfpack")

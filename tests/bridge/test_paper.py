@@ -62,8 +62,10 @@ def test_a_close_up_frames_the_object_alone(work, folder, monkeypatch, in_force)
 
 def test_the_chart_of_times_names_every_way(tmp_path):
     """Kinds of any name among them: none has a look of its own."""
-    ways = ("blocks", "background", "scratch", "retraining")
-    rows = [{"way": way, "seconds": s, "psnr": 30.0 + s} for way in ways for s in (1.0, 2.0)]
+    storage_settings = ("blocks", "background", "scratch", "retraining")
+    rows = [
+        {"way": storage, "seconds": s, "psnr": 30.0 + s} for storage in storage_settings for s in (1.0, 2.0)
+    ]
     figures.times(rows, 37.0, tmp_path / "times.svg")
     text = (tmp_path / "times.svg").read_text()
     assert all(name in text for name in ("fuse --kind blocks", "--from-scratch", "then train"))

@@ -8,10 +8,10 @@ import pytest
 from PIL import Image as Pillow
 
 from formats.captures import read_capture
-from formats.points import Points
-from formats.posing import Posed
+from formats.points import SparsePoints
+from formats.posing import PosedPhotos
 from formats.views import View
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from tests.bridge.conftest import part
 from tests.bridge.test_captures import DRAFT, eyes
@@ -20,7 +20,7 @@ from tests.formats.test_captures import looking_at
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch, tmp_path, in_force):
-    in_force(Presets(draft=TrainConfig(longest=16, steps=50, samples=1 << 12)))
+    in_force(TrainPresets(draft=TrainConfig(longest=16, steps=50, samples=1 << 12)))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
@@ -40,8 +40,8 @@ def holiday(folder, monkeypatch):
             View(photo.stem, pose, 12, 12, 8, 6, 16, 12, image_path=photo, seen=np.arange(i, 99, 2))
             for i, (photo, pose) in enumerate(zip(photos, poses, strict=False))
         ]
-        points = Points(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
-        return Posed(tuple(views), points, ("p5.png",), ("p5.png",), (5,), 0.5)
+        points = SparsePoints(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
+        return PosedPhotos(tuple(views), points, ("p5.png",), ("p5.png",), (5,), 0.5)
 
     monkeypatch.setattr(part("posing"), "estimate", estimate)
     monkeypatch.setattr(part("posing"), "check_extra", lambda source: None)

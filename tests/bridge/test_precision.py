@@ -17,7 +17,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.requests import Precision
 from tests.bridge.conftest import done, part
 
-VM = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
+VM = ("--kind", "vm", "--no-finetune", "--max-size", "400kB")
 AT = ("--name", "blue", "-t", "0.7,0,0")
 
 
@@ -75,7 +75,9 @@ def test_fewer_bits_leave_room_for_more_texels():
     settings = TrainConfig(longest=256)
     for precision in PRECISIONS:
         found = longest[precision] = train.fitting_longest(KIND, box, settings, 1_000_000, precision)
-        sizes = [train.bytes_of(KIND.untrained(box, n, settings.way), precision) for n in (found, found + 4)]
+        sizes = [
+            train.bytes_of(KIND.untrained(box, n, settings.storage), precision) for n in (found, found + 4)
+        ]
         assert sizes[0] <= 1_000_000 < sizes[1]
     assert longest["float32"] < longest["float16"] < longest["int8"] < longest["int4"]
 

@@ -43,8 +43,8 @@ def test_the_page(data, shop, tmp_path, monkeypatch, in_force):
     assert all(float(row["nearest photo"]) < 12 and float(row["seconds"]) > 0.5 for row in rows)
     assert read_image_header(out / "wall.jpg")[:2] == (640, 213)
     assert "![wall](wall.jpg)" in (out / "table.md").read_text() and (out / "psnr.svg").exists()
-    assert real.kept_rows(out / "real.csv", "capture", {"wall"}) == []
-    kept = real.kept_rows(out / "real.csv", "capture", {"fox"})
+    assert real.stored_rows(out / "real.csv", "capture", {"wall"}) == []
+    kept = real.stored_rows(out / "real.csv", "capture", {"fox"})
     assert [row["capture"] for row in kept] == ["wall", "wall"]
 
 

@@ -91,13 +91,13 @@ def test_a_film_turns(report, folder):
 
 
 def test_a_scene_put_together_shows_what_its_fields_do(report, folder):
-    """Turned and stretched, at the numbers that the fields have; `--naive` asks each of them."""
+    """Turned and stretched, at the numbers that the fields have; `--reference` asks each of them."""
     matrix = np.diag([1.2, 0.8, 1.0, 1.0])
     matrix[:2, :2] = [[0.9, -0.6], [0.5, 0.7]]
     nodes = [make_node("floor", source="floor.rfpack"), make_node("red", source="red.rfpack", matrix=matrix)]
     write_scene(folder / "turned.json", SceneGraph(tuple(nodes)))
     pictures = []
-    for words in ((), ("--naive",)):
+    for words in ((), ("--reference",)):
         report("render", "turned.json", "-o", "a.png", "-w", "--size", "96x72", *words)
         pictures.append(read_image(folder / "a.png")[..., :3] / 255)
     assert 42 < psnr(*pictures) < 100  # samples lie elsewhere, and the boxes have hard faces
@@ -135,7 +135,7 @@ def test_what_takes_long_is_said_before_it_begins(run, folder, in_force):
         make_node("tiny", source="blue.rfpack", scale=[1e-4] * 3),
     ]
     write_scene(folder / "tiny.json", SceneGraph(tuple(nodes)))
-    few = "render", "tiny.json", "-o", "out.png", "-w", "--naive", "--size", "2x2"
+    few = "render", "tiny.json", "-o", "out.png", "-w", "--reference", "--size", "2x2"
     assert run(*few).stderr.count("may take long") == 0
     in_force(WorkConfig(much_work=1 << 16))
     said = run(*few).stderr

@@ -99,7 +99,7 @@ def test_a_source_that_is_replaced_meanwhile_is_read_as_it_was(folder, tmp_path)
     opened, good or damaged as what has taken its name may be."""
     loaded = load_scene(str(folder / "scene.json"))
     before = [opened(placed.field).params.clone() for placed in loaded.placed]
-    loaded.shelf.resize(0)
+    loaded.field_cache.resize(0)
     for name in ("floor", "red", "blue"):
         damaged = bytearray((folder / f"{name}.rfpack").read_bytes())
         damaged[-2000:-1000] = bytes(1000)
@@ -145,7 +145,10 @@ def test_groups_of_nodes_have_a_rule_of_their_own():
     at[:3, 3] = 5, 0, 0
     fogs = {"a": Fog(1.0, (1.0, 0, 0)), "b": Fog(3.0, (0, 1.0, 0)), "c": Fog(3.5, (0, 0, 1.0))}
     placed = [Placed(name, fog, at) for name, fog in fogs.items()]
-    point, way = torch.tensor([[5.5, 0.5, 0.5]], dtype=torch.float64), torch.tensor([[0, 0, 1.0]]).double()
+    point, storage = (
+        torch.tensor([[5.5, 0.5, 0.5]], dtype=torch.float64),
+        torch.tensor([[0, 0, 1.0]]).double(),
+    )
     pair = [(("g", "add"),)] * 2
     cases = {
         "max": ([()] * 3, "max", 3.5, (0, 0, 1)),
@@ -158,6 +161,6 @@ def test_groups_of_nodes_have_a_rule_of_their_own():
     }  # fmt: skip
     for name, (groups, rule, sigma, rgb) in cases.items():
         field = ComposedField(grouped(placed, groups, rule), rule)
-        found, colour = field.query(point - torch.from_numpy(field.origin), way)
+        found, colour = field.query(point - torch.from_numpy(field.origin), storage)
         assert float(found[0]) == pytest.approx(sigma), name
         np.testing.assert_allclose(colour[0].numpy(), rgb, atol=1e-6, err_msg=name)

@@ -29,7 +29,7 @@ def kinds(shop, tmp_path_factory):
             f"{kind}.rfpack",
             "--kind",
             kind,
-            "--no-rgb",
+            "--no-finetune",
             "--max-size",
             size,
         )
@@ -116,7 +116,7 @@ def test_a_fused_scene_keeps_tints_through_edits(report, folder, picture):
     words = ("red.rfpack", "--name", "dark", "-t", "0.8,0,0", "--tint", "0.3,0.3,0.3")
     report("compose", "red.rfpack", *words, "-o", "s.json")
     for kind in ("blocks", "vm"):
-        report("fuse", "s.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-rgb", "-w")
+        report("fuse", "s.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-finetune", "-w")
         said = report("eval", f"{kind}.rfpack", "--against", "s.json", "--size", "96x96")
         assert said["mean"]["psnr"] > (90 if kind == "blocks" else 20)
     report("move", "blocks.rfpack", "dark", "-t", "0,0.4,0", "-o", "moved.rfpack")
@@ -141,11 +141,11 @@ def test_a_fused_scene_holds_what_is_shown_and_an_edit_knows_no_more(report, fol
     report(
         "compose", "floor.rfpack", "-t", "0,0,-0.7", "red.rfpack", *written("--crop", CROP), "-o", "s.json"
     )
-    report("fuse", "s.json", "-o", "f.rfpack", "--kind", "vm", "--no-rgb", "--max-size", "600kB")
+    report("fuse", "s.json", "-o", "f.rfpack", "--kind", "vm", "--no-finetune", "--max-size", "600kB")
     beyond = np.array([[0.15, y, 0.0] for y in np.linspace(-0.2, 0.2, 9)])
     inside = beyond - [0.3, 0, 0]
     assert sigma(folder, "f.rfpack", beyond).max() < 1 < sigma(folder, "f.rfpack", inside).min()
-    report("delete", "f.rfpack", "floor", "-o", "g.rfpack", "--no-rgb")
+    report("delete", "f.rfpack", "floor", "-o", "g.rfpack", "--no-finetune")
     assert sigma(folder, "g.rfpack", beyond).max() < 1
 
 

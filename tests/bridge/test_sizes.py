@@ -7,8 +7,8 @@ import torch
 from formats.records import FieldRecord, encode_field
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.vm.builder import contents_of
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
-from fusedrf_cli.engine.kinds.vm.students import contents_of
 from fusedrf_cli.engine.kinds.vm.trimming import without_unread
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from formats.bundle import read_bundle
 from fusedrf_cli.bridge.scene import make_field
-from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
+from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
 from fusedrf_cli.engine.rendering.metrics import psnr
 from tests.bridge.conftest import PLACES, TinySettings, done
 from tests.bridge.test_edit import AT, blues, covered
@@ -18,7 +18,7 @@ SPARSE = ("--kind", "sparse", "--max-size", "600kB", "--precision", "float16")
 @pytest.fixture(scope="module", autouse=True)
 def short(tiny):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
+        patch.setattr(SparseBuilder, "distil_config", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
         yield
 
 
@@ -49,7 +49,7 @@ def field_of(folder, name: str):
 def rows_by_place(folder, name: str) -> dict:
     """Bytes of every free row by its place in the world."""
     field, origin = field_of(folder, name)
-    places = np.round(field.fine.places[: field.fine.free] + origin, 5)
+    places = np.round(field.fine.positions[: field.fine.free] + origin, 5)
     return {tuple(p): r.tobytes() for p, r in zip(places, field.rows.numpy(), strict=False)}
 
 
@@ -66,7 +66,15 @@ def test_a_scene_becomes_bricks(fused, folder, picture):
 @pytest.mark.parametrize("limit", [60_000, 150_000])
 def test_a_file_is_filled_and_no_more_than_that(report, limit):
     said = report(
-        "fuse", "pair.json", "-o", "small.rfpack", "--kind", "sparse", "--max-size", str(limit), "--no-rgb"
+        "fuse",
+        "pair.json",
+        "-o",
+        "small.rfpack",
+        "--kind",
+        "sparse",
+        "--max-size",
+        str(limit),
+        "--no-finetune",
     )
     assert 0.75 * limit < said["bytes"] <= limit
 
@@ -116,5 +124,5 @@ def test_the_last_object_cannot_be_deleted(fused, run):
 
 def test_a_sparse_field_can_be_fused_again(fused, folder, report, picture):
     report("compose", "sparse.rfpack", "blue.rfpack", "-t", "0.7,0,0", "-o", "again.json")
-    said = done(folder, "fuse", "again.json", "-o", "again.rfpack", *SPARSE, "--no-rgb")
+    said = done(folder, "fuse", "again.json", "-o", "again.rfpack", *SPARSE, "--no-finetune")
     assert said["kind"] == "sparse" and blues(picture("again.rfpack")) > 20

@@ -15,11 +15,11 @@ from safetensors.numpy import save
 
 from formats import atomic
 from formats.bundle import read_bundle
+from formats.camera_set import read_camera_set
 from formats.checkpoints import read_checkpoint, write_checkpoint
-from formats.rig import read_rig
 from fusedrf_cli import signals
-from fusedrf_cli.bridge.running import RunningConfig
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.runtime import RuntimeConfig
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.poses import changed_each, turns
@@ -28,7 +28,7 @@ from fusedrf_cli.engine.settings import using
 from tests.bridge.conftest import done, part
 
 WORDS = ("--sh-degree", "1", "--aabb", "-0.5,-0.5,-0.5,0.5,0.5,0.5", "--precision", "float32")
-LONGER = Presets(normal=TrainConfig(longest=24, steps=300, samples=1 << 13))
+LONGER = TrainPresets(normal=TrainConfig(longest=24, steps=300, samples=1 << 13))
 
 
 def train(report, output="out.rfpack", *more):
@@ -99,7 +99,7 @@ def test_a_run_that_is_killed_goes_on_from_where_it_was_saved_last(
             raise Killed
         step(self, share)
 
-    with monkeypatch.context() as patch, using(RunningConfig(saved_every=0.0)):
+    with monkeypatch.context() as patch, using(RuntimeConfig(saved_every=0.0)):
         patch.setattr(FitRun, "step", killed)
         with pytest.raises(Killed):
             run("train", "photos", "-o", "out.rfpack", *WORDS)
@@ -185,11 +185,13 @@ def test_refined_poses_are_told_kept_and_measured_apart(report, folder, monkeypa
 
     def refine_poses(run, share):
         turn, move = (np.tile(axis, (len(run.pool.pixel), 1)) for axis in ((0, 0, 0.001), (0.002, 0, 0)))
-        run.pool.place(changed_each(run.pool.poses, np.concatenate([turn, move], 1)))
+        run.pool.set_poses(changed_each(run.pool.poses, np.concatenate([turn, move], 1)))
 
     monkeypatch.setattr(FitRun, "refine_poses", refine_poses)
     said = train(report, "out.rfpack", "--holdout", "4", "--refine-poses")
-    given, kept = (read_rig(read_bundle(folder / f"{n}.rfpack").scene.cameras) for n in ("as_given", "out"))
+    given, kept = (
+        read_camera_set(read_bundle(folder / f"{n}.rfpack").scene.cameras) for n in ("as_given", "out")
+    )
     rounds = round(said["poses"]["turned_degrees"] / np.degrees(0.001))
     assert rounds >= 4
     for before, after in zip(given.train, kept.train, strict=True):
@@ -200,7 +202,7 @@ def test_refined_poses_are_told_kept_and_measured_apart(report, folder, monkeypa
     for before, after in zip(given.test, kept.test, strict=True):
         np.testing.assert_array_equal(after.camera_to_world, before.camera_to_world)
     aligned = said["holdout"]["aligned"]
-    assert aligned["views"] == said["holdout"]["views"]  # what alignment finds: test_refined.py
+    assert aligned["views"] == said["holdout"]["views"]  # what alignment finds: test_pose_refinement.py
 
 
 def test_poses_of_a_mesh_are_exact(run, folder):
@@ -310,7 +312,7 @@ def test_a_checkpoint_whose_parts_do_not_fit_is_refused(run, folder, interrupted
 )
 def test_states_are_held_against_a_runs_own(found, own, alike):
     try:
-        part("running").check_alike(found, own, "a state")
+        part("runtime").check_alike(found, own, "a state")
         assert alike
     except ValueError:
         assert not alike
@@ -334,8 +336,8 @@ def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, in_f
         tries.append(state["steps"])
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(part("running"), "write_checkpoint", full)
-    in_force(RunningConfig(saved_every=0.0))
+    monkeypatch.setattr(part("runtime"), "write_checkpoint", full)
+    in_force(RuntimeConfig(saved_every=0.0))
     said = train(report)
     assert len(tries) > 5 and said["steps"] == 60
     assert len([text for text in said["warnings"] if "learning goes on" in text]) == 1
@@ -344,7 +346,7 @@ def test_a_full_disk_meanwhile_is_told_once_and_no_end(report, monkeypatch, in_f
 def test_an_interrupt_on_a_full_disk_saves_elsewhere(
     report, run, folder, interrupted_in_step, straight, monkeypatch
 ):
-    write, room = part("running").write_checkpoint, folder.parent / "room"
+    write, room = part("runtime").write_checkpoint, folder.parent / "room"
     room.mkdir()
 
     def full(path, *words):
@@ -353,7 +355,7 @@ def test_an_interrupt_on_a_full_disk_saves_elsewhere(
         write(path, *words)
 
     with monkeypatch.context() as patch:
-        patch.setattr(part("running"), "write_checkpoint", full)
+        patch.setattr(part("runtime"), "write_checkpoint", full)
         patch.setattr(tempfile, "tempdir", str(room))
         with interrupted_in_step(30):
             result = run("train", "photos", "-o", "out.rfpack", *WORDS)

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
+from formats.camera_set import CameraSet, read_camera_set
 from formats.captures import read_capture, write_capture
 from formats.errors import FormatError
 from formats.images import read_image, write_png
 from formats.meshes import mesh_capture
-from formats.rig import Rig, read_rig
 from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, read_scene, write_scene
 from formats.views import View
-from fusedrf_cli.bridge.extent import Extent
+from fusedrf_cli.bridge.capture_cameras import cameras_of_capture
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.bridge.rendering import renderable
-from fusedrf_cli.bridge.rigs import cameras_of_capture
 from fusedrf_cli.bridge.scene import load_scene, write_field
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.scene_bounds import SceneBounds
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.bridge.views import choose_views, pinhole, sized, standing
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.kinds import registry
@@ -30,13 +30,13 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.python import open_scene
 from fusedrf_cli.requests import RenderRequest
 from tests.bridge.conftest import FIELDS, part
+from tests.formats.test_camera_set import LENSES, TURNED, camera_set_of
 from tests.formats.test_captures import looking_at
 from tests.formats.test_meshes import two_coloured_cube
-from tests.formats.test_rig import LENSES, TURNED, rig_of
 from tests.promises.mutations import spoilt_json
 from tests.promises.packs import GOLDEN
 
-SMALL = ("--seed", "0", "--no-rgb")
+SMALL = ("--seed", "0", "--no-finetune")
 FOCUS = np.array([0.05, -0.1, 0.02])
 EYES = (
     *((1.6, 0.2, 0.5), (0.2, 1.5, 0.7), (-1.7, 0.1, 0.4)),
@@ -53,13 +53,13 @@ def photo(number: int, eye, size=(24, 16), **more) -> View:
     )
 
 
-RIG = rig_of([photo(i, eye) for i, eye in enumerate(EYES)], held_out=2)
+RIG = camera_set_of([photo(i, eye) for i, eye in enumerate(EYES)], held_out=2)
 OBJECT = replace(RIG, surroundings=False)
 
 
-def keep(folder, name: str, rig: Rig | None, field: str = "red", **more) -> None:
+def keep(folder, name: str, camera_set: CameraSet | None, field: str = "red", **more) -> None:
     """A bundle of one of the solids, as if it was learnt from a capture with those cameras."""
-    cameras = rig and rig.content()
+    cameras = camera_set and camera_set.content()
     write_field(
         str(folder / name), FIELDS[field], name.split(".")[0], precision="float32", overwrite=True,
         about=SceneGraph((), cameras=cameras), **more,
@@ -147,21 +147,21 @@ def test_an_orbit_of_photos_from_one_side_swings_between_them(folder, turn):
     way around where that is asked for by --from."""
     spread = (-0.5, -0.2, 0.0, 0.3, 0.9)
     eyes = [FOCUS + 2 * np.array([np.cos(turn + a), np.sin(turn + a), 0.4]) for a in spread]
-    keep(folder, "side.rfpack", rig_of([photo(i, eye) for i, eye in enumerate(eyes)], held_out=1))
-    rig = read_rig(read_bundle(folder / "side.rfpack").scene.cameras)
+    keep(folder, "side.rfpack", camera_set_of([photo(i, eye) for i, eye in enumerate(eyes)], held_out=1))
+    camera_set = read_camera_set(read_bundle(folder / "side.rfpack").scene.cameras)
     cameras = views_of(folder, "side.rfpack", orbit=40)
-    seen = azimuths(cameras, rig)
-    allowed = azimuths([camera_of(view) for view in rig.views], rig)
+    seen = azimuths(cameras, camera_set)
+    allowed = azimuths([camera_of(view) for view in camera_set.views], camera_set)
     about = seen[0]
     seen, allowed = ((a - about + np.pi) % (2 * np.pi) - np.pi for a in (seen, allowed))
     assert allowed.min() - 1e-6 < seen.min() and seen.max() < allowed.max() + 1e-6
     assert np.ptp(seen) > 0.98 * np.ptp(allowed) and abs(np.diff(np.append(seen, seen[0]))).max() < 0.2
     asked = views_of(folder, "side.rfpack", orbit=40, view_from=(10.0, 20.0))
-    assert np.ptp(azimuths(asked, rig)) > 5.8
+    assert np.ptp(azimuths(asked, camera_set)) > 5.8
 
 
-def azimuths(cameras: list[Camera], rig: Rig) -> np.ndarray:
-    return np.array([azimuth_of(eye_of(camera) - rig.focus, rig.up) for camera in cameras])
+def azimuths(cameras: list[Camera], camera_set: CameraSet) -> np.ndarray:
+    return np.array([azimuth_of(eye_of(camera) - camera_set.focus, camera_set.up) for camera in cameras])
 
 
 def test_every_view_of_the_capture_is_rendered_under_its_name(report, folder):
@@ -176,14 +176,14 @@ def test_every_view_of_the_capture_is_rendered_under_its_name(report, folder):
 def test_photos_of_the_same_name_get_pictures_of_their_own(report, folder):
     """Blender's captures name the photos of each split from r_0."""
     views = [photo(0, EYES[0]), replace(photo(0, EYES[1]), name="IMG_0")]
-    keep(folder, "twins.rfpack", rig_of(views, held_out=1))
+    keep(folder, "twins.rfpack", camera_set_of(views, held_out=1))
     said = report("render", "twins.rfpack", "-o", "all", "--views", "capture")
     assert said["files"] == ["all/IMG_0.png", "all/IMG_0_heldout.png"]
     assert report("render", "twins.rfpack", "-o", "b", "--views", "heldout")["files"] == ["b/IMG_0.png"]
 
 
 def test_a_film_has_one_size(run, report, folder):
-    keep(folder, "mixed.rfpack", rig_of([photo(0, EYES[0]), photo(1, EYES[1], (16, 24))]))
+    keep(folder, "mixed.rfpack", camera_set_of([photo(0, EYES[0]), photo(1, EYES[1], (16, 24))]))
     result = run("render", "mixed.rfpack", "-o", "a.gif", "--views", "capture")
     assert result.exit_code == 2 and "give --size" in result.stderr
     report("render", "mixed.rfpack", "-o", "a.gif", "--views", "capture", "--size", "20x20")
@@ -197,7 +197,7 @@ def test_what_keeps_no_cameras_says_so(run, folder):
         return result.stderr
 
     assert "keeps no cameras" in refused("red.rfpack", "capture")
-    keep(folder, "all.rfpack", rig_of(list(RIG.views)))
+    keep(folder, "all.rfpack", camera_set_of(list(RIG.views)))
     assert "none of its 6 cameras was held out" in refused("all.rfpack", "heldout")
     place(folder, "two.json", np.eye(4), False, "all")
     assert "'room', 'all' each keep cameras" in refused("two.json", "capture")
@@ -223,8 +223,8 @@ def test_a_placed_capture_shows_the_same_pixels(report, folder):
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_the_rays_of_placed_cameras_are_the_placed_rays(lens):
     """Of any lens: what lies along a ray before lies along it after."""
-    rig = rig_of([photo(i, eye, **lens) for i, eye in enumerate(EYES)])
-    for one, other in zip(rig.views, rig.placed(TURNED).views, strict=True):
+    camera_set = camera_set_of([photo(i, eye, **lens) for i, eye in enumerate(EYES)])
+    for one, other in zip(camera_set.views, camera_set.placed(TURNED).views, strict=True):
         (eyes, away), (moved_eyes, moved_away) = (camera_of(view).rays() for view in (one, other))
         np.testing.assert_allclose(moved_eyes, eyes @ TURNED[:3, :3].T + TURNED[:3, 3], atol=1e-12)
         np.testing.assert_allclose(moved_away, away @ TURNED[:3, :3].T / 2, atol=1e-12)
@@ -232,7 +232,7 @@ def test_the_rays_of_placed_cameras_are_the_placed_rays(lens):
 
 def test_cameras_are_those_of_the_background_or_of_the_only_source_that_has_any(folder):
     keep(folder, "chair.rfpack", OBJECT, "blue")
-    keep(folder, "other.rfpack", rig_of(list(RIG.views)[:3]), "blue")
+    keep(folder, "other.rfpack", camera_set_of(list(RIG.views)[:3]), "blue")
 
     def count(*sources: str, background: bool) -> int:
         place(folder, "s.json", np.eye(4), background, *sources)
@@ -255,7 +255,7 @@ def test_fused_converted_and_edited_bundles_keep_the_cameras(report, folder):
     report("delete", "g.rfpack", "blue", "-o", "h.rfpack", *SMALL)
     report("fuse", "h.rfpack", "-o", "i.rfpack", *SMALL)
     kept = cameras_in(folder, "f.rfpack")
-    np.testing.assert_allclose(read_rig(kept).poses, RIG.placed(TURNED).poses, atol=1e-6)
+    np.testing.assert_allclose(read_camera_set(kept).poses, RIG.placed(TURNED).poses, atol=1e-6)
     assert [cameras_in(folder, f"{name}.rfpack") for name in "ghi"] == [kept] * 3
     assert read_bundle(folder / "f.rfpack").scene.framing is None  # its cameras say what pictures show
     one, *others = (views_of(folder, f"{name}.rfpack")[0] for name in "fghi")
@@ -313,12 +313,12 @@ def test_hostile_cameras_are_refused_or_make_views_of_finite_numbers():
         except FormatError as error:
             assert str(error).isprintable()
             continue
-        rig, taken = read_rig(scene.cameras), taken + 1
-        for kept in filter(None, (rig, rig.placed(TURNED))):
+        camera_set, taken = read_camera_set(scene.cameras), taken + 1
+        for kept in filter(None, (camera_set, camera_set.placed(TURNED))):
             dump_scene(SceneGraph((), cameras=kept.content()))
-        lens = pinhole(camera_of(sized(rig.typical, (8, 6))))
-        photos = (camera_of(sized(view, (8, 6))) for view in rig.views)
-        for camera in [*standing(rig, rig.up).orbit(lens, 3), *photos]:
+        lens = pinhole(camera_of(sized(camera_set.typical, (8, 6))))
+        photos = (camera_of(sized(view, (8, 6))) for view in camera_set.views)
+        for camera in [*standing(camera_set, camera_set.up).orbit(lens, 3), *photos]:
             assert all(np.isfinite(numbers).all() for numbers in camera.rays()), seed
     assert 20 < taken < 200
 
@@ -336,20 +336,20 @@ def test_an_object_is_framed_as_before_whatever_photos_it_was_learnt_from(folder
     assert len(views_of(folder, "object.rfpack", views="capture")) == 6
 
 
-def rolled(rig: Rig, degrees: float) -> Rig:
+def rolled(camera_set: CameraSet, degrees: float) -> CameraSet:
     """The same rig in a world that was turned about +x, objects and all."""
     turn = np.radians(degrees)
     matrix = np.eye(4)
     matrix[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    return rig.placed(matrix)
+    return camera_set.placed(matrix)
 
 
 @pytest.mark.parametrize("degrees, follows", [(0, False), (30, False), (90, True), (180, True)])
 def test_an_object_stands_upright_in_a_world_whose_z_is_not_up(folder, degrees, follows):
     """As its photos were held, where that is more than 45 degrees from +z; --up goes before."""
-    rig = rolled(OBJECT, degrees)
-    keep(folder, "object.rfpack", rig)
-    up = rig.up if follows else np.array([0.0, 0, 1])
+    camera_set = rolled(OBJECT, degrees)
+    keep(folder, "object.rfpack", camera_set)
+    up = camera_set.up if follows else np.array([0.0, 0, 1])
     for camera in views_of(folder, "object.rfpack", orbit=4):
         assert camera.camera_to_world[:3, 1] @ up > 0.8  # from 26 degrees above
         assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-6)
@@ -400,7 +400,7 @@ def test_a_view_that_numbers_cannot_hold_is_refused(run, folder, scene, words):
 
 def test_a_picture_from_a_side(report, folder):
     """From +x and twice as near the red box fills the picture; from far away it does not."""
-    words = ("--from", "0,0", "--size", "16x16", "--look-at", "0,0,0")
+    words = ("--view-from", "0,0", "--size", "16x16", "--look-at", "0,0,0")
     report("render", "red.rfpack", "-o", "near.png", *words, "--zoom", "3")
     report("render", "red.rfpack", "-o", "far.png", *words, "--zoom", "0.3")
     near, far = ((read_image(folder / f"{name}.png")[..., 1] < 128).sum() for name in ("near", "far"))
@@ -412,7 +412,7 @@ def test_a_picture_from_a_side(report, folder):
 
 @pytest.fixture
 def short(in_force):
-    in_force(Presets(draft=TrainConfig(longest=64, steps=5, samples=512)))
+    in_force(TrainPresets(draft=TrainConfig(longest=64, steps=5, samples=512)))
 
 
 def speckled_capture(folder, count: int = 6) -> list[View]:
@@ -434,9 +434,9 @@ def speckled_capture(folder, count: int = 6) -> list[View]:
 def test_training_on_photos_keeps_their_cameras(report, run, folder, short):
     views = speckled_capture(folder)
     report("train", "wall", "-o", "out.rfpack", "--quality", "draft", "--holdout", "3")
-    rig = read_rig(cameras_in(folder, "out.rfpack"))
-    assert rig.surroundings and [view.name for view in rig.test] == ["IMG_0", "IMG_3"]
-    kept = {view.name: view for view in rig.views}
+    camera_set = read_camera_set(cameras_in(folder, "out.rfpack"))
+    assert camera_set.surroundings and [view.name for view in camera_set.test] == ["IMG_0", "IMG_3"]
+    kept = {view.name: view for view in camera_set.views}
     for view in views:
         np.testing.assert_allclose(kept[view.name].camera_to_world, view.camera_to_world, atol=1e-6)
         assert camera_of(kept[view.name]).intrinsics == camera_of(view).intrinsics
@@ -450,8 +450,8 @@ def test_training_on_photos_keeps_their_cameras(report, run, folder, short):
 
 def test_training_on_an_object_keeps_its_cameras_and_how_it_is_framed(report, folder, short):
     report("train", "photos", "-o", "out.rfpack", "--quality", "draft")
-    rig = read_rig(cameras_in(folder, "out.rfpack"))
-    assert not rig.surroundings and (len(rig.train), len(rig.test)) == (8, 2)
+    camera_set = read_camera_set(cameras_in(folder, "out.rfpack"))
+    assert not camera_set.surroundings and (len(camera_set.train), len(camera_set.test)) == (8, 2)
     box = renderable(load_scene(str(folder / "out.rfpack")))[0].occupancy.tight_aabb(0)
     assert same(views_of(folder, "out.rfpack")[0], framing_camera(box, 0.9, 0.45, 800, 800))
 
@@ -459,14 +459,14 @@ def test_training_on_an_object_keeps_its_cameras_and_how_it_is_framed(report, fo
 def test_cameras_count_in_the_size_that_is_allowed(folder, short):
     """A field that just fits is made smaller where cameras come on top."""
     training, capture = part("training"), read_capture(folder / "photos")
-    box = Extent(np.array([-1.0] * 3 + [1] * 3))
+    box = SceneBounds(np.array([-1.0] * 3 + [1] * 3))
     words = dict.fromkeys(("ranks", "sh_degree", "time_budget", "target_psnr", "max_size"))
     asked = SimpleNamespace(
         quality="draft", precision="float16", seed=0, masks="ignore", refine_poses=False, **words
     )
     kind = registry.kind("vm")
     whole = training.fit_settings(asked, kind, capture, box, "cpu")
-    asked.max_size = training.bytes_of(kind.untrained(box.box, whole.longest, whole.way), "float16")
+    asked.max_size = training.bytes_of(kind.untrained(box.box, whole.longest, whole.storage), "float16")
     found = [training.fit_settings(asked, kind, capture, box, "cpu", more).longest for more in (0, 1, 10_000)]
     assert found[0] == whole.longest > found[1] >= found[2]
 

@@ -108,7 +108,7 @@ def test_what_another_process_writes_is_refused(refused, folder, name, output):
 @pytest.mark.parametrize("name", HISTORY)
 def test_a_folder_that_cannot_keep_what_was_is_refused(refused, folder, name):
     (folder / "out.rfpack.history").write_text("mine")
-    code, said = refused(*COMMANDS[name].words, "--keep-history")
+    code, said = refused(*COMMANDS[name].words, "--undoable")
     assert code == 5 and "out.rfpack.history" in said and "no folder" in said
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from tests.analytic.export import SHAPE as THIRTY_TWO  # float32's: few shapes, since each is compiled
@@ -43,7 +43,7 @@ def random_vm(
     cells: int | None = None,
     scale: float = 3.0,
     shift: float = -1.0,
-    hashed: Hashed | None = None,
+    hashed: HashGrid | None = None,
 ) -> VMField:
     """A VM field of random numbers, dense enough to see; `cells` gives it a random occupancy of so many
     cells. Its shape, where none is given, is what loops of its type are compiled for."""

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from fusedrf_cli.bridge.looks import LookConfig
-from fusedrf_cli.engine.distillation.finish import FinetuneConfig, RayLesson
+from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
+from fusedrf_cli.engine.distillation.finetune import FinetuneConfig, FinetuneRays
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds import instances
+from fusedrf_cli.engine.kinds.builder import DistilledBuilder
 from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.student import Student
-from fusedrf_cli.engine.kinds.vm.students import VMConfig
+from fusedrf_cli.engine.kinds.vm.builder import VMConfig
 from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings
 from tests.engine.kinds.cases import SLOW_TO_COMPILE
@@ -79,11 +79,11 @@ def row(request) -> Row:
 def quick(monkeypatch, in_force) -> None:
     """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
     in_force(OccupancyConfig(scene_cells=48), VMConfig(SHAPE))
-    monkeypatch.setattr(Student, "lesson", TinySettings())
-    monkeypatch.setattr("fusedrf_cli.bridge.making.DistilConfig", TinySettings)  # for what is not taught
-    monkeypatch.setattr(instances.InstancesStudent, "ranks", (None,))  # others would be compiled
-    monkeypatch.setattr(RayLesson, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
-    in_force(LookConfig(whole=2, most_objects=0))
+    monkeypatch.setattr(DistilledBuilder, "distil_config", TinySettings())
+    monkeypatch.setattr("fusedrf_cli.bridge.building.DistilConfig", TinySettings)  # for what is not taught
+    monkeypatch.setattr(instances.InstancesBuilder, "ranks", (None,))  # others would be compiled
+    monkeypatch.setattr(FinetuneRays, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
+    in_force(EvaluationViewConfig(whole=2, most_objects=0))
 
 
 def pytest_generate_tests(metafunc):

@@ -14,10 +14,10 @@ from formats.scene import Node, SceneGraph, make_node, read_scene, write_scene
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composite import as_composite
-from fusedrf_cli.engine.composition.detail import opacity_off
+from fusedrf_cli.engine.composition.resolution_report import opacity_off
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.kinds.student import DistilConfig
+from fusedrf_cli.engine.kinds.builder import DistilConfig
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -128,7 +128,7 @@ def test_a2_fusing_to_one_tensor_says_what_a_stretch_costs(row, tmp_path):
     write_bundles(tmp_path, scene_of(("thin", Box(1.0, 0.5, tint=scenes.RED), affine((1, 1, 4)))))
     warned = {}
     for kind in ("vm", "blocks"):
-        said = done(tmp_path, "fuse", "scene.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-rgb")
+        said = done(tmp_path, "fuse", "scene.json", "-o", f"{kind}.rfpack", "--kind", kind, "--no-finetune")
         warned[kind] = [w for w in said["warnings"] if "stretched by 4.00" in w and "0.472" in w]
         (noted,) = said["objects"]
         assert noted["stretch"] == pytest.approx(4.0)
@@ -331,7 +331,7 @@ def marble_on_table(size: float) -> Scene:
 def test_a6_a_tiny_object_is_named_before_fusing(row, tmp_path):
     """One tensor has few voxels for a marble of a fiftieth of the table, and says so."""
     write_bundles(tmp_path, marble_on_table(0.02))
-    words = ("fuse", "scene.json", "-o", "vm.rfpack", "--kind", "vm", "--no-rgb", "--max-size", "300kB")
+    words = ("fuse", "scene.json", "-o", "vm.rfpack", "--kind", "vm", "--no-finetune", "--max-size", "300kB")
     said = done(tmp_path, *words)
     across = {o["name"]: o["voxels_across"] for o in said["objects"]}
     assert across["marble"] < 8 < across["table"]

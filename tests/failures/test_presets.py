@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.fit import fit
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 PRESETS = ("draft", "normal", "high")
 SIDE, SHOTS, ELEVATIONS = 80, 16, (-0.5, 0.3, 1.0)
 FACING = Tint(facing=np.array([[-1.5, 0, 0], [0, -1.5, 0], [0, 0, -1.5]]))
-SUBJECT = scene_of(
+LOOK_AT_BOX = scene_of(
     ("cube", Box(80.0, 0.3, tint=FACING), np.eye(4)),
     ("plate", Box(80.0, (0.6, 0.4, 0.05), tint=SAND), affine(turn(20, (0, 0, 1)), (0, 0, -0.35))),
     ("post", Box(80.0, (0.06, 0.06, 0.5), tint=RED), affine(turn(15, (1, 0, 0)), (0.45, 0, 0.1))),
@@ -46,11 +46,11 @@ def trained(preset: str) -> tuple:
     cameras = [camera for e in ELEVATIONS for camera in orbit(BOX, SHOTS, SIDE, SIDE, e)]
     images = []
     for camera in cameras:
-        found = SUBJECT.pixels(*camera.rays()).reshape(SIDE, SIDE, 4)
+        found = LOOK_AT_BOX.pixels(*camera.rays()).reshape(SIDE, SIDE, 4)
         straight = found[..., :3] / np.maximum(found[..., 3:], 1e-6)
         images.append(np.rint(255 * np.concatenate([straight, found[..., 3:]], -1)).astype(np.uint8))
     started = time.perf_counter()
-    field = fit(cameras, np.stack(images), BOX, getattr(Presets, preset))
+    field = fit(cameras, np.stack(images), BOX, getattr(TrainPresets, preset))
     return field, time.perf_counter() - started
 
 
@@ -73,8 +73,8 @@ def worst_view(preset: str, matrices: list[np.ndarray], truth: Scene, moved: np.
 @pytest.mark.parametrize("name", PLACINGS)
 def test_a_trained_field_bears_its_placing(row, name, preset):
     what, matrix = PLACINGS[name]
-    bar = worst_view(preset, [np.eye(4)], SUBJECT, np.eye(4))[0] - PLACING_COSTS
-    figure, seconds = worst_view(preset, [matrix], SUBJECT.under(matrix), matrix)
+    bar = worst_view(preset, [np.eye(4)], LOOK_AT_BOX, np.eye(4))[0] - PLACING_COSTS
+    figure, seconds = worst_view(preset, [matrix], LOOK_AT_BOX.under(matrix), matrix)
     row.check(name, f"trained, {what}", figure, bar, scene="S8", unit="dB", preset=preset, seconds=seconds)
 
 
@@ -82,7 +82,7 @@ def test_a_trained_field_bears_its_placing(row, name, preset):
 def test_b5_trained_fields_through_each_other(row, preset):
     """The subject and a turned copy in one place: whoever is denser at a point, both are the union."""
     other = affine(turn(90, (0, 0, 1)), (0.1, 0.1, 0.3))
-    truth = Scene(SUBJECT.parts + SUBJECT.under(other).parts)
+    truth = Scene(LOOK_AT_BOX.parts + LOOK_AT_BOX.under(other).parts)
     figure, seconds = worst_view(preset, [np.eye(4), other], truth, np.eye(4))
     what = "trained, two through each other"
     row.check("B5", what, figure, MEETING, scene="S8", unit="dB", preset=preset, seconds=seconds)

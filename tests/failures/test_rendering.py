@@ -19,7 +19,7 @@ from formats.images import read_image
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import fit
-from fusedrf_cli.engine.distillation.matter import occupancy_of
+from fusedrf_cli.engine.distillation.occupancy_update import occupancy_of
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.vm_mlp.field import WIDTH, VMMLPField, untrained
 from fusedrf_cli.engine.rendering import volume
@@ -126,7 +126,7 @@ def trained():
         straight = found[..., :3] / np.maximum(found[..., 3:], 1e-9)
         pixels = np.concatenate([straight, found[..., 3:]], -1)
         pictures.append(np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8))
-    settings = TrainConfig(way=way_of(SHAPE), longest=40, steps=200, samples=1 << 12)
+    settings = TrainConfig(storage=way_of(SHAPE), longest=40, steps=200, samples=1 << 12)
     field = fit(cameras, np.stack(pictures), box, settings)
     unseen = scattered(box, 3, 40, 40, seed=9, lowest=-0.6)
     return field, unseen, np.stack([scene.image(camera) for camera in unseen])

@@ -17,7 +17,7 @@ from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, make_field, write_field
 from fusedrf_cli.engine.distillation.distill import distill
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -71,7 +71,7 @@ def shop(tmp_path_factory, tiny):  # noqa: F811
         nodes = [make_node(n, source=f"{n}.rfpack", matrix=PARTS[n][1].tolist()) for n in names]
         write_scene(folder / f"{file}.json", SceneGraph(tuple(nodes)))
         done(folder, "fuse", f"{file}.json", "-o", f"{file}.rfpack")
-    vm = ("--kind", "vm", "--no-rgb", "--max-size", "400kB")
+    vm = ("--kind", "vm", "--no-finetune", "--max-size", "400kB")
     done(folder, "fuse", "scene.json", "-o", "vm.rfpack", *vm)
     eye = {"fl_x": EYE.fl_x, "fl_y": EYE.fl_y, "w": 48, "h": 48}
     frame = {"file_path": "eye", "transform_matrix": EYE.camera_to_world.tolist()}
@@ -150,7 +150,7 @@ def test_c3_added_and_deleted_is_as_before(row, folder):
 
 def test_c3_out_of_one_tensor_what_lies_outside_stays(row, folder):
     """The distilled field answers as it did, away from the object's box."""
-    said = done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
+    said = done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-finetune")
     old, new = (load_scene(str(folder / name)).placed[0] for name in ("vm.rfpack", "less.rfpack"))
     box = np.array(said["touched"]["aabb"]) + 2 * old.voxel_size * np.repeat([-1, 1], 3)
     points = old.aabb[:3] + np.random.default_rng(0).random((4000, 3)) * (old.aabb[3:] - old.aabb[:3])
@@ -165,7 +165,7 @@ def test_c3_without_its_sources_nothing_is_guessed(row, folder):
     """Whether anything stood in the object's box is known from the history; where nothing did, nothing is."""
     for name in PARTS:
         (folder / f"{name}.rfpack").unlink()
-    said = done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
+    said = done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-finetune")
     scene, _ = read_headers(folder / "less.rfpack")
     told = not said["warnings"] and scene.history[-1]["restored"] is True
     row.check("C3", "sources of what stands elsewhere are not missed", told, 1)
@@ -239,7 +239,7 @@ def test_c7_a_white_edge_is_white(row, folder):
     white = Tint.of(0.98, 0.98, 0.98)
     field = vm_field(Gaussian(60.0, tint=white), (33,) * 3, SHAPE)
     voxel = float((field.box[3:] - field.box[:3]).max()) / 8
-    field = VM.reduction(VM.outline(field), voxel, Way()).make(field)
+    field = VM.reduction(VM.outline(field), voxel, StorageSetting()).make(field)
     assert max(field.resolution) <= 9
     picture = render_image(field, scenes.camera_at((2.5, 1.0, 1.5), size=48))
     edge = (picture.opacity > 0.02) & (picture.opacity < 0.98)
@@ -332,7 +332,7 @@ def test_c10_float16_looks_like_float32(row, tmp_path, kind, density):
 
 def test_c11_what_is_cut_out_does_not_show_through(row, folder):
     """Out of one distilled tensor: where the object stood and nothing else is, there is nothing."""
-    done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-rgb")
+    done(folder, "delete", "vm.rfpack", "blue", "-o", "less.rfpack", "--no-finetune")
     field = load_scene(str(folder / "less.rfpack")).composed()
     y, z = np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0.0, 0.1, 5))
     rays_o = np.stack([np.full(25, 0.7), y.ravel(), z.ravel() + 1.5], 1) - field.origin

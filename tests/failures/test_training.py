@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation import fit as module
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun, fit
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.teacher import Points
+from fusedrf_cli.engine.distillation.teacher import TeacherPoints
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import VMField
@@ -31,7 +31,7 @@ from tests.engine.conftest import BOX, THIRTY_TWO
 from tests.engine.distillation.test_fit import pictures
 
 SHOWS = TrainConfig.steps_to_show
-BRIEF = TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
+BRIEF = TrainConfig(storage=way_of(THIRTY_TWO), longest=24, steps=80, samples=1 << 12)
 LONG = replace(BRIEF, longest=32, steps=300)
 CAMERAS = orbit(BOX, 14, 24, 24) + orbit(BOX, 8, 24, 24, elevation=-0.5)
 UNSEEN = scattered(BOX, 4, 24, 24, seed=3)  # of which a picture of the mean colour shows 16 dB
@@ -275,7 +275,7 @@ def test_t12_no_seed_fails(row, images, unseen_psnr):
 @pytest.mark.slow
 def test_t13_the_rate_may_be_a_third_or_thrice(row, images, unseen_psnr):
     """Over as many steps as the shortest preset has; two seeds of one rate are up to 2 dB apart."""
-    settings = replace(LONG, steps=Presets.draft.steps)
+    settings = replace(LONG, steps=TrainPresets.draft.steps)
     found = []
     for factor in (1 / 3, 1, 3):
         changed = replace(settings, rate=factor * settings.rate)
@@ -297,11 +297,11 @@ def test_t14_no_start_is_dead(row, opaque, empty):
     points[:, 0] = np.where(solid, BOX[0], BOX[3] - 1e-9)
     sigma, rgb = torch.from_numpy(np.where(solid, 20.0, 0.0)).float(), torch.full((2000, 3), 0.5)
     dirs = torch.tensor([[0.0, 0, 1]], dtype=torch.float64).expand(2000, 3).contiguous()
-    pool = Points(torch.from_numpy(points), dirs, sigma, rgb, torch.ones(2000))
+    pool = TeacherPoints(torch.from_numpy(points), dirs, sigma, rgb, torch.ones(2000))
     optimiser, generator = Adam(field, 1), torch.Generator().manual_seed(0)
     for _ in range(1000):
         chosen = torch.randint(2000, (500,), generator=generator)
-        point_step(field, Points(*(column[chosen] for column in pool.columns())), step, optimiser)
+        point_step(field, TeacherPoints(*(column[chosen] for column in pool.columns())), step, optimiser)
         optimiser.step(0.02)
     depth = field.query(pool.where, dirs)[0] * step
     row.check("T14", "optical depth of a step learnt from empty", depth[solid].min(), 5)

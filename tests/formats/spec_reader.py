@@ -63,7 +63,7 @@ def decoded(bits: int, shape: tuple, scales: np.ndarray, codes: np.ndarray, runs
     return scale * number / np.float32(127 if bits == 8 else 7)
 
 
-def contracted(x: np.ndarray, d: np.ndarray, space: str | dict) -> tuple[np.ndarray, np.ndarray]:
+def contract(x: np.ndarray, d: np.ndarray, space: str | dict) -> tuple[np.ndarray, np.ndarray]:
     """2.3: coordinates (N, 3) of points, and rho (N,) along d (N, 3)."""
     constants = dict(space) if isinstance(space, dict) else {"name": space}
     name = constants.pop("name")
@@ -173,7 +173,7 @@ def answer(field: tuple, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.n
 def of_grid(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
     """2.6: `cp`, `dense` and `dense-mlp`."""
     box, cells = np.array(told["aabb"]), told["cells"]
-    y, rho = contracted(x, d, cells.get("space", "bounded"))
+    y, rho = contract(x, d, cells.get("space", "bounded"))
     unit = (y - box[:3]) / (box[3:] - box[:3])
     grid = cells_of(arrays, "occupancy", cells["counts"])
     here = occupied(grid, np.array(cells["aabb"]), y) & ((unit >= 0) & (unit <= 1)).all(1)
@@ -229,7 +229,7 @@ def of_tensors(kind: str, told: dict, arrays: dict, x: np.ndarray, d: np.ndarray
         v = d @ inverse[:3, :3].T
         stretch = np.linalg.norm(v, axis=1)
         own_x, own_d = x @ inverse[:3, :3].T + inverse[:3, 3], v / stretch[:, None]
-        y, rho = contracted(own_x, own_d, tensor.get("space", "bounded"))
+        y, rho = contract(own_x, own_d, tensor.get("space", "bounded"))
         box = np.array(tensor["aabb"])
         here = occupied(cells_of(own, "occupancy", tensor["occupancy"]), box, y)
         unit = np.clip((y - box[:3]) / (box[3:] - box[:3]), 0, 1)
@@ -376,7 +376,7 @@ def between(numbers: dict, low: tuple, side: int, at: np.ndarray) -> np.ndarray:
 
 def of_bricks(told: dict, arrays: dict, x: np.ndarray, d: np.ndarray):
     """2.6: `sparse`."""
-    y, rho = contracted(x, d, told.get("space", "bounded"))
+    y, rho = contract(x, d, told.get("space", "bounded"))
     units = (y - np.array(told["aabb"])[:3]) / np.array(told["top"]) * 512
     bricks = Bricks(told, arrays)
     count = (told["sh_degree"] + 1) ** 2

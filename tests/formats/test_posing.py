@@ -14,12 +14,12 @@ from PIL import Image as Pillow
 
 from formats import posing
 from formats.captures import read_capture
+from formats.colmap_worker import ALIKE, NEIGHBOURS, matching_pairs
 from formats.errors import BadImage, MissingExtra, MissingFile, NoPoses, NotACapture, NoViews, PosingFailed
 from formats.images import read_focal, write_smaller
-from formats.mapper import ALIKE, NEIGHBOURS, likely_pairs
 from formats.overview import overview
-from formats.points import Points, read_ply_points, write_ply_points
-from formats.posing import DISTANCE, Posed, estimate, photos_to_pose, upright, write_posed
+from formats.points import SparsePoints, read_ply_points, write_ply_points
+from formats.posing import DISTANCE, PosedPhotos, estimate, photos_to_pose, upright, write_posed
 from formats.views import View
 from fusedrf_cli.progress import NullProgress
 from tests.formats import corner
@@ -32,7 +32,7 @@ with_pycolmap = pytest.mark.skipif(
 )
 
 
-class Told(NullProgress):
+class ObjectCues(NullProgress):
     """Keeps the phases, and how far each came."""
 
     def __init__(self):
@@ -147,7 +147,7 @@ def test_pairs_are_neighbours_and_those_that_look_alike():
     random = np.random.default_rng(0)
     places = random.integers(0, 256, (30, 40, 128))
     noisy = [places[i % 30] + random.integers(-8, 9, (40, 128)) for i in range(60)]
-    pairs = likely_pairs([np.clip(found, 0, 255).astype(np.uint8) for found in noisy])
+    pairs = matching_pairs([np.clip(found, 0, 255).astype(np.uint8) for found in noisy])
     assert pairs == sorted(set(pairs)) and all(i < j for i, j in pairs)
     assert {(i, i + 1) for i in range(59)} | {(i, i + 30) for i in range(30)} <= set(pairs)
     assert len(pairs) <= 60 * (NEIGHBOURS + ALIKE)
@@ -155,14 +155,14 @@ def test_pairs_are_neighbours_and_those_that_look_alike():
 
 def test_pairs_of_pictures_without_features():
     found = [np.zeros((0, 128), np.uint8), *np.random.default_rng(0).integers(0, 256, (4, 9, 128), np.uint8)]
-    assert likely_pairs(found) == [(i, j) for i in range(5) for j in range(i + 1, 5)]
-    assert {(i, i + 1) for i in range(29)} <= set(likely_pairs([np.zeros((0, 128), np.uint8)] * 30))
+    assert matching_pairs(found) == [(i, j) for i in range(5) for j in range(i + 1, 5)]
+    assert {(i, i + 1) for i in range(29)} <= set(matching_pairs([np.zeros((0, 128), np.uint8)] * 30))
 
 
 # --- the world's axes ---------------------------------------------------------------------------------------
 
 
-def anyhow(poses: np.ndarray) -> tuple[list[View], Points, np.ndarray]:
+def anyhow(poses: np.ndarray) -> tuple[list[View], SparsePoints, np.ndarray]:
     """Views and what they look at in a world turned, moved and scaled anyhow."""
     axis = np.array([0.3, -0.5, 0.81])
     a, b, c = axis / np.linalg.norm(axis)
@@ -173,7 +173,7 @@ def anyhow(poses: np.ndarray) -> tuple[list[View], Points, np.ndarray]:
     poses[:, :3, 3] = 7 * poses[:, :3, 3] @ turn.T + [50, -20, 3]
     points = 7 * np.random.default_rng(0).normal(size=(99, 3)) * 0.3 @ turn.T + [50, -20, 3]
     views = [View(f"{i}", pose, 80, 80, 50, 40, 100, 80) for i, pose in enumerate(poses)]
-    return views, Points(points, np.zeros((99, 3), np.uint8)), turn
+    return views, SparsePoints(points, np.zeros((99, 3), np.uint8)), turn
 
 
 def test_the_world_is_stood_upright():
@@ -237,14 +237,14 @@ def test_a_camera_that_looks_straight_down():
 
 def test_points_come_back(tmp_path):
     random = np.random.default_rng(0)
-    points = Points(random.normal(size=(50, 3)), random.integers(0, 256, (50, 3), np.uint8))
+    points = SparsePoints(random.normal(size=(50, 3)), random.integers(0, 256, (50, 3), np.uint8))
     write_ply_points(tmp_path / "p.ply", points)
     back = read_ply_points(tmp_path / "p.ply")
     assert back.positions == pytest.approx(points.positions, rel=1e-6)
     assert (back.colours == points.colours).all()
 
 
-def posed(folder: Path, count: int = 3) -> Posed:
+def posed(folder: Path, count: int = 3) -> PosedPhotos:
     """Photos that "found" a place in a row, one of them of another size."""
     views = []
     for i in range(count):
@@ -255,8 +255,8 @@ def posed(folder: Path, count: int = 3) -> Posed:
         views.append(
             View(f"{i}", pose, 80 + i, 81, 50, 40, *size, (0.1, 0, 0, 0, 0), image_path=folder / f"{i}.png")
         )
-    points = Points(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
-    return Posed(tuple(views), points, ("x.png",), (), (count,), 0.5)
+    points = SparsePoints(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
+    return PosedPhotos(tuple(views), points, ("x.png",), (), (count,), 0.5)
 
 
 @pytest.mark.parametrize("relative", [False, True])
@@ -280,11 +280,11 @@ def test_what_is_written_is_a_capture(tmp_path, relative):
 
 
 def in_its_place(monkeypatch, tmp_path, code: str) -> None:
-    """Let the process run `code` instead of `formats.mapper`."""
+    """Let the process run `code` instead of `formats.colmap_worker`."""
     place = tmp_path / "instead" / "formats"
     place.mkdir(parents=True)
     (place / "__init__.py").write_text("")
-    (place / "mapper.py").write_text(code)
+    (place / "colmap_worker.py").write_text(code)
     monkeypatch.setattr(posing, "__file__", str(place / "posing.py"))
     monkeypatch.setattr(posing, "check_extra", lambda folder: None)
 
@@ -345,7 +345,7 @@ def test_an_interrupt_ends_the_process_and_leaves_nothing(tmp_path, monkeypatch)
 def found(tmp_path_factory) -> tuple:
     """8 photos of the corner, one of a plain wall: what was found, what was told, and the true poses."""
     pytest.importorskip("pycolmap", reason="pycolmap is not installed (the extra fusedrf[capture])")
-    folder, told = tmp_path_factory.mktemp("corner"), Told()
+    folder, told = tmp_path_factory.mktemp("corner"), ObjectCues()
     true = corner.write_photos(folder, 8)
     Pillow.new("RGB", corner.SIZE, (90, 90, 90)).save(folder / "p99.png")
     return estimate(folder, photos_to_pose(folder), 1, told), told, true
@@ -384,7 +384,7 @@ def test_many_photos_are_posed_by_likely_pairs_and_their_lens_is_refined(tmp_pat
 
     place = Path(formats.__file__).parent
     shutil.copytree(place, tmp_path / "instead/formats")
-    mapper = tmp_path / "instead/formats/mapper.py"
+    mapper = tmp_path / "instead/formats/colmap_worker.py"
     text = mapper.read_text()
     for found, lowered in (("EXHAUSTIVE = 60", "EXHAUSTIVE = 4"), ("REFINED = 30", "REFINED = 6")):
         assert found in text
@@ -392,7 +392,7 @@ def test_many_photos_are_posed_by_likely_pairs_and_their_lens_is_refined(tmp_pat
     mapper.write_text(text)
     monkeypatch.setattr(posing, "__file__", str(tmp_path / "instead/formats/posing.py"))
     corner.write_photos(tmp_path / "photos", 6)
-    told = Told()
+    told = ObjectCues()
     posed = estimate(tmp_path / "photos", photos_to_pose(tmp_path / "photos"), 1, told)
     assert list(told.phases) == ["reading", "features", "comparing", "matching", "mapping", "refining"]
     (view, *_), true = posed.views, corner.poses(6)
@@ -419,7 +419,7 @@ def test_the_process_ends_with_its_parent(tmp_path):
     (tmp_path / "job.json").write_text(json.dumps(job))
     Pillow.new("RGB", (4000, 3000)).save(tmp_path / "a.png")
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    words = [sys.executable, "-m", "formats.mapper", str(tmp_path)]
+    words = [sys.executable, "-m", "formats.colmap_worker", str(tmp_path)]
     process = subprocess.Popen(words, cwd=ROOT, **pipes)
     with process:
         process.stdin.close()

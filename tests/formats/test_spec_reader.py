@@ -65,7 +65,7 @@ def test_the_words_of_spaces(space, tmp_path):
     made = made.with_occupancy(OccupancyGrid.full(space.WHOLE, 4, space))
     single_field_bundle(FieldRecord(made.kind, *made.state()), "node").write(tmp_path / "a.rfpack")
     _, fields = spec_reader.open_bundle(tmp_path / "a.rfpack")
-    points = space.placed(torch.from_numpy(points_in(0.9 * space.WHOLE, COUNT)))
+    points = space.inv_contract(torch.from_numpy(points_in(0.9 * space.WHOLE, COUNT)))
     dirs = unit(np.random.default_rng(5).normal(size=(COUNT, 3)))
     field = make_field(decode_field(encode_field(FieldRecord(made.kind, *made.state())), "here"), "here")
     assert field.space is space

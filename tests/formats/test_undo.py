@@ -9,7 +9,7 @@ from formats import undo as undoing
 from formats.bundle import sha256_of, single_field_bundle
 from formats.errors import BadSchema, FormatError, MissingFile, ResourceError
 from formats.records import FieldRecord
-from formats.undo import check_past, history, keep, past_of, undo
+from formats.undo import check_history_folder, history, history_folder, keep, undo
 
 
 def write(path, value: int, *entries) -> bytes:
@@ -42,7 +42,7 @@ def test_edits_are_undone_one_after_the_other_to_the_byte(tmp_path):
     with pytest.raises(BadSchema, match="not edited since it was made"):
         undo(path, path)
     write(path, 1, {"event": "fused"}, {"event": "added"})
-    with pytest.raises(BadSchema, match="was not kept; edit with --keep-history"):
+    with pytest.raises(BadSchema, match="was not kept; edit with --undoable"):
         undo(path, path)
 
 
@@ -52,7 +52,7 @@ def test_a_chain_over_several_files_can_be_undone(tmp_path):
     first = write(a, 0)
     second, entries = edited(a, 1, onto=b)
     edited(b, 2, *entries, onto=c)
-    assert sum(os.path.samefile(a, one) for one in past_of(c).iterdir()) == 1
+    assert sum(os.path.samefile(a, one) for one in history_folder(c).iterdir()) == 1
     undo(c, back)
     assert back.read_bytes() == second
     undo(back, start)
@@ -78,7 +78,7 @@ def test_the_oldest_go(tmp_path):
     for value in range(1, 7):
         os.utime(path, (value, value))
         _, entries = edited(path, value, *entries, most=3)
-    assert len(list(past_of(path).iterdir())) == 3 and history(path)["undoable"] == 3
+    assert len(list(history_folder(path).iterdir())) == 3 and history(path)["undoable"] == 3
 
 
 @pytest.mark.parametrize("harm", ["gone", "another"])
@@ -86,7 +86,7 @@ def test_what_is_not_there_as_it_was_is_not_given_back(tmp_path, harm):
     path = tmp_path / "one.rfpack"
     write(path, 0)
     edited(path, 1)
-    (kept,) = past_of(path).iterdir()
+    (kept,) = history_folder(path).iterdir()
     kept.unlink()
     if harm == "another":
         kept.write_bytes(b"another")
@@ -143,7 +143,7 @@ def test_what_another_bundle_left_goes_first(tmp_path):
     for value in (1, 2):
         os.utime(path, (0, 0))
         _, entries = edited(path, value, *entries, most=2)
-    assert history(path)["undoable"] == 2 and len(list(past_of(path).iterdir())) == 2
+    assert history(path)["undoable"] == 2 and len(list(history_folder(path).iterdir())) == 2
 
 
 @pytest.mark.parametrize("linked", [True, False])
@@ -158,8 +158,8 @@ def test_what_is_kept_is_on_the_disk(tmp_path, monkeypatch, linked):
     write(path, 0)
     flushed.clear()
     keep(path, path)
-    (kept,) = past_of(path).iterdir()
-    where = [place.stat().st_ino for place in (kept, past_of(path), tmp_path)]
+    (kept,) = history_folder(path).iterdir()
+    where = [place.stat().st_ino for place in (kept, history_folder(path), tmp_path)]
     assert set(where) <= set(flushed) and flushed[-1] == where[1]
 
 
@@ -169,21 +169,21 @@ def test_a_folder_that_cannot_keep_is_found_before(tmp_path, monkeypatch, harm):
     path = tmp_path / "one.rfpack"
     write(path, 0)
     if harm == "a file":
-        past_of(path).touch()
+        history_folder(path).touch()
     elif harm == "a dangling link":
-        past_of(path).symlink_to("nowhere")
+        history_folder(path).symlink_to("nowhere")
     else:
-        past_of(path).mkdir()
-        monkeypatch.setattr(os, "access", lambda place, _: place != past_of(path))
+        history_folder(path).mkdir()
+        monkeypatch.setattr(os, "access", lambda place, _: place != history_folder(path))
     with pytest.raises(ResourceError, match="keep-history"):
-        check_past(path, path)
+        check_history_folder(path, path)
 
 
 def test_a_file_in_the_place_of_what_is_to_be_kept_is_told(tmp_path):
     path = tmp_path / "one.rfpack"
     write(path, 0)
-    past_of(path).mkdir()
-    (past_of(path) / f"{sha256_of(path)}.rfpack").write_text("mine")
+    history_folder(path).mkdir()
+    (history_folder(path) / f"{sha256_of(path)}.rfpack").write_text("mine")
     with pytest.raises(ResourceError, match="something else than its name says"):
         keep(path, path)
 

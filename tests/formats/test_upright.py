@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from formats.camera_set import upward
 from formats.captures import read_capture
-from formats.rig import upward
 from formats.upright import EITHER, UNKNOWN, upward_doubt
 from tests.formats.test_captures import looking_at, photo
 

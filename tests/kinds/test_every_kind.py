@@ -12,8 +12,8 @@ from formats.bundle import read_bundle
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.sparse.students import SparseStudent
-from fusedrf_cli.engine.kinds.student import Student
+from fusedrf_cli.engine.kinds.builder import DistilledBuilder
+from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.requests import FuseRequest
 from fusedrf_cli.verbs import checked
@@ -29,8 +29,9 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 @pytest.fixture(scope="module", autouse=True)
 def short(tiny):  # noqa: F811
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SparseStudent, "lesson", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        patch.setattr(Student, "lesson", TinySettings(points_per_step=1 << 11))  # a network takes its time
+        patch.setattr(SparseBuilder, "distil_config", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
+        # a network takes its time
+        patch.setattr(DistilledBuilder, "distil_config", TinySettings(points_per_step=1 << 11))
         yield
 
 
@@ -69,7 +70,7 @@ def test_a_scene_becomes_a_field_of_it(fused, folder, picture, kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_equal_seeds_give_equal_bytes(report, folder, kind):
     for name in ("one", "two"):
-        words = ("--kind", kind, "--max-size", str(SIZE), "--no-rgb", "--seed", "4")
+        words = ("--kind", kind, "--max-size", str(SIZE), "--no-finetune", "--seed", "4")
         report("fuse", "pair.json", "-o", f"{name}.rfpack", *words)
     assert (folder / "one.rfpack").read_bytes() == (folder / "two.rfpack").read_bytes()
 
@@ -116,14 +117,14 @@ def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, ki
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_target_that_is_easy_takes_few_bytes(report, kind):
-    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "16", "--no-rgb")
+    words = ("--kind", kind, "--max-size", str(SIZE), "--target-psnr", "16", "--no-finetune")
     said = report("fuse", "pair.json", "-o", "small.rfpack", *words)
     assert said["psnr"]["stored"] >= 16 and said["bytes"] < SIZE
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_ladders_are_keywords_of_fuse(kind):
-    groups = registry.kind(kind).ladders(30.0)
+    groups = registry.kind(kind).sweeps(30.0)
     first = [asdict(next(ladder)) for found in groups.values() for ladder in found]
     words = {"scene": "scene.json", "output": "fused.rfpack", "kind": kind}
     assert first and all(checked(FuseRequest, words | rung) for rung in first)

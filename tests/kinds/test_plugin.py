@@ -19,11 +19,11 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "kinds.md"
 # The command line, but that a draft is some steps: no clock decides what is learnt.
 BRIEF = """
-from fusedrf_cli.bridge.training import Presets
+from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.main import main
-with using(Presets(draft=TrainConfig(longest=16, steps=300, samples=1 << 12))):
+with using(TrainPresets(draft=TrainConfig(longest=16, steps=300, samples=1 << 12))):
     main()
 """
 

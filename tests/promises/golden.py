@@ -22,8 +22,8 @@ import torch
 from click.testing import CliRunner
 
 from formats.bundle import read_bundle
+from formats.camera_set import CameraSet
 from formats.errors import FormatWarning
-from formats.rig import Rig
 from formats.scene import SHOWING_KEYS, Node, SceneGraph, make_node, write_scene
 from formats.views import View
 from fusedrf_cli.engine.settings import using
@@ -184,7 +184,7 @@ def coded(make: Callable[[Path], None]) -> Callable[[Path], None]:
 
     def made(folder: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("formats.quantised.LEAST", {2: 512, 3: 256})
+            patch.setattr("formats.quantisation.LEAST", {2: 512, 3: 256})
             make(folder)
 
     return made
@@ -241,7 +241,7 @@ def network(unbounded: bool = False):
 
 def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
     """A closed room of mottled walls around an empty core, in all of space, with a hashed detail."""
-    from fusedrf_cli.engine.fields.hashed import Hashed
+    from fusedrf_cli.engine.fields.hash_entries import HashGrid
     from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
     from fusedrf_cli.engine.kinds.vm.field import VMField
     from fusedrf_cli.engine.spaces import unbounded
@@ -249,7 +249,7 @@ def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
     from tests.engine.conftest import THIRTY_TWO
 
     generator = torch.Generator().manual_seed(seed)
-    detail = Hashed((1.0, 0.5), 256) if hashed else None
+    detail = HashGrid((1.0, 0.5), 256) if hashed else None
     made = VMField.create(
         replace(shape or THIRTY_TWO, hashed=detail), WHOLE, (resolution,) * 3, generator
     )
@@ -264,7 +264,7 @@ def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
 
 def furnished():
     """Far walls and a ball in the core that shows some of the detail's rows."""
-    from fusedrf_cli.engine.fields.hashed import Hashed
+    from fusedrf_cli.engine.fields.hash_entries import HashGrid
     from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
     from fusedrf_cli.engine.kinds.vm.field import VMField
     from fusedrf_cli.engine.spaces import unbounded
@@ -272,7 +272,7 @@ def furnished():
     from tests.engine.conftest import THIRTY_TWO
 
     generator = torch.Generator().manual_seed(3)
-    shape = replace(THIRTY_TWO, hashed=Hashed((1 / 8, 1 / 16), 1 << 12))
+    shape = replace(THIRTY_TWO, hashed=HashGrid((1 / 8, 1 / 16), 1 << 12))
     made = VMField.create(shape, WHOLE, (25,) * 3, generator)
     made.sections()["density_detail"].normal_(0, 0.5, generator=generator)
     grid = OccupancyGrid.full(WHOLE, 32, unbounded)
@@ -297,7 +297,7 @@ def cameras(surroundings: bool = True, scale: float = 1.0, centre=(0.0, 0.0, 0.0
         pose = look_at(eye, np.array(centre, float), np.array([0.0, 0.0, 1.0]))
         bent = {"distortion": (0.05, -0.02, 0.001, 0.0, 0.0)} if i == 2 else {}
         views.append(View(f"photo_{i}", pose, 24.0, 24.0, 16.0, 12.0, 32, 24, **bent))
-    return Rig(
+    return CameraSet(
         tuple(views[:4]), tuple(views[4:]), np.array(centre, float), 1.6 * scale, surroundings
     ).content()
 
@@ -326,10 +326,10 @@ MIRRORED[:3, 3] = 0.4, 0.5, 0.3
 
 def small_objects(folder: Path) -> None:
     """one, two and three: random `vm` fields, of which the second has a detail."""
-    from fusedrf_cli.engine.fields.hashed import Hashed
+    from fusedrf_cli.engine.fields.hash_entries import HashGrid
 
     write(folder / "one.rfpack", tensor(1))
-    write(folder / "two.rfpack", tensor(2, hashed=Hashed((0.31, 0.07), 64), scale=30.0, shift=-6.0))
+    write(folder / "two.rfpack", tensor(2, hashed=HashGrid((0.31, 0.07), 64), scale=30.0, shift=-6.0))
     write(folder / "three.rfpack", tensor(3, (7, 8, 9)))
 
 
@@ -386,7 +386,7 @@ def edited_blocks(folder: Path) -> None:
     )
     write_scene(folder / "pair.json", SceneGraph(nodes), overwrite=True)
     done("fuse", "pair.json", "-o", "kept.rfpack", "--kind", "blocks")
-    last = ("-o", "kept.rfpack", "-w", "--keep-history")
+    last = ("-o", "kept.rfpack", "-w", "--undoable")
     done(
         "add",
         "kept.rfpack",
@@ -436,7 +436,7 @@ def place_with_sources(folder: Path) -> None:
     done(
         "fuse", "place.json", "-o", "kept.rfpack", "--kind", "blocks", "--keep-sources", "--precision", "int8"
     )
-    done("move", "kept.rfpack", "first", "-t", "0.1,0,0.2", "-o", "kept.rfpack", "-w", "--keep-history")
+    done("move", "kept.rfpack", "first", "-t", "0.1,0,0.2", "-o", "kept.rfpack", "-w", "--undoable")
 
 
 def extracted(*words: str) -> Callable[[Path], None]:
@@ -464,7 +464,8 @@ def learnt(kind: str, *words: str, size: str = "60kB") -> Callable[[Path], None]
     """The shop's scene, distilled to a kind."""
 
     def made(folder: Path) -> None:
-        done("fuse", "pair.json", "-o", "kept.rfpack", "--kind", kind, "--max-size", size, "--no-rgb", *words)
+        kept = ("pair.json", "-o", "kept.rfpack", "--kind", kind, "--max-size", size, "--no-finetune")
+        done("fuse", *kept, *words)
 
     return made
 
@@ -476,7 +477,7 @@ def learnt_with_sources(kind: str, size: str) -> Callable[[Path], None]:
         small_sources(folder)
         learnt(kind, "--keep-sources", size=size)(folder)
         done("add", "kept.rfpack", "three.rfpack", "--name", "three", "-t", "0.6,0,0.2", "-s", "0.3",
-             "-o", "kept.rfpack", "-w", "--keep-history", "--no-rgb")  # fmt: skip
+             "-o", "kept.rfpack", "-w", "--undoable", "--no-finetune")  # fmt: skip
 
     return made
 
@@ -508,7 +509,7 @@ def restored(folder: Path) -> None:
     """A distilled field out of which an object was cut: a small tensor shows what it hid."""
     sunk(folder)
     learnt("vm", "--keep-sources", size="120kB")(folder)
-    done("delete", "kept.rfpack", "red", "-o", "kept.rfpack", "-w", "--keep-history", "--no-rgb")
+    done("delete", "kept.rfpack", "red", "-o", "kept.rfpack", "-w", "--undoable", "--no-finetune")
 
 
 def learnt_place(folder: Path) -> None:
@@ -526,7 +527,7 @@ def learnt_place(folder: Path) -> None:
         "vm",
         "--max-size",
         "200kB",
-        "--no-rgb",
+        "--no-finetune",
         "--keep-sources",
     )
 
@@ -537,7 +538,7 @@ def filled(folder: Path) -> None:
     learnt("vm", size="120kB")(folder)
     (folder / "red.rfpack").unlink()
     (folder / "floor.rfpack").unlink()
-    done("delete", "kept.rfpack", "red", "-o", "kept.rfpack", "-w", "--fill", "--no-rgb")
+    done("delete", "kept.rfpack", "red", "-o", "kept.rfpack", "-w", "--fill", "--no-finetune")
 
 
 def nodes_of_kinds(composition: str) -> Callable[[Path], None]:

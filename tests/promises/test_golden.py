@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from formats.bundle import sha256_of
-from formats.undo import past_of
+from formats.undo import history_folder
 from fusedrf_cli.main import cli
 from tests.promises.golden import CASES, KEPT, answers, decibels, drawn, edited, picture
 
@@ -64,7 +64,7 @@ def test_an_edit_of_it_gives_what_it_gave(name, edit, tmp_path):
     edited(path, words, out)
     check(out, kept(name), f"{edit} ")
     if words[0] == "undo":
-        assert (past_of(path) / f"{sha256_of(out)}.rfpack").read_bytes() == out.read_bytes()
+        assert (history_folder(path) / f"{sha256_of(out)}.rfpack").read_bytes() == out.read_bytes()
 
 
 def test_the_kept_history_tells_what_was_done():

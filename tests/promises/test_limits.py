@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from formats import errors, inputs, records, scene
+from formats import errors, records, safe_input, scene
 from formats.archive import MAX_MEMBERS, write_archive
 from formats.bundle import member_name
+from formats.camera_set import MAX_CAMERAS
 from formats.names import MAX_NAME_BYTES
 from formats.records import MAX_HEADER
-from formats.rig import MAX_CAMERAS
 from formats.scene import SceneGraph, dump_scene, make_node, parse_scene, write_scene
 from formats.sources import expand_scene
 from tests.formats.test_records import HOSTILE as BAD_FIELDS
@@ -30,8 +30,8 @@ from formats.errors import FormatError
 from tests.promises.packs import GOLDEN
 formats.bundle.read_bundle(GOLDEN / "lamp.rfpack")  # what is made once is made now
 if len(sys.argv) > 2:
-    import formats.inputs
-    formats.inputs.MAX_VALUES = formats.inputs.MAX_KEYS = float("inf")
+    import formats.safe_input
+    formats.safe_input.MAX_VALUES = formats.safe_input.MAX_KEYS = float("inf")
 def peak():  # getrusage would tell of the process that started this one
     return int(re.search(r"VmHWM:\\s+([0-9]+)", open("/proc/self/status").read())[1]) / 1024
 before, began = peak(), time.process_time()
@@ -245,7 +245,7 @@ def test_without_strict_numbers_they_get_in(monkeypatch, name, attribute, instea
         data = scene_json().replace(b"{", data[:-1] + b", ", 1)
     with pytest.raises(errors.BadJson):
         parse_scene(data, "here")
-    monkeypatch.setattr(inputs, attribute, instead)
+    monkeypatch.setattr(safe_input, attribute, instead)
     parse_scene(data, "here")
 
 
@@ -262,6 +262,6 @@ def test_limits_are_those_of_the_specification():
         assert words in spec
     assert (MAX_CAMERAS, MAX_NAME_BYTES) == (10_000, 200)
     assert (MAX_MEMBERS, MAX_HEADER, scene.MAX_SCENE_BYTES) == (10_001, 1 << 20, 4 << 20)
-    assert f"{inputs.MAX_VALUES:,}" in spec and f"{inputs.MAX_KEYS:,}" in spec
-    assert f"{inputs.MAX_NESTING} levels" in spec
+    assert f"{safe_input.MAX_VALUES:,}" in spec and f"{safe_input.MAX_KEYS:,}" in spec
+    assert f"{safe_input.MAX_NESTING} levels" in spec
     assert "those of a field 8 GiB" in spec and records.MAX_DECODED_BYTES == 8 << 30

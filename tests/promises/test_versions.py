@@ -11,9 +11,9 @@ from click.testing import CliRunner
 from formats import scene as scene_file
 from formats.archive import read_archive
 from formats.bundle import BundleWriter, OpenBundle, read_bundle, read_summary
+from formats.camera_set import read_camera_set
 from formats.errors import FormatWarning, NewerVersion
 from formats.images import read_image
-from formats.rig import read_rig
 from formats.scene import dump_scene
 from fusedrf_cli.bridge.rendering import reference, to_pixels
 from fusedrf_cli.bridge.scene import load_scene
@@ -69,7 +69,7 @@ def test_kept_packs_render_as_they_did(name, picture):
 def test_kept_cameras_stand_where_they_stood():
     """P1: ring.rfpack has four cameras around z, 2 away and 1 up, of which the third is a fisheye."""
     scene = read_bundle(GOLDEN / "ring.rfpack").scene
-    rig = read_rig(scene.cameras)
+    rig = read_camera_set(scene.cameras)
     assert (scene.version, scene.framing) == ("1.1", (-1.5, -1.0, -0.5, 1.5, 1.0, 0.75))
     assert [view.name for view in rig.train] == ["r_0", "r_1", "r_2"] and len(rig.test) == 1
     for view, place in zip(rig.views, ((2, 0, 1), (0, 2, 1), (-2, 0, 1), (0, -2, 1)), strict=True):
@@ -106,9 +106,9 @@ def test_another_meaning_of_the_same_bytes_would_show(monkeypatch):
 
 def test_another_meaning_of_codes_would_show(monkeypatch):
     """P1 with its defence removed: a reader that divides by 128 instead of 127."""
-    from formats import quantised
+    from formats import quantisation
 
-    monkeypatch.setitem(quantised.LEVELS, 8, 128)
+    monkeypatch.setitem(quantisation.LEVELS, 8, 128)
     assert decibels(rendered(GOLDEN / "coded-8.rfpack"), read_image(GOLDEN / "coded.png")[..., :3]) < 50
 
 

@@ -152,7 +152,9 @@ def test_what_a_bundle_keeps_stays_in_it(folder):
     field = open_scene("blue.rfpack").fields["blue"]
     kept = {red.member: folder / "red.rfpack"}
     about = SceneGraph((), history=({"event": "fused"},))
-    write_field("kept.rfpack", field, "blue", precision="float16", overwrite=False, about=about, kept=kept)
+    write_field(
+        "kept.rfpack", field, "blue", precision="float16", overwrite=False, about=about, kept_sources=kept
+    )
     open_scene("kept.rfpack").save("again.rfpack")
     assert Path("again.rfpack").read_bytes() == Path("kept.rfpack").read_bytes()
 

@@ -57,7 +57,7 @@ class Placed:
     def aabb(self) -> np.ndarray:
         """(6,) world box around the field's occupied cells, or, where it fills all of space, around the
         middle of its core."""
-        return transformed_aabb(self.field.occupancy.subject, self.object_to_world)
+        return transformed_aabb(self.field.occupancy.look_at_box, self.object_to_world)
 
     @cached_property
     def unbounded(self) -> bool:

@@ -19,7 +19,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     placed_cells,
     unbounded_cells,
 )
-from fusedrf_cli.engine.fields.pace import Pace
+from fusedrf_cli.engine.fields.step_size_grid import StepSizeGrid
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import unbounded
@@ -73,11 +73,11 @@ class ComposedField:
 
     def leaves(self) -> list[Placed]:
         """The fields that it places, in this frame; of composed scenes among them those that these place."""
-        found = []
+        leaves = []
         for p in self.placed:
             inner = p.field.leaves() if isinstance(p.field, ComposedField) else None
-            found += [p] if inner is None else [replace(q.within(p), name=q.name) for q in inner]
-        return found
+            leaves += [p] if inner is None else [replace(q.within(p), name=q.name) for q in inner]
+        return leaves
 
     def with_fields(self, change: Callable[[RadianceField], RadianceField]) -> "ComposedField":
         """The same scene of other fields: what `change` makes of each distinct one, in the order of
@@ -105,19 +105,19 @@ class ComposedField:
         if any(p.unbounded for p in self.placed):
             again = ((p.field.occupancy, p.object_to_world) for p in self.placed)
             steps = (sampling_step(p.field) for p in self.placed)
-            pace = Pace(OccupancyGrid.full(unbounded.WHOLE, config.scene_cells, unbounded))
+            pace = StepSizeGrid(OccupancyGrid.full(unbounded.WHOLE, config.scene_cells, unbounded))
             marks = pace.kept(unbounded_cells(grids, config.scene_cells), again, steps)
-            return replace(pace.grid(reduce(np.logical_or, marks)), looked_at=self.subject)
+            return replace(pace.grid(reduce(np.logical_or, marks)), looked_at=self.look_at_box)
         aabb, marks = placed_cells(np.stack([p.aabb for p in self.placed]), grids, config.scene_cells)
         return OccupancyGrid(aabb, reduce(np.logical_or, marks))
 
     @property
-    def subject(self) -> np.ndarray:
+    def look_at_box(self) -> np.ndarray:
         """(6,) box of this frame that views look at, as OccupancyGrid.subject."""
         if not any(p.unbounded for p in self.placed):
-            return self.occupancy.subject
+            return self.occupancy.look_at_box
         around = largest(self.placed)
-        return placed_box(around.field.occupancy.subject, around.object_to_world)
+        return placed_box(around.field.occupancy.look_at_box, around.object_to_world)
 
     @property
     def aabb(self) -> np.ndarray:
@@ -150,20 +150,22 @@ class ComposedField:
     def _densest(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
         """Where a field is denser than those before it (at points of indices `inside`), its answer is
         taken."""
-        found = placed.query(points[inside], dirs[inside], False)[0].float()
-        denser = found > sigma[inside]
+        densities = placed.query(points[inside], dirs[inside], False)[0].float()
+        denser = densities > sigma[inside]
         won = inside[denser]
-        sigma[won] = found[denser]
+        sigma[won] = densities[denser]
         if with_colour and len(won):
             rgb[won] = placed.query(points[won], dirs[won])[1]
 
     def _sum(self, placed: Placed, inside, points, dirs, with_colour: bool, sigma, rgb) -> None:
         """A field's density at points of indices `inside`, and its colour by that weight, added."""
-        found = placed.query(points[inside], dirs[inside], False)[0].float().double()
-        sigma[inside] += found
-        seen = inside[found > 0]
-        if with_colour and len(seen):
-            rgb[seen] += found[found > 0, None] * placed.query(points[seen], dirs[seen])[1].double()
+        densities = placed.query(points[inside], dirs[inside], False)[0].float().double()
+        sigma[inside] += densities
+        shown = inside[densities > 0]
+        if with_colour and len(shown):
+            rgb[shown] += (
+                densities[densities > 0, None] * placed.query(points[shown], dirs[shown])[1].double()
+            )
 
 
 def occupied_at(field: RadianceField, points: np.ndarray) -> np.ndarray:
@@ -172,11 +174,11 @@ def occupied_at(field: RadianceField, points: np.ndarray) -> np.ndarray:
     field = opened(field)
     if not isinstance(field, ComposedField):
         return field.occupancy.contains(mapped(points, field.occupancy.space))
-    found = np.zeros(len(points), bool)
+    occupied = np.zeros(len(points), bool)
     for p in field.placed:
         matrix = p.world_to_object
-        found |= occupied_at(p.field, points @ matrix[:3, :3].T + matrix[:3, 3])
-    return found
+        occupied |= occupied_at(p.field, points @ matrix[:3, :3].T + matrix[:3, 3])
+    return occupied
 
 
 def largest(placed: list[Placed]) -> Placed:

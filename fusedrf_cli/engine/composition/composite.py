@@ -160,8 +160,8 @@ class Composite(ComposedField):
     @cached_property
     def spaces(self) -> tuple[ModuleType, ...]:
         """Those without end that instances lie in, by name."""
-        found = {p.space for p in self.parts if p.unbounded}
-        return tuple(sorted(found, key=lambda space: space.__name__))
+        spaces = {p.space for p in self.parts if p.unbounded}
+        return tuple(sorted(spaces, key=lambda space: space.__name__))
 
     @cached_property
     def sampling_step(self) -> float:
@@ -178,15 +178,15 @@ class Composite(ComposedField):
         points, dirs, n = exact(points), exact(dirs), len(points)
         sigma, rgb = np.zeros(n), np.zeros((n, 3))
         for g, (_, rule) in enumerate(self.groups):
-            found = self.answers(np.flatnonzero(self.group == g), rule, points, dirs, with_colour)
+            group_answers = self.answers(np.flatnonzero(self.group == g), rule, points, dirs, with_colour)
             if len(self.groups) == 1:
-                sigma, rgb = found.sigma, found.rgb
+                sigma, rgb = group_answers.sigma, group_answers.rgb
             elif self.rule == "add":
-                share = found.sigma / np.maximum(sigma + found.sigma, 1e-300)
-                sigma, rgb = sigma + found.sigma, rgb + share[:, None] * (found.rgb - rgb)
+                share = group_answers.sigma / np.maximum(sigma + group_answers.sigma, 1e-300)
+                sigma, rgb = sigma + group_answers.sigma, rgb + share[:, None] * (group_answers.rgb - rgb)
             else:
-                rgb = np.where((found.sigma > sigma)[:, None], found.rgb, rgb)
-                sigma = np.maximum(sigma, found.sigma)
+                rgb = np.where((group_answers.sigma > sigma)[:, None], group_answers.rgb, rgb)
+                sigma = np.maximum(sigma, group_answers.sigma)
         return torch.from_numpy(sigma).float(), torch.from_numpy(rgb).float()
 
     def answers(
@@ -196,23 +196,23 @@ class Composite(ComposedField):
         matrix, adds, n = self.instances.world_to_instance, rule == "add", len(points)
         loops = self.device_loops
         place = loops.on_device
-        asked = PointQuery(place(points), place(dirs), None, 0, matrix, self.instances.shown, adds, False)
+        query = PointQuery(place(points), place(dirs), None, 0, matrix, self.instances.shown, adds, False)
         answers = PointAnswers(np.zeros(n), np.full(n, -1), np.empty(n, np.int64), np.zeros((n, 3)))
         answers = place(answers)
         near = {b: self.points_near(points, b) for b in members}
         for b, chosen in near.items():
-            self.ask("densest_at", asked._replace(chosen=chosen, instance=b), answers)
+            self.ask("densest_at", query._replace(chosen=chosen, instance=b), answers)
         sigma, densest = loops.on_host(answers.sigma), loops.on_host(answers.densest)
         for b, chosen in near.items() if with_colour else ():
             shown = sigma[chosen] > 0 if adds else densest[chosen] == b
-            coloured = asked._replace(chosen=chosen[shown], instance=b, with_colour=True)
+            coloured = query._replace(chosen=chosen[shown], instance=b, with_colour=True)
             self.ask("colour_at", coloured, answers)
         return answers._replace(sigma=sigma, rgb=loops.on_host(answers.rgb))
 
     def points_near(self, points: np.ndarray, b: int) -> np.ndarray:
         """(M,) those of points (N, 3) that may lie in the occupied cells of an instance."""
-        found = np.empty(len(points), np.int64)
-        return found[: points_in_sphere(points, self.instances.spheres[b], found)]
+        inside = np.empty(len(points), np.int64)
+        return inside[: points_in_sphere(points, self.instances.spheres[b], inside)]
 
     def ask(self, item: str, query: PointQuery, answers: PointAnswers) -> None:
         """Let an instance enter its answers at the query's points."""
@@ -270,11 +270,11 @@ class Waves:
         self.segment_loops, place = self.loops.segments(), self.loops.on_device
         self.steps = times * scene.instances.step
         n = len(out)
-        found = Segments(
+        segments = Segments(
             *np.empty((2, n)), np.empty(n, np.int64), np.empty(n), rays.reach[:, 0].copy(),
             np.empty(n, np.int64), np.empty((n, MEETING), np.int64),
         )  # fmt: skip
-        self.rays, self.out, self.segments = place(rays), place(out), place(found)
+        self.rays, self.out, self.segments = place(rays), place(out), place(segments)
         self.left = np.arange(n)
         self.numbers = place(self.left)
         unbounded = np.flatnonzero(scene.instances.spheres[:, 3] >= FARTHEST)
@@ -292,15 +292,22 @@ class Waves:
         """Take the rays that are left through their next segments; whether any are left behind them."""
         left = self.left
         self.find(left)
-        found = self.segments
+        next_segments = self.segments
         if self.unbounded is not None:
             alone = left[self.told("alone_to")[left] > self.told("alone_from")[left]]
-            ends = found.alone_from, found.alone_to
+            ends = next_segments.alone_from, next_segments.alone_to
             self.each("show_ray", alone, self.numbers, self.unbounded, ends, self.out)
-        shared = self.each("show_ray", left, self.numbers, found.instance, (found.begin, found.end), self.out)
+        shared = self.each(
+            "show_ray",
+            left,
+            self.numbers,
+            next_segments.instance,
+            (next_segments.begin, next_segments.end),
+            self.out,
+        )
         for part in self.parts(shared):
             self.show_shared(part)
-        self.left = self.segment_loops.rays_left(left, self.rays, found, self.out, self.early_stop)
+        self.left = self.segment_loops.rays_left(left, self.rays, next_segments, self.out, self.early_stop)
         return len(self.left) > 0
 
     def find(self, left: np.ndarray) -> None:
@@ -313,11 +320,11 @@ class Waves:
             return
         meet, room = self.told("n_meeting")[shared], self.segments.meeting.shape[1]
         if meet.max() > room:
-            again, found = shared[meet > room], self.here()
-            wider = np.empty((len(found.end), meet.max()), np.int64)
-            wider[:, :room] = found.meeting
-            found.end[again] = found.alone_from[again]
-            self.segments = self.loops.on_device(found._replace(meeting=wider))
+            again, n_meeting = shared[meet > room], self.here()
+            wider = np.empty((len(n_meeting.end), meet.max()), np.int64)
+            wider[:, :room] = n_meeting.meeting
+            n_meeting.end[again] = n_meeting.alone_from[again]
+            self.segments = self.loops.on_device(n_meeting._replace(meeting=wider))
             self.segment_loops.next_segments(*arguments, again, self.segments)
 
     def parts(self, shared: np.ndarray) -> list[np.ndarray]:
@@ -329,15 +336,15 @@ class Waves:
 
     def show_shared(self, shared: np.ndarray) -> None:
         """The shared segments of rays (M,)."""
-        found, counts, place = self.segments, self.told("n_meeting")[shared], self.loops.on_device
+        wave, counts, place = self.segments, self.told("n_meeting")[shared], self.loops.on_device
         start = np.concatenate([[0], np.cumsum(counts)])
-        there = np.arange(found.meeting.shape[1]) < counts[:, None]
+        there = np.arange(wave.meeting.shape[1]) < counts[:, None]
         instance = self.told("meeting")[shared][there]
         slots = np.arange(start[-1]), place(np.repeat(shared, counts)), place(instance)
         few = start[-1] <= SLOTS_AT_ONCE
         traces = self.scene.traces if few else place(room_for_traces(start[-1]))
-        ends, groups = (found.begin, found.end), self.scene.rules(instance)
-        merged = self.early_stop, groups, traces, found.end, self.out
+        ends, groups = (wave.begin, wave.end), self.scene.rules(instance)
+        merged = self.early_stop, groups, traces, wave.end, self.out
         self.each("trace_ray", *slots, ends, traces)
         self.segment_loops.merge_samples(shared, start, *merged)
         self.add_samples(shared, start, slots, ends, traces)

@@ -39,8 +39,8 @@ def query(
         kind, device = float_type(field), device_of(field)
         for part in parts(field):
             differentiable.settle(part)
-        found = structure(field, poses).query(points, dirs, with_colour)
-        return tuple(answers.to(device, kind) for answers in found)
+        structured = structure(field, poses).query(points, dirs, with_colour)
+        return tuple(answers.to(device, kind) for answers in structured)
     if isinstance(field, ComposedField):
         return composed_query(field, points, dirs, poses or {}, with_colour)
     if isinstance(field, Placed):
@@ -60,8 +60,8 @@ def check_names(field: RadianceField | Placed, poses: Poses | None) -> None:
     placed = [field] if isinstance(field, Placed) else getattr(field, "placed", [])
     unknown = sorted((poses or {}).keys() - {p.name for p in placed})
     if unknown:
-        known = ", ".join(f"'{p.name}'" for p in placed) or "nothing"
-        raise ValueError(f"there is no '{unknown[0]}' to place; this scene places {known}")
+        placed_names = ", ".join(f"'{p.name}'" for p in placed) or "nothing"
+        raise ValueError(f"there is no '{unknown[0]}' to place; this scene places {placed_names}")
 
 
 def composed_query(
@@ -74,14 +74,15 @@ def composed_query(
     sigma = torch.zeros(len(points), dtype=points.dtype, device=device)
     rgb = torch.zeros(len(points), 3, dtype=points.dtype, device=device)
     if field.rule == "max":
-        asked = densest(parts, points, dirs)
+        densest_parts = densest(parts, points, dirs)
     else:
-        asked = [(p, pose, reached(p, points)) for p, pose in parts]
-    for placed, pose, own in asked:  # also where a part is asked nothing: so its gradient is 0, not unknown
-        found, colour = placed_query(placed, points[own], dirs[own], pose, with_colour)
-        found, colour = found.to(sigma.dtype), colour.to(rgb.dtype)
-        share = 1 if field.rule == "max" else found[:, None]
-        sigma, rgb = sigma.index_add(0, own, found), rgb.index_add(0, own, share * colour)
+        densest_parts = [(p, pose, reached(p, points)) for p, pose in parts]
+    # also where a part is asked nothing: so its gradient is 0, not unknown
+    for placed, pose, indices in densest_parts:
+        sigma_part, colour = placed_query(placed, points[indices], dirs[indices], pose, with_colour)
+        sigma_part, colour = sigma_part.to(sigma.dtype), colour.to(rgb.dtype)
+        share = 1 if field.rule == "max" else sigma_part[:, None]
+        sigma, rgb = sigma.index_add(0, indices, sigma_part), rgb.index_add(0, indices, share * colour)
     if field.rule == "add":
         rgb = rgb / sigma.clamp_min(1e-30)[:, None]
     return sigma.to(kind), rgb.to(kind)
@@ -94,11 +95,11 @@ def densest(parts: list, points: torch.Tensor, dirs: torch.Tensor) -> list:
     best = torch.zeros(len(points), dtype=points.dtype, device=points.device)
     winner = torch.full((len(points),), -1, device=points.device)
     for i, (placed, pose) in enumerate(parts):
-        own = reached(placed, points)
-        if len(own):
-            found, _ = placed_query(placed, points[own], dirs[own], pose, with_colour=False)
-            denser = found > best[own]
-            best[own[denser]], winner[own[denser]] = found[denser].to(best.dtype), i
+        indices = reached(placed, points)
+        if len(indices):
+            sigma_part, _ = placed_query(placed, points[indices], dirs[indices], pose, with_colour=False)
+            denser = sigma_part > best[indices]
+            best[indices[denser]], winner[indices[denser]] = sigma_part[denser].to(best.dtype), i
     return [(*part, torch.nonzero(winner == i)[:, 0]) for i, part in enumerate(parts)]
 
 
@@ -163,8 +164,8 @@ def parts(field: RadianceField | Placed) -> list[RadianceField]:
 
 def numbers(field: RadianceField | Placed) -> list[torch.Tensor]:
     """The `params` of all the fields that a field places, or its own, each once."""
-    found = (part.params for part in parts(field) if hasattr(part, "params"))
-    return list({id(params): params for params in found}.values())
+    vectors = (part.params for part in parts(field) if hasattr(part, "params"))
+    return list({id(params): params for params in vectors}.values())
 
 
 def device_of(field: RadianceField | Placed) -> torch.device:

@@ -9,7 +9,7 @@ import math
 
 import torch
 
-from fusedrf_cli.engine.kernels.parts import sigmoid, softplus
+from fusedrf_cli.engine.kernels.primitives import sigmoid, softplus
 
 NAMES = "softplus", "exp", "relu"
 LARGEST = 15.0  # of what is exponentiated

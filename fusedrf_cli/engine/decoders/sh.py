@@ -5,7 +5,7 @@
 import torch
 
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import sh_basis
+from fusedrf_cli.engine.kernels.primitives import sh_basis
 
 
 def sizes(width: int, coefficients: int, apart: bool = False) -> dict[str, int]:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part, largest
+from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import add_scaled, dot, mixed_8, scatter, sh_basis
+from fusedrf_cli.engine.kernels.primitives import add_scaled, dot, mixed_8, scatter, sh_basis
 
 
 class Arrays(NamedTuple):
@@ -23,9 +23,9 @@ def sizes(width: int, coefficients: int) -> dict[str, int]:
     return {"WIDTH": width, "COEFFICIENTS": coefficients, "ROOM": 7 * width + 16, "KEPT": width}
 
 
-def sections(resolution: tuple[int, int, int], width: int, coefficients: int) -> list[Part]:
+def sections(resolution: tuple[int, int, int], width: int, coefficients: int) -> list[ParameterBlock]:
     """See decoders; B is drawn as wide as leaves logits of unit features of order 1."""
-    return [Part("basis", (3, coefficients, width), spread=width**-0.5)]
+    return [ParameterBlock("basis", (3, coefficients, width), spread=width**-0.5)]
 
 
 def arrays(field, starts: np.ndarray, width: int, coefficients: int) -> Arrays:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part
+from fusedrf_cli.engine.fields.box import ParameterBlock
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import dense, dense_backward, rectify, sh_basis
+from fusedrf_cli.engine.kernels.primitives import dense, dense_backward, rectify, sh_basis
 
 OUTPUTS = 8  # three colours, filled up to a run
 HARMONICS = 16
@@ -33,14 +33,14 @@ def sizes(width: int, hidden: int) -> dict[str, int]:
     }  # fmt: skip
 
 
-def sections(resolution: tuple[int, int, int], width: int, hidden: int) -> list[Part]:
+def sections(resolution: tuple[int, int, int], width: int, hidden: int) -> list[ParameterBlock]:
     """See decoders; (inputs, outputs) of each layer, and its bias."""
     inputs = width + HARMONICS
     return [
-        Part("hidden.weight", (inputs, hidden), spread=(2 / inputs) ** 0.5),
-        Part("hidden.bias", (hidden,)),
-        Part("out.weight", (hidden, OUTPUTS), spread=hidden**-0.5),
-        Part("out.bias", (OUTPUTS,)),
+        ParameterBlock("hidden.weight", (inputs, hidden), spread=(2 / inputs) ** 0.5),
+        ParameterBlock("hidden.bias", (hidden,)),
+        ParameterBlock("out.weight", (hidden, OUTPUTS), spread=hidden**-0.5),
+        ParameterBlock("out.bias", (OUTPUTS,)),
     ]
 
 

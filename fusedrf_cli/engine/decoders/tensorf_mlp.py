@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part
-from fusedrf_cli.engine.kernels.parts import add_scaled, dense, dense_backward, dot, rectify, scatter
+from fusedrf_cli.engine.fields.box import ParameterBlock
+from fusedrf_cli.engine.kernels.primitives import add_scaled, dense, dense_backward, dot, rectify, scatter
 
 OUTPUTS = 8  # of the last layer: three colours, filled up to a run
 LAYERS = 3
@@ -40,21 +40,22 @@ def sizes(width: int, rows: int, hidden: int) -> dict[str, int | float]:
         "D_X": rows + 3, "D_ROWS": width,
     }  # fmt: skip
     starts = np.cumsum([0, *rooms.values()]).tolist()
-    kept = np.cumsum([width, inputs, wide, wide, OUTPUTS]).tolist()
+    offsets = np.cumsum([width, inputs, wide, wide, OUTPUTS]).tolist()
     return {
         "WIDTH": width, "ROWS": rows, "INPUTS": inputs, "HIDDEN": wide,
         **dict(zip(rooms, starts, strict=False)), "ROOM": starts[-1],
-        "INPUT": kept[0], "FIRST": kept[1], "SECOND": kept[2], "LAST": kept[3], "KEPT": kept[4],
+        "INPUT": offsets[0], "FIRST": offsets[1], "SECOND": offsets[2], "LAST": offsets[3],
+        "KEPT": offsets[4],
         "LEARN_FROM": 1 / 64, "SHADING_COST": 8,
     }  # fmt: skip
 
 
-def sections(resolution: tuple[int, int, int], width: int, rows: int, hidden: int) -> list[Part]:
+def sections(resolution: tuple[int, int, int], width: int, rows: int, hidden: int) -> list[ParameterBlock]:
     """See decoders; a layer's bias is the last row of its array. Layers learn slower than B."""
     named = enumerate(layer_shapes(rows, hidden))
     return [
-        Part("basis", (rows, width)),
-        *(Part(f"layer_{i}", (inputs + 1, outputs), rate=1 / 3) for i, (inputs, outputs) in named),
+        ParameterBlock("basis", (rows, width)),
+        *(ParameterBlock(f"layer_{i}", (inputs + 1, outputs), rate=1 / 3) for i, (inputs, outputs) in named),
     ]
 
 

@@ -12,8 +12,8 @@ import torch
 
 from fusedrf_cli.engine.decoders import activations
 from fusedrf_cli.engine.decoders.activations import activated, activated_slope
-from fusedrf_cli.engine.fields.box import Part
-from fusedrf_cli.engine.kernels.parts import dense, dense_backward, rectify
+from fusedrf_cli.engine.fields.box import ParameterBlock
+from fusedrf_cli.engine.kernels.primitives import dense, dense_backward, rectify
 
 
 class Arrays(NamedTuple):
@@ -37,13 +37,13 @@ def sizes(width: int, hidden: int, outputs: int, activation: str = "softplus") -
 
 def sections(
     resolution: tuple, width: int, hidden: int, outputs: int, activation: str = "softplus"
-) -> list[Part]:
+) -> list[ParameterBlock]:
     """See decoders; each layer's (inputs, outputs), and its bias."""
     return [
-        Part("hidden.weight", (width, hidden), spread=(2 / width) ** 0.5),
-        Part("hidden.bias", (hidden,)),
-        Part("out.weight", (hidden, outputs), spread=hidden**-0.5),
-        Part("out.bias", (outputs,)),
+        ParameterBlock("hidden.weight", (width, hidden), spread=(2 / width) ** 0.5),
+        ParameterBlock("hidden.bias", (hidden,)),
+        ParameterBlock("out.weight", (hidden, outputs), spread=hidden**-0.5),
+        ParameterBlock("out.bias", (outputs,)),
     ]
 
 

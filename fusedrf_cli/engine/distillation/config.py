@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
+from fusedrf_cli.engine.distillation.depth_points import DepthConfig
 from fusedrf_cli.engine.distillation.exposure import ExposureConfig
-from fusedrf_cli.engine.distillation.keypoints import DepthConfig
 from fusedrf_cli.engine.distillation.poses import PoseConfig
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 
 Stages = tuple[tuple[float, float], ...]
 """(share of the run, share of the final voxels per axis from then on)."""
@@ -20,7 +20,7 @@ class TrainConfig:
 
     kind: str = registry.DEFAULT
     """Of the field."""
-    way: Way = Way()
+    storage: StorageSetting = StorageSetting()
     """Its ranks and SH degree."""
     longest: int = 256
     """Texels on the longest axis at the end."""
@@ -39,7 +39,7 @@ class TrainConfig:
     """Whether pictures may differ in exposure and white balance, as a camera's own do. Not for views of an
     object from all around: of a side that few of them see nothing tells how bright it is."""
     smooth: bool = False
-    """Whether planes are kept smooth (smoothness.py): photos of the real world contradict each other by more
+    """Whether planes are kept smooth (tv_loss.py): photos of the real world contradict each other by more
     than a field of theirs should follow; rendered pictures do not, and lose by it."""
     poses: bool = False
     """Whether to look for where the pictures were taken from, near where they are said to have been."""
@@ -137,7 +137,7 @@ class TrainConfig:
     shown_from: float = 0.005
     """Weight on a ray from which a cell of unbounded space counts as shown. With 0.01 there are fewer cells
     to sample: the park gains 0.1 dB, the cup 0.05, but the fox's room loses 0.3."""
-    low_density_left_from: float = 0.5
+    prune_low_density_from: float = 0.5
     """From which no more density is to come into cells of floaters."""
     shrink_below: float = 0.9
     """Share of the box's volume that its occupied part must fall under for the box to be cut down: floaters
@@ -148,7 +148,7 @@ class TrainConfig:
     @property
     def stages(self) -> Stages:
         """The resolutions of the run."""
-        if self.way.hashed:
+        if self.storage.hashed:
             return self.detail_stages
         return self.unbounded_stages if self.unbounded else self.resolution_stages
 

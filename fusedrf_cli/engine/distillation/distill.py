@@ -13,9 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.distillation.epochs import Epochs
-from fusedrf_cli.engine.distillation.guard import Guard
-from fusedrf_cli.engine.distillation.judging import HeldOut, scattered_judge
+from fusedrf_cli.engine.distillation.evaluation import HoldOutRays, scattered_evaluator
 from fusedrf_cli.engine.distillation.losses import (
     DensityLoss,
     Visibility,
@@ -23,22 +21,24 @@ from fusedrf_cli.engine.distillation.losses import (
     mostly_seen,
     point_step,
 )
-from fusedrf_cli.engine.distillation.matter import MatterConfig, without_haze
+from fusedrf_cli.engine.distillation.nan_guard import NanGuard
+from fusedrf_cli.engine.distillation.occupancy_update import OccupancyUpdateConfig, prune_low_density
 from fusedrf_cli.engine.distillation.optimiser import Adam, alike
-from fusedrf_cli.engine.distillation.pixels import ShownRays
+from fusedrf_cli.engine.distillation.ray_dataset import TeacherRays
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.schedule import Schedule
+from fusedrf_cli.engine.distillation.shuffle import Shuffle
 from fusedrf_cli.engine.distillation.student import halved, pruned, resampled_like, starts_coarse
 from fusedrf_cli.engine.distillation.teacher import (
     Chance,
-    TeacherPool,
-    ask,
-    looked_at,
-    matter_first,
+    TeacherSamples,
+    query_teacher,
+    render_teacher,
+    surface_first,
 )
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.kernels import working_time
-from fusedrf_cli.engine.kinds.student import DistilConfig
+from fusedrf_cli.engine.kinds.builder import DistilConfig
 from fusedrf_cli.engine.settings import current
 
 
@@ -46,7 +46,7 @@ from fusedrf_cli.engine.settings import current
 class Recipe:
     """The parts of the method."""
 
-    chance: Chance = matter_first
+    chance: Chance = surface_first
     density_loss: DensityLoss = log_depth
     visibility: Visibility = mostly_seen
     schedule: type[Schedule] = Schedule
@@ -61,13 +61,13 @@ class DistillReport:
     psnr_after_rgb: float | None = None
     rgb_kept: bool | None = None
     found_nothing: bool = False
-    """Whether the student held no matter after the points, so that the teacher's occupancy was kept."""
+    """Whether the student held no density after the points, so that the teacher's occupancy was kept."""
     steps: dict[str, int] = field(default_factory=dict)
     """Steps made, by phase."""
     curve: list[tuple[float, int, float]] = field(default_factory=list)
     """(seconds since the start, steps of all phases, PSNR in dB on rays that nothing is trained on)."""
     numeric: dict[str, int] = field(default_factory=dict)
-    """Steps skipped and returns to a good state, where there were any (guard.py)."""
+    """Steps skipped and returns to a good state, where there were any (nan_guard.py)."""
 
 
 def distill(
@@ -100,12 +100,12 @@ class DistillRun:
         config: DistilConfig,
         rgb: bool = True,
         recipe: Recipe = Recipe(),
-        judge: Callable[[StoredField], float] | None = None,
+        evaluator: Callable[[StoredField], float] | None = None,
     ):
         """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge
         says how near a student comes, in dB; None: one of the same teacher and config.
         """
-        self.teacher, self.sampler, self.rgb, self.judge = teacher, sampler, rgb, judge
+        self.teacher, self.sampler, self.rgb, self.evaluator = teacher, sampler, rgb, evaluator
         self.config, self.recipe, self.step = config, recipe, sampling_step(student)
         coarse = config.steps > 0 and starts_coarse(student, config.coarse_from)
         self.student, self.refined = (halved(student), student) if coarse else (student, None)
@@ -114,7 +114,7 @@ class DistillRun:
         self.report = DistillReport()
         self.optimiser = Adam.of(self.student)
         itself = weakref.ref(self)  # a circle of references would keep hundreds of megabytes for longer
-        self.guard = Guard(lambda: itself().optimiser.numbers())
+        self.nan_guard = NanGuard(lambda: itself().optimiser.numbers())
         self.phase, self.steps, self.elapsed = "points", 0, 0.0
         self.learnt_seconds = 0.0
         """That this process has learnt for."""
@@ -122,7 +122,7 @@ class DistillRun:
         self.began = working_time()
         self.before: torch.Tensor | None = None
         """The student's numbers before the RGB phase."""
-        self.epochs, self.count = Epochs(config.rays, self.generator), config.rays_at_first
+        self.shuffle, self.count = Shuffle(config.rays, self.generator), config.rays_at_first
         self.held: tuple[dict[str, np.ndarray], dict] | None = None
         """What `checkpoint` says between the steps, where other things may take long."""
         self.asked, self.random = False, None
@@ -142,77 +142,81 @@ class DistillRun:
         self.held = self.checkpoint()
         phase("asking the teachers")
         self.generator.manual_seed(config.seed + 1)
-        judge = self.judge or scattered_judge(self.teacher, config.views, config.view_size, config.seed)
+        evaluator = self.evaluator or scattered_evaluator(
+            self.teacher, config.views, config.view_size, config.seed
+        )
         rays_o, rays_d = self.sampler.draw(config.rays, self.generator)
         if config.steps:
-            pool = ask(self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance)
+            dataset = query_teacher(
+                self.teacher, rays_o, rays_d, self.step, self.generator, self.recipe.chance
+            )
         else:
-            pool = looked_at(self.teacher, rays_o, rays_d)
-        held_out = HeldOut(self.teacher, self.sampler, self.step, config.seed)
+            dataset = render_teacher(self.teacher, rays_o, rays_d)
+        held_out = HoldOutRays(self.teacher, self.sampler, self.step, config.seed)
         if self.random is not None:
             self.generator.set_state(self.random)
         self.asked = True
         clock.lap("teachers")
         if self.phase == "points":
             phase("points")
-            if len(pool.points) and config.steps:
-                self._learn(PointPass(pool, self), config.steps, held_out, advance, uninterrupted)
+            if len(dataset.points) and config.steps:
+                self._learn(PointPass(dataset, self), config.steps, held_out, advance, uninterrupted)
             with uninterrupted():
                 self._begin_pictures()
-                report.psnr_before_rgb = judge(self.student)
+                report.psnr_before_rgb = evaluator(self.student)
             clock.lap("points")
         if self.rgb:
             phase("pictures")
-            self._learn(RayPass(pool, self), config.rgb_steps, held_out, advance, uninterrupted)
+            self._learn(RayPass(dataset, self), config.rgb_steps, held_out, advance, uninterrupted)
             report.steps["pictures"] = self.steps
-            report.psnr_after_rgb = judge(self.student)
+            report.psnr_after_rgb = evaluator(self.student)
             report.rgb_kept = report.psnr_after_rgb > report.psnr_before_rgb
             if not report.rgb_kept:
                 self.student.params.copy_(self.before)
             clock.lap("pictures")
         with uninterrupted():
-            self._leave_haze_out(pool)
+            self._prune_low_density(dataset)
         self.held = None
-        report.numeric = self.guard.figures()
+        report.numeric = self.nan_guard.figures()
         return self.student, report
 
     def _begin_pictures(self) -> None:
         """What was learnt from points is the RGB phase's start, and what it has to surpass."""
         if self.refined is not None:
             self._refine()
-        self.guard.check()
+        self.nan_guard.check()
         self.before = self.student.params.clone()
         self._prune()
         if self.config.steps:  # else nothing was learnt before
             self.optimiser = Adam.of(self.student)
-            self.guard.renew()
+            self.nan_guard.renew()
         self.report.steps["points"] = self.steps
         self.phase, self.steps, self.elapsed = "pictures", 0, 0.0
         self.schedule = self.recipe.schedule(self.config)
 
     def _refine(self) -> None:
         """Go on at the full resolution, with moments that start anew."""
-        self.guard.check()
+        self.nan_guard.check()
         self.student, self.refined = resampled_like(self.student, self.refined), None
         self.optimiser = Adam.of(self.student)
-        self.guard.renew()
+        self.nan_guard.renew()
 
-    def _has_cells_to_give(self) -> bool:
+    def _has_prunable_cells(self) -> bool:
         """Whether the student learnt where there is nothing; only one on one grid over its own box did."""
         return self.student.resolution is not None and self.config.steps > 0
 
-    def _leave_haze_out(self, pool: TeacherPool) -> None:
-        """Leave out the room that cells had for matter to grow into, as `without_haze` does; what it shows is
-        held against the teacher's pictures."""
-        config = current(MatterConfig)
-        if self._has_cells_to_give() and not self.report.found_nothing:
-            rays = pool.rays_o[: config.rays_that_judge], pool.rays_d[: config.rays_that_judge]
-            truth = pool.pixels[: config.rays_that_judge].numpy()
-            self.student = self.student.with_occupancy(without_haze(self.student, *rays, truth=truth))
+    def _prune_low_density(self, dataset: TeacherSamples) -> None:
+        """Leave out the room that cells had for density to grow into, as `prune_low_density` does; what it
+        shows is held against the teacher's pictures."""
+        config = current(OccupancyUpdateConfig)
+        if self._has_prunable_cells() and not self.report.found_nothing:
+            rays = dataset.rays_o[: config.rays_that_judge], dataset.rays_d[: config.rays_that_judge]
+            truth = dataset.pixels[: config.rays_that_judge].numpy()
+            self.student = self.student.with_occupancy(prune_low_density(self.student, *rays, truth=truth))
 
     def _prune(self) -> None:
         """Leave out the cells that turned out empty, unless that would be all of them."""
-        if not self._has_cells_to_give():
+        if not self._has_prunable_cells():
             return
         occupancy = pruned(self.student)
         self.report.found_nothing = bool(self.teacher.occupancy.occupied.any() > occupancy.occupied.any())
@@ -223,7 +227,7 @@ class DistillRun:
         self,
         gradient: "PointPass | RayPass",
         steps: int,
-        held_out: HeldOut,
+        held_out: HoldOutRays,
         advance: Callable,
         uninterrupted: Callable,
     ) -> None:
@@ -235,26 +239,26 @@ class DistillRun:
             with uninterrupted():
                 if self.refined is not None and share >= self.config.coarse_until:
                     self._refine()
-                self.guard.keep()
+                self.nan_guard.keep()
                 sums, figures = gradient()
-                self.guard.step(sums, self.optimiser, gradient.rate * self.schedule.factor(share))
+                self.nan_guard.step(sums, self.optimiser, gradient.rate * self.schedule.factor(share))
                 self.steps += 1
                 if self.steps % self.config.look_every == 0:
-                    self._look(held_out, share)
+                    self._measure(held_out, share)
                 self.elapsed = working_time() - started
             if self.steps % 20 == 1:
                 advance(share / self.schedule.end, figures)
         self.learnt_seconds += working_time() - entered
-        self.guard.check()
+        self.nan_guard.check()
         self.held = self.checkpoint()
 
-    def _look(self, held_out: HeldOut, share: float) -> None:
+    def _measure(self, held_out: HoldOutRays, share: float) -> None:
         """A point of the learning curve, which the schedule follows."""
-        found = held_out(self.student)
+        psnr = held_out(self.student)
         if self.refined is None:
-            self.schedule.look(share, found)
-        made = self.steps + self.report.steps.get("points", 0)
-        self.report.curve.append((working_time() - self.began, made, found))
+            self.schedule.observe(share, psnr)
+        steps = self.steps + self.report.steps.get("points", 0)
+        self.report.curve.append((working_time() - self.began, steps, psnr))
 
     def _share(self, steps: int, seconds: float) -> float:
         """The share of the phase that is done: of its steps, or of its seconds where a budget is given, of
@@ -272,7 +276,7 @@ class DistillRun:
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
-        arrays, drawn = self.epochs.state()
+        arrays, drawn = self.shuffle.state()
         arrays |= {"params": self.student.params.cpu().numpy()} | self.optimiser.state()
         random = self.generator.get_state() if self.asked else self.random
         if random is not None:
@@ -287,7 +291,7 @@ class DistillRun:
             "adam_steps": self.optimiser.steps,
             "psnr_before_rgb": self.report.psnr_before_rgb,
             "rays": self.count,
-            "guard": self.guard.state(),
+            "guard": self.nan_guard.state(),
             "schedule": self.schedule.state(),
             "coarse": self.refined is not None,
             "points_steps": self.report.steps.get("points"),
@@ -312,10 +316,10 @@ class DistillRun:
         self.optimiser.restore(arrays, state["adam_steps"])
         self.count = state["rays"]
         self.phase, self.steps, self.elapsed = state["phase"], state["steps"], max(state["elapsed"], 0)
-        self.guard.restore(state["guard"])
+        self.nan_guard.restore(state["guard"])
         self.schedule.restore(state["schedule"])
-        self.report.curve = [(float(at), int(made), float(psnr)) for at, made, psnr in state["curve"]]
-        self.epochs.restore(arrays, state)
+        self.report.curve = [(float(at), int(steps), float(psnr)) for at, steps, psnr in state["curve"]]
+        self.shuffle.restore(arrays, state)
         self.random = torch.from_numpy(arrays["random"]) if "random" in arrays else None
         if self.random is not None:
             torch.Generator().set_state(self.random)  # a RuntimeError now rather than later
@@ -339,8 +343,8 @@ class _Clock:
 class PointPass:
     """The 3D losses at the points of the pool, in its random order (losses.py)."""
 
-    def __init__(self, pool: TeacherPool, run: DistillRun):
-        self.pool, self.run, self.rate = pool, run, run.config.rate
+    def __init__(self, dataset: TeacherSamples, run: DistillRun):
+        self.pool, self.run, self.rate = dataset, run, run.config.rate
 
     def __call__(self) -> tuple[np.ndarray, dict]:
         """Leave the gradient of the next points with the optimiser; the losses, and figures to tell."""
@@ -354,15 +358,15 @@ class PointPass:
 class RayPass:
     """The RGB loss over the teacher's own rays, colour over white and opacity."""
 
-    def __init__(self, pool: TeacherPool, run: DistillRun):
+    def __init__(self, dataset: TeacherSamples, run: DistillRun):
         self.run, self.rate = run, run.config.rgb_rate
-        self.rays = ShownRays(pool.rays_o, pool.rays_d, pool.pixels.numpy(), run.epochs)
+        self.rays = TeacherRays(dataset.rays_o, dataset.rays_d, dataset.pixels.numpy(), run.shuffle)
 
     def __call__(self) -> tuple[np.ndarray, dict]:
         """Leave the gradient of the next rays with the optimiser; the losses, and figures to tell."""
         run, config = self.run, self.run.config
         batch = self.rays.batch(run.count, run.step, config.opacity_weight, config.early_stop)
         sums, count = run.optimiser.learn_rays(batch), len(batch.rays_o)
-        wanted = config.rgb_samples * count / max(sums[2], 1)
-        run.count = int(np.clip(0.9 * run.count + 0.1 * wanted, 256, 1 << 14))
+        target = config.rgb_samples * count / max(sums[2], 1)
+        run.count = int(np.clip(0.9 * run.count + 0.1 * target, 256, 1 << 14))
         return sums, {"psnr": float(-10 * np.log10(max(sums[0] / count, 1e-10)))}

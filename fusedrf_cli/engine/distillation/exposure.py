@@ -1,5 +1,6 @@
-"""What each photo makes of the colours of a place: a camera that sets its exposure and white balance anew for
-each photo, or many cameras, would otherwise be learnt as haze and as colours that depend on the view.
+"""What each photo makes of the colours of an unbounded scene: a camera that sets its exposure and white
+balance anew for each photo, or many cameras, would otherwise be learnt as low density and as colours that
+depend on the view.
 
 A photo shows gain * colour + offset in each channel, of what is rendered (ComputedField.train_rays), and
 counts by a weight. Maps are (n, 3, 3) float64: of each photo the gains, the offsets, and the weights of its
@@ -13,7 +14,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.poses import Poses
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kernels.parts import CLIPPED
+from fusedrf_cli.engine.kernels.primitives import CLIPPED
 from fusedrf_cli.engine.rendering.volume import render_rays
 
 
@@ -87,9 +88,9 @@ def matched(
 def side_by_side(poses: Poses, config: ExposureConfig = ExposureConfig()) -> tuple[np.ndarray, np.ndarray]:
     """(m,) and (m,) photos, and of each the one that was taken nearest to it, looking the same way; without
     those that have none beside them."""
-    place = poses.position - poses.position.mean(0)
-    size = np.sqrt((place**2).sum(1).mean())
-    stands = np.concatenate([place / max(size, 1e-12), -poses.rotation[:, :, 2]], 1)
+    position = poses.position - poses.position.mean(0)
+    size = np.sqrt((position**2).sum(1).mean())
+    stands = np.concatenate([position / max(size, 1e-12), -poses.rotation[:, :, 2]], 1)
     pairs = []
     for i, stand in enumerate(stands):
         away = np.linalg.norm(stands - stand, axis=1)
@@ -116,9 +117,9 @@ def measured(
     has the identity.
     """
     n, m, _ = photos.shape
-    found = torch.from_numpy(render_rays(field, *rays, near=near)).reshape(n, m, 5).double()
-    shown = found[..., :3] / found[..., 3:4].clamp(min=config.opaque)
-    truth = torch.where(found[..., 3:4] > config.opaque, photos.double(), torch.nan)
+    rendered = torch.from_numpy(render_rays(field, *rays, near=near)).reshape(n, m, 5).double()
+    shown = rendered[..., :3] / rendered[..., 3:4].clamp(min=config.opaque)
+    truth = torch.where(rendered[..., 3:4] > config.opaque, photos.double(), torch.nan)
     if before is None and not differ(shown, truth, config):
         return None
     return fitted(shown, truth, before, config)

@@ -9,29 +9,33 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.depth_points import DepthPoints, KnownPoints
 from fusedrf_cli.engine.distillation.exposure import (
     matched,
     measured,
     rays_of_each,
     undone,
 )
-from fusedrf_cli.engine.distillation.guard import Guard
-from fusedrf_cli.engine.distillation.keypoints import KeyPoints, Known
-from fusedrf_cli.engine.distillation.matter import MatterConfig, occupancy_of, without_haze
+from fusedrf_cli.engine.distillation.nan_guard import NanGuard
+from fusedrf_cli.engine.distillation.occupancy_update import (
+    OccupancyUpdateConfig,
+    occupancy_of,
+    prune_low_density,
+)
 from fusedrf_cli.engine.distillation.optimiser import Adam, AdamConfig, alike
-from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
     changed,
     refined,
 )
-from fusedrf_cli.engine.distillation.smoothness import SmoothnessConfig, add_roughness
+from fusedrf_cli.engine.distillation.ray_dataset import Pictures, RayDataset
+from fusedrf_cli.engine.distillation.tv_loss import TVLossConfig, add_tv_gradient
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.computed import AS_IT_IS, NONE_KNOWN, Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, cell_counts, texels
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import StudentConfig
+from fusedrf_cli.engine.kinds.builder import BuilderConfig
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.settings import current
 
@@ -59,24 +63,25 @@ class FitRun:
     def __init__(
         self,
         field: StoredField,
-        pool: RayPool,
+        dataset: RayDataset,
         config: TrainConfig,
         generator: torch.Generator,
         limits: OccupancyGrid | None = None,
-        known: KeyPoints | None = None,
+        known: DepthPoints | None = None,
     ):
-        """limits: cells over the field's box that alone may hold matter, where something besides the pictures
-        says so: wherever no ray tells that there is nothing, cells found anew would grow by one each time."""
+        """limits: cells over the field's box that alone may are occupied, where something besides the
+        pictures says so: wherever no ray tells that there is nothing, cells found anew would grow by one each
+        time."""
         self.limits = limits
-        self.field, self.pool, self.config, self.generator = field, pool, config, generator
-        self.keypoints = known
+        self.field, self.pool, self.config, self.generator = field, dataset, config, generator
+        self.depth_points = known
         self.optimiser = self.fresh_optimiser()
         self.started, self.steps = working_time(), 0
         self.stages, self.refreshes = list(config.stages[1:]), [*self.config.occupancy_at, 1.0]
         self.maps: np.ndarray | None = None
         """(n, 3, 3) what each picture makes of the field's colours (exposure.py); None: nothing."""
         if config.exposure:
-            self.maps = matched(self.sampled()[1], pool.poses, config.exposures)
+            self.maps = matched(self.sampled()[1], dataset.poses, config.exposures)
         self.exposures = list(config.exposures.at) if config.exposure else []
         self.refinements = list(config.refining.at) if config.poses else []
         self.mse, self.rays = None, self.config.least_rays
@@ -84,7 +89,7 @@ class FitRun:
         self.held: tuple[dict[str, np.ndarray], dict] | None = None
         """What `checkpoint` said before the refresh that is going on, which may take long and changes no
         array."""
-        self.guard = Guard(lambda: self.optimiser.numbers())
+        self.nan_guard = NanGuard(lambda: self.optimiser.numbers())
 
     @classmethod
     def start(
@@ -95,20 +100,20 @@ class FitRun:
         config: TrainConfig,
         name: str = "",
         limits: OccupancyGrid | None = None,
-        known: Known | None = None,
+        known: KnownPoints | None = None,
     ) -> "FitRun":
         """A fit before its first step; the arguments are those of `fit` and of FitRun, and which points its
         pictures are known to show."""
         generator = torch.Generator().manual_seed(config.seed)
-        pool = RayPool(cameras, images, generator)
-        coarse = max(current(StudentConfig).least_texels, round(config.longest * config.stages[0][1]))
+        dataset = RayDataset(cameras, images, generator)
+        coarse = max(current(BuilderConfig).least_texels, round(config.longest * config.stages[0][1]))
         kind = registry.kind(config.kind)
-        field = kind.create(kind.untrained(aabb, coarse, config.way), generator, name).to(config.device)
+        field = kind.create(kind.untrained(aabb, coarse, config.storage), generator, name).to(config.device)
         if limits is not None:
             field = field.with_occupancy(limits)
-        ignored = None if pool.ignored is None else pool.ignored.numpy()
-        shown = None if known is None else KeyPoints(cameras, known, ignored, generator, config.depths)
-        return cls(field, pool, config, generator, limits, shown)
+        ignored = None if dataset.ignored is None else dataset.ignored.numpy()
+        shown = None if known is None else DepthPoints(cameras, known, ignored, generator, config.depths)
+        return cls(field, dataset, config, generator, limits, shown)
 
     def finish(
         self,
@@ -131,7 +136,7 @@ class FitRun:
             if self.refreshes:  # not where the run was interrupted after it
                 self.held = deepcopied(*self.checkpoint())
                 self.refreshes.clear()
-                self.guard.check()
+                self.nan_guard.check()
                 self.refresh_occupancy()
         self.held = None
         return self.field
@@ -149,7 +154,7 @@ class FitRun:
     def forget(self) -> None:
         """Let go of what only another step would need, several times the field's numbers."""
         self.optimiser = None
-        self.guard.renew()
+        self.nan_guard.renew()
 
     def checkpoint(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and JSON-able state from which `restore` goes on as if nothing had happened."""
@@ -163,10 +168,10 @@ class FitRun:
         }
         if self.maps is not None:
             arrays["exposure"] = self.maps
-        order, drawn = self.pool.epochs.state()
+        order, drawn = self.pool.shuffle.state()
         arrays |= order
-        if self.keypoints is not None:
-            order, drawn_points = self.keypoints.epochs.state()
+        if self.depth_points is not None:
+            order, drawn_points = self.depth_points.shuffle.state()
             arrays |= {f"keypoints.{name}": keys for name, keys in order.items()}
         state = {
             "command": "train",
@@ -182,9 +187,9 @@ class FitRun:
             "found": [self.found_matter, self.found_nothing],
             "mse": self.mse,
             "rays": self.rays,
-            "guard": self.guard.state(),
+            "guard": self.nan_guard.state(),
             **drawn,
-            "keypoints": None if self.keypoints is None else drawn_points,
+            "keypoints": None if self.depth_points is None else drawn_points,
         }
         return arrays, state
 
@@ -204,15 +209,15 @@ class FitRun:
             raise ValueError("exposure is learnt in one of both runs")
         if self.maps is not None:
             self.maps = alike(arrays["exposure"], self.maps, "exposure")
-        own = {"rotation": self.pool.rotation, "position": self.pool.position}
-        self.pool.place(Poses(*(alike(arrays[name], part, name) for name, part in own.items())))
+        poses = {"rotation": self.pool.rotation, "position": self.pool.position}
+        self.pool.set_poses(Poses(*(alike(arrays[name], part, name) for name, part in poses.items())))
         self.found_matter, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
         self.started = working_time() - max(state["elapsed"], 0)
-        self.guard.restore(state["guard"])
-        self.pool.epochs.restore(arrays, state)
-        if self.keypoints is not None:
-            self.keypoints.epochs.restore(part_of(arrays, "keypoints."), state["keypoints"])
+        self.nan_guard.restore(state["guard"])
+        self.pool.shuffle.restore(arrays, state)
+        if self.depth_points is not None:
+            self.depth_points.shuffle.restore(part_of(arrays, "keypoints."), state["keypoints"])
         self.generator.set_state(torch.from_numpy(arrays["random"]))
 
     @property
@@ -224,7 +229,7 @@ class FitRun:
     def faded(self) -> float:
         """The share of the numbers that fade which a step at the first rate takes away."""
         fading = sum(group.high - group.low for group in self.field.groups() if group.fades)
-        return min(self.config.most_faded, self.config.fade * (fading / self.pool.epochs.count) ** 2)
+        return min(self.config.most_faded, self.config.fade * (fading / self.pool.shuffle.count) ** 2)
 
     def share(self) -> float:
         """How much of the run is done, in [0, 1]."""
@@ -246,11 +251,11 @@ class FitRun:
         """Occupancy, box and resolution changes that are due."""
         if self.shows() and self.refreshes and share >= self.refreshes[0]:
             self.refreshes = [at for at in self.refreshes if at > share]
-            self.guard.check()
+            self.nan_guard.check()
             self.refresh_occupancy()
         if self.stages and share >= self.stages[0][0]:
             _, part = self.stages.pop(0)
-            self.guard.check()
+            self.nan_guard.check()
             self.resize(self.field.aabb, round(self.config.longest * part))
         if self.exposures and share >= self.exposures[0]:
             self.exposures.pop(0)
@@ -265,14 +270,14 @@ class FitRun:
 
     def refine_poses(self, share: float) -> None:
         """Move each picture's camera to where the field shows it better."""
-        pool, how = self.pool, self.config.refining
-        most = int(np.clip(how.rays // len(pool.pixel), *how.rays_of_each))
-        *rays, colours = pool.sample(most, self.generator)
+        dataset, how = self.pool, self.config.refining
+        most = int(np.clip(how.rays // len(dataset.pixel), *how.rays_of_each))
+        *rays, colours = dataset.sample(most, self.generator)
         first, last = how.tried_by
         pixels = max(last, first * (last / first) ** (2 * share))
         colours = colours if self.maps is None else undone(self.maps, colours)
-        change = refined(self.field, rays, colours, self.config.near, pixels * pool.pixel, how)
-        pool.place(changed(pool.poses, change))
+        change = refined(self.field, rays, colours, self.config.near, pixels * dataset.pixel, how)
+        dataset.set_poses(changed(dataset.poses, change))
 
     def sampled(self) -> tuple[list[np.ndarray], torch.Tensor]:
         """Rays and colours of each picture from which its exposure is found. They are drawn apart, so that
@@ -282,8 +287,8 @@ class FitRun:
         return rays, colours
 
     def refresh_occupancy(self) -> None:
-        """Mark the cells that hold matter, and cut the box down to them where that saves much; late in a run
-        haze that no picture shows is left out. Where none does, nothing changes, and it is tried again
+        """Mark the cells that are occupied, and cut the box down to them where that saves much; late in a run
+        low density that no picture shows is left out. Where none does, nothing changes, and it is tried again
         later."""
         occupancy = self.shown_cells() if self.config.unbounded else occupancy_of(self.field)
         if not occupancy.occupied.any():
@@ -304,13 +309,13 @@ class FitRun:
                 self.optimiser = self.fresh_optimiser()
                 return
             self.occupy(occupancy)
-        if self.share() >= self.config.low_density_left_from or not self.refreshes:
-            rays_o, rays_d, *_ = self.pool.draw(current(MatterConfig).rays_that_judge)
-            self.occupy(without_haze(self.field, rays_o, rays_d, self.config.near))
+        if self.share() >= self.config.prune_low_density_from or not self.refreshes:
+            rays_o, rays_d, *_ = self.pool.draw(current(OccupancyUpdateConfig).rays_that_judge)
+            self.occupy(prune_low_density(self.field, rays_o, rays_d, self.config.near))
 
     def shown_cells(self) -> OccupancyGrid:
-        """Cells of which some training ray shows anything, grown by one: haze that no photo shows, and what
-        lies behind surfaces, is no matter."""
+        """Cells of which some training ray shows anything, grown by one: low density that no photo shows, and
+        what lies behind surfaces, is no density."""
         field = self.field
         grid = field.occupancy
         counts = cell_counts(grid.aabb, min(current(OccupancyConfig).cells, max(field.resolution)))
@@ -333,22 +338,22 @@ class FitRun:
             self.optimiser.field = self.field
         else:
             self.optimiser = self.fresh_optimiser()
-            self.guard.renew()
+            self.nan_guard.renew()
 
     def resize(self, aabb: np.ndarray, longest: int) -> None:
         """Another box or resolution; the optimiser starts anew, since its moments belong to other texels."""
         self.field = self.field.resampled(aabb, texels(aabb, longest))
         self.optimiser = self.fresh_optimiser()
-        self.guard.renew()
+        self.nan_guard.renew()
 
     def step(self, share: float) -> None:
         """One batch of rays and one optimiser step."""
         config, field = self.config, self.field
-        self.guard.keep()
+        self.nan_guard.keep()
         rays_o, rays_d, pixels, pictures, depths = self.draw(share)
         jitter = torch.rand(len(rays_o), generator=self.generator, dtype=torch.float64).numpy()
         background = np.ones((len(rays_o), 3), np.float32)
-        if config.unbounded:  # haze before any one colour would be wrong before the others
+        if config.unbounded:  # low density before any one colour would be wrong before the others
             background = torch.rand(len(rays_o), 3, generator=self.generator).numpy()
         target, behind, exposure = pixels.clone(), background, AS_IT_IS
         if self.maps is not None:
@@ -372,17 +377,17 @@ class FitRun:
             exposure,
         )
         sums = self.optimiser.learn_rays(batch)
-        if self.guard.accepts(sums, self.optimiser):
-            self.learn(sums, len(rays_o), config.decay(share) * self.guard.rate, len(depths))
+        if self.nan_guard.accepts(sums, self.optimiser):
+            self.learn(sums, len(rays_o), config.decay(share) * self.nan_guard.rate, len(depths))
         self.steps += 1
 
     def draw(self, share: float) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray, np.ndarray]:
         """Rays of a step with their pixels and pictures, as RayPool.draw gives them, and the depths (m,) of
         the first m, which are known."""
-        wanted = 0 if self.keypoints is None else self.keypoints.wanted(self.rays, share)
-        if not wanted:
+        n_depth = 0 if self.depth_points is None else self.depth_points.wanted(self.rays, share)
+        if not n_depth:
             return *self.pool.draw(self.rays), NONE_KNOWN
-        chosen, points = self.keypoints.draw(wanted)
+        chosen, points = self.depth_points.draw(n_depth)
         known, others = self.pool.of(chosen), self.pool.draw(self.rays - len(chosen))
         depths = np.linalg.norm(points - known[0], axis=1)
         rays_o, rays_d, pictures = (np.concatenate([known[k], others[k]]) for k in (0, 1, 3))
@@ -390,7 +395,7 @@ class FitRun:
 
     def near(self, share: float) -> float:
         """The distance from a camera before which nothing is learnt, which shrinks while the scene takes
-        shape: the cheapest explanation of a photo is fog right before its camera."""
+        shape: the cheapest explanation of a photo is floaters right before its camera."""
         config = self.config
         early = max(0.0, 1 - share / self.config.settled) if config.unbounded else 0.0
         return config.near * (1 + (self.config.early_near - 1) * early)
@@ -398,10 +403,10 @@ class FitRun:
     def learn(self, sums: np.ndarray, rays: int, decay: float, known: int = 0) -> None:
         """Apply the gradient of a batch of so many rays, at `decay` times the first rate, and steer the size
         of the next. Of `known` of them depths are known, and their colour errors are not in the sums."""
-        config = current(SmoothnessConfig)
+        config = current(TVLossConfig)
         if self.config.smooth:
             strip = int(torch.randint(config.strips, (), generator=self.generator))
-            add_roughness(self.field, self.optimiser.gradient[0], config.weight * rays, strip)
+            add_tv_gradient(self.field, self.optimiser.gradient[0], config.weight * rays, strip)
         if self.steps % self.config.faded_each == 0:
             self.optimiser.fade(self.config.faded_each * decay * self.faded)
         self.optimiser.step(self.config.rate * decay)
@@ -409,9 +414,9 @@ class FitRun:
         self.mse = mse if self.mse is None else 0.98 * self.mse + 0.02 * mse
         per_ray = max(sums[2] / rays, 1.0)
         in_a_box = 1 if self.stages else self.config.fine_samples
-        wanted = self.config.samples * (self.config.unbounded_samples if self.config.unbounded else in_a_box)
+        target = self.config.samples * (self.config.unbounded_samples if self.config.unbounded else in_a_box)
         most = self.config.most_per_sample * self.config.samples
-        self.rays = int(np.clip(0.9 * self.rays + 0.1 * wanted / per_ray, self.config.least_rays, most))
+        self.rays = int(np.clip(0.9 * self.rays + 0.1 * target / per_ray, self.config.least_rays, most))
 
 
 def deepcopied(arrays: dict[str, np.ndarray], state: dict) -> tuple[dict[str, np.ndarray], dict]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.teacher import Points
+from fusedrf_cli.engine.distillation.teacher import TeacherPoints
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.settings import current
 
@@ -18,7 +18,7 @@ class LossConfig:
     opaque: float = 5.0
     """Optical depth of a step beyond which more density cannot be seen."""
     depth_gain: float = 10.0
-    """In log1p(gain τ): how much thin fog counts."""
+    """In log1p(gain τ): how much thin floaters counts."""
     faint: float = 1e-8
     """Optical depth of a step under which a student that should be denser learns as if it had it."""
     most_lift: float = 1e30
@@ -34,15 +34,15 @@ Visibility = Callable[[torch.Tensor], torch.Tensor]
 """What points count (N,), by the transmittance (N,) of their rays up to them."""
 
 
-def log_depth(depth: torch.Tensor, wanted: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def log_depth(depth: torch.Tensor, target: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """(log1p(g τ_s) - log1p(g τ_t))², with depths beyond `opaque` taken as equal: they look the same.
 
     Raw σ is unstable for dense teachers, and alpha gives a saturated student no gradient; this does.
     """
     config = current(LossConfig)
-    wanted = wanted.clamp_max(config.opaque)
-    error = torch.log1p(config.depth_gain * depth) - torch.log1p(config.depth_gain * wanted)
-    error[(depth >= config.opaque) & (wanted >= config.opaque)] = 0
+    target = target.clamp_max(config.opaque)
+    error = torch.log1p(config.depth_gain * depth) - torch.log1p(config.depth_gain * target)
+    error[(depth >= config.opaque) & (target >= config.opaque)] = 0
     return error**2, 2 * error * config.depth_gain / (1 + config.depth_gain * depth)
 
 
@@ -54,7 +54,7 @@ def mostly_seen(transmittance: torch.Tensor) -> torch.Tensor:
 
 def point_step(
     student: RadianceField,
-    points: Points,
+    points: TeacherPoints,
     step: float,
     optimiser: Adam,
     density_loss: DensityLoss = log_depth,
@@ -65,12 +65,12 @@ def point_step(
     visibility."""
     config = current(LossConfig)
     sigma, rgb = student.query(points.where, points.dirs)
-    tau, wanted = sigma * step, points.sigma * step
-    loss, d_tau = density_loss(tau, wanted)
+    tau, target = sigma * step, points.sigma * step
+    loss, d_tau = density_loss(tau, target)
     # σ = softplus(f) and its slope vanish together: far below `faint` the gradient would be too small
     lift = torch.where(d_tau < 0, (config.faint / tau).clamp(1, config.most_lift), 1)
     counts = visibility(points.transmittance) / len(points)
-    shown = config.colour_weight * counts * (1 - torch.exp(-wanted))
+    shown = config.colour_weight * counts * (1 - torch.exp(-target))
     off = rgb - points.rgb
     student.query_backward(
         points.where,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields import large_pages
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
 from fusedrf_cli.engine.settings import current
 
@@ -21,11 +21,11 @@ class AdamConfig:
     """A gradient here can be tiny, which it must not damp."""
 
 
-def alike(array: np.ndarray, own: torch.Tensor | np.ndarray, name: str) -> np.ndarray:
+def alike(array: np.ndarray, expected: torch.Tensor | np.ndarray, name: str) -> np.ndarray:
     """A saved array. Raises ValueError where it is not of the shape and type of a run's own."""
-    kind = str(own.dtype).removeprefix("torch.")
-    if array.shape != tuple(own.shape) or array.dtype.name != kind:
-        raise ValueError(f"{name} is {array.dtype} {array.shape}, expected {kind} {tuple(own.shape)}")
+    kind = str(expected.dtype).removeprefix("torch.")
+    if array.shape != tuple(expected.shape) or array.dtype.name != kind:
+        raise ValueError(f"{name} is {array.dtype} {array.shape}, expected {kind} {tuple(expected.shape)}")
     return array
 
 
@@ -42,8 +42,8 @@ class Adam:
         params = self.field.params
         # Rows start on a cache line, so that a run of numbers touches no more lines than it must.
         count, kind = len(params), (params.dtype, params.device)
-        self.gradient = pages.zeros(self.parts * count, *kind).view(self.parts, count)
-        self.moments = pages.zeros(count if self.beta1 else 0, *kind), pages.zeros(count, *kind)
+        self.gradient = large_pages.zeros(self.parts * count, *kind).view(self.parts, count)
+        self.moments = large_pages.zeros(count if self.beta1 else 0, *kind), large_pages.zeros(count, *kind)
         shared = self.field.device_loops.shared
         self.grads, self.moment1, self.moment2 = shared(self.gradient), *map(shared, self.moments)
         self.steps = 0
@@ -86,11 +86,11 @@ class Adam:
         rest = [np.float32(x) for x in (self.beta1, config.beta2, config.eps, correction1, correction2)]
         moved = self.field.arrays.params, self.grads, self.moment1, self.moment2
         for group in self.field.groups():
-            own = np.float32(rate * group.rate)
+            group_rate = np.float32(rate * group.rate)
             if group.lines is None:
-                self.field.device_loops.adam(*moved, own, group.low, group.high, *rest)
+                self.field.device_loops.adam(*moved, group_rate, group.low, group.high, *rest)
             else:
-                self.field.device_loops.adam_lines(*moved, own, group.lines, *rest)
+                self.field.device_loops.adam_lines(*moved, group_rate, group.lines, *rest)
         self.field.settle()
 
     def fade(self, share: float) -> None:

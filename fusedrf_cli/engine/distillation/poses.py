@@ -80,8 +80,8 @@ def refined(
         """(k, m, 5) what those photos' poses (k,) show when they are changed."""
         turned = d[which] @ turns(change[which, :3]).transpose(0, 2, 1)
         moved = o[which] + change[which, None, 3:]
-        found = render_rays(field, moved.reshape(-1, 3), turned.reshape(-1, 3), near=near)
-        return found.reshape(-1, m, 5).astype(np.float64)
+        rendered = render_rays(field, moved.reshape(-1, 3), turned.reshape(-1, 3), near=near)
+        return rendered.reshape(-1, m, 5).astype(np.float64)
 
     every = np.arange(n)
     now = shown(np.zeros((n, 6)), every)
@@ -123,10 +123,10 @@ def step_of(
     square = np.einsum("nm,nmcp,nmcq->npq", fair, slopes, slopes)
     square += config.damping * np.einsum("npp->np", square)[:, :, None] * np.eye(6) + 1e-9 * np.eye(6)
     step = -np.linalg.solve(square, np.einsum("nm,nmcp,nmc->np", fair, slopes, missed)[..., None])[..., 0]
-    told = np.einsum("np,npq,nq->n", step, square, step)
-    left = np.maximum((fair * (missed**2).sum(2)).sum(1) - told, 0)
+    certainty = np.einsum("np,npq,nq->n", step, square, step)
+    left = np.maximum((fair * (missed**2).sum(2)).sum(1) - certainty, 0)
     noise = left / np.maximum(3 * (fair > 0).sum(1) - 6, 1)
-    step *= np.maximum(0, 1 - config.sure * 6 * noise / np.maximum(told, 1e-300))[:, None]
+    step *= np.maximum(0, 1 - config.sure * 6 * noise / np.maximum(certainty, 1e-300))[:, None]
     return step * np.minimum(1, config.largest / np.maximum(abs(step).max(1, keepdims=True), 1e-12))
 
 

@@ -39,18 +39,20 @@ class RaySampler:
         fills = any(p.unbounded for p in scene.placed)
         views = tuple(views) if fills else ()
         objects = (p.aabb for p in scene.placed if not (views and p.unbounded))
-        return cls([scene.occupancy.subject, *sorted(objects, key=list)], views)
+        return cls([scene.occupancy.look_at_box, *sorted(objects, key=list)], views)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[np.ndarray, np.ndarray]:
         """rays_o, rays_d (count, 3) float64, rays_d of unit length, in random order."""
         others = self.boxes[1:] or ([] if self.views else self.boxes)
-        whole = int(count * current(SamplerConfig).whole_scene_share) if others else count
+        n_scene = int(count * current(SamplerConfig).whole_scene_share) if others else count
         parts = [
-            through(self.views, whole, generator) if self.views else around(self.boxes[0], whole, generator)
+            through(self.views, n_scene, generator)
+            if self.views
+            else around(self.boxes[0], n_scene, generator)
         ]
         for i, box in enumerate(others):
-            own = (count - whole) // len(others) + (i < (count - whole) % len(others))
-            parts.append(around(box, own, generator))
+            n_object = (count - n_scene) // len(others) + (i < (count - n_scene) % len(others))
+            parts.append(around(box, n_object, generator))
         order = torch.randperm(count, generator=generator).numpy()
         rays_o, rays_d = (np.concatenate(column)[order] for column in zip(*parts, strict=True))
         return rays_o, rays_d

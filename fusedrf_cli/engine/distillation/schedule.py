@@ -1,6 +1,6 @@
 """When a phase of learning slows down, and when it ends."""
 
-from fusedrf_cli.engine.kinds.student import DistilConfig
+from fusedrf_cli.engine.kinds.builder import DistilConfig
 
 
 class Schedule:
@@ -16,7 +16,7 @@ class Schedule:
         self.best, self.looks_since = float("-inf"), 0
         self.cooling_from = 1 - config.cooling
 
-    def look(self, share: float, psnr: float) -> None:
+    def observe(self, share: float, psnr: float) -> None:
         """Take note of the held-out PSNR at a share of the phase."""
         if psnr > self.best + self.config.least_gain:
             self.best, self.looks_since = psnr, 0

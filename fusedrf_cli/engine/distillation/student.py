@@ -1,6 +1,6 @@
 """A student on a grid while it learns: half its resolution first, and the cells it gives up."""
 
-from fusedrf_cli.engine.distillation.matter import MatterConfig, depths_across
+from fusedrf_cli.engine.distillation.occupancy_update import OccupancyUpdateConfig, depths_across
 from fusedrf_cli.engine.fields.base import StoredField
 from fusedrf_cli.engine.fields.occupancy import PROBES, OccupancyGrid, harmless_depth
 from fusedrf_cli.engine.settings import current
@@ -26,6 +26,6 @@ def pruned(student: StoredField) -> OccupancyGrid:
     """The student's occupancy without the cells in which it turned out to hold nothing."""
     grid, depth = student.occupancy, depths_across(student, PROBES)
     lost = 5e-3  # optical depth that pruning may take off a ray: opacity to half a percent
-    occupied = depth > harmless_depth(depth, current(MatterConfig).empty_below, lost)
-    kept = grid.marked(occupied).dilated().occupied & grid.occupied
-    return grid.marked(kept)
+    occupied = depth > harmless_depth(depth, current(OccupancyUpdateConfig).empty_below, lost)
+    remaining = grid.marked(occupied).dilated().occupied & grid.occupied
+    return grid.marked(remaining)

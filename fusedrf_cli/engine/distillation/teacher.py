@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields import large_pages
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.rendering.volume import (
     RenderConfig,
@@ -27,10 +27,10 @@ class TeacherConfig:
 
     seen: float = 1e-2
     """Transmittance under which what lies behind is not worth learning."""
-    matter: float = 1e-3
-    """Optical depth of a step from which a sample counts as matter."""
+    occupied_depth: float = 1e-3
+    """Optical depth of a step from which a sample counts as density."""
     empty_share: float = 0.15
-    """Of the samples with less that are kept: nine in ten are such, and without them fog stays."""
+    """Of the samples with less that are kept: nine in ten are such, and without them floaters stays."""
     reckoned_rays: int = 2000
     """Of which the number of points is reckoned."""
 
@@ -39,14 +39,14 @@ Chance = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 """The chances (N,) that samples are kept as points, by their optical depths (N,) and transmittances (N,)."""
 
 
-def matter_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
-    """All that can be seen of matter, and a share of the emptiness before it."""
+def surface_first(depth: torch.Tensor, transmittance: torch.Tensor) -> torch.Tensor:
+    """All that can be seen of density, and a share of the emptiness before it."""
     config = current(TeacherConfig)
-    return torch.where(depth > config.matter, 1.0, config.empty_share)
+    return torch.where(depth > config.occupied_depth, 1.0, config.empty_share)
 
 
 @dataclass
-class Points:
+class TeacherPoints:
     """Samples of a teacher, in the teacher's frame."""
 
     where: torch.Tensor
@@ -66,7 +66,7 @@ class Points:
         """The fields in their order."""
         return self.where, self.dirs, self.sigma, self.rgb, self.transmittance
 
-    def batch(self, number: int, size: int) -> "Points":
+    def batch(self, number: int, size: int) -> "TeacherPoints":
         """The number-th run of `size` points, or of all where there are fewer, one run after the other and
         over again.
 
@@ -76,12 +76,12 @@ class Points:
         start = number * size % len(self)
         over = start + size - len(self)
         if over <= 0:
-            return Points(*(column[start : start + size] for column in self.columns()))
-        return Points(*(torch.cat([column[start:], column[:over]]) for column in self.columns()))
+            return TeacherPoints(*(column[start : start + size] for column in self.columns()))
+        return TeacherPoints(*(torch.cat([column[start:], column[:over]]) for column in self.columns()))
 
 
 @dataclass
-class TeacherPool:
+class TeacherSamples:
     """Rays of a teacher and the points on them, in the teacher's frame."""
 
     rays_o: np.ndarray
@@ -89,18 +89,18 @@ class TeacherPool:
     """(R, 3) float64."""
     pixels: torch.Tensor
     """(R, 4) float32: rgb premultiplied by opacity, opacity."""
-    points: Points
+    points: TeacherPoints
 
 
-def ask(
+def query_teacher(
     teacher: RadianceField,
     rays_o: np.ndarray,
     rays_d: np.ndarray,
     step: float,
     generator: torch.Generator,
-    chance: Chance = matter_first,
+    chance: Chance = surface_first,
     at_once: int = RenderConfig.rays_at_once,
-) -> TeacherPool:
+) -> TeacherSamples:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
     """
@@ -110,40 +110,40 @@ def ask(
         parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
     pixels, *columns = (list(column) for column in zip(*parts, strict=True))
     parts.clear()
-    places = torch.randperm(sum(map(len, columns[0])), generator=generator, dtype=torch.int32)
-    points = Points(*(_shuffled(column, places) for column in columns))
-    return TeacherPool(rays_o, rays_d, torch.cat(pixels), points)
+    order = torch.randperm(sum(map(len, columns[0])), generator=generator, dtype=torch.int32)
+    points = TeacherPoints(*(_shuffled(column, order) for column in columns))
+    return TeacherSamples(rays_o, rays_d, torch.cat(pixels), points)
 
 
-def looked_at(teacher: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray) -> TeacherPool:
+def render_teacher(teacher: RadianceField, rays_o: np.ndarray, rays_d: np.ndarray) -> TeacherSamples:
     """Rays (R, 3) through a teacher without any points, for a student that learns from rays alone."""
     pixels = torch.from_numpy(render_rays(teacher, rays_o, rays_d)[:, :4])
     none = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0)
-    return TeacherPool(rays_o, rays_d, pixels, Points(*none))
+    return TeacherSamples(rays_o, rays_d, pixels, TeacherPoints(*none))
 
 
-def _shuffled(pieces: list[torch.Tensor], places: torch.Tensor) -> torch.Tensor:
+def _shuffled(pieces: list[torch.Tensor], order: torch.Tensor) -> torch.Tensor:
     """The rows of the pieces, which are taken away, each at its place (N,) of the whole."""
-    whole, start = _like(pieces[0], len(places)), 0
+    shuffled, start = _like(pieces[0], len(order)), 0
     while pieces:  # one after the other: together they can be a gigabyte, and would be two
         piece = pieces.pop(0)
-        whole[places[start : start + len(piece)].long()] = piece
+        shuffled[order[start : start + len(piece)].long()] = piece
         start += len(piece)
-    return whole
+    return shuffled
 
 
 def _like(rows: torch.Tensor, count: int) -> torch.Tensor:
     """Room for so many of such rows. Pages of their own go back to the system with them, whereas freed pieces
     of a heap may stay."""
-    return pages.zeros(count * rows.shape[1:].numel()).view(count, *rows.shape[1:])
+    return large_pages.zeros(count * rows.shape[1:].numel()).view(count, *rows.shape[1:])
 
 
-def points_kept(teacher: RadianceField, sampler: RaySampler, rays: int, step: float, seed: int) -> int:
+def expected_points(teacher: RadianceField, sampler: RaySampler, rays: int, step: float, seed: int) -> int:
     """About how many points `ask` keeps of so many rays, reckoned from a few of them."""
     config = current(TeacherConfig)
     generator = torch.Generator().manual_seed(seed)
     few = sampler.draw(config.reckoned_rays, generator)
-    return len(ask(teacher, *few, step, generator).points) * rays // config.reckoned_rays
+    return len(query_teacher(teacher, *few, step, generator).points) * rays // config.reckoned_rays
 
 
 def _ask_part(
@@ -159,19 +159,19 @@ def _ask_part(
     n = len(rays_o)
     trans, pixels = np.ones(n, np.float32), np.zeros((n, 4), np.float32)
     jitter = torch.rand(n, generator=generator, dtype=torch.float64).numpy()
-    kept = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
+    samples = [(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), torch.zeros(0))]
     reach = reach_of(len(rays_o), 0.0, np.inf)
     for ray, ts, spans, counts in waves(teacher, rays_o, rays_d, reach, jitter, step, lambda: trans > 1e-3):
         mask = np.arange(ts.shape[1]) < counts[:, None]
         points = torch.from_numpy((rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None])[mask])
         dirs = torch.from_numpy(np.broadcast_to(rays_d[ray][:, None], (*ts.shape, 3))[mask])
-        found = teacher.query(points, dirs, with_colour=False)[0].float()
+        densities = teacher.query(points, dirs, with_colour=False)[0].float()
         sigma = np.zeros(ts.shape, np.float32)
-        sigma[mask] = found.numpy()
+        sigma[mask] = densities.numpy()
         weights, after = weights_from_depths(sigma * spans.astype(np.float32), trans[ray])
         before = torch.from_numpy((trans[ray][:, None] - np.cumsum(weights, 1) + weights)[mask])
         trans[ray] = after
-        depth = found * torch.from_numpy(spans[mask]).float()
+        depth = densities * torch.from_numpy(spans[mask]).float()
         chosen = (before > teacher_config.seen) & (
             torch.rand(len(points), generator=generator) < chance(depth, before)
         )
@@ -183,8 +183,8 @@ def _ask_part(
         rgb = np.zeros((*ts.shape, 3), np.float32)
         rgb[mask] = colour.numpy()
         pixels[ray, :3] += (weights[..., None] * rgb).sum(1)
-        kept.append(tuple(column[chosen].float() for column in (points, dirs, found, colour, before)))
+        samples.append(tuple(column[chosen].float() for column in (points, dirs, densities, colour, before)))
     pixels[:, 3] = 1 - trans
-    columns = list(zip(*kept, strict=True))
+    columns = list(zip(*samples, strict=True))
     count = sum(map(len, columns[0]))
     return torch.from_numpy(pixels), *(torch.cat(c, out=_like(c[-1], count)) for c in columns)

@@ -17,15 +17,17 @@ unit cube of the box, three float64:
 Points may lie a rounding outside the cube; no index may. A multiple of 8 features lets them use vectors.
 
 The density's encoding may also have
-    steps_at(field, cell, unit, k)
-                               for how many steps of a ray its sample k stands, 0 where there is nothing; left
+    steps_at(field, cell, unit, index)
+                               for how many steps of a ray its sample of that index stands, 0 where there is
+                               nothing; left
                                out: 1 in the box
-    advance(field, cell, many, steps, k, p, way, u, u0, step), known(field, grid, p)
+    next_index(field, cell, n_steps, strides, index, p, direction, t_local, t_begin, step), is_inside(field,
+    grid, p)
                                as kernels/loops.py has them
     located(field, cell, scratch)
                                the cell with what the last `summed` or `forward` has found out of it
-    keep(cell), again(field, held, unit)
-                               an int from which `again` makes the cell once more, where `locate` does not
+    pack_cell(cell), unpack_cell(field, packed, unit)
+                               an int from which `unpack_cell` makes the cell again, where `locate` does not
     logits(field, cell, scratch), logits_backward(field, cell, d_logits, scratch)
                                what it adds to the three logits of the colour, and what they send back, which
                                waits in scratch for the way back of the density
@@ -34,7 +36,8 @@ For Python, with `options` what a field's shape says of the encoding:
     sizes(**options)           constants: WIDTH, ROOM (numbers of scratch, if any, which lie from AT on), and
                                its own
     sections(resolution, **options)
-                               its numbers, if any: a list of Parts (fields/box.py), whose names get a prefix
+                               its numbers, if any: a list of ParameterBlocks (fields/box.py), whose names get
+                               a prefix
     Arrays, arrays(field, starts, **options)
                                what the functions read beside `field.params`, if anything: a NamedTuple, and
                                that of a field where its sections begin at starts in `params`

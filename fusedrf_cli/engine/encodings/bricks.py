@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import (
+from fusedrf_cli.engine.kernels.primitives import (
     FACE_TOLERANCE,
     accumulate,
     add_scaled,
@@ -178,30 +178,30 @@ def locate(field, unit):
     return in_brick(field, brick, level, unit)
 
 
-def steps_at(field, cell, unit, k):
+def steps_at(field, cell, unit, index):
     """See encodings: only multiples of a brick's steps are sampled."""
     if cell[2] < 0:
         return 0
-    many = 1 << (field.finest - cell[1])
-    return many if k & (many - 1) == 0 else 0
+    n_steps = 1 << (field.finest - cell[1])
+    return n_steps if index & (n_steps - 1) == 0 else 0
 
 
-def known(field, grid, p):
+def is_inside(field, grid, p):
     """See encodings: voxels are found without the grid."""
     return True
 
 
-def keep(cell):
+def pack_cell(cell):
     """See encodings: the brick."""
     return cell[0]
 
 
-def again(field, held, unit):
+def unpack_cell(field, packed, unit):
     """See encodings; rounding may put the point beside the brick, or into a voxel that is not active."""
-    return in_brick(field, held, int(field.level[np.uint64(held)]), unit)
+    return in_brick(field, packed, int(field.level[np.uint64(packed)]), unit)
 
 
-def node_exit(field, level, p, way):
+def node_exit(field, level, p, direction):
     """Distance from a point to where a ray leaves the node of a level around it."""
     n = 1.0 / (1 << level)
     a, b, c = n * field.side[0], n * field.side[1], n * field.side[2]
@@ -209,24 +209,24 @@ def node_exit(field, level, p, way):
     j = math.floor((p[1] - field.lo[1]) / b)
     m = math.floor((p[2] - field.lo[2]) / c)
     return min(
-        exit_distance(p[0], way[0], field.lo[0], a, i, 1),
+        exit_distance(p[0], direction[0], field.lo[0], a, i, 1),
         min(
-            exit_distance(p[1], way[1], field.lo[1], b, j, 1),
-            exit_distance(p[2], way[2], field.lo[2], c, m, 1),
+            exit_distance(p[1], direction[1], field.lo[1], b, j, 1),
+            exit_distance(p[2], direction[2], field.lo[2], c, m, 1),
         ),
     )
 
 
-def advance(field, cell, many, steps, k, p, way, u, u0, step):
+def next_index(field, cell, n_steps, strides, index, p, direction, t_local, t_begin, step):
     """See encodings: in a brick the next number that is a multiple of its steps, or the first beyond it; else
     the first beyond the empty node."""
     brick, level = cell[0], cell[1]
     stride = 1 << (field.finest - level)
     if brick >= 0 and stride == 1:
-        return k + 1
-    away = node_exit(field, level, p, way)
-    beyond = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
-    return min((k | (stride - 1)) + 1, beyond) if brick >= 0 else beyond
+        return index + 1
+    away = node_exit(field, level, p, direction)
+    beyond = max(index + 1, int(math.ceil((t_local + away - t_begin) / step - FACE_TOLERANCE)))
+    return min((index | (stride - 1)) + 1, beyond) if brick >= 0 else beyond
 
 
 # -- compiled: what is there ---------------------------------------------------------------------------------

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part, largest
+from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import accumulate, add_scaled, scatter
 from fusedrf_cli.engine.kernels.prefetch import prefetch
+from fusedrf_cli.engine.kernels.primitives import accumulate, add_scaled, scatter
 
 
 class Arrays(NamedTuple):
@@ -25,11 +25,11 @@ def sizes(numbers: int) -> dict[str, int]:
     return {"WIDTH": numbers if numbers == 1 else -(-numbers // 8) * 8}
 
 
-def sections(resolution: tuple[int, int, int], numbers: int) -> list[Part]:
+def sections(resolution: tuple[int, int, int], numbers: int) -> list[ParameterBlock]:
     """See encodings."""
     if numbers == 1:
-        return [Part("", resolution, (0, 1, 2))]
-    return [Part("", (*resolution, sizes(numbers)["WIDTH"]), (0, 1, 2), columns=numbers)]
+        return [ParameterBlock("", resolution, (0, 1, 2))]
+    return [ParameterBlock("", (*resolution, sizes(numbers)["WIDTH"]), (0, 1, 2), columns=numbers)]
 
 
 def arrays(field, starts: np.ndarray, numbers: int) -> Arrays:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part, largest
-from fusedrf_cli.engine.kernels.parts import accumulate
+from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels.prefetch import prefetch
+from fusedrf_cli.engine.kernels.primitives import accumulate
 
 PRIMES = 2654435761, 805459861  # of y and z
 FILLED = 8  # rows of a level are filled up to a multiple of
@@ -42,10 +42,10 @@ def sizes(levels: int, features: int, log2_rows: int, base: int, growth: float) 
 
 def sections(
     resolution: tuple[int, int, int], levels: int, features: int, log2_rows: int, base: int, growth: float
-) -> list[Part]:
+) -> list[ParameterBlock]:
     """See encodings; levels do not depend on the resolution. Drawn as in the paper (sec. 4), but normal."""
     rows = int(levels_of(levels, log2_rows, base, growth)[2].sum())
-    return [Part("rows", (rows, features), spread=1e-4)]
+    return [ParameterBlock("rows", (rows, features), spread=1e-4)]
 
 
 def arrays(

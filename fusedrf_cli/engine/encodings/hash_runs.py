@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part, largest
-from fusedrf_cli.engine.fields.hashed import ROW, RUN, Hashed
-from fusedrf_cli.engine.kernels.parts import accumulate
+from fusedrf_cli.engine.fields.box import ParameterBlock, largest
+from fusedrf_cli.engine.fields.hash_entries import ROW, RUN, HashGrid
 from fusedrf_cli.engine.kernels.prefetch import prefetch
+from fusedrf_cli.engine.kernels.primitives import accumulate
 from fusedrf_cli.engine.kernels.reference import exact
 
 
@@ -24,25 +24,25 @@ class Arrays(NamedTuple):
     lattice: object  # (levels, 2, 3) float, sides and lower corner of the box in a level's spacings
 
 
-def sizes(hashed: Hashed) -> dict[str, int]:
+def sizes(hashed: HashGrid) -> dict[str, int]:
     """See encodings."""
     return {"WIDTH": ROW}
 
 
-def sections(resolution: tuple[int, int, int], hashed: Hashed) -> list[Part]:
+def sections(resolution: tuple[int, int, int], hashed: HashGrid) -> list[ParameterBlock]:
     """See encodings. They learn once texels are fine enough, and begin as 0."""
     learns = max(resolution) >= hashed.learns_from
-    return [Part("detail", hashed.shape, rate=hashed.rate if learns else 0.0, fades=True)]
+    return [ParameterBlock("detail", hashed.shape, rate=hashed.rate if learns else 0.0, fades=True)]
 
 
-def arrays(field, starts: np.ndarray, hashed: Hashed) -> Arrays:
+def arrays(field, starts: np.ndarray, hashed: HashGrid) -> Arrays:
     """See encodings."""
     low, side = field.box[:3], field.box[3:] - field.box[:3]
     lattice = [np.stack([side, low]) / spacing for spacing in hashed.spacings]
     return Arrays(np.int64(starts[0]), np.int64(hashed.rows), np.asarray(lattice, field.real))
 
 
-def reference(field, sections: dict, unit: torch.Tensor, read: None, hashed: Hashed) -> torch.Tensor:
+def reference(field, sections: dict, unit: torch.Tensor, read: None, hashed: HashGrid) -> torch.Tensor:
     """See encodings."""
     box, table = exact(field.box, unit.device), sections["detail"]
     at, total = box[:3] + unit.to(box.dtype) * (box[3:] - box[:3]), table.new_zeros(len(unit), ROW)
@@ -57,7 +57,7 @@ def reference(field, sections: dict, unit: torch.Tensor, read: None, hashed: Has
     return total
 
 
-def hashed_row(hashed: Hashed, vertex: torch.Tensor) -> torch.Tensor:
+def hashed_row(hashed: HashGrid, vertex: torch.Tensor) -> torch.Tensor:
     """(N,) int64: which row of a level the vertices (N, 3) int64 of its lattice have. Products wrap around at
     64 bits; what is kept of them is the same whether they have a sign."""
     i, j, k = vertex.unbind(1)
@@ -66,7 +66,7 @@ def hashed_row(hashed: Hashed, vertex: torch.Tensor) -> torch.Tensor:
     return (h & (hashed.rows // RUN - 1)) * RUN + k.remainder(RUN)
 
 
-def bound(sections: dict, read: None, hashed: Hashed) -> torch.Tensor:
+def bound(sections: dict, read: None, hashed: HashGrid) -> torch.Tensor:
     """See encodings."""
     return len(hashed.spacings) * largest(sections["detail"], kept=1)
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part, largest
+from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import linear, scatter, texel
+from fusedrf_cli.engine.kernels.primitives import linear, scatter, texel
 
 
 class Arrays(NamedTuple):
@@ -23,9 +23,11 @@ def sizes(rank: int) -> dict[str, int]:
     return {"RANK": rank, "WIDTH": rank, "ROOM": 3 * rank}
 
 
-def sections(resolution: tuple[int, int, int], rank: int) -> list[Part]:
+def sections(resolution: tuple[int, int, int], rank: int) -> list[ParameterBlock]:
     """See encodings; drawn as TensoRF's lines."""
-    return [Part(f"line_{axis}", (resolution[axis], rank), (axis,), spread=0.2) for axis in range(3)]
+    return [
+        ParameterBlock(f"line_{axis}", (resolution[axis], rank), (axis,), spread=0.2) for axis in range(3)
+    ]
 
 
 def arrays(field, starts: np.ndarray, rank: int) -> Arrays:

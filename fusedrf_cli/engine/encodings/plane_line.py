@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import Part, largest
+from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels import reference as torch_reference
-from fusedrf_cli.engine.kernels.parts import bilinear, linear, scatter, store_8, texel
 from fusedrf_cli.engine.kernels.prefetch import prefetch_plane
+from fusedrf_cli.engine.kernels.primitives import bilinear, linear, scatter, store_8, texel
 
 SPREAD = 0.1  # TensoRF's, of an untrained field's numbers
 MODES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # plane axes a, b and line axis c of each mode
@@ -27,11 +27,16 @@ def sizes(rank: int) -> dict[str, int]:
     return {"RANK": rank, "WIDTH": 3 * rank, "ROOM": 2 * rank}
 
 
-def sections(resolution: tuple[int, int, int], rank: int) -> list[Part]:
+def sections(resolution: tuple[int, int, int], rank: int) -> list[ParameterBlock]:
     """See encodings."""
     n, drawn = resolution, {"spread": SPREAD}
-    planes = [Part(f"plane_{m}", (n[a], n[b], rank), (a, b), **drawn) for m, (a, b, _) in enumerate(MODES)]
-    return [*planes, *(Part(f"line_{m}", (n[c], rank), (c,), **drawn) for m, (_, _, c) in enumerate(MODES))]
+    planes = [
+        ParameterBlock(f"plane_{m}", (n[a], n[b], rank), (a, b), **drawn) for m, (a, b, _) in enumerate(MODES)
+    ]
+    return [
+        *planes,
+        *(ParameterBlock(f"line_{m}", (n[c], rank), (c,), **drawn) for m, (_, _, c) in enumerate(MODES)),
+    ]
 
 
 def arrays(field, starts: np.ndarray, rank: int) -> Arrays:

@@ -1,4 +1,4 @@
-"""Planes times lines, and where their sum says that there may be matter a hash grid in the units of space
+"""Planes times lines, and where their sum says that there may be density a hash grid in the units of space
 (hash_runs.py): the first number of its rows is a feature more, the other three are added to the colour's
 logits. Products of planes and lines over all of a captured place cannot tell leaves and stones apart; rows
 cost time and memory only where some surface uses them.
@@ -17,8 +17,8 @@ from fusedrf_cli.engine.encodings.hash_runs import rows_at, scatter_rows
 from fusedrf_cli.engine.encodings.plane_line import prefetch_at as prefetch_planes
 from fusedrf_cli.engine.encodings.plane_line import summed as planes_summed
 from fusedrf_cli.engine.encodings.plane_line import summed_backward as planes_backward
-from fusedrf_cli.engine.fields.box import Part
-from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Hashed
+from fusedrf_cli.engine.fields.box import ParameterBlock
+from fusedrf_cli.engine.fields.hash_entries import EMPTY_FROM, HashGrid
 
 
 class Arrays(NamedTuple):
@@ -32,7 +32,7 @@ class Arrays(NamedTuple):
     shift: object  # float, of the density
 
 
-def sizes(rank: int, hashed: Hashed) -> dict[str, int]:
+def sizes(rank: int, hashed: HashGrid) -> dict[str, int]:
     """See encodings; behind what plane_line.py needs, scratch holds whether rows were asked, of which point
     (1 and three coordinates) the last logits are, these, and the gradient of logits."""
     at = plane_line.sizes(rank)["ROOM"]
@@ -40,18 +40,18 @@ def sizes(rank: int, hashed: Hashed) -> dict[str, int]:
     return {"RANK": rank, "WIDTH": 3 * rank + 1} | places
 
 
-def sections(resolution: tuple[int, int, int], rank: int, hashed: Hashed) -> list[Part]:
+def sections(resolution: tuple[int, int, int], rank: int, hashed: HashGrid) -> list[ParameterBlock]:
     """See encodings."""
     return [*plane_line.sections(resolution, rank), *hash_runs.sections(resolution, hashed)]
 
 
-def arrays(field, starts: np.ndarray, rank: int, hashed: Hashed) -> Arrays:
+def arrays(field, starts: np.ndarray, rank: int, hashed: HashGrid) -> Arrays:
     """See encodings."""
     own, rows = plane_line.arrays(field, starts[:6], rank), hash_runs.arrays(field, starts[6:], hashed)
     return Arrays(*own, *rows, field.activation[1])
 
 
-def said(field, sections: dict, unit: torch.Tensor, rank: int, hashed: Hashed) -> tuple[torch.Tensor, ...]:
+def said(field, sections: dict, unit: torch.Tensor, rank: int, hashed: HashGrid) -> tuple[torch.Tensor, ...]:
     """(N, 3 rank) the products, and (N, ROW) what the rows add, 0 where they are not asked."""
     products = plane_line.reference(field, sections, unit, None, rank)
     asked = products.detach().sum(1) + field.shift > EMPTY_FROM
@@ -60,24 +60,24 @@ def said(field, sections: dict, unit: torch.Tensor, rank: int, hashed: Hashed) -
 
 
 def reference(
-    field, sections: dict, unit: torch.Tensor, read: None, rank: int, hashed: Hashed
+    field, sections: dict, unit: torch.Tensor, read: None, rank: int, hashed: HashGrid
 ) -> torch.Tensor:
     """See encodings."""
     products, rows = said(field, sections, unit, rank, hashed)
     return torch.cat([products, rows[:, :1]], 1)
 
 
-def logits_reference(field, sections: dict, unit: torch.Tensor, rank: int, hashed: Hashed) -> torch.Tensor:
+def logits_reference(field, sections: dict, unit: torch.Tensor, rank: int, hashed: HashGrid) -> torch.Tensor:
     """See encodings."""
     return said(field, sections, unit, rank, hashed)[1][:, 1:]
 
 
-def bound(sections: dict, read: None, rank: int, hashed: Hashed) -> torch.Tensor:
+def bound(sections: dict, read: None, rank: int, hashed: HashGrid) -> torch.Tensor:
     """See encodings."""
     return torch.cat([plane_line.bound(sections, None, rank), hash_runs.bound(sections, None, hashed)[:1]])
 
 
-def logits_bound(sections: dict, rank: int, hashed: Hashed) -> float:
+def logits_bound(sections: dict, rank: int, hashed: HashGrid) -> float:
     """See encodings."""
     return float(hash_runs.bound(sections, None, hashed)[1:].max())
 
@@ -87,7 +87,7 @@ def logits_bound(sections: dict, rank: int, hashed: Hashed) -> float:
 
 def locate(field, unit):
     """See encodings."""
-    return again(field, 0, unit)
+    return unpack_cell(field, 0, unit)
 
 
 def located(field, cell, scratch):
@@ -95,15 +95,15 @@ def located(field, cell, scratch):
     return cell[0], cell[1], cell[2], int(scratch[AT + ASKED])
 
 
-def keep(cell):
+def pack_cell(cell):
     """See encodings: whether rows were asked."""
     return cell[3]
 
 
-def again(field, kept, unit):
+def unpack_cell(field, samples, unit):
     """See encodings."""
     real = field.params.dtype.type
-    return real(unit[0]), real(unit[1]), real(unit[2]), kept
+    return real(unit[0]), real(unit[1]), real(unit[2]), samples
 
 
 def summed(field, cell, scratch):
@@ -111,12 +111,12 @@ def summed(field, cell, scratch):
     f = planes_summed(field, (cell[0], cell[1], cell[2]), scratch)
     scratch[AT + ASKED] = 0
     if f + field.shift > EMPTY_FROM:
-        f += rows_asked(field, cell, scratch)
+        f += rows_queried(field, cell, scratch)
         scratch[AT + ASKED] = 1
     return f
 
 
-def rows_asked(field, cell, scratch):
+def rows_queried(field, cell, scratch):
     """What the rows at a point add to the density; what they add to the logits is left in scratch."""
     at = np.uint64(AT + POINT)
     total, red, green, blue = rows_at(field, (cell[0], cell[1], cell[2]))
@@ -132,7 +132,7 @@ def logits(field, cell, scratch):
     if cell[3] != 0:
         known = scratch[at] != 0 and scratch[at + np.uint64(1)] == cell[0]
         if not (known and scratch[at + np.uint64(2)] == cell[1] and scratch[at + np.uint64(3)] == cell[2]):
-            rows_asked(field, cell, scratch)
+            rows_queried(field, cell, scratch)
         return scratch[at + np.uint64(4)], scratch[at + np.uint64(5)], scratch[at + np.uint64(6)]
     zero = scratch.dtype.type(0)
     return zero, zero, zero

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields.box import BoxField, Part
+from fusedrf_cli.engine.fields.box import BoxField, ParameterBlock
 from fusedrf_cli.engine.fields.computed import ComputedField
 from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.kernels.reference import cell_at, exact
@@ -40,7 +40,7 @@ class Slot:
         """Its arrays, of a field where its numbers begin at starts in `params`."""
         return self.module.arrays(field, starts, **self.options) if hasattr(self.module, "arrays") else ()
 
-    def parts(self, resolution: tuple[int, int, int]) -> list[Part]:
+    def parts(self, resolution: tuple[int, int, int]) -> list[ParameterBlock]:
         """Its numbers."""
         if not hasattr(self.module, "sections"):
             return []
@@ -109,7 +109,7 @@ class Assembled(ComputedField):
         raise NotImplementedError
 
     @property
-    def bodies(self) -> ModuleType:
+    def device_module(self) -> ModuleType:
         """See ComputedField."""
         return assemble(**{name: slot.module for name, slot in self.slots.items()})
 
@@ -118,7 +118,7 @@ class Assembled(ComputedField):
         values, starts = [params, *self.cube], self.slot_starts()
         for name, slot in self.slots.items():
             values += slot.arrays(self, starts[name])
-        return self.bodies.Arrays(*values)
+        return self.device_module.Arrays(*values)
 
     def reference(
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
@@ -156,7 +156,7 @@ class AssembledField(Assembled, BoxField):
         return self.slots_of(self.shape)
 
     @classmethod
-    def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[Part]:
+    def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[ParameterBlock]:
         """See BoxField: those of each slot in turn."""
         return [part for slot in cls.slots_of(shape).values() for part in slot.parts(resolution)]
 
@@ -194,13 +194,13 @@ class AssembledField(Assembled, BoxField):
 
     def check_answers(self) -> None:
         """See BoxField."""
-        own = self.slot_sections()
+        sections = self.slot_sections()
         density, colour, sigma, rgb = self.slots.values()
-        features = density.module.bound(own["density"], None, **density.options)
-        largest, outputs = sigma.module.bound(self, own["sigma"], features, **sigma.options)
+        features = density.module.bound(sections["density"], None, **density.options)
+        largest, outputs = sigma.module.bound(self, sections["sigma"], features, **sigma.options)
         self.check_density(largest)
-        features = colour.module.bound(own["colour"], outputs, **colour.options)
-        logit = rgb.module.bound(self, own["rgb"], features, **rgb.options)
+        features = colour.module.bound(sections["colour"], outputs, **colour.options)
+        logit = rgb.module.bound(self, sections["rgb"], features, **rgb.options)
         if hasattr(density.module, "logits_bound"):
-            logit += density.module.logits_bound(own["density"], **density.options)
+            logit += density.module.logits_bound(sections["density"], **density.options)
         self.check_logit(logit)

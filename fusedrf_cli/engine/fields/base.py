@@ -36,7 +36,7 @@ class RadianceField(Protocol):
 
 
 @dataclass(frozen=True)
-class FieldNeeds:
+class FieldMemory:
     """Bytes of memory that a stored field takes, told by its header: few bytes of a file can say many
     numbers."""
 
@@ -99,7 +99,7 @@ def check_samples(samples: float, what: str, most: int = SamplingConfig.most_sam
         )
 
 
-def holds_matter(field: RadianceField) -> bool:
+def is_occupied(field: RadianceField) -> bool:
     """Whether a field is dense enough anywhere to be seen, by asking it in the middle and at eight points of
     every occupied cell."""
     config = current(SamplingConfig)
@@ -109,7 +109,7 @@ def holds_matter(field: RadianceField) -> bool:
     for start in range(0, len(middles), config.probed_at_once):
         for offset in offsets:
             at = torch.from_numpy(middles[start : start + config.probed_at_once] + offset)
-            points = grid.space.placed(at)
+            points = grid.space.inv_contract(at)
             sigma, _ = field.query(points, torch.eye(3, dtype=torch.float64)[[0] * len(points)], False)
             if bool((sigma / grid.space.rates(at) * through > config.nothing).any()):
                 return True

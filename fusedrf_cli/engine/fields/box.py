@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.fields import pages
-from fusedrf_cli.engine.fields.base import FieldNeeds, check_samples, sampling_step
+from fusedrf_cli.engine.fields import large_pages
+from fusedrf_cli.engine.fields.base import FieldMemory, check_samples, sampling_step
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
     PER_CELL_MADE,
@@ -30,7 +30,7 @@ DENSITY_SCALE_PER_EXTENT = 75.0
 
 
 @dataclass(frozen=True)
-class Part:
+class ParameterBlock:
     """A stretch of a field's numbers."""
 
     name: str
@@ -53,7 +53,7 @@ class Part:
         return self.axes == (0, 1, 2)
 
 
-def aligned(part: Part) -> int:
+def aligned(part: ParameterBlock) -> int:
     """Floats of a part, up to whole cache lines."""
     return -(-math.prod(part.shape) // LINE) * LINE
 
@@ -64,8 +64,9 @@ class BoxField(ComputedField):
     Of a part with numbers for each vertex of the grid those of *used* vertices alone are learnt and stored,
     which touch a voxel that an occupied cell reaches into: no answer depends on the others.
 
-    A kind sets `kind`, `bodies` and `shape_type`, a frozen dataclass of whole numbers that refuses what its
-    bodies were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and `check_answers`.
+    A kind sets `kind`, `device_module` and `shape_type`, a frozen dataclass of whole numbers that refuses
+    what its bodies were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and
+    `check_answers`.
     """
 
     shape_type: type
@@ -86,13 +87,13 @@ class BoxField(ComputedField):
         zeros; occupancy None: full."""
         self.shape, self.box, self.resolution = shape, np.asarray(box, np.float64), tuple(resolution)
         self.scale, self.shift = float(scale), float(shift)
-        self.params = pages.zeros(self.size) if params is None else params
+        self.params = large_pages.zeros(self.size) if params is None else params
         self.occupancy = OccupancyGrid.full(self.box) if occupancy is None else occupancy
 
     # -- for kinds to define -----------------------------------------------------------------------------
 
     @classmethod
-    def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[Part]:
+    def parts_of(cls, shape: object, resolution: tuple[int, int, int]) -> list[ParameterBlock]:
         """The parts of `params`, in order."""
         raise NotImplementedError
 
@@ -134,7 +135,7 @@ class BoxField(ComputedField):
     # -- reading -----------------------------------------------------------------------------------------
 
     @cached_property
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[ParameterBlock]:
         """The parts of `params`, in order."""
         return self.parts_of(self.shape, self.resolution)
 
@@ -237,7 +238,7 @@ class BoxField(ComputedField):
         """The name in files of the array of a part."""
         return name
 
-    def stored_shape(self, part: Part, used: int | None = None) -> tuple[int, ...]:
+    def stored_shape(self, part: ParameterBlock, used: int | None = None) -> tuple[int, ...]:
         """Shape under which a part is stored; of vertices, the used ones in order. used: how many these are,
         where that is known."""
         if part.on_vertices and used is None:
@@ -245,12 +246,12 @@ class BoxField(ComputedField):
         shape = (used, *part.shape[3:]) if part.on_vertices else part.shape
         return shape if part.columns is None else (*shape[:-1], part.columns)
 
-    def pack(self, part: Part, values: torch.Tensor) -> torch.Tensor:
+    def pack(self, part: ParameterBlock, values: torch.Tensor) -> torch.Tensor:
         """A part as it is stored."""
-        kept = values[torch.from_numpy(self.used)] if part.on_vertices else values
-        return kept if part.columns is None else kept[..., : part.columns]
+        used_values = values[torch.from_numpy(self.used)] if part.on_vertices else values
+        return used_values if part.columns is None else used_values[..., : part.columns]
 
-    def unpack(self, part: Part, stored: torch.Tensor, values: torch.Tensor) -> None:
+    def unpack(self, part: ParameterBlock, stored: torch.Tensor, values: torch.Tensor) -> None:
         """Inverse of `pack`, into a part that is 0, as what is not stored stays."""
         if part.on_vertices:
             rows = values.view(math.prod(self.resolution), -1)
@@ -261,20 +262,20 @@ class BoxField(ComputedField):
             values[..., : stored.shape[-1]] = stored
 
     @classmethod
-    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
         """See Kind.field_needs."""
         parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
         numbers = sum(map(aligned, parts))
         counts, texels = metadata["cells"]["counts"], metadata["resolution"]
-        made, unwritten = PER_CELL_MADE * math.prod(counts), 0
+        making, unwritten = PER_CELL_MADE * math.prod(counts), 0
         for part in parts:
             if part.on_vertices:  # used_vertices axis by axis, and the used ones' places
                 halves, used = [math.prod([*texels[:n], *counts[n:]]) for n in range(4)], shapes[part.name][0]
                 # 7 bytes of a vertex, or of a cell, while the used ones are found; of these each may be
                 # alone in a large page.
-                made = max(made, 7 * max(halves), math.prod(texels) + 8 * used)
+                making = max(making, 7 * max(halves), math.prod(texels) + 8 * used)
                 unwritten += max(0, 4 * math.prod(part.shape) - used * (2 << 20))
-        return FieldNeeds(4 * numbers + PER_CELL * math.prod(counts), made, unwritten)
+        return FieldMemory(4 * numbers + PER_CELL * math.prod(counts), making, unwritten)
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "BoxField":
@@ -296,9 +297,9 @@ class BoxField(ComputedField):
         check_samples(grid.space.most_samples(grid.aabb, sampling_step(bare)), "the field")
         for part in bare.parts:  # before `params` takes memory
             name, expected = cls.stored_name(part.name), bare.stored_shape(part)
-            found = arrays.get(name)
-            if found is None or found.shape != expected:
-                have = "nothing" if found is None else list(found.shape)
+            array = arrays.get(name)
+            if array is None or array.shape != expected:
+                have = "nothing" if array is None else list(array.shape)
                 raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
         field = cls(shape, bare.box, resolution, scale, shift, occupancy=grid)
         for part, view in zip(field.parts, field.sections().values(), strict=True):
@@ -342,17 +343,17 @@ def used_vertices(occupancy: OccupancyGrid, box: np.ndarray, resolution: tuple[i
         at = np.linspace(box[axis], box[axis + 3], resolution[axis])
         voxel = (box[axis + 3] - box[axis]) / (resolution[axis] - 1)
         cells = occupancy.occupied.shape[axis]
-        place = (np.stack([at - voxel, at + voxel]) - occupancy.aabb[axis]) / occupancy.cell[axis]
-        low, high = np.floor(place[0]).astype(int), np.floor(place[1]).astype(int)
+        between_cells = (np.stack([at - voxel, at + voxel]) - occupancy.aabb[axis]) / occupancy.cell[axis]
+        low, high = np.floor(between_cells[0]).astype(int), np.floor(between_cells[1]).astype(int)
         spans.append((np.clip(low, 0, cells), np.clip(high + 1, 0, cells)))
-    found = occupancy.occupied
+    used = occupancy.occupied
     for axis, (low, high) in enumerate(spans):  # the box of cells around a vertex is a product of three runs
-        shape = list(found.shape)
+        shape = list(used.shape)
         shape[axis] += 1
         total = np.zeros(shape, np.int16)  # MAX_TEXELS of them at most
-        np.cumsum(found, axis, out=total[(slice(None),) * axis + (slice(1, None),)])
-        found = total.take(high, axis) > total.take(low, axis)
-    return found
+        np.cumsum(used, axis, out=total[(slice(None),) * axis + (slice(1, None),)])
+        used = total.take(high, axis) > total.take(low, axis)
+    return used
 
 
 def checked_box(values: list, what: str) -> np.ndarray:
@@ -381,8 +382,8 @@ def interpolate_axis(values: torch.Tensor, axis: int, unit: torch.Tensor) -> tor
     1]. On a texel, up to a rounding, it is that texel's own to the bit."""
     n = values.shape[axis]
     position = unit * (n - 1)
-    whole = position.round()
-    position = torch.where((position - whole).abs() < 1e-9, whole, position)
+    rounded = position.round()
+    position = torch.where((position - rounded).abs() < 1e-9, rounded, position)
     lower = position.floor().clamp(0, n - 2).long()
     fraction = (position - lower).to(values.dtype)
     inside = ((unit >= -1e-9) & (unit <= 1 + 1e-9)).to(values.dtype)

@@ -12,18 +12,18 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.fields.base import FieldNeeds
+from fusedrf_cli.engine.fields.base import FieldMemory
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import GridArrays
 from fusedrf_cli.engine.kernels.instances import FARTHEST, Slots
 from fusedrf_cli.engine.kernels.loops import (
     RAYS_PER_TASK,
-    Answers,
     Cells,
-    Points,
-    Sent,
-    Voting,
-    Weighed,
+    PointBatch,
+    PointValues,
+    QueryGradients,
+    VoteRays,
+    WeightRays,
 )
 
 BRICK = 4  # cells a side
@@ -64,9 +64,9 @@ class Batch(NamedTuple):
     near: float
     step: float
     early_stop: float
-    distortion: float = 0.0  # weight of the loss by which a ray's matter draws together
+    distortion: float = 0.0  # weight of the loss by which a ray's density draws together
     light: float = 0.0  # weight under which a sample is followed back by chance alone; 0: every one is
-    depth_weight: float = 0.0  # weight of the loss by which matter comes to known depths
+    depth_weight: float = 0.0  # weight of the loss by which density comes to known depths
     depths: np.ndarray = NONE_KNOWN  # (m,) float64, how far away what the first m rays show is, if known
     # (n, 3, 3) float64, gains and offsets that make a ray's colour that of its photo, and weights; or none
     exposure: np.ndarray = AS_IT_IS
@@ -89,13 +89,13 @@ class Group:
 class ComputedField:
     """A field that the loops of kernels/loops.py compute.
 
-    A kind sets `kind` and `bodies`, its module of scalar functions; a field of it has `params` (P,), whose
-    length is a multiple of LINE, `occupancy`, and `kernel_arrays`. Immutable but for `params`, which
+    A kind sets `kind` and `device_module`, its module of scalar functions; a field of it has `params` (P,),
+    whose length is a multiple of LINE, `occupancy`, and `kernel_arrays`. Immutable but for `params`, which
     optimisers update in place (`settle` afterwards).
     """
 
     kind: str
-    bodies: ModuleType
+    device_module: ModuleType
     params: torch.Tensor
     occupancy: OccupancyGrid
 
@@ -143,7 +143,7 @@ class ComputedField:
         self, params: torch.Tensor, points: torch.Tensor, dirs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """σ (N,) per length of the frame and rgb (N, 3) at points (N, 3) of it, by `reference`."""
-        at = self.space.contracted(points)
+        at = self.space.contract(points)
         sigma, rgb = self.reference(params, at, dirs)
         return sigma * self.space.density_rates(at, dirs.to(at)).to(sigma.dtype), rgb
 
@@ -171,11 +171,11 @@ class ComputedField:
         """The field as it comes back from a bundle that keeps as_stored(array, name, runs) of each array of
         numbers; runs (R,) are those of its rows, or None."""
         arrays, metadata = self.state()
-        kept = {
+        stored_arrays = {
             name: as_stored(array, name, arrays.get(runs_of(name))) if array.dtype.kind == "f" else array
             for name, array in arrays.items()
         }
-        return type(self).from_state(kept, metadata).to(self.params.device)
+        return type(self).from_state(stored_arrays, metadata).to(self.params.device)
 
     def _afresh(self, *names: str) -> "ComputedField":
         """Itself without what was computed from things that have changed."""
@@ -196,9 +196,9 @@ class ComputedField:
         return self.occupancy.space
 
     @classmethod
-    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
         """See Kind.field_needs."""
-        return FieldNeeds(4 * sum(math.prod(shape) for shape in shapes.values()), 0)
+        return FieldMemory(4 * sum(math.prod(shape) for shape in shapes.values()), 0)
 
     @property
     def device_loops(self) -> ModuleType:
@@ -213,8 +213,8 @@ class ComputedField:
     @cached_property
     def loops(self) -> kernels.cpu.Loops:
         """The loops for fields of these sizes, on the device that the numbers lie on."""
-        sizes = self.bodies.sizes(self)
-        return self.device_loops.loops_for(self.bodies, tuple(sorted(sizes.items())), self.space)
+        sizes = self.device_module.sizes(self)
+        return self.device_loops.loops_for(self.device_module, tuple(sorted(sizes.items())), self.space)
 
     @cached_property
     def arrays(self) -> NamedTuple:
@@ -242,12 +242,12 @@ class ComputedField:
         if self.device_loops is None:
             with torch.no_grad():
                 device = self.params.device
-                found = self.answers(self.params, points.to(device), dirs.to(device))
-                return tuple(answer.cpu() for answer in found)
-        asked = Points(exact(points), exact(dirs), bool(with_colour))
-        found = Answers(np.empty(len(points), self.real), np.empty((len(points), 3), self.real))
-        self.loops.each("query_point", self.arrays, self.grid, asked, len(points), found)
-        return torch.from_numpy(found.sigma), torch.from_numpy(found.rgb)
+                values = self.answers(self.params, points.to(device), dirs.to(device))
+                return tuple(answer.cpu() for answer in values)
+        query = PointBatch(exact(points), exact(dirs), bool(with_colour))
+        values = PointValues(np.empty(len(points), self.real), np.empty((len(points), 3), self.real))
+        self.loops.each("query_point", self.arrays, self.grid, query, len(points), values)
+        return torch.from_numpy(values.sigma), torch.from_numpy(values.rgb)
 
     def render_rays(
         self,
@@ -270,9 +270,9 @@ class ComputedField:
         out[:] = 0
         self.each("show_ray", slots, count, out, RAYS_PER_TASK)
 
-    def each(self, item: str, asked: NamedTuple, count: int, out: object, per_task: int) -> None:
+    def each(self, item: str, query: NamedTuple, count: int, out: object, per_task: int) -> None:
         """An item of work for each i < count, which fills `out`; see Loops.each."""
-        self.loops.each(item, self.arrays, self.grid, asked, count, out, per_task)
+        self.loops.each(item, self.arrays, self.grid, query, count, out, per_task)
 
     def peaks(self, lo: np.ndarray, cell: np.ndarray, cells: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         """(N,) largest σ over offsets (K, 3) in each of `cells` (N, 3) int64 of a grid with corner lo (3,)
@@ -281,9 +281,9 @@ class ComputedField:
         at_once = 1 << 18  # between which an interrupt is heard
         for start in range(0, len(cells), at_once):
             part = slice(start, start + at_once)
-            own = np.ascontiguousarray(cells[part], np.int64)
-            asked = Cells(exact(lo), exact(cell), own, exact(offsets))
-            self.loops.each("peak_of_cell", self.arrays, self.grid, asked, len(own), out[part])
+            part_cells = np.ascontiguousarray(cells[part], np.int64)
+            query = Cells(exact(lo), exact(cell), part_cells, exact(offsets))
+            self.loops.each("peak_of_cell", self.arrays, self.grid, query, len(part_cells), out[part])
         return out
 
     def weights_in_cells(
@@ -291,11 +291,11 @@ class ComputedField:
     ) -> np.ndarray:
         """(X, Y, Z) for each cell of the occupancy the largest weight (NeRF, eq. 3) that a sample in it has
         on any of rays (N, 3)."""
-        asked = Weighed(exact(rays_o), exact(rays_d), exact(jitter), float(near), float(step), 1e-3)
+        query = WeightRays(exact(rays_o), exact(rays_d), exact(jitter), float(near), float(step), 1e-3)
         parts = self.gradient_rows
         most = np.zeros((parts, self.occupancy.occupied.size), np.float32)
         self.loops.sweep(
-            "weigh_ray", self.arrays, self.grid, asked, len(rays_o), 1, most, np.zeros((parts, 3))
+            "weigh_ray", self.arrays, self.grid, query, len(rays_o), 1, most, np.zeros((parts, 3))
         )
         return most.max(0).reshape(self.occupancy.occupied.shape)
 
@@ -312,14 +312,14 @@ class ComputedField:
         (NeRF, eq. 3) that samples in it have on those of rays (N, 3) that are not `inside` (N,), and on those
         that are."""
         counts = np.array(cells.occupied.shape, np.int64)
-        asked = Voting(
+        query = VoteRays(
             exact(rays_o), exact(rays_d), exact(jitter), np.ascontiguousarray(inside, np.uint8), float(step),
             1e-3, exact(cells.aabb[:3]), exact(cells.cell), counts,
         )  # fmt: skip
         parts = self.gradient_rows
         sums = np.zeros((parts, 2 * cells.occupied.size), np.float32)
         self.loops.sweep(
-            "vote_ray", self.arrays, self.grid, asked, len(rays_o), 1, sums, np.zeros((parts, 3))
+            "vote_ray", self.arrays, self.grid, query, len(rays_o), 1, sums, np.zeros((parts, 3))
         )
         return np.moveaxis(sums.sum(0).reshape(*counts, 2), -1, 0)
 
@@ -335,7 +335,8 @@ class ComputedField:
     ) -> None:
         """Adjoint of `query`: add to the rows of grads (parts, P) what the derivatives d_sigma (N,) and d_rgb
         (N, 3) of a loss send back to `params`."""
-        sent = Sent(exact(points), exact(dirs), as_array(d_sigma, self.real), as_array(d_rgb, self.real))
+        d_sigma, d_rgb = as_array(d_sigma, self.real), as_array(d_rgb, self.real)
+        sent = QueryGradients(exact(points), exact(dirs), d_sigma, d_rgb)
         unused = np.zeros((len(grads), 3))
         most = 1, grads, unused
         self.loops.sweep("query_point_backward", self.arrays, self.grid, sent, len(points), *most)
@@ -352,7 +353,7 @@ class ComputedField:
         elsewhere or nowhere: a is 0 where |t / D - 1| is up to DEPTH_TOLERANCE and 1 from twice that on. It
         is ours, after the losses along lidar's lines of sight of Urban Radiance Fields (Rematas et al. 2022).
         With batch.exposure, what is compared is gain_c (C_c + (1 - A) background_c) + offset_c, only
-        one-sided where a photo's range ends (kernels/parts.py, `within`), and the squares are weighted.
+        one-sided where a photo's range ends (kernels/primitives.py, `within`), and the squares are weighted.
         loss (parts, 3) gains the sums over rays of the colour term, not weighted, where no depth is known, of
         the opacity term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose
         mean over jitters is that of the loss (loops.py, `followed`).
@@ -387,9 +388,9 @@ def packed_bits(name: str, grid: np.ndarray, least: int = FEW_CELLS) -> dict[str
     if grid.size <= least:
         return packed
     bricks = in_bricks(np.pad(grid, [(0, -n % BRICK) for n in grid.shape], "edge"))
-    some, whole = bricks.any(1), bricks.all(1)
-    mixed = np.packbits(bricks[some & ~whole], axis=1)
-    parts = {f"{name}.bricks": np.packbits(np.stack([some, whole])), f"{name}.mixed": mixed}
+    some, full = bricks.any(1), bricks.all(1)
+    mixed = np.packbits(bricks[some & ~full], axis=1)
+    parts = {f"{name}.bricks": np.packbits(np.stack([some, full])), f"{name}.mixed": mixed}
     # Bricks are worth it up to three quarters of the bytes of all bits.
     return parts if sum(part.nbytes for part in parts.values()) < 0.75 * packed[name].nbytes else packed
 
@@ -425,12 +426,12 @@ def unpacked_bricks(
     number = int(np.prod(counts))
     if marks.dtype != np.uint8 or marks.shape != (-(-number // 4),):
         raise ValueError(f"array '{name}.bricks' should be {-(-number // 4)} bytes for a grid of {shape}")
-    some, whole = np.unpackbits(marks, count=2 * number).reshape(2, number).astype(bool)
-    some &= ~whole
+    some, full = np.unpackbits(marks, count=2 * number).reshape(2, number).astype(bool)
+    some &= ~full
     if mixed is None or mixed.dtype != np.uint8 or mixed.shape != (some.sum(), BRICK**3 // 8):
         raise ValueError(f"array '{name}.mixed' should have {some.sum()} rows of {BRICK**3 // 8} bytes")
     bricks = np.zeros((number, BRICK**3), bool)
-    bricks[whole] = True
+    bricks[full] = True
     bricks[some] = np.unpackbits(mixed, axis=1)
     cells = bricks.reshape(*counts, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
     return cells.reshape([n * BRICK for n in counts])[tuple(slice(n) for n in shape)].copy()

@@ -28,21 +28,21 @@ def query(
     gradient. Raises ValueError where a gradient is asked of a field that has no `reference`.
     """
     field = opened(field)
-    asked = (points, dirs, getattr(field, "params", None) if params is None else params)
-    wanted = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in asked)
+    inputs = (points, dirs, getattr(field, "params", None) if params is None else params)
+    needs_grad = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in inputs)
     if not hasattr(field, "reference"):
-        if wanted or params is not None:
+        if needs_grad or params is not None:
             raise ValueError(
                 f"fields of kind '{field.kind}' have no reference in torch and cannot be differentiated; "
                 "convert them to another kind"
             )
         return field.query(points, dirs, with_colour)
-    params = asked[-1]
+    params = inputs[-1]
     points, dirs = exact(points, params.device), exact(dirs, params.device)
     if field.device_loops is None:
         sigma, rgb = field.answers(params, points, dirs)
         return sigma, rgb if with_colour else torch.zeros_like(rgb)
-    if not wanted:
+    if not needs_grad:
         return by_kernels(holding(field, params), points, dirs, with_colour)
     return _Query.apply(field, params, points, dirs, with_colour)
 
@@ -70,8 +70,8 @@ def by_kernels(
     field, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The field's own `query`, on whatever device it lies."""
-    found = field.query(points.detach().cpu(), dirs.detach().cpu(), with_colour)
-    return tuple(answer.to(field.params.device) for answer in found)
+    values = field.query(points.detach().cpu(), dirs.detach().cpu(), with_colour)
+    return tuple(answer.to(field.params.device) for answer in values)
 
 
 class _Query(torch.autograd.Function):
@@ -105,10 +105,10 @@ def gradient(
     rows = params.new_zeros(torch.get_num_threads() if on_cpu else 1, len(params))
     back = (x.detach().cpu().contiguous() for x in (points, dirs, d_sigma, d_rgb))
     field.query_backward(*back, field.device_loops.shared(rows))
-    found = rows.sum(0)
+    total = rows.sum(0)
     for low, high in field.dependent():
-        found[low:high] = 0
-    return found
+        total[low:high] = 0
+    return total
 
 
 def of_reference(
@@ -116,10 +116,10 @@ def of_reference(
 ) -> tuple[torch.Tensor, ...]:
     """(N, 3) and (N, 3) what the derivatives send back to points and directions, by the reference."""
     with torch.enable_grad():
-        places = [x.detach().requires_grad_() for x in (points, dirs)]
-        answers = field.answers(field.params.detach(), *places)
+        inputs = [x.detach().requires_grad_() for x in (points, dirs)]
+        answers = field.answers(field.params.detach(), *inputs)
         sent = [(a, d) for a, d in zip(answers, (d_sigma, d_rgb), strict=True) if a.requires_grad]
         if not sent:  # nothing is there
-            return tuple(torch.zeros_like(x) for x in places)
+            return tuple(torch.zeros_like(x) for x in inputs)
         answers, sent = zip(*sent, strict=True)
-        return torch.autograd.grad(answers, places, sent, materialize_grads=True)
+        return torch.autograd.grad(answers, inputs, sent, materialize_grads=True)

@@ -1,4 +1,4 @@
-"""The occupancy grid of a field: which cells of its box hold matter, and how far away the next such cell
+"""The occupancy grid of a field: which cells of its box are occupied, and how far away the next such cell
 is."""
 
 from collections.abc import Iterable, Iterator
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.kernels import GridArrays
-from fusedrf_cli.engine.kernels.plain import mark_cells
+from fusedrf_cli.engine.kernels.field_free import mark_cells
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
@@ -79,10 +79,10 @@ class OccupancyGrid:
     @cached_property
     def arrays(self) -> GridArrays:
         """The arrays kernels read."""
-        found = GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
+        arrays = GridArrays(self.skip, self.aabb[:3].copy(), self.aabb[3:].copy(), self.cell)
         if self.stride is None:
-            return found
-        return found._replace(stride=self.stride, unit=self.unit)
+            return arrays
+        return arrays._replace(stride=self.stride, unit=self.unit)
 
     @cached_property
     def passage(self) -> float:
@@ -91,15 +91,15 @@ class OccupancyGrid:
         that it follows most, each in at most √3 times its thickness."""
         if not self.occupied.any():
             return 0.0
-        found = []
+        lengths = []
         for axis in range(3):
             others = tuple({0, 1, 2} - {axis})
             often = self.occupied.any(others)
             if self.stride is not None:
                 closest = self.stride.min(others, where=self.occupied, initial=MAX_STRIDE)
                 often = often / np.maximum(closest, 1)
-            found.append(often.sum() * self.cell[axis])
-        return float(np.sqrt(3) * max(found))
+            lengths.append(often.sum() * self.cell[axis])
+        return float(np.sqrt(3) * max(lengths))
 
     def most_samples(self, step: float) -> int:
         """How many samples a ray can have in occupied cells, at most; step: where there are no strides."""
@@ -113,12 +113,12 @@ class OccupancyGrid:
         if not self.occupied.any():
             return self.aabb
         layers = [np.flatnonzero(self.occupied.any(tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-        lo = self.aabb[:3] + (np.array([held[0] for held in layers]) - margin_cells) * self.cell
-        hi = self.aabb[:3] + (np.array([held[-1] for held in layers]) + 1 + margin_cells) * self.cell
+        lo = self.aabb[:3] + (np.array([layer[0] for layer in layers]) - margin_cells) * self.cell
+        hi = self.aabb[:3] + (np.array([layer[-1] for layer in layers]) + 1 + margin_cells) * self.cell
         return np.concatenate([np.maximum(lo, self.aabb[:3]), np.minimum(hi, self.aabb[3:])])
 
     @property
-    def subject(self) -> np.ndarray:
+    def look_at_box(self) -> np.ndarray:
         """(6,) box of the field's frame that views of it look at: that around the occupied cells, or, in
         spaces without end, the middle of the core; of a grid that does not reach there, since all cameras
         stand in the core and look one way, the middle half of the cells no farther than 5 from it."""
@@ -126,9 +126,9 @@ class OccupancyGrid:
             return self.looked_at
         if self.space is bounded:
             return self.tight_aabb(0)
-        if hasattr(self.space, "SUBJECT") and (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
-            return self.space.SUBJECT
-        points = self.space.placed(torch.from_numpy(self.centres())).numpy()
+        if hasattr(self.space, "LOOK_AT_BOX") and (self.aabb[:3] < 0).all() and (self.aabb[3:] > 0).all():
+            return self.space.LOOK_AT_BOX
+        points = self.space.inv_contract(torch.from_numpy(self.centres())).numpy()
         near = np.abs(points).max(1) < 5
         chosen = points[near] if near.any() else points
         return np.concatenate(np.quantile(chosen, [0.25, 0.75], axis=0))
@@ -165,22 +165,22 @@ class OccupancyGrid:
     def halved(self) -> "OccupancyGrid":
         """Cells twice as wide, occupied where any of the eight in them is."""
         counts = -(-np.array(self.occupied.shape) // 2)
-        found = np.pad(self.occupied, [(0, n) for n in 2 * counts - self.occupied.shape])
+        padded = np.pad(self.occupied, [(0, n) for n in 2 * counts - self.occupied.shape])
         for axis in range(3):
-            found = found.take(range(0, found.shape[axis], 2), axis) | found.take(
-                range(1, found.shape[axis], 2), axis
+            padded = padded.take(range(0, padded.shape[axis], 2), axis) | padded.take(
+                range(1, padded.shape[axis], 2), axis
             )
         aabb = np.concatenate([self.aabb[:3], self.aabb[:3] + 2 * counts * self.cell])
-        return OccupancyGrid(aabb, found, self.space)
+        return OccupancyGrid(aabb, padded, self.space)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool: which points (N, 3) of the space's coordinates lie in an occupied cell."""
         index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
         inside = ((index >= 0) & (index < self.occupied.shape)).all(1)
-        found = np.zeros(len(points), bool)
+        contained = np.zeros(len(points), bool)
         i, j, k = index[inside].T
-        found[inside] = self.occupied[i, j, k]
-        return found
+        contained[inside] = self.occupied[i, j, k]
+        return contained
 
     def strides_at(self, points: np.ndarray) -> np.ndarray:
         """(N,) how many times `unit` samples may lie apart at points (N, 3) of the space's coordinates, the
@@ -200,8 +200,8 @@ class OccupancyGrid:
 
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:
     """The largest optical depth, at most `most`, up to which cells may be left out of a grid of optical
-    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin fog is no
-    emptiness.
+    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin floaters is
+    no emptiness.
     """
     for threshold in most * 0.25 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)
@@ -259,36 +259,36 @@ def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int)
     whose middle lies in or beside one."""
     if grid.space is unbounded and np.array_equal(object_to_field, np.eye(4)):
         return overlapped(grid, longest)
-    own, back = grid.dilated(), np.linalg.inv(object_to_field)
-    wanted = OccupancyGrid.full(unbounded.WHOLE, longest, unbounded)
-    found = []
+    grown, back = grid.dilated(), np.linalg.inv(object_to_field)
+    full = OccupancyGrid.full(unbounded.WHOLE, longest, unbounded)
+    marked = []
     for part in np.array_split(
-        wanted.centres(), -(-wanted.occupied.size // current(OccupancyConfig).points_at_once)
+        full.centres(), -(-full.occupied.size // current(OccupancyConfig).points_at_once)
     ):
-        at = unbounded.placed(torch.from_numpy(part)).numpy() @ back[:3, :3].T + back[:3, 3]
-        found.append(own.contains(mapped(at, grid.space)))
-    return np.concatenate(found).reshape(wanted.occupied.shape)
+        at = unbounded.inv_contract(torch.from_numpy(part)).numpy() @ back[:3, :3].T + back[:3, 3]
+        marked.append(grown.contains(mapped(at, grid.space)))
+    return np.concatenate(marked).reshape(full.occupied.shape)
 
 
 def overlapped(grid: OccupancyGrid, longest: int, aabb: np.ndarray = unbounded.WHOLE) -> np.ndarray:
     """(X, Y, Z) bool: cells of a box (6,) in a grid's coordinates, `longest` along its longest axis, that
     share a volume with an occupied cell of the grid; by default of all of unbounded space."""
-    found, counts = grid.occupied, np.asarray(grid.occupied.shape)
-    wanted, sides = cell_counts(aabb, longest), aabb[3:] - aabb[:3]
+    occupied, counts = grid.occupied, np.asarray(grid.occupied.shape)
+    shape, sides = cell_counts(aabb, longest), aabb[3:] - aabb[:3]
     for axis, count in enumerate(counts):
         low, side = grid.aabb[axis], grid.aabb[axis + 3] - grid.aabb[axis]
-        edges = aabb[axis] + sides[axis] / wanted[axis] * np.arange(wanted[axis] + 1)
+        edges = aabb[axis] + sides[axis] / shape[axis] * np.arange(shape[axis] + 1)
         at = (edges - low) / side * count
         at = np.where(abs(at - np.rint(at)) < 1e-9, np.rint(at), at)  # faces but for rounding
         first, last = np.floor(at[:-1]).astype(int), np.ceil(at[1:]).astype(int)
         runs = zip(np.clip(first, 0, count), np.clip(last, 0, count), strict=True)
-        found = np.stack([found.take(range(a, b), axis).any(axis) for a, b in runs], axis)
-    return found
+        occupied = np.stack([occupied.take(range(a, b), axis).any(axis) for a, b in runs], axis)
+    return occupied
 
 
 def mapped(points: np.ndarray, space: ModuleType) -> np.ndarray:
     """Points (N, 3) of a frame in the coordinates of a space."""
-    return space.contracted(torch.from_numpy(points)).numpy()
+    return space.contract(torch.from_numpy(points)).numpy()
 
 
 def marked_cells(
@@ -310,12 +310,12 @@ def marked_cells(
     )
     steps = np.stack(np.meshgrid(*[np.linspace(0, 1, n) for n in points], indexing="ij"), -1).reshape(-1, 3)
     corners = grid.aabb[:3] + np.argwhere(grid.occupied) * grid.cell
-    found = np.zeros(counts, bool)
+    marked = np.zeros(counts, bool)
     if space is bounded:
         linear = object_to_field[:3, :3].T / cell
         begin = corners @ linear + (object_to_field[:3, 3] - aabb[:3]) / cell
-        mark_cells(begin, steps * grid.cell @ linear, found)
-        return OccupancyGrid(aabb, found).dilated().occupied
+        mark_cells(begin, steps * grid.cell @ linear, marked)
+        return OccupancyGrid(aabb, marked).dilated().occupied
     # Many cells and few steps, or, in a coarse grid, the other way round: loop over the fewer.
     fewer, more = sorted((corners, steps * grid.cell), key=len)
     for part in (
@@ -324,8 +324,8 @@ def marked_cells(
         for offset in fewer:
             at = mapped((part + offset) @ object_to_field[:3, :3].T + object_to_field[:3, 3], space)
             index = np.clip(np.floor((at - aabb[:3]) / cell).astype(np.int64), 0, counts - 1)
-            found[tuple(index.T)] = True
-    return OccupancyGrid(aabb, found).dilated().occupied
+            marked[tuple(index.T)] = True
+    return OccupancyGrid(aabb, marked).dilated().occupied
 
 
 def squeezed(matrix: np.ndarray) -> float:

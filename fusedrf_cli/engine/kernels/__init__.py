@@ -31,18 +31,18 @@ def kernel_cache() -> Path:
     It is named for the text of what the loops inline: numba only looks for changes in the file of the loop.
     Where no folder can be had, nothing is kept.
     """
-    bodies = hashlib.sha256(b"".join(path.read_bytes() for path in inlined())).hexdigest()[:12]
-    bodies += "-one" if ONE_THREAD else ""
-    wanted = user_cache_path("fusedrf") / "kernels" / bodies
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in inlined())).hexdigest()[:12]
+    digest += "-one" if ONE_THREAD else ""
+    folder = user_cache_path("fusedrf") / "kernels" / digest
     try:
-        wanted.mkdir(parents=True, exist_ok=True)
-        probe = tempfile.TemporaryFile(dir=wanted)
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = tempfile.TemporaryFile(dir=folder)
         probe.close()
-        ours = is_ours(wanted, others=stat.S_IWGRP | stat.S_IWOTH)
+        ours = is_ours(folder, others=stat.S_IWGRP | stat.S_IWOTH)
     except OSError:
         ours = False
     try:
-        return wanted if ours else temporary_cache(bodies)
+        return folder if ours else temporary_cache(digest)
     except OSError:
         return NOWHERE
 
@@ -50,15 +50,15 @@ def kernel_cache() -> Path:
 def inlined() -> list[Path]:
     """Every file of the engine whose functions may be inlined into a loop."""
     engine = Path(__file__).parent.parent
-    patterns = "kernels/*.py", "spaces/*.py", "encodings/*.py", "decoders/*.py", "kinds/*/bodies.py"
+    patterns = "kernels/*.py", "spaces/*.py", "encodings/*.py", "decoders/*.py"
     return sorted(path for pattern in patterns for path in engine.glob(pattern))
 
 
-def temporary_cache(bodies: str) -> Path:
+def temporary_cache(digest: str) -> Path:
     """A folder in the temporary one that is found again by its name, or a new one that lasts as long as the
     process where that name is another user's or open to others.
     """
-    shared = Path(tempfile.gettempdir()) / f"fusedrf-kernels-{os.getuid()}-{bodies}"
+    shared = Path(tempfile.gettempdir()) / f"fusedrf-kernels-{os.getuid()}-{digest}"
     with contextlib.suppress(OSError):
         shared.mkdir(mode=0o700, exist_ok=True)
         if is_ours(shared, others=stat.S_IRWXG | stat.S_IRWXO):
@@ -82,7 +82,7 @@ if "NUMBA_CACHE_DIR" not in os.environ:
 numba.config.SLP_VECTORIZE = 1
 
 from fusedrf_cli.engine.kernels import cpu  # noqa: E402  (compiles under the settings above)
-from fusedrf_cli.engine.kernels.parts import GridArrays  # noqa: E402
+from fusedrf_cli.engine.kernels.primitives import GridArrays  # noqa: E402
 
 
 def device_loops(device: str) -> ModuleType | None:
@@ -100,33 +100,33 @@ def set_threads(count: int) -> None:
     numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
 
 
-class _First(event.Listener):
+class _FirstCompilation(event.Listener):
     """Calls a function at the first compilation: what the cache holds is not compiled."""
 
-    def __init__(self, tell: Callable[[], None]):
-        self.tell, self.told = tell, False
+    def __init__(self, report: Callable[[], None]):
+        self.tell, self.told = report, False
 
-    def on_start(self, found: event.Event) -> None:
+    def on_start(self, compile_event: event.Event) -> None:
         if not self.told:
             self.told = True
             self.tell()
 
-    def on_end(self, found: event.Event) -> None:
+    def on_end(self, compile_event: event.Event) -> None:
         """Nothing."""
 
 
 @contextlib.contextmanager
-def telling_of_compilation(
-    tell: Callable[[], None], warn: Callable[[str], None] = warnings.warn
+def report_compilation(
+    report: Callable[[], None], warn: Callable[[str], None] = warnings.warn
 ) -> Iterator[None]:
     """Within it `tell` is called once, before the first kernel that has to be compiled, and `warn` where
     compiled kernels cannot be kept."""
-    before, locator.Kept.warn = locator.Kept.warn, staticmethod(warn)
+    before, locator.KernelStore.warn = locator.KernelStore.warn, staticmethod(warn)
     try:
-        with event.install_listener("numba:compile", _First(tell)):
+        with event.install_listener("numba:compile", _FirstCompilation(report)):
             yield
     finally:
-        locator.Kept.warn = staticmethod(before)
+        locator.KernelStore.warn = staticmethod(before)
 
 
 _compiling = event.TimingListener()
@@ -147,6 +147,6 @@ __all__ = [
     "device_loops",
     "kernel_cache",
     "set_threads",
-    "telling_of_compilation",
+    "report_compilation",
     "working_time",
 ]

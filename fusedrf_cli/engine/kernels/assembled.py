@@ -16,13 +16,14 @@ from functools import cache
 from types import FunctionType, ModuleType
 from typing import NamedTuple
 
-from fusedrf_cli.engine.kernels.parts import LINE, sigmoid
+from fusedrf_cli.engine.kernels.primitives import LINE, sigmoid
 
 READS = {"density": "", "colour": "sigma", "sigma": "density", "rgb": "colour"}
 """Every slot, in the order of a field's numbers, and the slot that it reads."""
 HOOKS = (
-    "locate", "steps_at", "located", "known", "keep", "again", "advance", "forward", "backward", "summed",
-    "summed_backward", "logits", "logits_backward", "prefetch_at", "ray_setup", "ray_backward",
+    "locate", "steps_at", "located", "is_inside", "pack_cell", "unpack_cell", "next_index", "forward",
+    "backward", "summed", "summed_backward", "logits", "logits_backward", "prefetch_at", "ray_setup",
+    "ray_backward",
 )  # fmt: skip
 """What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"
@@ -44,113 +45,114 @@ def unit_of(field, p):
     )
 
 
-def density(field, grid, k, p, d, scratch):
-    """See loops.py; a place is (unit coordinates, what the density's encoding located there)."""
+def density(field, grid, index, p, d, scratch):
+    """See loops.py; a cell is (unit coordinates, what the density's encoding located there)."""
     unit = unit_of(field, p)
     cell = density_locate(field, unit)
-    steps = density_steps_at(field, cell, unit, k)
-    if steps == 0:
+    strides = density_steps_at(field, cell, unit, index)
+    if strides == 0:
         return 0.0, 0.0, 0, (unit, cell)
     sigma, pre = sigma_forward(field, cell, scratch)
-    return sigma, pre, steps, (unit, density_located(field, cell, scratch))
+    return sigma, pre, strides, (unit, density_located(field, cell, scratch))
 
 
-def again(field, held, p):
+def unpack_cell(field, packed, p):
     """See loops.py."""
     unit = unit_of(field, p)
     return unit, density_locate(field, unit)
 
 
-def shared_cell(field, place):
+def shared_cell(field, cell):
     """What the colour's encoding located, where that is the density's as well."""
-    return place[1]
+    return cell[1]
 
 
-def own_cell(field, place):
+def separate_cell(field, cell):
     """The same, where it is another."""
-    return colour_locate(field, place[0])
+    return colour_locate(field, cell[0])
 
 
-def begin(field, d, scratch):
+def ray_setup(field, d, scratch):
     """See loops.py."""
     rgb_ray_setup(field, d, scratch)
 
 
-def end(field, d, scratch, grad):
+def ray_backward(field, d, scratch, grad):
     """See loops.py."""
     rgb_ray_backward(field, d, scratch, grad)
 
 
-def plain_logits(field, place, r, g, b, scratch):
+def plain_logits(field, cell, r, g, b, scratch):
     """The logits of a colour, to which the density's encoding adds none."""
     return r, g, b
 
 
-def shifted_logits(field, place, r, g, b, scratch):
+def shifted_logits(field, cell, r, g, b, scratch):
     """The same, where it does."""
-    red, green, blue = density_logits(field, place[1], scratch)
+    red, green, blue = density_logits(field, cell[1], scratch)
     return r + red, g + green, b + blue
 
 
-def colour(field, place, p, d, scratch, memory, at):
+def colour(field, cell, p, d, scratch, memory, at):
     """See loops.py."""
-    r, g, b = rgb_forward(field, colour_cell(field, place), d, scratch, memory, at)
-    r, g, b = shown_logits(field, place, r, g, b, scratch)
+    r, g, b = rgb_forward(field, colour_cell(field, cell), d, scratch, memory, at)
+    r, g, b = shown_logits(field, cell, r, g, b, scratch)
     return float(sigmoid(r)), float(sigmoid(g)), float(sigmoid(b))
 
 
-def backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
+def backward(field, cell, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad):
     """See loops.py; colour first, since it may send back to what sigma hands on."""
     if shaded:
         d_red, d_green = d_rgb[0] * rgb[0] * (1 - rgb[0]), d_rgb[1] * rgb[1] * (1 - rgb[1])
         d_logits = d_red, d_green, d_rgb[2] * rgb[2] * (1 - rgb[2])
-        rgb_backward(field, colour_cell(field, place), d, d_logits, scratch, memory, at, grad)
-        density_logits_backward(field, place[1], d_logits, scratch)
-    sigma_backward(field, place[1], pre, d_sigma, scratch, grad)
+        rgb_backward(field, colour_cell(field, cell), d, d_logits, scratch, memory, at, grad)
+        density_logits_backward(field, cell[1], d_logits, scratch)
+    sigma_backward(field, cell[1], pre, d_sigma, scratch, grad)
 
 
-TEMPLATES = unit_of, density, again, begin, end, colour, backward
+TEMPLATES = unit_of, density, unpack_cell, ray_setup, ray_backward, colour, backward
 
 
 # -- where an encoding has the hook that they call; else the loops' own serve --------------------------------
 
 
-def held_keep(place):
+def slot_pack_cell(cell):
     """See loops.py."""
-    return density_keep(place[1])
+    return density_pack_cell(cell[1])
 
 
-def held_again(field, held, p):
+def slot_unpack_cell(field, packed, p):
     """See loops.py."""
     unit = unit_of(field, p)
-    return unit, density_again(field, held, unit)
+    return unit, density_unpack_cell(field, packed, unit)
 
 
-def own_advance(field, grid, place, many, steps, k, p, way, u, u0, step):
+def slot_next_index(field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step):
     """See loops.py."""
-    return density_advance(field, place[1], many, steps, k, p, way, u, u0, step)
+    return density_next_index(field, cell[1], n_steps, strides, index, p, direction, t_local, t_begin, step)
 
 
-def own_known(field, grid, p):
+def slot_is_inside(field, grid, p):
     """See loops.py."""
-    return density_known(field, grid, p)
+    return density_is_inside(field, grid, p)
 
 
-def ahead_density(field, array, held, p):
+def prefetch_density(field, array, packed, p):
     """See loops.py."""
-    density_prefetch_at(field, array, again(field, held, p)[1])
+    density_prefetch_at(field, array, unpack_cell(field, packed, p)[1])
 
 
-def ahead_colour(field, array, held, p):
+def prefetch_colour(field, array, packed, p):
     """See loops.py."""
-    colour_prefetch_at(field, array, colour_cell(field, again(field, held, p)))
+    colour_prefetch_at(field, array, colour_cell(field, unpack_cell(field, packed, p)))
 
 
 OPTIONAL = {
-    "keep": (held_keep, "density_keep"), "again": (held_again, "density_again"),
-    "advance": (own_advance, "density_advance"), "known": (own_known, "density_known"),
-    "ahead_density": (ahead_density, "density_prefetch_at"),
-    "ahead_colour": (ahead_colour, "colour_prefetch_at"),
+    "pack_cell": (slot_pack_cell, "density_pack_cell"),
+    "unpack_cell": (slot_unpack_cell, "density_unpack_cell"),
+    "next_index": (slot_next_index, "density_next_index"), "is_inside": (slot_is_inside, "density_is_inside"),
+    "prefetch_density": (prefetch_density, "density_prefetch_at"),
+    "prefetch_colour": (prefetch_colour, "colour_prefetch_at"),
 }  # fmt: skip
 """By name, and the hook that each calls."""
 
@@ -167,10 +169,10 @@ def locate(field, unit):
     return unit
 
 
-def steps_at(field, cell, unit, k):
+def steps_at(field, cell, unit, index):
     """Every sample in the box stands for one step."""
-    u, v, w = unit
-    return 1 if min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE else 0
+    t_local, v, w = unit
+    return 1 if min(t_local, min(v, w)) >= -EDGE and max(t_local, max(v, w)) <= 1 + EDGE else 0
 
 
 def located(field, cell, scratch):
@@ -182,15 +184,18 @@ def logits_backward(field, cell, d_logits, scratch):
     """Nothing was added to a colour's logits."""
 
 
-def ray_setup(field, d, scratch):
+def no_ray_setup(field, d, scratch):
     """Nothing is known of a ray."""
 
 
-def ray_backward(field, d, scratch, grad):
+def no_ray_backward(field, d, scratch, grad):
     """Nothing is gathered for a ray."""
 
 
-DEFAULTS = {f.__name__: f for f in (locate, steps_at, located, logits_backward, ray_setup, ray_backward)}
+DEFAULTS = {
+    f.__name__.removeprefix("no_"): f
+    for f in (locate, steps_at, located, logits_backward, no_ray_setup, no_ray_backward)
+}
 
 
 # -- one namespace of four slots -----------------------------------------------------------------------------
@@ -198,11 +203,12 @@ DEFAULTS = {f.__name__: f for f in (locate, steps_at, located, logits_backward, 
 
 @cache
 def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: ModuleType) -> ModuleType:
-    """A module as kinds' `bodies.py`, with functions, `Arrays` and `sizes`, of these encodings and decoders.
-    Raises ValueError where a slot reads what another lacks, or two slots give one name two meanings."""
+    """A kind's module of device functions, with `functions`, `Arrays` and `sizes`, of these encodings and
+    decoders. Raises ValueError where a slot reads what another lacks, or two slots give one name two
+    meanings."""
     slots = {"density": density, "colour": colour, "sigma": sigma, "rgb": rgb}
     label = "_".join(module.__name__.split(".")[-1] for module in slots.values())
-    assembly = ModuleType(f"{__name__}.{label}.bodies")
+    assembly = ModuleType(f"{__name__}.{label}.device_functions")
     names = vars(assembly) | {"sigmoid": sigmoid}
     for slot, module in slots.items():
         for name, value in slot_names(slot, module, slots.get(READS[slot]), assembly).items():
@@ -211,7 +217,7 @@ def assemble(density: ModuleType, colour: ModuleType, sigma: ModuleType, rgb: Mo
     templates = {template.__name__: template for template in TEMPLATES}
     templates |= {name: template for name, (template, hook) in OPTIONAL.items() if hook in names}
     shared = colour is density or getattr(colour, "locate", locate) is None
-    templates["colour_cell"] = shared_cell if shared else own_cell
+    templates["colour_cell"] = shared_cell if shared else separate_cell
     templates["shown_logits"] = shifted_logits if hasattr(density, "logits") else plain_logits
     names |= {name: renamed(template, name, assembly, {}) for name, template in templates.items()}
     functions = {name: value for name, value in names.items() if isinstance(value, FunctionType)}
@@ -229,9 +235,10 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
     known_as = dict(pending)
     while pending:
         name, function = pending.popitem()
-        new, known = {}, function.__globals__  # of the slot's module, or of one that it takes functions from
+        # of the slot's module, or of one that it takes functions from
+        new, module_names = {}, function.__globals__
         for used in function.__code__.co_names:
-            value = known.get(used)
+            value = module_names.get(used)
             if used.startswith("features_"):
                 needed = used.removeprefix("features_")
                 if not isinstance(getattr(read, needed, None), FunctionType):
@@ -244,9 +251,10 @@ def slot_names(slot: str, module: ModuleType, read: ModuleType | None, assembly:
                         raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
                     if new[used] not in names:
                         pending[used] = value
-                elif used.isupper() and used in known:
+                elif used.isupper() and used in module_names:
                     names[new[used]] = value
-            elif used in known and names.setdefault(used, value) is not value:  # numpy, kernels/parts.py
+            # numpy, kernels/primitives.py
+            elif used in module_names and names.setdefault(used, value) is not value:
                 raise ValueError(f"'{used}' of '{module.__name__}' has two meanings")
         names[f"{slot}_{name}"] = renamed(function, f"{slot}_{name}", assembly, new)
     return names
@@ -286,8 +294,8 @@ def constants(field) -> dict[str, int | float]:
     prefix, and AT, where its ROOM numbers of scratch begin, on a cache line."""
     named, start = {}, 0
     for slot, filled in field.slots.items():
-        own = filled.sizes
-        named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in own.items()}
+        slot_sizes = filled.sizes
+        named |= {name if name in OF_LOOPS else f"{slot}_{name}": value for name, value in slot_sizes.items()}
         named[f"{slot}_AT"] = start
-        start += -(-own.get("ROOM", 0) // LINE) * LINE
+        start += -(-slot_sizes.get("ROOM", 0) // LINE) * LINE
     return {"KEPT": 0, **named, "SCRATCH": start}

@@ -2,7 +2,7 @@
 
 from types import ModuleType
 
-from fusedrf_cli.engine.kernels.plain import adam, adam_lines, lens_rays, sums_of_rows, unbent
+from fusedrf_cli.engine.kernels.field_free import adam, adam_lines, lens_rays, sums_of_rows, unbent
 from fusedrf_cli.engine.kernels.specialise import Loops, loops_for
 
 __all__ = [

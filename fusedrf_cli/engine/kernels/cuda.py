@@ -15,8 +15,8 @@ from numba import cuda
 from numba.core import event
 from numba.np.numpy_support import from_dtype
 
-from fusedrf_cli.engine.kernels import parts, specialise
-from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, Kept
+from fusedrf_cli.engine.kernels import primitives, specialise
+from fusedrf_cli.engine.kernels.loops import POINTS_PER_TASK, RaySamples
 from fusedrf_cli.engine.settings import current
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
@@ -50,10 +50,10 @@ if not SIMULATED:  # whose compiler has settings of its own
         def __init__(self, kind: str):
             self.kind = kind
 
-        def on_start(self, heard: gpu_event.Event) -> None:
+        def on_start(self, gpu_started: gpu_event.Event) -> None:
             event.start_event(self.kind)
 
-        def on_end(self, heard: gpu_event.Event) -> None:
+        def on_end(self, gpu_started: gpu_event.Event) -> None:
             event.end_event(self.kind)
 
     gpu_event.register("numba-cuda:run_pass", Forwarded("numba:compile"))
@@ -100,7 +100,7 @@ def scatter_8(out, o, weight, values, v):
 
 
 @device
-def ahead(field, array, held, p):
+def ahead(field, array, packed, p):
     """Nothing: while some threads wait for memory, others work."""
 
 
@@ -112,33 +112,35 @@ def literally(value):
 
 REPLACED = {
     "accumulate": accumulate, "raise_to": raise_to, "scatter_4": scatter_4, "scatter_8": scatter_8,
-    "ahead_density": ahead, "ahead_colour": ahead, "literally": literally,
+    "prefetch_density": ahead, "prefetch_colour": ahead, "literally": literally,
 }  # fmt: skip
 
 
 def as_device_functions(names: dict) -> dict:
     """The namespace with every function in it, compiled for the CPU or not at all, as one of the device."""
-    found = dict(names)
+    device_names = dict(names)
     for name, value in names.items():
         function = getattr(value, "py_func", None)
         if function is not None:
-            found[name] = device(FunctionType(function.__code__, found, name, function.__defaults__))
-    found.update(REPLACED)
-    return found
+            device_names[name] = device(
+                FunctionType(function.__code__, device_names, name, function.__defaults__)
+            )
+    device_names.update(REPLACED)
+    return device_names
 
 
 class Loops:
     """The GPU's loops for the fields of a kind that share some sizes; see specialise.Loops."""
 
-    def __init__(self, bodies: ModuleType, sizes: dict[str, int], space: ModuleType):
-        self.tag, names = specialise.specialised(bodies, sizes, space)
+    def __init__(self, device_module: ModuleType, sizes: dict[str, int], space: ModuleType):
+        self.tag, names = specialise.specialised(device_module, sizes, space)
         room = {"SCRATCH_ROOM": max(sizes["SCRATCH"], 1), "MEMORY_ROOM": max(sizes["KEPT"], 1)}
-        self.names = {**as_device_functions(names), **room, "cuda": cuda, "Kept": Kept}
+        self.names = {**as_device_functions(names), **room, "cuda": cuda, "RaySamples": RaySamples}
         self.kernels = {}
 
-    def each(self, item: str, field, grid, asked, count: int, out, per_task: int = POINTS_PER_TASK):
+    def each(self, item: str, field, grid, query, count: int, out, per_task: int = POINTS_PER_TASK):
         """See specialise.Loops."""
-        launch(self._kernel(each_thread, item, field), count, (field, grid, asked, count), (out,))
+        launch(self._kernel(each_thread, item, field), count, (field, grid, query, count), (out,))
 
     def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
         """See specialise.Loops; all is added to row 0 of grads and loss."""
@@ -167,14 +169,14 @@ def kernel_of(template: FunctionType, names: dict, tag: str):
     return cuda.jit(fastmath=True, cache=True)(specialise.rebound(template, names, tag))
 
 
-def each_thread(field, grid, asked, count, out):
+def each_thread(field, grid, query, count, out):
     """`each` of loops.py, a thread for each item."""
     i = cuda.grid(1)
     if i < count:
         scratch, memory = cuda.local.array(SCRATCH_ROOM, REAL), cuda.local.array(MEMORY_ROOM, REAL)
         for r in range(SCRATCH_ROOM):  # what lies there is another thread's
             scratch[r] = 0
-        item(field, grid, asked, i, scratch, memory, out)
+        item(field, grid, query, i, scratch, memory, out)
 
 
 def sweep_thread(field, grid, batch, count, wholes, reals, losses, grads):
@@ -185,7 +187,7 @@ def sweep_thread(field, grid, batch, count, wholes, reals, losses, grads):
     if thread < threads:
         for r in range(SCRATCH_ROOM):
             scratch[r] = 0
-        kept = Kept(
+        samples = RaySamples(
             wholes[0, :, thread], wholes[1, :, thread], wholes[2, :, thread], wholes[3, :, thread],
             wholes[4, :, thread], wholes[5, :, thread], reals[0, :, thread], reals[1, :, thread],
             reals[2, :, thread], reals[3, :, thread], reals[4, :, thread], reals[5:8, :, thread].T,
@@ -193,35 +195,40 @@ def sweep_thread(field, grid, batch, count, wholes, reals, losses, grads):
         )  # fmt: skip
         losses[thread, 0], losses[thread, 1], losses[thread, 2] = 0, 0, 0
         for i in range(thread, count, threads):
-            item(field, grid, batch, i, kept, scratch, grads[0], losses[thread])
+            item(field, grid, batch, i, samples, scratch, grads[0], losses[thread])
 
 
 @lru_cache(maxsize=2)
 def sweep_memory(most: int, threads: int, kind: np.dtype) -> tuple:
     """What the ways back of so many threads need: (6, most, threads) whole numbers and (8, ..) reals, a
     thread's own next to its neighbours', as threads read them; and (threads, 3) losses."""
-    whole, real = cuda.device_array((6, most, threads), np.int32), cuda.device_array((8, most, threads), kind)
-    return whole, real, cuda.device_array((threads, 3))
+    integers, reals = (
+        cuda.device_array((6, most, threads), np.int32),
+        cuda.device_array((8, most, threads), kind),
+    )
+    return integers, reals, cuda.device_array((threads, 3))
 
 
 @cache
-def loops_for(bodies: ModuleType, sizes: tuple[tuple[str, int], ...], space: ModuleType) -> Loops:
+def loops_for(device_module: ModuleType, sizes: tuple[tuple[str, int], ...], space: ModuleType) -> Loops:
     """The loops of a kind for some sizes, made once."""
-    return Loops(bodies, dict(sizes), space)
+    return Loops(device_module, dict(sizes), space)
 
 
 @lru_cache(maxsize=1)
 def plain_kernels() -> SimpleNamespace:
     """Kernels that know no kind of field."""
-    names = {**as_device_functions(vars(parts)), "cuda": cuda}
-    made = {t.__name__: kernel_of(t, names, "plain") for t in (adam_thread, adam_lines_thread, sums_thread)}
-    return SimpleNamespace(**made)
+    names = {**as_device_functions(vars(primitives)), "cuda": cuda}
+    kernels = {
+        t.__name__: kernel_of(t, names, "plain") for t in (adam_thread, adam_lines_thread, sums_thread)
+    }
+    return SimpleNamespace(**kernels)
 
 
 def adam_thread(
     params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2
 ):
-    """`adam` of plain.py, a thread for each cache line."""
+    """`adam` of field_free.py, a thread for each cache line."""
     start = low + LINE * cuda.grid(1)
     if start < high and touched(grads, np.uint64(start)):
         adam_line(
@@ -233,7 +240,7 @@ def adam_thread(
 def adam_lines_thread(
     params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2
 ):
-    """`adam_lines` of plain.py, a thread for each cache line."""
+    """`adam_lines` of field_free.py, a thread for each cache line."""
     i = cuda.grid(1)
     if i < lines.shape[0] and touched(grads, np.uint64(lines[i])):
         adam_line(
@@ -243,7 +250,7 @@ def adam_lines_thread(
 
 
 def sums_thread(base, width, start, source, weight, target, keep, values):
-    """`sums_of_rows` of plain.py, a thread for each sum."""
+    """`sums_of_rows` of field_free.py, a thread for each sum."""
     i = cuda.grid(1)
     if i < target.shape[0]:
         sum_of_rows(values, base, width, start, source, weight, target, i, keep)
@@ -254,7 +261,7 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
     arrays = params, grads, moment1, moment2
     placed = [on_device(array) for array in arrays]
     rest = rate, low, high, beta1, beta2, eps, correction1, correction2
-    lines = -(-(high - low) // parts.LINE)
+    lines = -(-(high - low) // primitives.LINE)
     if lines > 0:
         plain_kernels().adam_thread[(lines + THREADS - 1) // THREADS, THREADS](*placed, *rest)
     fetch(arrays, placed)

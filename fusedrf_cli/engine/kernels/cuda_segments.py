@@ -32,11 +32,11 @@ def ray_kernels(spaces: tuple[ModuleType, ...] = ()) -> SimpleNamespace:
     }
     tag = "segments_" + "_".join(space.__name__ for space in spaces)
     in_space = next_in_any([own[s]["next_change"] for s in spaces or (unbounded,)], tag, device)
-    found = {"next_in_box": own[bounded]["next_change"], "next_in_space": in_space}
-    found["ray_in_instance"] = own[bounded]["ray_in_instance"]
-    plain = {name: value for name, value in vars(segments).items() if name not in found}
+    kernels = {"next_in_box": own[bounded]["next_change"], "next_in_space": in_space}
+    kernels["ray_in_instance"] = own[bounded]["ray_in_instance"]
+    plain = {name: value for name, value in vars(segments).items() if name not in kernels}
     names = as_device_functions(plain)
-    names |= found | {"cuda": cuda}
+    names |= kernels | {"cuda": cuda}
     templates = near_thread, merge_thread, add_thread, left_thread
     return SimpleNamespace(**{t.__name__: kernel_of(t, names, tag) for t in templates})
 
@@ -79,13 +79,13 @@ def left_thread(chosen, rays, segments, rendered, early_stop, left):
 
 
 def next_segments(
-    rays: RayBatch, instances, spaces: tuple[ModuleType, ...], chosen: np.ndarray, found: Segments
+    rays: RayBatch, instances, spaces: tuple[ModuleType, ...], chosen: np.ndarray, segments: Segments
 ) -> None:
     """See segments.py."""
     count = len(instances.step)
     threads = max(1, min(len(chosen), NEAR_AT_ONCE // count))
     room = [cuda.device_array((threads, count), kind) for kind in (np.int64, np.float64) * 2]
-    launch(ray_kernels(spaces).near_thread, threads, (rays, instances, chosen, *room), (found,))
+    launch(ray_kernels(spaces).near_thread, threads, (rays, instances, chosen, *room), (segments,))
 
 
 def merge_samples(
@@ -101,8 +101,10 @@ def add_colours(shared: np.ndarray, start: np.ndarray, traces, out) -> None:
     launch(ray_kernels().add_thread, len(shared), (shared, start, traces), (out,))
 
 
-def rays_left(chosen: np.ndarray, rays: RayBatch, found: Segments, rendered, early_stop: float) -> np.ndarray:
+def rays_left(
+    chosen: np.ndarray, rays: RayBatch, segments: Segments, rendered, early_stop: float
+) -> np.ndarray:
     """See segments.py."""
     left = np.zeros(len(chosen), bool)
-    launch(ray_kernels().left_thread, len(chosen), (chosen, rays, found, rendered, early_stop), (left,))
+    launch(ray_kernels().left_thread, len(chosen), (chosen, rays, segments, rendered, early_stop), (left,))
     return chosen[left]

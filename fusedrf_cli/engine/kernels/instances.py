@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusedrf_cli.engine.kernels.parts import FACE_TOLERANCE, along, cell_of, exit_distance, next_sample
+from fusedrf_cli.engine.kernels.primitives import FACE_TOLERANCE, along, cell_of, exit_distance, next_sample
 
 MAX_TRACED = 24  # samples of a slot: what does not fit is left to the ray's next segment
 FARTHEST = 1e30  # farther than any ray goes
@@ -44,7 +44,7 @@ class Instances(NamedTuple):
 
 
 class Box(NamedTuple):
-    """As much of a grid as `stretch` reads."""
+    """As much of a grid as `next_piece` reads."""
 
     lo: object
     hi: object
@@ -78,7 +78,7 @@ class Traces(NamedTuple):
     middle: object  # (S, MAX_TRACED) where it was taken
     depth: object  # (S, MAX_TRACED) its optical depth
     weight: object  # (S, MAX_TRACED) the share of the light that it takes, see `merge_samples`
-    cell: object  # (S, MAX_TRACED) int64, what `keep` makes of its place
+    cell: object  # (S, MAX_TRACED) int64, what `pack_cell` makes of its cell
     cursor: object  # (S,) int64, used while samples are merged
     rgb: object  # (S, 3) the sum of their colours by weight
 
@@ -101,7 +101,7 @@ class PointAnswers(NamedTuple):
 
     sigma: object  # (N,) float64 per length of the scene's frame
     densest: object  # (N,) int64, the densest instance, or -1
-    cell: object  # (N,) int64, what `keep` makes of its place
+    cell: object  # (N,) int64, what `pack_cell` makes of its cell
     rgb: object  # (N, 3) float64
 
 
@@ -135,16 +135,16 @@ def slot_ray(slots, s):
     return r, o, (d[0] / length, d[1] / length, d[2] / length), length
 
 
-def samples_between(slots, r, length, warp, u0, u1):
-    """Which samples of a piece from u0 to u1 lie in the segment of ray r: (where sample 0 is, the number of
-    the first, where they end). Both ends go by the numbers of samples, so that of two segments that touch
-    every sample is in one, and none of them stands for less than it does in the whole ray."""
+def samples_between(slots, r, length, warp, t_begin, t_end):
+    """Which samples of a piece from t_begin to t_end lie in the segment of ray r: (where sample 0 is, the
+    number of the first, where they end). Both ends go by the numbers of samples, so that of two segments that
+    touch every sample is in one, and none of them stands for less than it does in the whole ray."""
     step, end = slots.step, length_at(warp, slots.end[r] * length)
-    u0 = u0 + 0.5 * step
-    first = math.ceil((min(length_at(warp, slots.begin[r] * length), u1) - u0) / step)
-    if end < u1:
-        u1 = u0 + (math.ceil((end - u0) / step) - 0.5) * step
-    return u0, max(0, int(first)), u1
+    t_begin = t_begin + 0.5 * step
+    first = math.ceil((min(length_at(warp, slots.begin[r] * length), t_end) - t_begin) / step)
+    if end < t_end:
+        t_end = t_begin + (math.ceil((end - t_begin) / step) - 0.5) * step
+    return t_begin, max(0, int(first)), t_end
 
 
 def show_ray(field, grid, slots, i, scratch, memory, out):
@@ -161,38 +161,40 @@ def show_ray(field, grid, slots, i, scratch, memory, out):
     red, green, blue, depth = 0.0, 0.0, 0.0, 0.0
     c_r, c_g, c_b = 0.0, 0.0, 0.0
     trans, pending, enough = 1.0 - out[r, 3], 0.0, COLOUR_FROM
-    ready, begun = False, entered(o, d, slots.reach[r, 0] * length)
+    ready, piece_begin = False, first_piece_at(o, d, slots.reach[r, 0] * length)
     for _ in range(PIECES):
         if trans <= slots.early_stop:
             break
-        (origin, way, u0, u1, warp), begun = stretch(begun, grid, o, d, far)
-        if u1 <= u0:
+        (origin, direction, t_begin, t_end, warp), piece_begin = next_piece(piece_begin, grid, o, d, far)
+        if t_end <= t_begin:
             continue
-        u0, index, u1 = samples_between(slots, r, length, warp, u0, u1)
-        index, many = next_sample(grid, origin, way, u0, u1, step, index)
+        t_begin, index, t_end = samples_between(slots, r, length, warp, t_begin, t_end)
+        index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         while index >= 0 and trans > slots.early_stop:
-            u = u0 + 0.5 * between(index, many) * step
-            p = position_at(origin, way, u)
-            sigma, _, steps, place = density(field, grid, index, p, d, scratch)
-            if steps > 0:
-                tau = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
+            t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            p = position_at(origin, direction, t_local)
+            sigma, _, strides, cell = density(field, grid, index, p, d, scratch)
+            if strides > 0:
+                tau = thick * sigma * optical_length(warp, p, d, t_local, n_steps, strides, step)
                 weight = trans * (1.0 - math.exp(-tau))
                 if slots.early_stop > 0.0 and trans - weight <= REST_FROM:
                     weight = trans
                 trans -= weight
-                depth += weight * distance(warp, u)
+                depth += weight * distance(warp, t_local)
                 pending += weight
                 if pending > enough:
                     if not ready:
-                        begin(field, d, scratch)
+                        ray_setup(field, d, scratch)
                         ready = True
-                    c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
+                    c_r, c_g, c_b = colour(field, cell, p, d, scratch, memory, 0)
                     red += pending * c_r
                     green += pending * c_g
                     blue += pending * c_b
-                    pending, enough = 0.0, LENT_FROM
-            index = advance(field, grid, place, many, steps, index, p, way, u, u0, step)
-            index, many = next_sample(grid, origin, way, u0, u1, step, index)
+                    pending, enough = 0.0, SHARED_COLOUR_FROM
+            index = next_index(
+                field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step
+            )
+            index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
     out[r, 0] += shown[1] * (red + pending * c_r)
     out[r, 1] += shown[2] * (green + pending * c_g)
     out[r, 2] += shown[3] * (blue + pending * c_b)
@@ -206,31 +208,35 @@ def trace_ray(field, grid, slots, i, scratch, memory, out):
     r, o, d, length = slot_ray(slots, s)
     step, far, thick = slots.step, slots.reach[r, 1] * length, slots.shown[slots.instance[s], 0]
     trans, count, complete = 1.0 - slots.rendered[r, 3], 0, FARTHEST
-    begun = entered(o, d, slots.reach[r, 0] * length)
+    piece_begin = first_piece_at(o, d, slots.reach[r, 0] * length)
     for _ in range(PIECES):
         if trans <= slots.early_stop or count == MAX_TRACED:
             break
-        (origin, way, u0, u1, warp), begun = stretch(begun, grid, o, d, far)
-        if u1 <= u0:
+        (origin, direction, t_begin, t_end, warp), piece_begin = next_piece(piece_begin, grid, o, d, far)
+        if t_end <= t_begin:
             continue
-        u0, index, u1 = samples_between(slots, r, length, warp, u0, u1)
-        index, many = next_sample(grid, origin, way, u0, u1, step, index)
+        t_begin, index, t_end = samples_between(slots, r, length, warp, t_begin, t_end)
+        index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         while index >= 0 and trans > slots.early_stop and count < MAX_TRACED:
-            u = u0 + 0.5 * between(index, many) * step
-            p = position_at(origin, way, u)
-            sigma, _, steps, place = density(field, grid, index, p, d, scratch)
-            if steps > 0 and sigma > 0.0:
-                depth = thick * sigma * optical_length(warp, p, d, u, many, steps, step)
-                low, high = interval(warp, u + 0.5 * (steps - 1) * many * step, steps * many * step)
+            t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            p = position_at(origin, direction, t_local)
+            sigma, _, strides, cell = density(field, grid, index, p, d, scratch)
+            if strides > 0 and sigma > 0.0:
+                depth = thick * sigma * optical_length(warp, p, d, t_local, n_steps, strides, step)
+                low, high = interval(
+                    warp, t_local + 0.5 * (strides - 1) * n_steps * step, strides * n_steps * step
+                )
                 out.low[s, count], out.high[s, count] = low / length, high / length
-                out.middle[s, count] = distance(warp, u) / length
-                out.depth[s, count], out.weight[s, count], out.cell[s, count] = depth, 0.0, keep(place)
+                out.middle[s, count] = distance(warp, t_local) / length
+                out.depth[s, count], out.weight[s, count], out.cell[s, count] = depth, 0.0, pack_cell(cell)
                 trans *= math.exp(-depth)
                 count += 1
-            index = advance(field, grid, place, many, steps, index, p, way, u, u0, step)
-            index, many = next_sample(grid, origin, way, u0, u1, step, index)
+            index = next_index(
+                field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step
+            )
+            index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
         if count == MAX_TRACED:
-            left_out = u0 + (index - 0.5) * step if index >= 0 else u1
+            left_out = t_begin + (index - 0.5) * step if index >= 0 else t_end
             complete = distance(warp, left_out) / length
     out.count[s], out.complete[s] = count, complete
 
@@ -248,15 +254,15 @@ def shade_ray(field, grid, slots, i, scratch, memory, out):
         pending += out.weight[s, q]
         if pending > enough:
             p = point(along(o, d, out.middle[s, q] * length))
-            place = again(field, out.cell[s, q], p)
+            cell = unpack_cell(field, out.cell[s, q], p)
             if not ready:
-                begin(field, d, scratch)
+                ray_setup(field, d, scratch)
                 ready = True
-            c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
+            c_r, c_g, c_b = colour(field, cell, p, d, scratch, memory, 0)
             red += pending * c_r
             green += pending * c_g
             blue += pending * c_b
-            pending, enough = 0.0, LENT_FROM
+            pending, enough = 0.0, SHARED_COLOUR_FROM
     out.rgb[s, 0] = shown[1] * (red + pending * c_r)
     out.rgb[s, 1] = shown[2] * (green + pending * c_g)
     out.rgb[s, 2] = shown[3] * (blue + pending * c_b)
@@ -271,10 +277,10 @@ def point_in_instance(field, grid, query, i):
     matrix, b, n = query.world_to_instance, query.instance, i + POINTS_AHEAD
     if n < query.chosen.shape[0]:
         p = point(ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[n])[0])
-        if known(field, grid, p):
-            ahead_density(field, field.params, 0, p)
+        if is_inside(field, grid, p):
+            prefetch_density(field, field.params, 0, p)
             if query.with_colour:
-                ahead_colour(field, field.params, 0, p)
+                prefetch_colour(field, field.params, 0, p)
     o, d, length = ray_in_instance(matrix, b, query.points, query.dirs, query.chosen[i])
     p, d = point(o), (d[0] / length, d[1] / length, d[2] / length)
     return p, d, rate(p, d) * length * query.shown[b, 0]
@@ -284,13 +290,13 @@ def densest_at(field, grid, query, i, scratch, memory, out):
     """Enter an instance's density at point chosen[i] where it is the densest so far, or add it."""
     j = query.chosen[i]
     p, d, times = point_in_instance(field, grid, query, i)
-    if known(field, grid, p):
-        sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
+    if is_inside(field, grid, p):
+        sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
         sigma *= times
-        if steps > 0 and query.adds:
+        if strides > 0 and query.adds:
             out.sigma[j] += sigma
-        elif steps > 0 and sigma > DENSER * out.sigma[j]:
-            out.sigma[j], out.densest[j], out.cell[j] = sigma, query.instance, keep(place)
+        elif strides > 0 and sigma > DENSER * out.sigma[j]:
+            out.sigma[j], out.densest[j], out.cell[j] = sigma, query.instance, pack_cell(cell)
 
 
 def colour_at(field, grid, query, i, scratch, memory, out):
@@ -299,16 +305,16 @@ def colour_at(field, grid, query, i, scratch, memory, out):
     j, share, shown = query.chosen[i], 1.0, query.shown[query.instance]
     p, d, times = point_in_instance(field, grid, query, i)
     if query.adds:
-        if not known(field, grid, p):
+        if not is_inside(field, grid, p):
             return
-        sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
-        if steps == 0 or sigma <= 0.0:
+        sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
+        if strides == 0 or sigma <= 0.0:
             return
         share = sigma * times / out.sigma[j]
     else:
-        place = again(field, out.cell[j], p)
-    begin(field, d, scratch)
-    c_r, c_g, c_b = colour(field, place, p, d, scratch, memory, 0)
+        cell = unpack_cell(field, out.cell[j], p)
+    ray_setup(field, d, scratch)
+    c_r, c_g, c_b = colour(field, cell, p, d, scratch, memory, 0)
     out.rgb[j, 0] += share * shown[1] * c_r
     out.rgb[j, 1] += share * shown[2] * c_g
     out.rgb[j, 2] += share * shown[3] * c_b
@@ -324,30 +330,30 @@ def next_change(instances, b, o, d, t, end, gap):
     box = Box(instances.lo[b], instances.hi[b])
     lo, cell, first = instances.lo[b], instances.cell[b], instances.first_cell[b]
     nx, ny, nz = instances.counts[b, 0], instances.counts[b, 1], instances.counts[b, 2]
-    begun, last = entered(o, d, t), t
+    piece_begin, last = first_piece_at(o, d, t), t
     for _ in range(PIECES):
-        (origin, way, u0, u1, warp), begun = stretch(begun, box, o, d, end)
+        (origin, direction, t_begin, t_end, warp), piece_begin = next_piece(piece_begin, box, o, d, end)
         # From where the ray enters, so that steps are seen however far away that is.
-        start, u, most = along(origin, way, u0), 0.0, u1 - u0
-        least = FACE_TOLERANCE * cell[0] / max(abs(way[0]), max(abs(way[1]), abs(way[2])))
-        while u < most:
-            x, y, z = along(start, way, u)
+        start, t_local, most = along(origin, direction, t_begin), 0.0, t_end - t_begin
+        least = FACE_TOLERANCE * cell[0] / max(abs(direction[0]), max(abs(direction[1]), abs(direction[2])))
+        while t_local < most:
+            x, y, z = along(start, direction, t_local)
             i, j = cell_of(x, lo[0], cell[0], nx), cell_of(y, lo[1], cell[1], ny)
             k = cell_of(z, lo[2], cell[2], nz)
             empty = int(instances.skip[np.uint64(first + (i * ny + j) * nz + k)])
             if empty == 0 and gap < 0.0:
-                return distance(warp, u0 + u)
-            if empty != 0 and gap >= 0.0 and distance(warp, u0 + u) > last + gap:
+                return distance(warp, t_begin + t_local)
+            if empty != 0 and gap >= 0.0 and distance(warp, t_begin + t_local) > last + gap:
                 return last
             cube = max(empty, 1)
             away = min(
-                exit_distance(x, way[0], lo[0], cell[0], i, cube),
+                exit_distance(x, direction[0], lo[0], cell[0], i, cube),
                 min(
-                    exit_distance(y, way[1], lo[1], cell[1], j, cube),
-                    exit_distance(z, way[2], lo[2], cell[2], k, cube),
+                    exit_distance(y, direction[1], lo[1], cell[1], j, cube),
+                    exit_distance(z, direction[2], lo[2], cell[2], k, cube),
                 ),
             )
-            u += max(away, 0.0) + least
+            t_local += max(away, 0.0) + least
             if empty == 0:
-                last = distance(warp, u0 + min(u, most))
+                last = distance(warp, t_begin + min(t_local, most))
     return FARTHEST if gap < 0.0 else last

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from fusedrf_cli.engine.kernels.parts import along, hit_box
+from fusedrf_cli.engine.kernels.primitives import along, hit_box
 
 
 class Light(NamedTuple):
@@ -33,20 +33,20 @@ def expose_cube(field, grid, light, i, scratch, memory, out):
     facing[i, 0], facing[i, 1], facing[i, 2] = 0, 0, 0
     origin, total = triple(light.places, i), 0.0
     for q in range(light.directions.shape[0]):
-        way = triple(light.directions, q)
-        far = min(light.far, hit_box(origin, way, grid.lo, grid.hi)[1])
+        direction = triple(light.directions, q)
+        far = min(light.far, hit_box(origin, direction, grid.lo, grid.hi)[1])
         trans, k, u = 1.0, 0, side
         while u < far and trans > light.blocked:
-            p = along(origin, way, u)
-            sigma, _, steps, place = density(field, grid, k, p, way, scratch)
+            p = along(origin, direction, u)
+            sigma, _, steps, place = density(field, grid, k, p, direction, scratch)
             trans *= math.exp(-sigma * steps * light.step)
-            k = advance(field, grid, place, 1, steps, k, p, way, u, side, light.step)
+            k = next_index(field, grid, place, 1, steps, k, p, direction, u, side, light.step)
             u = side + k * light.step
         if trans > light.blocked:
             clearest[i] = max(clearest[i], trans)
-            facing[i, 0] -= trans * way[0]
-            facing[i, 1] -= trans * way[1]
-            facing[i, 2] -= trans * way[2]
+            facing[i, 0] -= trans * direction[0]
+            facing[i, 1] -= trans * direction[1]
+            facing[i, 2] -= trans * direction[2]
             total += trans
     if total > 0:
         facing[i, 0] /= total

@@ -36,7 +36,7 @@ class PackageLocator(UserProvidedCacheLocator):
         """Nothing: what cannot be kept is said when it is to be written."""
 
 
-class Kept:
+class KernelStore:
     """The compiled code of one function, each overload in a file of its own: in place of numba's
     IndexDataCacheFile, whose index and data are unpickled as they are.
 
@@ -65,8 +65,8 @@ class Kept:
         if hashlib.sha256(content[DIGEST:]).digest() != content[:DIGEST]:
             self.say("damaged", f"compiled kernels in {self.folder} are damaged; they are compiled again")
             return None
-        made_of, found, data = pickle.loads(content[DIGEST:])
-        return data if (made_of, found) == (self.made_of, key) else None
+        made_of, saved_key, data = pickle.loads(content[DIGEST:])
+        return data if (made_of, saved_key) == (self.made_of, key) else None
 
     def save(self, key: object, data: object) -> None:
         """Keep data under a key, whole or not at all."""
@@ -90,7 +90,7 @@ class Kept:
         """Warn of something, once in a process."""
         if what not in self.said:
             self.said.add(what)
-            Kept.warn(sentence)
+            KernelStore.warn(sentence)
 
     def flush(self) -> None:
         """See IndexDataCacheFile: forget all overloads."""
@@ -100,13 +100,13 @@ class Kept:
 
 def install(caches: ModuleType = caching) -> None:
     """Have numba, or the GPU's compiler with a module of caches of its own, ask PackageLocator first and keep
-    what lies in its cache folder as `Kept` does."""
+    what lies in its cache folder as `KernelStore` does."""
     if caches is caching and PackageLocator not in CacheImpl._locator_classes:
         CacheImpl._locator_classes.insert(0, PackageLocator)
     plain = caches.IndexDataCacheFile
 
     def kept(cache_path: str, filename_base: str, source_stamp: object):
-        own = numba.config.CACHE_DIR and Path(cache_path).is_relative_to(numba.config.CACHE_DIR)
-        return (Kept if own else plain)(cache_path, filename_base, source_stamp)
+        is_ours = numba.config.CACHE_DIR and Path(cache_path).is_relative_to(numba.config.CACHE_DIR)
+        return (KernelStore if is_ours else plain)(cache_path, filename_base, source_stamp)
 
     caches.IndexDataCacheFile = kept

@@ -1,29 +1,30 @@
 """The loops of every kind of field, written once: march, ask, render, train.
 
-These functions are templates: `specialise` gives them, the scalar functions of a kind (its bodies.py) and
-those of a space one namespace, compiled for the sizes of a field. So names that are not defined here, such as
-`density`, `piece` or SCRATCH, are the kind's, the space's and the field's.
+These functions are templates: `specialise` gives them, the device functions of a kind and those of a space
+one namespace, compiled for the sizes of a field. So names that are not defined here, such as `density`,
+`piece` or SCRATCH, are the kind's, the space's and the field's.
 
-What a kind has in its bodies.py, with p the point in the space's coordinates, d the unit direction of the ray
-in the field's frame, `field` its Arrays, and `scratch` SCRATCH numbers of the field's type, 0 at first where
-gradients are gathered:
+What a kind's module of device functions has, with p the point in the space's coordinates, d the unit
+direction of the ray in the field's frame, `field` its Arrays, and `scratch` SCRATCH numbers of the field's
+type, 0 at first where gradients are gathered:
     sizes(field)                       for Python: constants of the namespace by name; SCRATCH and KEPT, the
                                        numbers kept per shaded sample for the way back, are among them
-    density(field, grid, k, p, d, scratch)
-                                       (σ, pre, steps, place): σ in the unit of the space (`rate`); `pre`
-                                       what `backward` needs of it; for how many steps of the ray the sample k
-                                       stands, 0 where there is nothing to sample; `place`, an int or a
-                                       tuple, what the other functions need to know of where p lies
-    colour(field, place, p, d, scratch, memory, at)
+    density(field, grid, index, p, d, scratch)
+                                       (σ, pre, strides, cell): σ in the unit of the space (`rate`); `pre`
+                                       what `backward` needs of it; for how many steps of the ray the
+                                       sample of that index stands, 0 where there is nothing to sample;
+                                       `cell`, an int or a tuple, what the other functions need to know of
+                                       where p lies
+    colour(field, cell, p, d, scratch, memory, at)
                                        (r, g, b) in [0, 1] as floats; leaves KEPT numbers in memory[at:]
-    backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad)
+    backward(field, cell, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, memory, at, grad)
                                        adds to grad what d_sigma, and where shaded d_rgb (3), send back; rgb
                                        and memory[at:] are as `colour` left them
 And what it may have, with the defaults below:
-    begin, end                         once per ray before the first `colour`, and after the last
+    ray_setup, ray_backward            once per ray before the first `colour`, and after the last
                                        `backward`: fold the direction into a basis; scatter its gradient, and
                                        leave 0 what has gathered it
-    keep, again, advance, known, ahead_density, ahead_colour
+    pack_cell, unpack_cell, next_index, is_inside, prefetch_density, prefetch_colour
     COLOUR_FROM, LEARN_FROM, SHADING_COST among its sizes
 """
 
@@ -33,10 +34,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from fusedrf_cli.engine.kernels.parts import (  # noqa: F401
+from fusedrf_cli.engine.kernels.primitives import (  # noqa: F401
     accumulate,
     cell_of,
-    compared,
+    loss_and_grad,
     next_sample,
     occupied,
     raise_to,
@@ -44,16 +45,16 @@ from fusedrf_cli.engine.kernels.parts import (  # noqa: F401
 
 COLOUR_FROM = 1e-4  # weight below which a sample's colour is not evaluated
 LEARN_FROM = COLOUR_FROM  # the same in training
-LENT_FROM = 2e-3  # the same in pictures, behind a ray's first colour
+SHARED_COLOUR_FROM = 2e-3  # the same in pictures, behind a ray's first colour
 REST_FROM = 0.0  # transmittance from which, in pictures that may stop early, all that is left shows a sample
 SHADING_COST = 0  # of a shaded sample, beyond that of one sample: training counts work in samples
-DEPTH_TOLERANCE = 0.01  # share of a known depth that matter may lie from it
+DEPTH_TOLERANCE = 0.01  # share of a known depth that density may lie from it
 POINTS_AHEAD = 4  # a point's numbers are asked for so many points before it
 POINTS_PER_TASK = 2048
 RAYS_PER_TASK = 256
 
 
-class Points(NamedTuple):
+class PointBatch(NamedTuple):
     """What `query_point` answers."""
 
     points: object  # (N, 3) float64
@@ -61,14 +62,14 @@ class Points(NamedTuple):
     with_colour: object  # bool
 
 
-class Answers(NamedTuple):
+class PointValues(NamedTuple):
     """What `query_point` fills."""
 
     sigma: object  # (N,)
     rgb: object  # (N, 3)
 
 
-class Sent(NamedTuple):
+class QueryGradients(NamedTuple):
     """What `query_point_backward` takes back to the field's numbers."""
 
     points: object  # (N, 3) float64
@@ -77,7 +78,7 @@ class Sent(NamedTuple):
     d_rgb: object  # (N, 3)
 
 
-class Weighed(NamedTuple):
+class WeightRays(NamedTuple):
     """What `weigh_ray` follows."""
 
     rays_o: object  # (N, 3) float64
@@ -88,7 +89,7 @@ class Weighed(NamedTuple):
     early_stop: object  # float
 
 
-class Voting(NamedTuple):
+class VoteRays(NamedTuple):
     """What `vote_ray` follows, and the cells it votes for."""
 
     rays_o: object  # (N, 3) float64
@@ -111,19 +112,20 @@ class Cells(NamedTuple):
     offsets: object  # (K, 3) in [0, 1], where in a cell
 
 
-class Kept(NamedTuple):
+class RaySamples(NamedTuple):
     """What the way back of one ray needs of its samples. `memory` holds the KEPT numbers of as many shaded
     samples as fit; its last slot serves all beyond, whose colours are then evaluated twice."""
 
-    k: object  # int, twice the number of the sample in its piece: where `many` is even it is between two
+    # int, twice the number of the sample in its piece: where `n_steps` is even it is between two
+    index: object
     piece: object  # int
-    held: object  # int, what `again` makes the place of
-    many: object  # int
-    steps: object  # int
+    packed: object  # int, what `unpack_cell` makes the cell of
+    n_steps: object  # int
+    strides: object  # int
     slot: object  # int, where in memory, or -1: not shaded
     pre: object
     weight: object
-    carried: object  # weight that its colour stands for
+    colour_weight: object  # weight that its colour stands for
     along: object  # how far along the ray, from 0 at its origin to 1 at infinity, where that is needed
     times: object  # how many times what it sends back counts; 0: it is not followed back
     rgb: object  # (K, 3)
@@ -133,42 +135,42 @@ class Kept(NamedTuple):
 # -- what a kind may leave out -------------------------------------------------------------------------------
 
 
-def begin(field, d, scratch):
+def ray_setup(field, d, scratch):
     """Prepare `scratch` for colours seen along d."""
 
 
-def end(field, d, scratch, grad):
-    """Send back what `backward` has gathered in `scratch` since `begin`, and clear it."""
+def ray_backward(field, d, scratch, grad):
+    """Send back what `backward` has gathered in `scratch` since `ray_setup`, and clear it."""
 
 
-def keep(place):
-    """An int from which `again` makes the place again."""
+def pack_cell(cell):
+    """An int from which `unpack_cell` makes the cell again."""
     return 0
 
 
-def again(field, held, p):
-    """The place of a point p, from what `keep` made of it; whatever rounding does to p, this and `backward`
-    must read no number out of bounds."""
-    return held
+def unpack_cell(field, packed, p):
+    """The cell of a point p, from what `pack_cell` made of it; whatever rounding does to p, this and
+    `backward` must read no number out of bounds."""
+    return packed
 
 
-def advance(field, grid, place, many, steps, k, p, way, u, u0, step):
-    """The number of the sample after k, which lies at p, u on a line along `way`, and stands for `many` times
-    `steps` steps, which is 0 where there is nothing. Sample n lies at u0 + n step."""
-    return k + max(many * steps, 1)
+def next_index(field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step):
+    """The number of the sample after k, which lies at p, t_local on a line along `direction`, and stands for
+    `n_steps` times `strides` steps, which is 0 where there is nothing. Sample n lies at t_begin + n step."""
+    return index + max(n_steps * strides, 1)
 
 
-def known(field, grid, p):
+def is_inside(field, grid, p):
     """Whether a query of p is answered at all."""
     return occupied(grid, p)
 
 
-def ahead_density(field, array, held, p):
-    """Ask for what `density` will read at p in an array laid out as the field's numbers, in the place that
-    `held` (0 where it is not known) belongs to."""
+def prefetch_density(field, array, packed, p):
+    """Ask for what `density` will read at p in an array laid out as the field's numbers, in the cell that
+    `packed` (0 where it is not known) belongs to."""
 
 
-def ahead_colour(field, array, held, p):
+def prefetch_colour(field, array, packed, p):
     """As `ahead_density`, what `colour` will read."""
 
 
@@ -185,89 +187,89 @@ def share_along(t):
     return t / (1.0 + t)
 
 
-def astray(along, depth):
+def depth_error(along, depth):
     """How far what lies at `along` of a ray (share_along) is from a depth that is known: 0 within
     DEPTH_TOLERANCE of it, 1 from twice that on."""
     away = abs(along / max((1.0 - along) * depth, 1e-12) - 1.0)
     return min(1.0, max(0.0, away / DEPTH_TOLERANCE - 1.0))
 
 
-def between(k, many):
-    """Twice the number, on a ray's lattice, of the middle of `many` steps from step k on."""
-    return 2 * k + many - 1
+def midpoint(index, n_steps):
+    """Twice the number, on a ray's lattice, of the middle of `n_steps` steps from step k on."""
+    return 2 * index + n_steps - 1
 
 
-def optical_length(course, p, d, u, many, steps, step):
-    """How much of a ray along d, by the unit that σ at p is of, a sample at u stands for: `many` steps around
-    it, and as many again behind it for each of `steps` beyond the first."""
-    return rate(p, d) * span(course, u + 0.5 * (steps - 1) * many * step, steps * many * step)
+def optical_length(warp, p, d, t_local, n_steps, strides, step):
+    """How much of a ray along d, by the unit that σ at p is of, a sample at t_local stands for: `n_steps`
+    steps around it, and as many again behind it for each of `strides` beyond the first."""
+    return rate(p, d) * span(warp, t_local + 0.5 * (strides - 1) * n_steps * step, strides * n_steps * step)
 
 
-def met(field, grid, line, k, many, u, step, d, scratch):
-    """What a ray meets at u of a piece, line (origin, direction, course), in `many` steps from step k on: the
-    point; the share of the light that is lost there; and what `density` says besides σ."""
-    origin, way, course = line
-    p = position_at(origin, way, u)
-    sigma, pre, steps, place = density(field, grid, k, p, d, scratch)
+def alpha_at(field, grid, line, index, n_steps, t_local, step, d, scratch):
+    """What a ray meets at t_local of a piece, line (origin, direction, course), in `n_steps` steps from step
+    k on: the point; the share of the light that is lost there; and what `density` says besides σ."""
+    origin, direction, warp = line
+    p = position_at(origin, direction, t_local)
+    sigma, pre, strides, cell = density(field, grid, index, p, d, scratch)
     opacity = 0.0
-    if steps > 0:
-        opacity = 1.0 - math.exp(-sigma * optical_length(course, p, d, u, many, steps, step))
-    return p, opacity, pre, steps, place
+    if strides > 0:
+        opacity = 1.0 - math.exp(-sigma * optical_length(warp, p, d, t_local, n_steps, strides, step))
+    return p, opacity, pre, strides, cell
 
 
-def query_point(field, grid, asked, i, scratch, memory, out):
+def query_point(field, grid, query, i, scratch, memory, out):
     """σ (1/length) and rgb at point i; both 0 where the field is not known."""
-    p, d = point(triple(asked.points, i)), triple(asked.dirs, i)
+    p, d = point(triple(query.points, i)), triple(query.dirs, i)
     n = i + POINTS_AHEAD
-    if n < asked.points.shape[0]:
-        q = point(triple(asked.points, n))
-        ahead_density(field, field.params, 0, q)
-        if asked.with_colour:
-            ahead_colour(field, field.params, 0, q)
+    if n < query.points.shape[0]:
+        q = point(triple(query.points, n))
+        prefetch_density(field, field.params, 0, q)
+        if query.with_colour:
+            prefetch_colour(field, field.params, 0, q)
     out.sigma[i] = 0
     out.rgb[i, 0], out.rgb[i, 1], out.rgb[i, 2] = 0, 0, 0
-    if known(field, grid, p):
-        sigma, _, steps, place = density(field, grid, 0, p, d, scratch)
-        if steps > 0:
+    if is_inside(field, grid, p):
+        sigma, _, strides, cell = density(field, grid, 0, p, d, scratch)
+        if strides > 0:
             out.sigma[i] = rate(p, d) * sigma
-            if asked.with_colour and sigma > 0:
-                begin(field, d, scratch)
-                rgb = colour(field, place, p, d, scratch, memory, 0)
+            if query.with_colour and sigma > 0:
+                ray_setup(field, d, scratch)
+                rgb = colour(field, cell, p, d, scratch, memory, 0)
                 out.rgb[i, 0], out.rgb[i, 1], out.rgb[i, 2] = rgb
 
 
-def query_point_backward(field, grid, sent, i, kept, scratch, grad, loss):
+def query_point_backward(field, grid, gradients, i, samples, scratch, grad, loss):
     """Adjoint of `query_point`: adds to grad (P,) what d_sigma[i] and d_rgb[i] send back."""
-    p, d, d_rgb = point(triple(sent.points, i)), triple(sent.dirs, i), triple(sent.d_rgb, i)
+    p, d, d_rgb = point(triple(gradients.points, i)), triple(gradients.dirs, i), triple(gradients.d_rgb, i)
     n = i + POINTS_AHEAD
-    if n < sent.points.shape[0]:
-        q = point(triple(sent.points, n))
-        ahead_density(field, field.params, 0, q)
-        ahead_density(field, grad, 0, q)
-        if sent.d_rgb[n, 0] != 0 or sent.d_rgb[n, 1] != 0 or sent.d_rgb[n, 2] != 0:
-            ahead_colour(field, field.params, 0, q)
-            ahead_colour(field, grad, 0, q)
-    if known(field, grid, p):
-        sigma, pre, steps, place = density(field, grid, 0, p, d, scratch)
-        if steps > 0 and sigma > 0:
+    if n < gradients.points.shape[0]:
+        q = point(triple(gradients.points, n))
+        prefetch_density(field, field.params, 0, q)
+        prefetch_density(field, grad, 0, q)
+        if gradients.d_rgb[n, 0] != 0 or gradients.d_rgb[n, 1] != 0 or gradients.d_rgb[n, 2] != 0:
+            prefetch_colour(field, field.params, 0, q)
+            prefetch_colour(field, grad, 0, q)
+    if is_inside(field, grid, p):
+        sigma, pre, strides, cell = density(field, grid, 0, p, d, scratch)
+        if strides > 0 and sigma > 0:
             shaded = d_rgb[0] != 0 or d_rgb[1] != 0 or d_rgb[2] != 0
             rgb = 0.0, 0.0, 0.0
             if shaded:
-                begin(field, d, scratch)
-                rgb = colour(field, place, p, d, scratch, kept.memory, 0)
-            d_sigma = rate(p, d) * float(sent.d_sigma[i])
-            backward(field, place, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, kept.memory, 0, grad)
+                ray_setup(field, d, scratch)
+                rgb = colour(field, cell, p, d, scratch, samples.memory, 0)
+            d_sigma = rate(p, d) * float(gradients.d_sigma[i])
+            backward(field, cell, p, d, pre, d_sigma, shaded, rgb, d_rgb, scratch, samples.memory, 0, grad)
             if shaded:
-                end(field, d, scratch, grad)
+                ray_backward(field, d, scratch, grad)
 
 
-def drawn(jitter):
+def random_of(jitter):
     """A number in [0, 1) that has nothing to do with where a ray's samples lie: the jitter's last digits."""
     last = jitter * 1048576.0
     return last - math.floor(last)
 
 
-def followed(batch, weight, chance):
+def stochastic_backprop(batch, weight, chance):
     """How many times the gradient of a ray's next sample counts, 0 where it is not followed back; and the
     chance for the sample behind it. weight: its own, and what waits before it for a colour.
 
@@ -277,161 +279,177 @@ def followed(batch, weight, chance):
     """
     if batch.light <= 0.0:
         return 1.0, chance
-    part = min(1.0, weight / batch.light)
-    chance += part
+    share = min(1.0, weight / batch.light)
+    chance += share
     if chance < 1.0:
         return 0.0, chance
-    return 1.0 / part, chance - 1.0
+    return 1.0 / share, chance - 1.0
 
 
-def ask_for(field, held, origin, way, u0, step, k, many):
-    """Ask for what the sample of `many` steps from step k of a piece on, if there is one, will read; `held`
-    is of the one before it. Planes and rows lie all over memory: asked for one sample early, their misses
-    overlap with the work on the one before."""
-    if k >= 0:
-        p = position_at(origin, way, u0 + 0.5 * between(k, many) * step)
-        ahead_density(field, field.params, held, p)
-        ahead_colour(field, field.params, held, p)
+def prefetch_sample(field, packed, origin, direction, t_begin, step, index, n_steps):
+    """Ask for what the sample of `n_steps` steps from step k of a piece on, if there is one, will read;
+    `packed` is of the one before it. Planes and rows lie all over memory: asked for one sample early, their
+    misses overlap with the work on the one before."""
+    if index >= 0:
+        p = position_at(origin, direction, t_begin + 0.5 * midpoint(index, n_steps) * step)
+        prefetch_density(field, field.params, packed, p)
+        prefetch_colour(field, field.params, packed, p)
 
 
-def train_ray(field, grid, batch, i, kept, scratch, grad, loss):
+def train_ray(field, grid, batch, i, samples, scratch, grad, loss):
     """Ray i of a batch: forward as in `show_ray` of instances.py, compare, and back along the ray into grad
     (P,)."""
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
     red, green, blue = 0.0, 0.0, 0.0
-    trans, waiting = 1.0, 0.0
-    count, shaded, chance = 0, 0, drawn(batch.jitter[i])
-    last, begun = kept.memory.shape[0] - KEPT, entered(o, d, batch.near)
-    held = 0
+    trans, pending = 1.0, 0.0
+    count, shaded, chance = 0, 0, random_of(batch.jitter[i])
+    last, piece_begin = samples.memory.shape[0] - KEPT, first_piece_at(o, d, batch.near)
+    packed = 0
     for number in range(PIECES):
         if trans <= batch.early_stop:
             break
-        (origin, way, u0, u1, course), begun = stretch(begun, grid, o, d, FARTHEST)
-        u0 = u0 + batch.jitter[i] * step
-        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
-        ask_for(field, held, origin, way, u0, step, k, many)
-        while k >= 0 and trans > batch.early_stop and count < kept.k.shape[0]:
-            u = u0 + 0.5 * between(k, many) * step
-            following, wide = next_sample(grid, origin, way, u0, u1, step, k + many)
-            ask_for(field, held, origin, way, u0, step, following, wide)
-            p, opacity, pre, steps, place = met(
-                field, grid, (origin, way, course), k, many, u, step, d, scratch
+        (origin, direction, t_begin, t_end, warp), piece_begin = next_piece(piece_begin, grid, o, d, FARTHEST)
+        t_begin = t_begin + batch.jitter[i] * step
+        index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, 0)
+        prefetch_sample(field, packed, origin, direction, t_begin, step, index, n_steps)
+        while index >= 0 and trans > batch.early_stop and count < samples.index.shape[0]:
+            t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            following, wide = next_sample(grid, origin, direction, t_begin, t_end, step, index + n_steps)
+            prefetch_sample(field, packed, origin, direction, t_begin, step, following, wide)
+            p, opacity, pre, strides, cell = alpha_at(
+                field, grid, (origin, direction, warp), index, n_steps, t_local, step, d, scratch
             )
-            if steps > 0:
-                held = keep(place)
+            if strides > 0:
+                packed = pack_cell(cell)
                 weight = trans * opacity
                 trans -= weight
-                times, chance = followed(batch, weight + waiting, chance)
+                times, chance = stochastic_backprop(batch, weight + pending, chance)
                 if times > 0.0:
-                    ahead_density(field, grad, held, p)
-                kept.times[count] = times
-                kept.k[count], kept.many[count], kept.steps[count] = between(k, many), many, steps
-                kept.piece[count], kept.held[count] = number, held
-                kept.slot[count], kept.pre[count], kept.weight[count] = -1, pre, weight
+                    prefetch_density(field, grad, packed, p)
+                samples.times[count] = times
+                samples.index[count], samples.n_steps[count], samples.strides[count] = (
+                    midpoint(index, n_steps),
+                    n_steps,
+                    strides,
+                )
+                samples.piece[count], samples.packed[count] = number, packed
+                samples.slot[count], samples.pre[count], samples.weight[count] = -1, pre, weight
                 if batch.distortion > 0.0 or i < batch.depths.shape[0]:
-                    kept.along[count] = share_along(distance(course, u))
-                waiting += weight
-                if waiting > LEARN_FROM:
+                    samples.along[count] = share_along(distance(warp, t_local))
+                pending += weight
+                if pending > LEARN_FROM:
                     if shaded == 0:
-                        begin(field, d, scratch)
+                        ray_setup(field, d, scratch)
                     at = min(shaded * KEPT, last)
                     if times > 0.0:
-                        ahead_colour(field, grad, held, p)
-                    r, g, b = colour(field, place, p, d, scratch, kept.memory, at)
-                    red += waiting * r
-                    green += waiting * g
-                    blue += waiting * b
-                    kept.rgb[count, 0], kept.rgb[count, 1], kept.rgb[count, 2] = r, g, b
-                    kept.slot[count], kept.carried[count] = at, waiting
-                    waiting = 0.0
+                        prefetch_colour(field, grad, packed, p)
+                    r, g, b = colour(field, cell, p, d, scratch, samples.memory, at)
+                    red += pending * r
+                    green += pending * g
+                    blue += pending * b
+                    samples.rgb[count, 0], samples.rgb[count, 1], samples.rgb[count, 2] = r, g, b
+                    samples.slot[count], samples.colour_weight[count] = at, pending
+                    pending = 0.0
                     shaded += 1
                 count += 1
-            to = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
-            if to != k + many:
-                following, wide = next_sample(grid, origin, way, u0, u1, step, to)
-            k, many = following, wide
+            to = next_index(field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step)
+            if to != index + n_steps:
+                following, wide = next_sample(grid, origin, direction, t_begin, t_end, step, to)
+            index, n_steps = following, wide
     work = count + SHADING_COST * shaded
-    d_colour, d_trans = compared(batch, i, (red, green, blue), trans, work, loss)
+    d_colour, d_trans = loss_and_grad(batch, i, (red, green, blue), trans, work, loss)
     if count > 0:
-        taken = count, shaded
-        train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad)
+        counts = count, shaded
+        train_ray_backward(field, grid, batch, i, samples, counts, trans, d_colour, d_trans, scratch, grad)
 
 
-def train_ray_backward(field, grid, batch, i, kept, taken, trans, d_colour, d_trans, scratch, grad):
-    """The way back of `train_ray` over the samples taken: (how many, how many of them shaded).
+def train_ray_backward(field, grid, batch, i, samples, counts, trans, d_colour, d_trans, scratch, grad):
+    """The way back of `train_ray` over the samples counts: (how many, how many of them shaded).
 
     d_colour is the gradient of the loss in the ray's colour, d_trans that in the transmittance behind it;
     `behind` gathers the share of all that lies behind a sample.
     """
-    count, shaded = taken
+    count, shaded = counts
     o, d, step = triple(batch.rays_o, i), triple(batch.rays_d, i), batch.step
-    last = kept.memory.shape[0] - KEPT
-    overwritten = shaded * KEPT > kept.memory.shape[0]
+    last = samples.memory.shape[0] - KEPT
+    overwritten = shaded * KEPT > samples.memory.shape[0]
     depth, far = 0.0, 0.0
     if i < batch.depths.shape[0]:
         depth, far = batch.depths[i], batch.depth_weight / batch.target.shape[0]
     behind = trans * (d_trans + far)
     after = trans
-    own = 0.0
+    shown = 0.0
     before, beyond = (0.0, 0.0), (0.0, 0.0)
     if batch.distortion > 0.0:
         for q in range(count):
-            before = before[0] + kept.weight[q], before[1] + kept.weight[q] * kept.along[q]
-    number = kept.piece[count - 1]
-    origin, way, u0, _, course = piece(number, grid, o, d, batch.near, FARTHEST)
+            before = before[0] + samples.weight[q], before[1] + samples.weight[q] * samples.along[q]
+    number = samples.piece[count - 1]
+    origin, direction, t_begin, _, warp = piece(number, grid, o, d, batch.near, FARTHEST)
     for q in range(count - 1, -1, -1):
-        if PIECES > 1 and kept.piece[q] != number:
-            number = kept.piece[q]
-            origin, way, u0, _, course = piece(number, grid, o, d, batch.near, FARTHEST)
-        u = u0 + batch.jitter[i] * step + 0.5 * kept.k[q] * step
-        p = position_at(origin, way, u)
-        place, at, weight = again(field, kept.held[q], p), kept.slot[q], kept.weight[q]
+        if PIECES > 1 and samples.piece[q] != number:
+            number = samples.piece[q]
+            origin, direction, t_begin, _, warp = piece(number, grid, o, d, batch.near, FARTHEST)
+        t_local = t_begin + batch.jitter[i] * step + 0.5 * samples.index[q] * step
+        p = position_at(origin, direction, t_local)
+        cell, at, weight = unpack_cell(field, samples.packed[q], p), samples.slot[q], samples.weight[q]
         rgb, d_rgb = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         if at >= 0:
-            rgb = kept.rgb[q, 0], kept.rgb[q, 1], kept.rgb[q, 2]
-            own = d_colour[0] * rgb[0] + d_colour[1] * rgb[1] + d_colour[2] * rgb[2]
+            rgb = samples.rgb[q, 0], samples.rgb[q, 1], samples.rgb[q, 2]
+            shown = d_colour[0] * rgb[0] + d_colour[1] * rgb[1] + d_colour[2] * rgb[2]
             if overwritten and at == last:
-                colour(field, place, p, d, scratch, kept.memory, last)
-            carried = kept.carried[q]
-            d_rgb = d_colour[0] * carried, d_colour[1] * carried, d_colour[2] * carried
-        length = optical_length(course, p, d, u, kept.many[q], kept.steps[q], step)
-        spread = far * astray(kept.along[q], depth) if far > 0.0 else 0.0
+                colour(field, cell, p, d, scratch, samples.memory, last)
+            colour_weight = samples.colour_weight[q]
+            d_rgb = d_colour[0] * colour_weight, d_colour[1] * colour_weight, d_colour[2] * colour_weight
+        length = optical_length(warp, p, d, t_local, samples.n_steps[q], samples.strides[q], step)
+        spread = far * depth_error(samples.along[q], depth) if far > 0.0 else 0.0
         if batch.distortion > 0.0:
-            here = kept.along[q]
+            here = samples.along[q]
             before = before[0] - weight, before[1] - weight * here
             apart = here * (before[0] - beyond[0]) - (before[1] - beyond[1])
             apart += weight * length / rate(p, d) * (1.0 - here) * (1.0 - here) / 3.0
             spread += 2.0 * batch.distortion / batch.target.shape[0] * apart
             beyond = beyond[0] + weight, beyond[1] + weight * here
-        d_sigma = length * (after * (own + spread) - behind)
-        behind += weight * (own + spread)
+        d_sigma = length * (after * (shown + spread) - behind)
+        behind += weight * (shown + spread)
         after += weight
-        times = kept.times[q]
+        times = samples.times[q]
         if weight > 0.0 and times > 0.0:
             d_sigma, d_rgb = times * d_sigma, (times * d_rgb[0], times * d_rgb[1], times * d_rgb[2])
             backward(
-                field, place, p, d, kept.pre[q], d_sigma, at >= 0, rgb, d_rgb, scratch, kept.memory, at, grad
+                field,
+                cell,
+                p,
+                d,
+                samples.pre[q],
+                d_sigma,
+                at >= 0,
+                rgb,
+                d_rgb,
+                scratch,
+                samples.memory,
+                at,
+                grad,
             )
     if shaded > 0:
-        end(field, d, scratch, grad)
+        ray_backward(field, d, scratch, grad)
 
 
-def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
+def weigh_ray(field, grid, rays, i, samples, scratch, most, loss):
     """Raises most[c] to the weight of each sample of ray i that lies in cell c of the grid, counted z first,
     where it is more. Samples lie `rays.jitter[i]` of a step into each step."""
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     nx, ny, nz = grid.skip.shape
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, rays.near, FARTHEST)
-        u0 = u0 + rays.jitter[i] * step
-        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
-        while k >= 0 and trans > rays.early_stop:
-            u = u0 + 0.5 * between(k, many) * step
-            p, opacity, _, steps, place = met(
-                field, grid, (origin, way, course), k, many, u, step, d, scratch
+        origin, direction, t_begin, t_end, warp = piece(number, grid, o, d, rays.near, FARTHEST)
+        t_begin = t_begin + rays.jitter[i] * step
+        index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, 0)
+        while index >= 0 and trans > rays.early_stop:
+            t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            p, opacity, _, strides, cell = alpha_at(
+                field, grid, (origin, direction, warp), index, n_steps, t_local, step, d, scratch
             )
-            if steps > 0:
+            if strides > 0:
                 weight = trans * opacity
                 trans -= weight
                 x = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
@@ -439,26 +457,28 @@ def weigh_ray(field, grid, rays, i, kept, scratch, most, loss):
                 z = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
                 c = (x * ny + y) * nz + z
                 raise_to(most, c, weight)
-            k = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
-            k, many = next_sample(grid, origin, way, u0, u1, step, k)
+            index = next_index(
+                field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step
+            )
+            index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
 
 
-def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
+def vote_ray(field, grid, rays, i, samples, scratch, votes, loss):
     """Adds to votes[2 c], or, where `rays.inside[i]`, to votes[2 c + 1] the weight of each sample of ray i in
     cell c of a box of cells, counted z first. Samples lie `rays.jitter[i]` of a step into each step."""
     o, d, step = triple(rays.rays_o, i), triple(rays.rays_d, i), rays.step
     nx, ny, nz = rays.counts[0], rays.counts[1], rays.counts[2]
     trans = 1.0
     for number in range(PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, 0.0, FARTHEST)
-        u0 = u0 + rays.jitter[i] * step
-        k, many = next_sample(grid, origin, way, u0, u1, step, 0)
-        while k >= 0 and trans > rays.early_stop:
-            u = u0 + 0.5 * between(k, many) * step
-            p, opacity, _, steps, place = met(
-                field, grid, (origin, way, course), k, many, u, step, d, scratch
+        origin, direction, t_begin, t_end, warp = piece(number, grid, o, d, 0.0, FARTHEST)
+        t_begin = t_begin + rays.jitter[i] * step
+        index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, 0)
+        while index >= 0 and trans > rays.early_stop:
+            t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            p, opacity, _, strides, cell = alpha_at(
+                field, grid, (origin, direction, warp), index, n_steps, t_local, step, d, scratch
             )
-            if steps > 0:
+            if strides > 0:
                 weight = trans * opacity
                 trans -= weight
                 x = math.floor((p[0] - rays.lo[0]) / rays.cell[0])
@@ -466,8 +486,10 @@ def vote_ray(field, grid, rays, i, kept, scratch, votes, loss):
                 z = math.floor((p[2] - rays.lo[2]) / rays.cell[2])
                 if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
                     accumulate(votes, 2 * ((x * ny + y) * nz + z) + rays.inside[i], weight)
-            k = advance(field, grid, place, many, steps, k, p, way, u, u0, step)
-            k, many = next_sample(grid, origin, way, u0, u1, step, k)
+            index = next_index(
+                field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step
+            )
+            index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index)
 
 
 def peak_of_cell(field, grid, cells, i, scratch, memory, out):
@@ -486,17 +508,17 @@ def peak_of_cell(field, grid, cells, i, scratch, memory, out):
 # `item` is one of the functions above, or one of a kind's own with the same arguments.
 
 
-def each_task(field, grid, asked, low, high, scratch, memory, out):
+def each_task(field, grid, query, low, high, scratch, memory, out):
     """`each` for items low..high: the serial work of one core."""
     for i in range(low, high):
-        item(field, grid, asked, i, scratch, memory, out)
+        item(field, grid, query, i, scratch, memory, out)
 
 
-def each(field, grid, asked, count, per_task, threads, out):
+def each(field, grid, query, count, per_task, threads, out):
     """An item of work for each i < count, each filling what is its own in `out`.
 
-    A thread gets a run of what is iterated over, so tasks are dealt out to so many threads in turn: half of a
-    picture is often sky, and the thread that had it would wait for the others.
+    A thread gets a run of what is iterated over, so tasks are dealt out to so many threads in turn: half
+    of a picture is often sky, and the thread that had it would wait for the others.
     """
     parts = (count + per_task - 1) // per_task
     each_has = (parts + threads - 1) // threads
@@ -505,28 +527,28 @@ def each(field, grid, asked, count, per_task, threads, out):
         real = field.params.dtype
         scratch, memory = np.zeros(SCRATCH, real), np.empty(max(KEPT, 1), real)
         low, high = part * per_task, min(count, (part + 1) * per_task)
-        each_task(field, grid, asked, low, high, scratch, memory, out)
+        each_task(field, grid, query, low, high, scratch, memory, out)
 
 
-def sweep_task(field, grid, batch, low, high, kept, scratch, grad, loss):
+def sweep_task(field, grid, batch, low, high, samples, scratch, grad, loss):
     """`sweep` for items low..high, into one row of gradients and losses."""
     for i in range(low, high):
-        item(field, grid, batch, i, kept, scratch, grad, loss)
+        item(field, grid, batch, i, samples, scratch, grad, loss)
 
 
 def sweep(field, grid, batch, count, most, grads, loss):
-    """An item of work, of at most so many samples, for each i < count, each adding to a gradient: part p of
-    them to row p of grads (parts, P) and of loss (parts, 3)."""
-    parts = grads.shape[0]
-    for p in prange(parts):
+    """An item of work, of at most so many samples, for each i < count, each adding to a gradient: part p
+    of them to row p of grads (parts, P) and of loss (parts, 3)."""
+    n_rows = grads.shape[0]
+    for p in prange(n_rows):
         real = field.params.dtype
-        whole, reals = np.empty((6, most), np.int64), np.empty((5, most))
-        kept = Kept(
-            whole[0], whole[1], whole[2], whole[3], whole[4], whole[5], reals[0], reals[1], reals[2],
-            reals[3], reals[4], np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
+        integers, reals = np.empty((6, most), np.int64), np.empty((5, most))
+        samples = RaySamples(
+            integers[0], integers[1], integers[2], integers[3], integers[4], integers[5], reals[0], reals[1],
+            reals[2], reals[3], reals[4], np.empty((most, 3)), np.empty(max(most * KEPT, 1), real),
         )  # fmt: skip
-        low, high = p * count // parts, (p + 1) * count // parts
-        sweep_task(field, grid, batch, low, high, kept, np.zeros(SCRATCH, real), grads[p], loss[p])
+        low, high = p * count // n_rows, (p + 1) * count // n_rows
+        sweep_task(field, grid, batch, low, high, samples, np.zeros(SCRATCH, real), grads[p], loss[p])
 
 
 # -- marching, which needs no field --------------------------------------------------------------------------
@@ -537,17 +559,20 @@ def march_ray(grid, rays_o, rays_d, reach, jitter, step, i, start, ts, spans, co
     ts[i], what lengths of the ray they stand for, spans[i], as many as counts[i]."""
     o, d = triple(rays_o, i), triple(rays_d, i)
     for number in range(start[i] % PIECES, PIECES):
-        origin, way, u0, u1, course = piece(number, grid, o, d, reach[i, 0], reach[i, 1])
-        u0 = u0 + jitter[i] * step
+        origin, direction, t_begin, t_end, warp = piece(number, grid, o, d, reach[i, 0], reach[i, 1])
+        t_begin = t_begin + jitter[i] * step
         first = start[i] // PIECES if number == start[i] % PIECES else 0
-        k, many = next_sample(grid, origin, way, u0, u1, step, first)
-        while k >= 0 and counts[i] < ts.shape[1]:
-            u = u0 + 0.5 * between(k, many) * step
-            ts[i, counts[i]], spans[i, counts[i]] = distance(course, u), span(course, u, many * step)
+        index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, first)
+        while index >= 0 and counts[i] < ts.shape[1]:
+            t_local = t_begin + 0.5 * midpoint(index, n_steps) * step
+            ts[i, counts[i]], spans[i, counts[i]] = (
+                distance(warp, t_local),
+                span(warp, t_local, n_steps * step),
+            )
             counts[i] += 1
-            k, many = next_sample(grid, origin, way, u0, u1, step, k + many)
-        if k >= 0:
-            start[i] = k * PIECES + number
+            index, n_steps = next_sample(grid, origin, direction, t_begin, t_end, step, index + n_steps)
+        if index >= 0:
+            start[i] = index * PIECES + number
             return
     start[i] = -1
 

@@ -5,7 +5,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from fusedrf_cli.engine.kernels.parts import LINE, body
+from fusedrf_cli.engine.kernels.primitives import LINE, device
 
 
 @intrinsic(prefer_literal=False)
@@ -25,7 +25,7 @@ def prefetch(typing, array, index):
     return types.void(array, index), generate
 
 
-@body
+@device
 def prefetch_plane(rank, array, plane, na, nb, a, b):
     """Ask for the four texels, of `rank` numbers each, of a plane around unit coordinates (a, b), which may
     lie outside."""

@@ -119,7 +119,7 @@ def composite_weights(sigma: torch.Tensor, step: float) -> torch.Tensor:
     return before * alpha
 
 
-def lent(weights: torch.Tensor, first: float, later: float) -> torch.Tensor:
+def shared_colour_weights(weights: torch.Tensor, first: float, later: float) -> torch.Tensor:
     """(N, K) the weights that the colours of a ray's samples stand for, of weights (N, K): that of all since
     the last sample that was shaded, where it is over `first`, or over `later` behind the first that was; what
     is left over at the end goes to the last."""
@@ -143,12 +143,12 @@ def interval(
     misses leaves before it enters. Differentiable in all three tensors."""
     lo, hi = box[:3], box[3:]
     parallel = rays_d == 0
-    held = (~parallel | ((rays_o >= lo) & (rays_o < hi))).all(1)
+    is_between = (~parallel | ((rays_o >= lo) & (rays_o < hi))).all(1)
     safe = torch.where(parallel, 1, rays_d)
     a, b = (lo - rays_o) / safe, (hi - rays_o) / safe
     enter = torch.where(parallel, 0, torch.minimum(a, b)).amax(1).clamp_min(near).clamp_min(0)
     leave = torch.where(parallel, torch.inf, torch.maximum(a, b)).amin(1)
-    return enter, torch.where(held, leave, enter)
+    return enter, torch.where(is_between, leave, enter)
 
 
 def lattice(field, rays_o, rays_d, near: float, step: float, jitter) -> tuple[torch.Tensor, torch.Tensor]:
@@ -181,24 +181,24 @@ def render_rays(
     Every sample of the lattice is asked. A sample counts while the transmittance before it is over
     early_stop, and its colour where its weight is over the first number of `lending`: both thresholds are the
     kernels' own, 0 leaves them out. With a second one, light samples take other ones' colours as in pictures
-    (`lent`).
+    (`shared_colour_weights`).
     """
-    colour_from, lent_from = lending
-    ts, taken = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter, dtype=torch.float64))
-    points = (rays_o[:, None] + ts[..., None] * rays_d[:, None])[taken]
-    dirs = rays_d[:, None].expand(*ts.shape, 3)[taken]
-    found, colour = field.reference(field.params, points, dirs)
-    sigma = found.new_zeros(ts.shape).masked_scatter(taken, found)
-    rgb = found.new_zeros(*ts.shape, 3).masked_scatter(taken[..., None], colour)
+    colour_from, shared_colour_from = lending
+    ts, is_sampled = lattice(field, rays_o, rays_d, near, step, torch.as_tensor(jitter, dtype=torch.float64))
+    points = (rays_o[:, None] + ts[..., None] * rays_d[:, None])[is_sampled]
+    dirs = rays_d[:, None].expand(*ts.shape, 3)[is_sampled]
+    densities, colour = field.reference(field.params, points, dirs)
+    sigma = densities.new_zeros(ts.shape).masked_scatter(is_sampled, densities)
+    rgb = densities.new_zeros(*ts.shape, 3).masked_scatter(is_sampled[..., None], colour)
     with torch.no_grad():
         before = torch.exp(-step * (torch.cumsum(sigma, 1) - sigma))
     weights = composite_weights(torch.where(before > early_stop, sigma, 0), step)
     shown = torch.where(weights > colour_from, weights, 0)
-    if lent_from is not None:
-        shown = lent(weights, colour_from, lent_from)
+    if shared_colour_from is not None:
+        shown = shared_colour_weights(weights, colour_from, shared_colour_from)
     columns = [
         (shown[..., None] * rgb).sum(1),
         weights.sum(1, keepdim=True),
         (weights * ts).sum(1, keepdim=True),
     ]
-    return torch.cat([c.to(found.dtype) for c in columns], 1)
+    return torch.cat([c.to(densities.dtype) for c in columns], 1)

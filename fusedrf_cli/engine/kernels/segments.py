@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import get_num_threads, prange
 
+from fusedrf_cli.engine.kernels.field_free import loop, serial
 from fusedrf_cli.engine.kernels.instances import ANYWHERE, DENSER, FARTHEST
-from fusedrf_cli.engine.kernels.parts import along, body
-from fusedrf_cli.engine.kernels.plain import loop, task
-from fusedrf_cli.engine.kernels.specialise import body as inlined
-from fusedrf_cli.engine.kernels.specialise import loops_for, rebound
+from fusedrf_cli.engine.kernels.primitives import along, device
+from fusedrf_cli.engine.kernels.specialise import inlined, loops_for, rebound
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 TILE, FEW = 256, 16  # rays, which lie close together in pictures
@@ -62,7 +61,7 @@ ray_in_instance = loops_for(None, (), bounded).names["ray_in_instance"]
 # -- which instances a ray may meet --------------------------------------------------------------------------
 
 
-@body
+@device
 def bundle_of(rays, chosen, low, high):
     """A cone that holds the directions of rays chosen[low:high], and a ball that holds their origins: centre,
     radius, axis, and sine and cosine of half its angle."""
@@ -85,7 +84,7 @@ def bundle_of(rays, chosen, low, high):
     return (x, y, z), math.sqrt(wide), (dx, dy, dz), (math.sqrt(max(1.0 - least * least, 0.0)), least)
 
 
-@body
+@device
 def bundle_reaches(bundle, sphere):
     """From which distance on a ray of a bundle, see `bundle_of`, may be in a sphere (centre and radius), or
     FARTHEST where none comes there: a sphere is reached whose centre is no farther from the cone than its
@@ -100,7 +99,7 @@ def bundle_reaches(bundle, sphere):
     return far * (1 - ROUNDING) - radius
 
 
-@body
+@device
 def ray_reaches(rays, r, sphere, begin, end):
     """Whether ray r comes into a sphere (centre and radius) between two distances."""
     x, y, z = sphere[0] - rays.rays_o[r, 0], sphere[1] - rays.rays_o[r, 1], sphere[2] - rays.rays_o[r, 2]
@@ -111,7 +110,7 @@ def ray_reaches(rays, r, sphere, begin, end):
     return passes and middle + sphere[3] >= begin and middle - sphere[3] < end
 
 
-@body
+@device
 def instances_near(rays, instances, chosen, low, high, near, begins):
     """The instances that rays chosen[low:high] may meet into near (B,), unbounded ones first, the others by
     where they may begin, which goes into begins (B,): how many are unbounded, and how many there are."""
@@ -131,7 +130,7 @@ def instances_near(rays, instances, chosen, low, high, near, begins):
     return n_unbounded, count
 
 
-@body
+@device
 def fewer_near(rays, instances, chosen, low, high, near, begins, count, few, few_begin):
     """Those of instances near[:count] that rays chosen[low:high], some of those that they are near to, may
     meet, in the same order, into few (B,) and few_begin (B,): how many."""
@@ -144,7 +143,7 @@ def fewer_near(rays, instances, chosen, low, high, near, begins, count, few, few
     return left
 
 
-@body
+@device
 def sort_by(keys, values, low, high):
     """Order keys[low:high], and values with them, by Shell's method with Ciura's gaps."""
     for gap in (701, 301, 132, 57, 23, 10, 4, 1):
@@ -159,7 +158,7 @@ def sort_by(keys, values, low, high):
 # -- the next segment of a ray -------------------------------------------------------------------------------
 
 
-@body
+@device
 def next_on_ray(rays, instances, b, r, begin, end, gaps):
     """`next_change` of instance b on ray r, for a gap of so many of its steps, and how long a step is."""
     o, d, length = ray_in_instance(instances.world_to_instance, b, rays.rays_o, rays.rays_d, r)
@@ -169,7 +168,7 @@ def next_on_ray(rays, instances, b, r, begin, end, gaps):
     return next_in_box(instances, b, o, d, begin, end, gaps * step), step
 
 
-@body
+@device
 def occupied_from(rays, instances, b, r, begin, end):
     """Where from `begin` on instance b has occupied cells on ray r, or FARTHEST where it has none before the
     end; and how long one of its steps is there."""
@@ -178,7 +177,7 @@ def occupied_from(rays, instances, b, r, begin, end):
     return next_on_ray(rays, instances, b, r, begin, end, ANYWHERE)
 
 
-@body
+@device
 def first_two(rays, instances, r, near, begins, low, high, begin, two):
     """Those two of instances near[low:high], and of `two`, whose occupied cells come first on ray r from
     `begin` on: (where the first begins, where the second does, the first, the second, a step of the first).
@@ -197,7 +196,7 @@ def first_two(rays, instances, r, near, begins, low, high, begin, two):
     return two
 
 
-@body
+@device
 def end_of_meeting(rays, instances, r, two, far):
     """Where the first of two instances whose cells begin close to each other on ray r ends."""
     first, second, b, other, step = two
@@ -206,26 +205,26 @@ def end_of_meeting(rays, instances, r, two, far):
     return min(max(min(one, end), second + GAP * step), far)
 
 
-@body
+@device
 def note_meeting(rays, instances, r, near, begins, count, begin, end, segments):
     """Enter those of instances near[:count] that have occupied cells on ray r between two distances, in
     order."""
-    found, room = 0, segments.meeting.shape[1]
+    n_meeting, room = 0, segments.meeting.shape[1]
     for c in range(count):
         if begins[c] > end:
             break
         at, _ = occupied_from(rays, instances, near[c], r, begin, end)
         if at < end:
-            k = min(found, room - 1)
+            k = min(n_meeting, room - 1)
             while k > 0 and segments.meeting[r, k - 1] > near[c]:
                 segments.meeting[r, k] = segments.meeting[r, k - 1]
                 k -= 1
             segments.meeting[r, k] = near[c]
-            found += 1
-    segments.n_meeting[r] = found
+            n_meeting += 1
+    segments.n_meeting[r] = n_meeting
 
 
-@body
+@device
 def segment_of(rays, instances, r, near, begins, n_unbounded, count, segments):
     """Enter the next segment of ray r, which may meet instances near[:count], n_unbounded of them without
     end."""
@@ -248,7 +247,7 @@ def segment_of(rays, instances, r, near, begins, n_unbounded, count, segments):
             note_meeting(rays, instances, r, near, begins, count, begin, segments.end[r], segments)
 
 
-@task
+@serial
 def segment_task(rays, instances, chosen, low, high, near, begins, few, few_begin, segments):
     """`next_segments` of rays chosen[low:high]; near, begins, few and few_begin (B,) are room."""
     n_unbounded, count = instances_near(rays, instances, chosen, low, high, near, begins)
@@ -293,11 +292,11 @@ def next_in_either(instances, b, o, d, t, end, gap):
 
 def next_in_any(changes, tag, compiled):
     """`next_change` of instances in several spaces, by that of each, as `compiled` makes functions."""
-    found = changes[-1]
+    change = changes[-1]
     for number in range(len(changes) - 2, -1, -1):
-        names = {"next_in_this": changes[number], "next_in_others": found, "NUMBER": number}
-        found = compiled(rebound(next_in_either, names, f"{tag}_{number}"))
-    return found
+        names = {"next_in_this": changes[number], "next_in_others": change, "NUMBER": number}
+        change = compiled(rebound(next_in_either, names, f"{tag}_{number}"))
+    return change
 
 
 @cache
@@ -307,18 +306,20 @@ def segments_loop_in(spaces: tuple[ModuleType, ...]):
         return segments_loop
     loops = [loops_for(None, (), space) for space in spaces]
     tag = "_".join(each.tag for each in loops)
-    names = globals() | {"next_in_space": next_in_any([one.names["next_change"] for one in loops], tag, task)}
+    names = globals() | {
+        "next_in_space": next_in_any([one.names["next_change"] for one in loops], tag, serial)
+    }
     for function in (next_on_ray, occupied_from, first_two, end_of_meeting, note_meeting, segment_of):
         name = function.py_func.__name__
         names[name] = inlined(rebound(function.py_func, names, tag))
-    names["segment_task"] = task(rebound(segment_task.py_func, names, tag))
+    names["segment_task"] = serial(rebound(segment_task.py_func, names, tag))
     return loop(rebound(segments_loop.py_func, names, tag))
 
 
 # -- slots and rays ------------------------------------------------------------------------------------------
 
 
-@task
+@serial
 def sort_slots(chosen, instance, field_of, ends, order):
     """Slots chosen (M,) into order (M,) by the fields of instance (S,): SHARED ones up to ends[0], then those
     of field f up to ends[1 + f], where instance b has field field_of[b]. DONE ones are left out."""
@@ -338,7 +339,7 @@ def sort_slots(chosen, instance, field_of, ends, order):
             ends[f] += 1
 
 
-@body
+@device
 def goes_on(r, rays, segments, rendered, early_stop):
     """Whether ray r goes on behind its segment. One whose segment has no length does not: it would never come
     any farther."""
@@ -352,7 +353,7 @@ def rays_left(chosen, rays, segments, rendered, early_stop):
     return left[: rays_left_task(chosen, rays, segments, rendered, early_stop, left)]
 
 
-@task
+@serial
 def rays_left_task(chosen, rays, segments, rendered, early_stop, left):
     """`rays_left` into left (M,): how many."""
     count = 0
@@ -366,7 +367,7 @@ def rays_left_task(chosen, rays, segments, rendered, early_stop, left):
 # -- samples of several instances ----------------------------------------------------------------------------
 
 
-@body
+@device
 def sample_at(traces, s, t, end):
     """The sample of slot s that stands at t, or comes next: (whether there is one that was taken before the
     end, whether it stands at t, its density)."""
@@ -379,7 +380,7 @@ def sample_at(traces, s, t, end):
     return True, traces.low[s, q] <= t, traces.depth[s, q] / (traces.high[s, q] - traces.low[s, q])
 
 
-@body
+@device
 def group_at(traces, group, adds, s, behind, t, end):
     """The group of slots that begins with slot s: (the first slot of the next one, the group's density at t,
     its densest slot there or -1, where one of its samples begins or ends next)."""
@@ -397,7 +398,7 @@ def group_at(traces, group, adds, s, behind, t, end):
     return s, total if adds[g] else densest, winner, following
 
 
-@body
+@device
 def share_out(traces, group, adds, s, behind, t, end, weight):
     """Give a weight to what stands at t of the group that begins with slot s: to its densest sample, or,
     where it adds them up, to all by their densities; returns the first slot of the next group."""
@@ -412,7 +413,7 @@ def share_out(traces, group, adds, s, behind, t, end, weight):
     return following
 
 
-@body
+@device
 def merge_ray(traces, group, adds, all_add, s0, s1, r, early_stop, segment_end, out):
     """`merge_samples` of slots s0 to s1 of ray r."""
     trans, depth, t, end = 1.0 - out[r, 3], 0.0, -FARTHEST, FARTHEST
@@ -445,7 +446,7 @@ def merge_ray(traces, group, adds, all_add, s0, s1, r, early_stop, segment_end, 
     out[r, 4] += depth
 
 
-@task
+@serial
 def merge_task(shared, start, low, high, early_stop, groups, traces, segment_end, out):
     """`merge_samples` for rays shared[low:high]."""
     for m in range(low, high):
@@ -473,12 +474,12 @@ def add_colours(shared, start, traces, out):
                 out[shared[m], c] += traces.rgb[s, c]
 
 
-@task
-def points_in_sphere(points, sphere, found):
-    """The numbers of points (N, 3) in a sphere into found (N,): how many."""
+@serial
+def points_in_sphere(points, sphere, inside):
+    """The numbers of points (N, 3) in a sphere into inside (N,): how many."""
     count = 0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] - sphere[0], points[i, 1] - sphere[1], points[i, 2] - sphere[2]
-        found[count] = i
+        inside[count] = i
         count += 1 if x * x + y * y + z * z <= sphere[3] * sphere[3] else 0
     return count

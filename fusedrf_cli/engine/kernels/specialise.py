@@ -13,24 +13,24 @@ from types import FunctionType, ModuleType
 
 from numba import get_num_threads, njit
 
-from fusedrf_cli.engine.kernels import instances, light, loops, parts
-from fusedrf_cli.engine.kernels.plain import FLAGS, loop, task
+from fusedrf_cli.engine.kernels import instances, light, loops, primitives
+from fusedrf_cli.engine.kernels.field_free import FLAGS, loop, serial
 
-ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": task, "sweep_task": task}
-body = njit(**FLAGS, forceinline=True, _nrt=False)
+ROLES = {"each": loop, "sweep": loop, "march": loop, "each_task": serial, "sweep_task": serial}
+inlined = njit(**FLAGS, forceinline=True, _nrt=False)
 
 
 class Loops:
     """The CPU's loops for the fields of a kind that share some sizes."""
 
-    def __init__(self, bodies: ModuleType | None, sizes: dict[str, int], space: ModuleType):
+    def __init__(self, device_module: ModuleType | None, sizes: dict[str, int], space: ModuleType):
         """bodies are the kind's scalar functions; None: there is no field, only the space to march in."""
-        self.tag, self.names = specialised(bodies, sizes, space)
+        self.tag, self.names = specialised(device_module, sizes, space)
         self.runs: dict[tuple[str, str], FunctionType] = {}
 
-    def each(self, item: str, field, grid, asked, count: int, out, per_task: int = loops.POINTS_PER_TASK):
+    def each(self, item: str, field, grid, query, count: int, out, per_task: int = loops.POINTS_PER_TASK):
         """An item of work, a function of loops.py or of the kind, for each i < count, which fills `out`."""
-        self._over("each", item)(field, grid, asked, count, per_task, get_num_threads(), out)
+        self._over("each", item)(field, grid, query, count, per_task, get_num_threads(), out)
 
     def sweep(self, item: str, field, grid, batch, count: int, most: int, grads, loss):
         """An item of work of at most so many samples for each i < count, which adds to the rows of grads
@@ -53,30 +53,38 @@ class Loops:
 
 
 @cache
-def loops_for(bodies: ModuleType | None, sizes: tuple[tuple[str, int], ...], space: ModuleType) -> Loops:
+def loops_for(
+    device_module: ModuleType | None, sizes: tuple[tuple[str, int], ...], space: ModuleType
+) -> Loops:
     """The loops of a kind for some sizes, made once."""
-    return Loops(bodies, dict(sizes), space)
+    return Loops(device_module, dict(sizes), space)
 
 
-def specialised(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleType) -> tuple[str, dict]:
+def specialised(
+    device_module: ModuleType | None, sizes: dict[str, int], space: ModuleType
+) -> tuple[str, dict]:
     """A name for the combination, and its namespace of compiled functions."""
-    names, functions = namespace(bodies, space)
-    if getattr(space, "CURVED", False) and names["advance"] is not loops.advance:
-        raise ValueError(f"{bodies.__name__} follows straight rays, which {space.__name__} has none of")
+    names, functions = namespace(device_module, space)
+    if getattr(space, "CURVED", False) and names["next_index"] is not loops.next_index:
+        raise ValueError(
+            f"{device_module.__name__} follows straight rays, which {space.__name__} has none of"
+        )
     names |= sizes
-    tag = combination(bodies, sizes, space, names)
+    tag = combination(device_module, sizes, space, names)
     for name, function in functions.items():
-        names[name] = ROLES.get(name, body)(rebound(function, names, tag))
+        names[name] = ROLES.get(name, inlined)(rebound(function, names, tag))
     return tag, names
 
 
-def namespace(bodies: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
+def namespace(device_module: ModuleType | None, space: ModuleType) -> tuple[dict, dict[str, FunctionType]]:
     """What the names mean before anything is compiled, and which of them are plain functions to compile."""
-    modules = [loops, instances, light, *bases_of(space), space, *([bodies] if bodies else ())]
-    names = {name: value for module in (parts, *modules) for name, value in vars(module).items()}
-    own = {module.__name__ for module in modules}
-    found = {n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in own}
-    return names, found | getattr(bodies, "functions", {})
+    modules = [loops, instances, light, *bases_of(space), space, *([device_module] if device_module else ())]
+    names = {name: value for module in (primitives, *modules) for name, value in vars(module).items()}
+    module_names = {module.__name__ for module in modules}
+    functions = {
+        n: f for n, f in names.items() if isinstance(f, FunctionType) and f.__module__ in module_names
+    }
+    return names, functions | getattr(device_module, "functions", {})
 
 
 def bases_of(space: ModuleType) -> list[ModuleType]:
@@ -89,20 +97,22 @@ def rebound(function: FunctionType, names: dict, tag: str) -> FunctionType:
     """The same code over another namespace. Compiled code is kept by qualified name and types of arguments,
     so that the name must tell combinations apart: with one name for two, the second would load the machine
     code of the first."""
-    own = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
-    own.__qualname__ = f"{function.__name__}_{tag}"
-    own.__module__ = function.__module__
-    return own
+    copy = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
+    copy.__qualname__ = f"{function.__name__}_{tag}"
+    copy.__module__ = function.__module__
+    return copy
 
 
-def combination(bodies: ModuleType | None, sizes: dict[str, int], space: ModuleType, names: dict) -> str:
+def combination(
+    device_module: ModuleType | None, sizes: dict[str, int], space: ModuleType, names: dict
+) -> str:
     """A name of its own for a kind's module, sizes and space, and for the text of all files that their
     functions come from: numba looks for changes only in the file of the loop, not of what it inlines."""
     files = {getattr(f, "py_func", f).__code__.co_filename for f in names.values() if is_compilable(f)}
-    said = [bodies.__name__ if bodies else "", space.__name__, repr(sorted(sizes.items()))]
-    said += [text_digest(file) for file in sorted(files)]
-    kind = bodies.__name__.split(".")[-2] if bodies and "." in bodies.__name__ else "any"
-    return f"{kind}_{hashlib.sha256(' '.join(said).encode()).hexdigest()[:16]}"
+    text = [device_module.__name__ if device_module else "", space.__name__, repr(sorted(sizes.items()))]
+    text += [text_digest(file) for file in sorted(files)]
+    kind = device_module.__name__.split(".")[-2] if device_module and "." in device_module.__name__ else "any"
+    return f"{kind}_{hashlib.sha256(' '.join(text).encode()).hexdigest()[:16]}"
 
 
 def is_compilable(value: object) -> bool:

@@ -8,23 +8,23 @@ from functools import cached_property
 from itertools import product
 
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.detail import Detail, extent
+from fusedrf_cli.engine.composition.resolution_report import ResolutionReport, extent
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField
 from fusedrf_cli.engine.fields.occupancy import squeezed
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.kind import Kind
-from fusedrf_cli.engine.kinds.ladders import Ladder, Rung, shrinking
-from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.student import (
-    Made,
-    MadeStudent,
-    Needs,
-    StudentRequest,
-    Suits,
+from fusedrf_cli.engine.kinds.builder import (
+    BuildRequest,
+    Candidate,
+    DirectBuilder,
+    MemoryEstimate,
+    StorageSetting,
+    Suitability,
     TooSmall,
-    Way,
 )
+from fusedrf_cli.engine.kinds.kind import Kind
+from fusedrf_cli.engine.kinds.reduction import Reduction
+from fusedrf_cli.engine.kinds.sweeps import Sweep, SweepPoint, shrinking
 from fusedrf_cli.engine.settings import current
 
 
@@ -59,44 +59,46 @@ class InstancesKind(Kind):
     takes = frozenset({"ranks", "sh_degree"})
     precisions = ("int4", "int8", "float16")
 
-    def suits(self, scene: ComposedField) -> Suits:
+    def suits(self, scene: ComposedField) -> Suitability:
         """Nothing is nearer to a scene, in far less time (decision 024)."""
-        return Suits(2.0, "every source stays a field of its own, in its own axes")
+        return Suitability(2.0, "every source stays a field of its own, in its own axes")
 
-    def student(self, scene: ComposedField, request: StudentRequest) -> "InstancesStudent":
+    def builder(self, scene: ComposedField, request: BuildRequest) -> "InstancesBuilder":
         """Instances of a scene."""
-        return InstancesStudent(self, scene, request)
+        return InstancesBuilder(self, scene, request)
 
     def describe(self, field: ComposedField) -> dict:
         """What each field says of itself."""
         fields = [opened(one) for one in distinct_fields(field)]
         return {"fields": [{"kind": one.kind, **registry.kind(one.kind).describe(one)} for one in fields]}
 
-    def details(self, scene: ComposedField, field: ComposedField) -> list[Detail]:
+    def resolution_reports(self, scene: ComposedField, field: ComposedField) -> list[ResolutionReport]:
         """Instance by instance; a stretch of density is kept."""
         return [
-            Detail(p.name, p.condition, 0.0, p.voxel_size, q.voxel_size, extent(p) / q.voxel_size)
+            ResolutionReport(p.name, p.condition, 0.0, p.voxel_size, q.voxel_size, extent(p) / q.voxel_size)
             for p, q in zip(scene.leaves(), field.leaves(), strict=True)
         ]
 
-    def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
+    def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
         """What is only made smaller, and what is finished."""
         config = current(InstancesConfig)
-        plain = [Rung(p, r, rgb=False) for r, p in product(config.ladder_ranks, config.ladder_precisions)]
-        finished = [Rung(p, r) for r, p in product(config.ladder_ranks, config.ladder_finished)]
+        plain = [
+            SweepPoint(p, r, rgb=False) for r, p in product(config.ladder_ranks, config.ladder_precisions)
+        ]
+        finished = [SweepPoint(p, r) for r, p in product(config.ladder_ranks, config.ladder_finished)]
         groups = {self.name: plain, f"{self.name}, finished": finished}
-        return {name: [shrinking(rung, least_psnr) for rung in rungs] for name, rungs in groups.items()}
+        return {name: [shrinking(point, least_psnr) for point in rungs] for name, rungs in groups.items()}
 
 
-class InstancesStudent(MadeStudent):
+class InstancesBuilder(DirectBuilder):
     """The fields of a scene, made smaller by one common voxel until they fit."""
 
-    lesson = None
+    distil_config = None
     gain = 5.0  # dB, the most that was seen
     ranks: Sequence[tuple[int, int] | None] = InstancesConfig.ranks
     """That are compared where none are asked for."""
 
-    def __init__(self, kind: InstancesKind, scene: ComposedField, request: StudentRequest):
+    def __init__(self, kind: InstancesKind, scene: ComposedField, request: BuildRequest):
         super().__init__(kind, scene, request)
         self.fields = distinct_fields(scene)
         self.placed = [[p for p in scene.leaves() if p.field is field] for field in self.fields]
@@ -106,40 +108,40 @@ class InstancesStudent(MadeStudent):
         self.outlines = [kind.outline(opened(field)) for kind, field in pairs]
         self._exactly: dict[tuple[int, str], int] = {}
 
-    def ways(self) -> list[list[Way]]:
+    def storage_settings(self) -> list[list[StorageSetting]]:
         """By precision, and ranks, where any of the fields has such."""
         request = self.request
         precisions = (request.precision,) if request.precision else self.kind.precisions
         ranked = any("ranks" in kind.reduces for kind in self.kinds)
         ranks = (request.ranks,) if request.ranks or not ranked else self.ranks
-        return [[Way(p, r, request.sh_degree) for r in ranks] for p in precisions]
+        return [[StorageSetting(p, r, request.sh_degree) for r in ranks] for p in precisions]
 
-    def unchanged(self) -> Made | None:
+    def unchanged(self) -> Candidate | None:
         """See MadeStudent: with the bytes of the sources."""
         request, size = self.request, self.bytes_as_they_are
         if request.precision or request.ranks or request.sh_degree is not None or request.target is not None:
             return None
-        return Made(self.scene, size, True, True) if size is not None and size <= request.limit else None
+        return Candidate(self.scene, size, True, True) if size is not None and size <= request.limit else None
 
-    def made(self, way: Way, limit: int) -> Made | None:
+    def build(self, storage: StorageSetting, limit: int) -> Candidate | None:
         """The fields, as far as the limit and the way need it with fewer numbers. One whose own bytes are no
         more than those of its numbers in the way's precision keeps them."""
-        reductions, size = self.fitting(way, limit)
+        reductions, size = self.fitting(storage, limit)
         if size > limit:
             return None
         lossless = all(one.lossless for one in reductions)
-        if lossless and way == Way(self.kind.faithful) and self.fits_as_it_is(limit):
-            return Made(self.scene, self.bytes_as_they_are, True, True)
+        if lossless and storage == StorageSetting(self.kind.faithful) and self.fits_as_it_is(limit):
+            return Candidate(self.scene, self.bytes_as_they_are, True, True)
         by_field = {id(f): i for i, f in enumerate(self.fields)}
 
         def smaller(field: RadianceField) -> RadianceField:
             i = by_field[id(field)]
-            if self.keeps_bytes(i, reductions[i], way):
+            if self.keeps_bytes(i, reductions[i], storage):
                 return field
             return reductions[i].make(opened(field).to("cpu"))
 
         try:
-            return Made(self.scene.with_fields(smaller), size, lossless, lossless)
+            return Candidate(self.scene.with_fields(smaller), size, lossless, lossless)
         except TooSmall:
             return None
 
@@ -156,30 +158,32 @@ class InstancesStudent(MadeStudent):
 
     # -- bytes -----------------------------------------------------------------------------------------------
 
-    def keeps_bytes(self, i: int, reduction: Reduction, way: Way) -> bool:
+    def keeps_bytes(self, i: int, reduction: Reduction, storage: StorageSetting) -> bool:
         """Whether the i-th field stays as its source has it."""
         own = self.request.stored_bytes.get(id(self.fields[i]))
         free = reduction.lossless and self.request.precision is None and own is not None
-        return free and own <= self.bytes_at(i, reduction, way)
+        return free and own <= self.bytes_at(i, reduction, storage)
 
-    def bytes_at(self, i: int, reduction: Reduction, way: Way) -> int:
+    def bytes_at(self, i: int, reduction: Reduction, storage: StorageSetting) -> int:
         """At most so many bytes for the numbers of the i-th field in a way's precision."""
         if reduction.contents is not None:
-            return self.request.sizes.of(reduction.contents, way.precision)
-        key = i, way.precision
+            return self.request.sizes.of(reduction.contents, storage.precision)
+        key = i, storage.precision
         if key not in self._exactly:
-            self._exactly[key] = self.request.sizes.exactly(opened(self.fields[i]).to("cpu"), way.precision)
+            self._exactly[key] = self.request.sizes.exactly(
+                opened(self.fields[i]).to("cpu"), storage.precision
+            )
         return self._exactly[key]
 
-    def bytes_with(self, reductions: Sequence[Reduction], way: Way) -> int:
+    def bytes_with(self, reductions: Sequence[Reduction], storage: StorageSetting) -> int:
         """At most so many bytes of the file."""
         total = self.request.overhead
         for i, one in enumerate(reductions):
-            kept = self.keeps_bytes(i, one, way)
-            total += self.request.stored_bytes[id(self.fields[i])] if kept else self.bytes_at(i, one, way)
+            kept = self.keeps_bytes(i, one, storage)
+            total += self.request.stored_bytes[id(self.fields[i])] if kept else self.bytes_at(i, one, storage)
         return total
 
-    def bytes_of(self, field: ComposedField, way: Way) -> int:
+    def bytes_of(self, field: ComposedField, storage: StorageSetting) -> int:
         """See Student."""
         total = self.request.overhead
         for source, one in zip(self.fields, distinct_fields(field), strict=True):
@@ -187,24 +191,26 @@ class InstancesStudent(MadeStudent):
                 total += self.request.stored_bytes[id(source)]
             else:
                 kind = registry.kind(one.kind)
-                reduction = kind.reduction(kind.outline(one), 0.0, Way(way.precision))
+                reduction = kind.reduction(kind.outline(one), 0.0, StorageSetting(storage.precision))
                 sizes, contents = self.request.sizes, reduction.contents
                 known = contents is not None
-                total += sizes.of(contents, way.precision) if known else sizes.exactly(one, way.precision)
+                total += (
+                    sizes.of(contents, storage.precision) if known else sizes.exactly(one, storage.precision)
+                )
         return total
 
-    def fitting(self, way: Way, limit: int) -> tuple[list[Reduction], int]:
+    def fitting(self, storage: StorageSetting, limit: int) -> tuple[list[Reduction], int]:
         """The fields at their own resolution, or at that of the finest common voxel, in the scene's frame, at
         which they fit in so many bytes, as far as that goes; and how many they take."""
 
         config = current(InstancesConfig)
 
         def at_voxel(voxel: float) -> tuple[list[Reduction], int]:
-            found = [
-                kind.reduction(outline, voxel / stretch, way)
+            fields = [
+                kind.reduction(outline, voxel / stretch, storage)
                 for kind, outline, stretch in zip(self.kinds, self.outlines, self.stretches, strict=True)
             ]
-            return found, self.bytes_with(found, way)
+            return fields, self.bytes_with(fields, storage)
 
         best = at_voxel(0.0)
         if best[1] <= limit:
@@ -215,9 +221,9 @@ class InstancesStudent(MadeStudent):
         best = at_voxel(coarse)
         while coarse > config.tolerance * fine and best[1] <= limit:
             middle = (fine * coarse) ** 0.5
-            found = at_voxel(middle)
-            if found[1] <= limit:
-                best, coarse = found, middle
+            fields = at_voxel(middle)
+            if fields[1] <= limit:
+                best, coarse = fields, middle
             else:
                 fine = middle
         return best
@@ -229,7 +235,7 @@ class InstancesStudent(MadeStudent):
 
     def smallest(self) -> int:
         """See MadeStudent."""
-        return min(self.fitting(way, 1)[1] for group in self.ways() for way in group)
+        return min(self.fitting(storage, 1)[1] for group in self.storage_settings() for storage in group)
 
     # -- telling ---------------------------------------------------------------------------------------------
 
@@ -237,12 +243,14 @@ class InstancesStudent(MadeStudent):
         """How many nodes over how many fields."""
         return f"{len(field.leaves())} nodes over {len(self.fields)} fields, each in its own axes"
 
-    def needs(self) -> Needs:
+    def needs(self) -> MemoryEstimate:
         """The sources' numbers as far as the limit lets them."""
         request, per_number = self.request, self.request.sizes.per_number
         own = sum(request.source_bytes) // FLOAT
         cheapest = request.precision or self.kind.precisions[0]
-        return Needs(min(own, int(request.limit / per_number(cheapest))), current(InstancesConfig).copies)
+        return MemoryEstimate(
+            min(own, int(request.limit / per_number(cheapest))), current(InstancesConfig).copies
+        )
 
 
 def distinct_fields(scene: ComposedField) -> list[StoredField]:

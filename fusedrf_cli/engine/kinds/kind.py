@@ -11,16 +11,24 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.composition.detail import Detail, details_at_voxel
-from fusedrf_cli.engine.fields.base import FieldNeeds, RadianceField, StoredField
+from fusedrf_cli.engine.composition.resolution_report import ResolutionReport, resolution_at_voxel
+from fusedrf_cli.engine.fields.base import FieldMemory, RadianceField, StoredField
 from fusedrf_cli.engine.fields.box import BoxField
 from fusedrf_cli.engine.fields.computed import ComputedField, Reads
 from fusedrf_cli.engine.fields.occupancy import texels
-from fusedrf_cli.engine.kinds import splitting
-from fusedrf_cli.engine.kinds.ladders import Ladder, by_sizes
+from fusedrf_cli.engine.kinds import field_cutting
+from fusedrf_cli.engine.kinds.builder import (
+    BuildRequest,
+    DistilledBuilder,
+    Plan,
+    Section,
+    StorageSetting,
+    Suitability,
+    finest_within,
+)
+from fusedrf_cli.engine.kinds.field_cutting import Holds
 from fusedrf_cli.engine.kinds.reduction import Reduction
-from fusedrf_cli.engine.kinds.splitting import Holds
-from fusedrf_cli.engine.kinds.student import Plan, Section, Student, StudentRequest, Suits, Way, finest_within
+from fusedrf_cli.engine.kinds.sweeps import Sweep, by_sizes
 from fusedrf_cli.engine.selection.cells import Selection
 
 
@@ -40,9 +48,9 @@ class Kind:
     reduces: frozenset[str] = frozenset()
     """Which of them `reduction` heeds."""
     hashes = False
-    """Whether its fields may have a hashed detail (`Way.hashed`)."""
-    takes_over = False
-    """Whether a student may start as the scene's background (`taken_over`)."""
+    """Whether its fields may have a hashed detail (`StorageSetting.hashed`)."""
+    warm_starts = False
+    """Whether a student may start as the scene's background (`warm_start`)."""
     beside_background = True
     """Whether a field of it is learnt beside the background of a captured unbounded scene, which stays as it
     is."""
@@ -55,7 +63,7 @@ class Kind:
 
     # -- making ----------------------------------------------------------------------------------------------
 
-    def sections(self, way: Way, resolution: tuple[int, int, int]) -> Sequence[Section]:
+    def sections(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> Sequence[Section]:
         """The arrays of numbers that a field of a resolution (texels per axis) is stored with."""
         raise NotImplementedError
 
@@ -63,51 +71,62 @@ class Kind:
         """An untrained field as planned, whose occupancy is full."""
         raise NotImplementedError
 
-    def numbers(self, way: Way, resolution: tuple[int, int, int]) -> int:
+    def numbers(self, storage: StorageSetting, resolution: tuple[int, int, int]) -> int:
         """Floats of such a field in memory."""
-        return sum(int(np.prod(section.shape)) for section in self.sections(way, resolution))
+        return sum(int(np.prod(section.shape)) for section in self.sections(storage, resolution))
 
-    def plan(self, box: np.ndarray, finest: float, way: Way, most: int) -> Plan:
+    def plan(self, box: np.ndarray, finest: float, storage: StorageSetting, most: int) -> Plan:
         """The finest field over a box (6,) with voxels no finer than `finest` and at most so many numbers."""
-        return self.plan_at(box, finest_within(box, finest, lambda r: self.numbers(way, r), most), way, most)
+        return self.plan_at(
+            box, finest_within(box, finest, lambda r: self.numbers(storage, r), most), storage, most
+        )
 
     def plan_at(
-        self, box: np.ndarray, resolution: tuple[int, int, int], way: Way, allowed: int | None = None
+        self,
+        box: np.ndarray,
+        resolution: tuple[int, int, int],
+        storage: StorageSetting,
+        allowed: int | None = None,
     ) -> Plan:
         """A field over a box (6,) at a resolution."""
-        numbers = self.numbers(way, resolution)
+        numbers = self.numbers(storage, resolution)
         return Plan(
-            way,
+            storage,
             box,
             resolution,
             numbers,
             numbers if allowed is None else allowed,
-            self.sections(way, resolution),
+            self.sections(storage, resolution),
         )
 
-    def untrained(self, box: np.ndarray, longest: int, way: Way) -> Plan:
+    def untrained(self, box: np.ndarray, longest: int, storage: StorageSetting) -> Plan:
         """What a field learnt from photos of a box (6,) is, with so many texels on the longest axis."""
-        return self.plan_at(box, texels(box, longest), way)
+        return self.plan_at(box, texels(box, longest), storage)
 
     def empty(
-        self, teacher: RadianceField, way: Way, most: int, generator: torch.Generator, name: str
+        self,
+        teacher: RadianceField,
+        storage: StorageSetting,
+        most: int,
+        generator: torch.Generator,
+        name: str,
     ) -> StoredField:
         """An untrained student of at most so many numbers over a teacher's box, with the teacher's
         occupancy."""
-        plan = self.plan(teacher.occupancy.aabb, teacher.voxel_size, way, most)
+        plan = self.plan(teacher.occupancy.aabb, teacher.voxel_size, storage, most)
         return self.create(plan, generator, name).with_occupancy(teacher.occupancy)
 
     # -- standing for a scene --------------------------------------------------------------------------------
 
-    def suits(self, scene: ComposedField) -> Suits:
+    def suits(self, scene: ComposedField) -> Suitability:
         """Whether it can hold a scene, and how well."""
-        return Suits(0.0, f"a field of kind '{self.name}' learns whatever a scene shows")
+        return Suitability(0.0, f"a field of kind '{self.name}' learns whatever a scene shows")
 
-    def student(self, scene: ComposedField, request: StudentRequest) -> Student:
+    def builder(self, scene: ComposedField, request: BuildRequest) -> DistilledBuilder:
         """Its stand for a scene that it suits."""
-        return Student(self, scene, request)
+        return DistilledBuilder(self, scene, request)
 
-    def taken_over(
+    def warm_start(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator
     ) -> StoredField | None:
         """A student that starts as a placed field; None where that cannot be."""
@@ -123,7 +142,7 @@ class Kind:
         """A field without its numbers, as far as that goes: what `reduction` needs of it."""
         return field.with_params(field.params.new_zeros(0)) if isinstance(field, ComputedField) else field
 
-    def reduction(self, outline: StoredField, voxel: float, way: Way) -> Reduction:
+    def reduction(self, outline: StoredField, voxel: float, storage: StorageSetting) -> Reduction:
         """The same field with texels no finer than `voxel`, in the field's coordinates, and at most the ranks
         and SH degree of a way; of a kind that has no such, the field as it is."""
         return Reduction(None, lambda field: field, True)
@@ -134,16 +153,18 @@ class Kind:
         """What a report says of a field's size and make."""
         return {"resolution": [int(n) for n in field.resolution]}
 
-    def details(self, scene: ComposedField, field: StoredField) -> list[Detail]:
+    def resolution_reports(self, scene: ComposedField, field: StoredField) -> list[ResolutionReport]:
         """What a field holds of the objects placed in a scene."""
-        return details_at_voxel(scene.placed, field.voxel_size)
+        return resolution_at_voxel(scene.placed, field.voxel_size)
 
-    def field_needs(self, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+    def field_memory(
+        self, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads
+    ) -> FieldMemory:
         """What a stored field of these metadata and shapes of arrays needs of memory; array(name) reads one
         of them. Raises what `from_state` does where they make no field."""
         return self.field.needs(metadata, shapes, array)
 
-    def ladders(self, least_psnr: float) -> dict[str, list[Ladder]]:
+    def sweeps(self, least_psnr: float) -> dict[str, list[Sweep]]:
         """The ways to fuse that are worth charting, in groups that take about as long; those that learn least
         come first."""
         return {self.name: [by_sizes()]}
@@ -154,22 +175,22 @@ class Kind:
         """A selected object as a field in the frame of the field, with the numbers that it has there; None
         where there is nothing of it. The selection may be one in a scene that places the field
         (`Selection.seen_from`). Raises ValueError where the kind cannot be taken apart."""
-        return splitting.cut_out(self.on_one_grid(field), field.box, selection)
+        return field_cutting.cut_out(self.on_one_grid(field), field.box, selection)
 
     def cut_away(self, field: StoredField, selection: Selection) -> StoredField | None:
         """A field without a selected object, with its numbers: itself where it has nothing of it, None where
         nothing is left. Raises ValueError as `cut_out`."""
-        return splitting.cut_away(self.on_one_grid(field), selection)
+        return field_cutting.cut_away(self.on_one_grid(field), selection)
 
     def cropped(self, field: StoredField, holds: Holds) -> StoredField | None:
         """What of a field lies in cells that lie wholly where `holds` says so, with the numbers that it has;
         None where there is nothing. Raises ValueError as `cut_out`."""
-        return splitting.cropped(self.on_one_grid(field), field.box, holds)
+        return field_cutting.crop_of(self.on_one_grid(field), field.box, holds)
 
     def restricted(self, field: StoredField, holds: Holds) -> StoredField | None:
         """The whole field without those of its cells that do not lie wholly where `holds` says so; None where
         nothing is left. Raises ValueError as `cut_out`."""
-        return splitting.restricted(self.on_one_grid(field), holds)
+        return field_cutting.restricted(self.on_one_grid(field), holds)
 
     def trimmed(self, field: StoredField) -> StoredField:
         """The same field without the numbers that none of its cells asks, where that makes its files

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.kinds.student import Contents
+from fusedrf_cli.engine.kinds.builder import Contents
 
 
 @dataclass(frozen=True)

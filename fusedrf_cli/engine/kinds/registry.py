@@ -40,11 +40,11 @@ def own_kinds() -> dict[str, str]:
 def plugged_in() -> dict[str, EntryPoint]:
     """Names of the kinds of other packages. Where two packages offer the same name the first is taken, and a
     name of our own is never replaced."""
-    found: dict[str, EntryPoint] = {}
+    by_name: dict[str, EntryPoint] = {}
     for point in entry_points(group=GROUP):
         if point.name not in own_kinds():
-            found.setdefault(point.name, point)
-    return found
+            by_name.setdefault(point.name, point)
+    return by_name
 
 
 def names() -> list[str]:
@@ -63,7 +63,7 @@ def kind(name: str) -> "Kind":
         raise UnknownKind(f"unknown kind '{name}'; this version knows {', '.join(names())}")
     package = package_of(name)
     try:
-        found = point.load()
+        loaded = point.load()
     except Exception as error:  # whatever a stranger's module raises, the other kinds work
         raise BrokenKind(
             f"the kind '{name}' of the package '{package}' does not load "
@@ -71,13 +71,13 @@ def kind(name: str) -> "Kind":
         ) from error
     from fusedrf_cli.engine.kinds.kind import Kind
 
-    found = getattr(found, "KIND", found)
-    if not isinstance(found, Kind) or found.name != name:
+    loaded = getattr(loaded, "KIND", loaded)
+    if not isinstance(loaded, Kind) or loaded.name != name:
         raise BrokenKind(
             f"the kind '{name}' of the package '{package}' is no Kind of that name; update or uninstall "
             "that package"
         )
-    return found
+    return loaded
 
 
 def package_of(name: str) -> str:
@@ -90,11 +90,11 @@ def package_of(name: str) -> str:
 
 def kinds() -> "list[Kind]":
     """All kinds that load; a plug-in that does not is left out."""
-    found = []
+    usable = []
     for name in names():
         with contextlib.suppress(BrokenKind):
-            found.append(kind(name))
-    return found
+            usable.append(kind(name))
+    return usable
 
 
 def field_kinds() -> dict[str, type]:

@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from fusedrf_cli.engine.kernels import cpu
-from fusedrf_cli.engine.kernels.parts import NEWTON_NEAR, NEWTON_STEPS
-from fusedrf_cli.engine.kernels.parts import bend as bend_numbers
+from fusedrf_cli.engine.kernels.primitives import NEWTON_NEAR, NEWTON_STEPS
+from fusedrf_cli.engine.kernels.primitives import bend as bend_numbers
 from fusedrf_cli.engine.settings import current
 
 TILE = 16  # pixels along the side of a tile
@@ -150,8 +150,8 @@ def fisheye_directions(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ..
     step = table[1]
     low, high = np.maximum(angle - step, 0), np.minimum(angle + step, table[-1])
     for _ in range(NEWTON_STEPS):
-        found, slope = bend_angle(angle, distortion)
-        following = np.clip(angle - (found - radius) / np.where(slope > 1e-9, slope, 1e-9), low, high)
+        bent, slope = bend_angle(angle, distortion)
+        following = np.clip(angle - (bent - radius) / np.where(slope > 1e-9, slope, 1e-9), low, high)
         if np.abs(following - angle).max(initial=0) < NEWTON_NEAR:
             break
         angle = following

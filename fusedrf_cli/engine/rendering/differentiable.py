@@ -71,30 +71,30 @@ def render_rays(
         field = ComposedField([field])
         poses, origin = shifted(poses, field.origin), field.origin
     rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
-    known, device = structure(field, poses), device_of(field)
-    if per_length is not None and isinstance(field, ComposedField) and known.occupancy.space is bounded:
+    structured, device = structure(field, poses), device_of(field)
+    if per_length is not None and isinstance(field, ComposedField) and structured.occupancy.space is bounded:
         unit = float(np.linalg.norm(field.origin[:3, 0]))
         near, step = near / unit, step and step / unit
-    step = step or sampling_step(known)
+    step = step or sampling_step(structured)
     host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]
     if not needs_gradient(field, rays_o, rays_d, *(poses or {}).values()):
         for part in parts(field):
             settle(part)
-        found = volume.render_rays(known, *host, near=near, step=step, early_stop=early_stop)
-        return in_lengths(torch.from_numpy(found).to(device), per_length)
+        pixels = volume.render_rays(structured, *host, near=near, step=step, early_stop=early_stop)
+        return in_lengths(torch.from_numpy(pixels).to(device), per_length)
     volume.check_directions(host[1])
-    ray, ts, spans = visible_samples(known, *host, near, step, early_stop)
+    ray, ts, spans = visible_samples(structured, *host, near, step, early_stop)
     ray, ts, spans = torch.from_numpy(ray).to(device), exact(ts, device), exact(spans, device)
     rays_o, rays_d = exact(rays_o, device), exact(rays_d, device)
-    if known.occupancy.space is bounded:  # an unbounded one has no first face for a ray to enter by
+    if structured.occupancy.space is bounded:  # an unbounded one has no first face for a ray to enter by
         start, _ = interval(rays_o, rays_d, bounds(field, poses), near)
         ts = ts + (start - start.detach())[ray]
     dirs = rays_d[ray]
     sigma, rgb = query(field, rays_o[ray] + ts[:, None] * dirs, dirs, poses)
     weights = composite(sigma * spans.to(sigma.dtype), ray, len(rays_o))
     columns = torch.cat([rgb, torch.ones_like(sigma)[:, None], ts.to(sigma.dtype)[:, None]], 1)
-    found = sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
-    return in_lengths(found, per_length)
+    pixels = sigma.new_zeros(len(rays_o), 5).index_add(0, ray, weights[:, None] * columns)
+    return in_lengths(pixels, per_length)
 
 
 def seen_from(
@@ -104,20 +104,24 @@ def seen_from(
     (N,) a unit of the world's is there along each; None: as long."""
     if origin is None:
         return points, dirs, None
-    place = exact(origin, points.device)
-    if place.shape == (3,):
-        return exact(points, points.device) - place, dirs, None
-    inverse = torch.linalg.inv(place[:3, :3])
-    ways = exact(dirs, dirs.device) @ inverse.T
-    lengths = ways.norm(dim=1)
-    return (exact(points, points.device) - place[:3, 3]) @ inverse.T, ways / lengths[:, None], lengths
+    frame_origin = exact(origin, points.device)
+    if frame_origin.shape == (3,):
+        return exact(points, points.device) - frame_origin, dirs, None
+    inverse = torch.linalg.inv(frame_origin[:3, :3])
+    directions = exact(dirs, dirs.device) @ inverse.T
+    lengths = directions.norm(dim=1)
+    return (
+        (exact(points, points.device) - frame_origin[:3, 3]) @ inverse.T,
+        directions / lengths[:, None],
+        lengths,
+    )
 
 
-def in_lengths(found: torch.Tensor, per_length: torch.Tensor | None) -> torch.Tensor:
+def in_lengths(columns: torch.Tensor, per_length: torch.Tensor | None) -> torch.Tensor:
     """(N, 5) rays' columns with distances in a unit of which `per_length` (N,) make up one of another."""
     if per_length is None:
-        return found
-    return torch.cat([found[:, :4], found[:, 4:] / per_length[:, None].to(found)], 1)
+        return columns
+    return torch.cat([columns[:, :4], columns[:, 4:] / per_length[:, None].to(columns)], 1)
 
 
 def shifted(poses: Poses | None, origin: np.ndarray) -> dict[str, torch.Tensor]:
@@ -152,15 +156,15 @@ def visible_samples(
         dirs = rays_d[ray[row]]
         points = rays_o[ray[row]] + ts[row, slot, None] * dirs
         sigma = np.zeros(ts.shape)
-        found, _ = query(field, torch.from_numpy(points), torch.from_numpy(dirs), with_colour=False)
-        sigma[row, slot] = found.cpu().numpy()
+        densities, _ = query(field, torch.from_numpy(points), torch.from_numpy(dirs), with_colour=False)
+        sigma[row, slot] = densities.cpu().numpy()
         weights, after = weights_from_depths(sigma * spans, trans[ray])
         before = trans[ray, None] - (np.cumsum(weights, 1) - weights)
-        kept = before[row, slot] > early_stop
+        visible = before[row, slot] > early_stop
         trans[ray] = after
-        rays.append(ray[row[kept]])
-        distances.append(ts[row[kept], slot[kept]])
-        lengths.append(spans[row[kept], slot[kept]])
+        rays.append(ray[row[visible]])
+        distances.append(ts[row[visible], slot[visible]])
+        lengths.append(spans[row[visible], slot[visible]])
     ray, ts, spans = (np.concatenate(column) for column in (rays, distances, lengths))
     order = np.argsort(ray, kind="stable")
     return ray[order], ts[order], spans[order]
@@ -202,7 +206,7 @@ def render_image(
     for origin. Differentiable as that is, and in `pose`."""
     rays_o, rays_d = camera_rays(camera, pose)
     how = {"poses": poses, "origin": origin, "near": near, "step": step, "early_stop": early_stop}
-    found = render_rays(field, rays_o, rays_d, **how).view(camera.height, camera.width, 5)
-    opacity = found[..., 3]
-    depth = torch.where(opacity > 1e-3, found[..., 4] / opacity.clamp_min(1e-3), torch.inf)
-    return Picture(found[..., :3], opacity, depth)
+    columns = render_rays(field, rays_o, rays_d, **how).view(camera.height, camera.width, 5)
+    opacity = columns[..., 3]
+    depth = torch.where(opacity > 1e-3, columns[..., 4] / opacity.clamp_min(1e-3), torch.inf)
+    return Picture(columns[..., :3], opacity, depth)

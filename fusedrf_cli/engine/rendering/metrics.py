@@ -25,15 +25,15 @@ def colour_corrected(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.clip(known @ matrix, 0, 1)
 
 
-def ssim(a: np.ndarray, b: np.ndarray, kept: np.ndarray | None = None) -> float:
+def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Structural similarity (Wang et al. 2004) of two (H, W, 3) pictures, Gaussian window of sigma 1.5, mean
-    over the whole windows, or over those around the pixels that are `kept`, (H, W) bool; NaN where there is
+    over the whole windows, or over those around the pixels that are `mask`, (H, W) bool; NaN where there is
     none, as under 11 pixels."""
     from skimage.metrics import structural_similarity
 
     if min(a.shape[:2]) < SSIM_WINDOW:
         return float("nan")
-    _, found = structural_similarity(
+    _, similarity = structural_similarity(
         a,
         b,
         data_range=1.0,
@@ -43,6 +43,6 @@ def ssim(a: np.ndarray, b: np.ndarray, kept: np.ndarray | None = None) -> float:
         use_sample_covariance=False,
         full=True,
     )
-    whole = (slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2)),) * 2
-    found = found[whole] if kept is None else found[whole][kept[whole]]
-    return float(found.mean(dtype=np.float64)) if found.size else float("nan")
+    valid = (slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2)),) * 2
+    similarity = similarity[valid] if mask is None else similarity[valid][mask[valid]]
+    return float(similarity.mean(dtype=np.float64)) if similarity.size else float("nan")

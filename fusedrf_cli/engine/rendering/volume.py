@@ -134,12 +134,12 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Whether an error says that memory could not be had, here or on a GPU; torch says so by a RuntimeError,
     the GPU's compiler by an error of CUDA's."""
     of_cuda = "CudaAPIError", "CudaDriverError", "CudaRuntimeError"  # numba-cuda, which may not be there
-    said = str(error).lower().replace("_", " ")
+    message = str(error).lower().replace("_", " ")
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError)
-        and ("alloc" in said or "out of memory" in said)
+        and ("alloc" in message or "out of memory" in message)
         or type(error).__name__ in of_cuda
-        and "out of memory" in said
+        and "out of memory" in message
     )
 
 
@@ -163,16 +163,16 @@ def march_rays(
         points = rays_o[ray][:, None] + ts[..., None] * rays_d[ray][:, None]
         dirs = np.broadcast_to(rays_d[ray][:, None], points.shape)
         sigma = np.zeros(ts.shape, np.float32)
-        found, _ = field.query(
+        densities, _ = field.query(
             torch.from_numpy(points[mask]), torch.from_numpy(dirs[mask]), with_colour=False
         )
-        sigma[mask] = found.numpy()
+        sigma[mask] = densities.numpy()
         weights, trans[ray] = weights_from_depths(sigma * spans.astype(np.float32), trans[ray])
         seen = weights > current(RenderConfig).seen_weight
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
-            _, found = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
-            colour[seen] = found.numpy()
+            _, densities = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
+            colour[seen] = densities.numpy()
         total[ray, :3] += (weights[..., None] * colour).sum(1)
         # Along columns, so that every ray is summed in one order however long its wave's longest ray is.
         total[ray, 4] += np.add.reduce(np.asfortranarray(weights * ts), axis=1)
@@ -205,8 +205,8 @@ def waves(
     ts, spans, counts = *np.zeros((2, n, current(RenderConfig).samples_per_wave)), np.zeros(n, np.int64)
     loops = cpu.loops_for(None, (), field.occupancy.space)
     while True:
-        places = ts, spans, counts
-        loops.march(field.occupancy.arrays, rays_o, rays_d, reach, jitter, step, start, alive(), *places)
+        samples = ts, spans, counts
+        loops.march(field.occupancy.arrays, rays_o, rays_d, reach, jitter, step, start, alive(), *samples)
         ray = np.flatnonzero(counts)
         if not len(ray):
             return
@@ -256,10 +256,10 @@ def render_bands(
         order = tile_order(camera.width, min(rows, camera.height - top))
         rays_o, rays_d, per_length = rays_from(origin, camera, slice(top, top + rows), order)
         reach = {"near": near * per_length, "far": far * per_length}
-        found = render_rays(field, rays_o, rays_d, **reach, step=step, early_stop=early_stop)
-        found[:, 4] /= per_length
-        pixels = np.empty_like(found)
-        pixels[order] = found
+        columns = render_rays(field, rays_o, rays_d, **reach, step=step, early_stop=early_stop)
+        columns[:, 4] /= per_length
+        pixels = np.empty_like(columns)
+        pixels[order] = columns
         pixels = pixels.reshape(-1, camera.width, 5)
         opacity = pixels[..., 3]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -270,8 +270,8 @@ def render_bands(
 def rays_from(
     origin: np.ndarray | None, camera: Camera, rows: slice, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-    """`seen_from` of a camera's rays. A frame that is turned and scaled alike along all axes, as a place's
-    is, has a camera of its own: that is one pass over the rays less."""
+    """`seen_from` of a camera's rays. A frame that is turned and scaled alike along all axes, as an unbounded
+    scene's is, has a camera of its own: that is one pass over the rays less."""
     if origin is not None and origin.shape == (4, 4):
         squares = origin[:3, :3].T @ origin[:3, :3]
         if np.allclose(squares, squares[0, 0] * np.eye(3), rtol=0, atol=1e-12 * squares[0, 0]):
@@ -291,6 +291,6 @@ def seen_from(
     if np.array_equal(origin[:3, :3], np.eye(3)):
         return rays_o - origin[:3, 3], rays_d, 1.0
     inverse = np.linalg.inv(origin[:3, :3])
-    ways = rays_d @ inverse.T
-    lengths = np.linalg.norm(ways, axis=1)
-    return (rays_o - origin[:3, 3]) @ inverse.T, ways / lengths[:, None], lengths
+    directions = rays_d @ inverse.T
+    lengths = np.linalg.norm(directions, axis=1)
+    return (rays_o - origin[:3, 3]) @ inverse.T, directions / lengths[:, None], lengths

@@ -22,45 +22,45 @@ class CellConfig:
     fine: int = 192
     """Of a second look at the object's box."""
     dense: float = 0.02
-    """Optical depth along a cell from which it holds matter that shows."""
+    """Optical depth along a cell from which it is occupied that shows."""
     aside: float = 0.05
     """A piece with less than so much of the largest one's weight is not the object's."""
     island: float = 0.05
-    """Of the object's cells: a piece of other matter with fewer, inside of its box and touching nothing
+    """Of the object's cells: a piece of other density with fewer, inside of its box and touching nothing
     outside, cannot stand without it."""
     mixed: int = 2
-    """Cells from other matter up to which a cell may hold some of it."""
+    """Cells from other density up to which a cell may hold some of it."""
     window: int = 4
     """Cells up to which colours are compared."""
     foreign: float = 2.0
-    """How many times farther from the object's colours nearby than from those of other matter a cell's colour
-    is that is not its."""
+    """How many times farther from the object's colours nearby than from those of other density a cell's
+    colour is that is not its."""
     contrast: float = 0.15
     """How far these colours must lie apart, of 1 in each channel."""
     asked_at_once: int = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
-class Lattice:
-    """Cells of a box in the coordinates of a field's space, those of them that the field has matter in."""
+class CellGrid:
+    """Cells of a box in the coordinates of a field's space, those of them that the field has density in."""
 
     field: object
     grid: OccupancyGrid
     """Occupied where the field's own grid is, at the cell's middle."""
 
     @classmethod
-    def over(cls, field, box: np.ndarray, longest: int) -> "Lattice":
+    def over(cls, field, box: np.ndarray, longest: int) -> "CellGrid":
         """At most `longest` cells along the longest side of a box (6,), and no finer than a voxel of the
         field."""
         space, voxel = field.occupancy.space, field.voxel_size
         longest = max(1, min(longest, int(np.ceil((box[3:] - box[:3]).max() / voxel))))
-        whole = OccupancyGrid.full(box, longest, space)
-        held = field.occupancy.contains(whole.centres()).reshape(cell_counts(box, longest))
-        return cls(field, whole.marked(held))
+        full = OccupancyGrid.full(box, longest, space)
+        occupied = field.occupancy.contains(full.centres()).reshape(cell_counts(box, longest))
+        return cls(field, full.marked(occupied))
 
-    def kept(self, cells: np.ndarray) -> "Lattice":
+    def kept(self, cells: np.ndarray) -> "CellGrid":
         """With those of its cells alone, (M,) bool, in order of `index`."""
-        return Lattice(self.field, self.grid.marked(self.spread(cells)))
+        return CellGrid(self.field, self.grid.marked(self.spread(cells)))
 
     @cached_property
     def index(self) -> np.ndarray:
@@ -70,7 +70,7 @@ class Lattice:
     @cached_property
     def points(self) -> np.ndarray:
         """(M, 3) middles of the occupied cells in the field's frame."""
-        return self.grid.space.placed(torch.from_numpy(self.grid.centres())).numpy()
+        return self.grid.space.inv_contract(torch.from_numpy(self.grid.centres())).numpy()
 
     @cached_property
     def widths(self) -> np.ndarray:
@@ -87,26 +87,26 @@ class Lattice:
 
     @cached_property
     def dense(self) -> np.ndarray:
-        """(M,) bool: those with matter that shows."""
+        """(M,) bool: those with density that shows."""
         config = current(CellConfig)
         at = torch.from_numpy(self.points)
         ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-        found = [
+        depths = [
             self.field.query(part, ahead.expand(len(part), 3), False)[0].numpy()
             for part in at.split(config.asked_at_once)
         ]
-        return np.concatenate([*found, np.zeros(0)]) * self.widths > config.dense
+        return np.concatenate([*depths, np.zeros(0)]) * self.widths > config.dense
 
     def colours(self) -> np.ndarray:
         """(M, 3) colours in the middles of the cells, mean of what is seen along the axes."""
         at, total = torch.from_numpy(self.points), 0.0
-        ways = torch.cat([torch.eye(3), -torch.eye(3)]).double()
-        for way in ways:
-            total = total + self.field.query(at, way.expand(len(at), 3))[1].numpy()
-        return total / len(ways)
+        directions = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+        for direction in directions:
+            total = total + self.field.query(at, direction.expand(len(at), 3))[1].numpy()
+        return total / len(directions)
 
     def beside(self, allowed: np.ndarray) -> np.ndarray:
-        """(K,) bool, of allowed cells (M,) with K of them: those next to matter in cells that are not."""
+        """(K,) bool, of allowed cells (M,) with K of them: those next to density in cells that are not."""
         other = self.grid.marked(self.spread(~allowed & self.dense)).dilated().occupied
         return other[self.grid.occupied][allowed]
 
@@ -118,12 +118,12 @@ class Lattice:
     def means(self, values: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """(M, D) the mean of values (M, D) of some cells, (M,) bool, up to `window` cells away; nan where
         there are none."""
-        side, held = 2 * current(CellConfig).window + 1, cells.astype(np.float32)
-        columns = [held, *(values * held[:, None]).T.astype(np.float32)]
+        side, mask = 2 * current(CellConfig).window + 1, cells.astype(np.float32)
+        columns = [mask, *(values * mask[:, None]).T.astype(np.float32)]
         low, high = self.index.min(0), self.index.max(0) + 1
-        whole = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         count, *sums = (
-            uniform_filter(self.spread(column)[whole], side, mode="constant")[tuple((self.index - low).T)]
+            uniform_filter(self.spread(column)[box], side, mode="constant")[tuple((self.index - low).T)]
             for column in columns
         )
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -131,27 +131,27 @@ class Lattice:
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """(X, Y, Z) of what is known of the occupied cells, (M,); 0 elsewhere."""
-        whole = np.zeros(self.grid.occupied.shape, values.dtype)
-        whole[self.grid.occupied] = values
-        return whole
+        grid = np.zeros(self.grid.occupied.shape, values.dtype)
+        grid[self.grid.occupied] = values
+        return grid
 
     def pieces(self, chosen: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """(M,) bool: of chosen cells those of the piece of dense ones with the most weight, and of others
         that are not much lighter, with the chosen cells around them."""
-        found, count = label(self.spread(chosen & self.dense), np.ones((3, 3, 3)))
+        labels, count = label(self.spread(chosen & self.dense), np.ones((3, 3, 3)))
         if not count:
             return chosen
-        sums = np.bincount(found[self.grid.occupied], weights, count + 1)
+        sums = np.bincount(labels[self.grid.occupied], weights, count + 1)
         sums[0] = 0
-        kept = self.grid.marked((sums >= current(CellConfig).aside * sums.max())[found] & (found > 0))
-        return chosen & kept.dilated(2).occupied[self.grid.occupied]
+        large = self.grid.marked((sums >= current(CellConfig).aside * sums.max())[labels] & (labels > 0))
+        return chosen & large.dilated(2).occupied[self.grid.occupied]
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
     """An object in a field: what is cut out."""
 
-    lattice: Lattice
+    lattice: CellGrid
     chosen: np.ndarray
     """(M,) bool: its cells."""
     sure: float = 1.0
@@ -169,7 +169,7 @@ class Selection:
         """(N, 3) points of the coordinates of a space, of the field that is cut, in those of the lattice."""
         if self.is_aligned(space):
             return points
-        at = space.placed(torch.from_numpy(points)).numpy() @ self.object_to_lattice[:3, :3].T
+        at = space.inv_contract(torch.from_numpy(points)).numpy() @ self.object_to_lattice[:3, :3].T
         return mapped(at + self.object_to_lattice[:3, 3], self.lattice.grid.space)
 
     def is_aligned(self, space: ModuleType) -> bool:
@@ -200,37 +200,37 @@ class Selection:
 
     @cached_property
     def other(self) -> OccupancyGrid:
-        """Cells with matter that shows and is not its."""
+        """Cells with density that shows and is not its."""
         return self.lattice.grid.marked(self.lattice.spread(~self.chosen & self.lattice.dense))
 
     def with_islands(self) -> "Selection":
-        """The object with small pieces of other matter that hang in its box."""
-        found, count = label(self.other.occupied, np.ones((3, 3, 3)))
-        sizes = np.bincount(found.ravel(), minlength=count + 1)
+        """The object with small pieces of other density that hang in its box."""
+        labels, count = label(self.other.occupied, np.ones((3, 3, 3)))
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)
         lost = sizes < current(CellConfig).island * (self.chosen & self.lattice.dense).sum()
         lost[0] = False
-        for side in (found[[0, -1]], found[:, [0, -1]], found[:, :, [0, -1]]):
+        for side in (labels[[0, -1]], labels[:, [0, -1]], labels[:, :, [0, -1]]):
             lost[side.ravel()] = False
-        return self.joined(lost[found][self.lattice.grid.occupied])
+        return self.joined(lost[labels][self.lattice.grid.occupied])
 
     def without_foreign(self) -> "Selection":
-        """The object without cells beside other matter that have its colour and not the object's: of what the
-        object touches, a little comes along."""
+        """The object without cells beside other density that have its colour and not the object's: of what
+        the object touches, a little comes along."""
         config = current(CellConfig)
         around = self.lattice.around
-        own, other = self.chosen & self.lattice.dense, ~self.chosen & self.lattice.dense
-        near_own, near_other = around(own, config.mixed), around(other, config.mixed)
-        band = (own & around(other, config.window)) | (other & around(own, config.window))
+        object_cells, other = self.chosen & self.lattice.dense, ~self.chosen & self.lattice.dense
+        near_own, near_other = around(object_cells, config.mixed), around(other, config.mixed)
+        band = (object_cells & around(other, config.window)) | (other & around(object_cells, config.window))
         if not band.any():
             return self
         inner = self.lattice.kept(band)
         colours = inner.colours()
-        means = [inner.means(colours, sure[band]) for sure in (own & ~near_other, other & ~near_own)]
+        means = [inner.means(colours, sure[band]) for sure in (object_cells & ~near_other, other & ~near_own)]
         away = [((colours - mean) ** 2).sum(1) for mean in means]
         differ = ((means[0] - means[1]) ** 2).sum(1) > 3 * config.contrast**2
-        foreign = np.zeros(len(own), bool)
+        foreign = np.zeros(len(object_cells), bool)
         foreign[band] = differ & (away[0] > config.foreign**2 * away[1])
-        return self.without(foreign & own & near_other)
+        return self.without(foreign & object_cells & near_other)
 
     def without(self, cells: np.ndarray) -> "Selection":
         """The object without some cells, (M,) bool, and without small pieces that then lie apart."""
@@ -243,5 +243,5 @@ class Selection:
 
     @property
     def shows(self) -> bool:
-        """Whether any of its cells has matter that shows."""
+        """Whether any of its cells has density that shows."""
         return bool((self.chosen & self.lattice.dense).any())

@@ -103,10 +103,10 @@ class Patch:
         at = (points - self.frame[:3, 3]) @ self.frame[:3, :3]
         column = np.floor(at[:, :2] / self.pitch).astype(int)
         size = np.array(self.filled.shape)
-        held = ((column >= 0) & (column < size)).all(1)
+        inside = ((column >= 0) & (column < size)).all(1)
         column = np.clip(column, 0, size - 1)
         there = binary_dilation(self.filled, iterations=grown) if grown else self.filled
-        return column[:, 0], column[:, 1], at[:, 2], held & there[column[:, 0], column[:, 1]]
+        return column[:, 0], column[:, 1], at[:, 2], inside & there[column[:, 0], column[:, 1]]
 
     def query(
         self, points: torch.Tensor, dirs: torch.Tensor, with_colour: bool = True
@@ -150,15 +150,15 @@ def patches(
     """Surfaces that fill the holes that an object of a box (6,) leaves in `rest`: in what it stood on, by the
     unit vector `up` (3,), and what it leant or hung at; and the share of what it covered there that is a
     hole. All in the frame of `rest`. gone: the object; None: it covered what is in the box."""
-    found, holes, looked = [], 0, 0
-    for way in ways(up):
-        seen = columns(rest, box, way, gone)
-        patch, share = mended(seen)
+    surfaces, holes, looked = [], 0, 0
+    for direction in ways(up):
+        view = columns(rest, box, direction, gone)
+        patch, share = mended(view)
         if patch is not None:
-            found.append(patch)
-            holes += share * seen.covered.sum()
-            looked += int(seen.covered.sum())
-    return found, float(holes / looked) if looked else 0.0
+            surfaces.append(patch)
+            holes += share * view.covered.sum()
+            looked += int(view.covered.sum())
+    return surfaces, float(holes / looked) if looked else 0.0
 
 
 def ways(up: np.ndarray) -> list[np.ndarray]:
@@ -170,13 +170,13 @@ def ways(up: np.ndarray) -> list[np.ndarray]:
 
 
 def columns(
-    rest: RadianceField, box: np.ndarray, way: np.ndarray, gone: RadianceField | None = None
+    rest: RadianceField, box: np.ndarray, direction: np.ndarray, gone: RadianceField | None = None
 ) -> Columns:
     """Look along -way at the back of a box (6,) and at what is beside it."""
     config = current(HoleConfig)
-    first = np.cross(way, np.eye(3)[np.abs(way).argmin()])
+    first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     first /= np.linalg.norm(first)
-    axes = np.stack([first, np.cross(way, first), way], 1)
+    axes = np.stack([first, np.cross(direction, first), direction], 1)
     corners = np.stack(np.meshgrid(*box.reshape(2, 3).T, indexing="ij"), -1).reshape(-1, 3) @ axes
     low, size = corners.min(0), np.ptp(corners, 0)
     beside = config.beside * float(size[:2].max())
@@ -187,61 +187,61 @@ def columns(
     deepest, top = -config.behind * size[2] - 2 * pitch, size[2] * 1.02
     u, v = np.meshgrid(*((np.arange(n) + 0.5) * pitch for n in counts), indexing="ij")
     starts = np.stack([u, v, np.full_like(u, top)], -1).reshape(-1, 3) @ axes.T + frame[:3, 3]
-    down = np.broadcast_to(-way, starts.shape).copy()
+    down = np.broadcast_to(-direction, starts.shape).copy()
     shown = render_rays(rest, starts, down, far=float(top - deepest)).reshape(*counts, 5)
     opacity = shown[..., 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         heights = np.where(opacity > config.shows, top - shown[..., 4] / opacity, np.nan)
         colours = np.where(opacity[..., None] > config.shows, shown[..., :3] / opacity[..., None], 0)
-    seen = Columns(frame, pitch, tuple(size), beside, heights.astype(np.float64), colours, None, None)
-    covered, tops = seen.of_box, np.full(tuple(counts), size[2] / 2)
+    view = Columns(frame, pitch, tuple(size), beside, heights.astype(np.float64), colours, None, None)
+    covered, tops = view.of_box, np.full(tuple(counts), size[2] / 2)
     if gone is not None:
         there = render_rays(gone, starts, down).reshape(*counts, 5)
         covered = covered & (there[..., 3] > config.shows)
         tops[covered] = top - there[covered, 4] / there[covered, 3]
-    return replace(seen, covered=covered, tops=tops)
+    return replace(view, covered=covered, tops=tops)
 
 
-def mended(seen: Columns) -> tuple[Patch | None, float]:
+def mended(view: Columns) -> tuple[Patch | None, float]:
     """The surface that fills the covered columns where none is seen near the plane of what is beside them,
     and their share; None where what is beside lies in no plane near the back of the box, or there is no
     hole."""
     config = current(HoleConfig)
-    plane = plane_of(seen)
+    plane = plane_of(view)
     if plane is None:
         return None, 0.0
-    u, v = np.indices(seen.heights.shape)
+    u, v = np.indices(view.heights.shape)
     level = plane[0] * u + plane[1] * v + plane[2]
-    own = np.abs(np.nan_to_num(seen.heights, nan=np.inf) - level) < config.flat * max(seen.size)
-    hole = seen.covered & ~own
-    share = float(hole.sum() / max(1, seen.covered.sum()))
+    level_columns = np.abs(np.nan_to_num(view.heights, nan=np.inf) - level) < config.flat * max(view.size)
+    hole = view.covered & ~level_columns
+    share = float(hole.sum() / max(1, view.covered.sum()))
     if share < config.least_hole:
         return None, 0.0
     # The rim of a hole is thin, and shows what is behind it.
-    hole = binary_dilation(hole, iterations=2) & seen.of_box
-    own &= ~hole
-    values = np.concatenate([np.where(own, seen.heights - level, 0)[..., None], seen.colours], -1)
-    smooth = membrane(values, own, hole)
+    hole = binary_dilation(hole, iterations=2) & view.of_box
+    level_columns &= ~hole
+    values = np.concatenate([np.where(level_columns, view.heights - level, 0)[..., None], view.colours], -1)
+    smooth = membrane(values, level_columns, hole)
     heights, colours = level + smooth[..., 0], np.clip(smooth[..., 1:], 0, 1)
-    return Patch(seen.frame, seen.pitch, heights, colours, hole), share
+    return Patch(view.frame, view.pitch, heights, colours, hole), share
 
 
-def plane_of(seen: Columns) -> np.ndarray | None:
+def plane_of(view: Columns) -> np.ndarray | None:
     """(3,) a, b, c of the plane a u + b v + c, by columns, in which most surfaces lie that are seen close
     beside the object and do not hide it (RANSAC, Fischler and Bolles 1981); None where too few do."""
     config = current(HoleConfig)
-    near, far = (binary_dilation(seen.covered, iterations=n) for n in config.ring)
+    near, far = (binary_dilation(view.covered, iterations=n) for n in config.ring)
     ring = far & ~near
-    places = np.argwhere(ring & np.isfinite(seen.heights))
-    heights = seen.heights[tuple(places.T)]
-    if len(places) < 3:
+    cells = np.argwhere(ring & np.isfinite(view.heights))
+    heights = view.heights[tuple(cells.T)]
+    if len(cells) < 3:
         return None
-    rows = np.c_[places, np.ones(len(places))]
-    under = np.c_[np.argwhere(seen.covered), np.ones(int(seen.covered.sum()))]
-    tops, flat = seen.tops[seen.covered], config.flat * max(seen.size)
-    g, best = np.random.default_rng(0), np.zeros(len(places), bool)
+    rows = np.c_[cells, np.ones(len(cells))]
+    under = np.c_[np.argwhere(view.covered), np.ones(int(view.covered.sum()))]
+    tops, flat = view.tops[view.covered], config.flat * max(view.size)
+    g, best = np.random.default_rng(0), np.zeros(len(cells), bool)
     for _ in range(config.draws):
-        three = g.choice(len(places), 3, replace=False)
+        three = g.choice(len(cells), 3, replace=False)
         try:
             plane = np.linalg.solve(rows[three], heights[three])
         except np.linalg.LinAlgError:
@@ -254,20 +254,20 @@ def plane_of(seen: Columns) -> np.ndarray | None:
     return np.linalg.lstsq(rows[best], heights[best], rcond=None)[0]
 
 
-def membrane(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def membrane(values: np.ndarray, known: np.ndarray, missing: np.ndarray) -> np.ndarray:
     """(A, B, C) values where they are known, and where they are wanted the solution of Laplace's equation
     between: each cell the mean of those of its four neighbours that are known or wanted."""
-    number = np.full(wanted.shape, -1)
-    number[wanted] = np.arange(wanted.sum())
+    number = np.full(missing.shape, -1)
+    number[missing] = np.arange(missing.sum())
     rows, columns, entries = [], [], []
-    right = np.zeros((int(wanted.sum()), values.shape[-1]))
+    right = np.zeros((int(missing.sum()), values.shape[-1]))
     for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
         beside = np.roll(number, shift, axis)
-        held = np.roll(known, shift, axis)
+        shifted = np.roll(known, shift, axis)
         edge = [slice(None)] * 2
         edge[axis] = 0 if shift == 1 else -1
-        beside[tuple(edge)], held[tuple(edge)] = -1, False
-        to_known, to_wanted = wanted & held, wanted & (beside >= 0)
+        beside[tuple(edge)], shifted[tuple(edge)] = -1, False
+        to_known, to_wanted = missing & shifted, missing & (beside >= 0)
         right[number[to_known]] += np.roll(values, shift, axis)[to_known]
         for here in (number[to_known], number[to_wanted]):
             rows.append(here), columns.append(here), entries.append(np.ones(len(here)))
@@ -278,7 +278,7 @@ def membrane(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.nd
     # A piece without any known neighbour has no solution but the smallest.
     entries = np.concatenate([*entries, np.full(n, 1e-9)])
     matrix = coo_matrix((entries, (rows, columns)), shape=(n, n)).tocsc()
-    found = values.copy()
+    filled = values.copy()
     if n:
-        found[wanted] = np.stack([spsolve(matrix, part) for part in right.T], -1)
-    return found
+        filled[missing] = np.stack([spsolve(matrix, part) for part in right.T], -1)
+    return filled

@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 
 from fusedrf_cli.engine.rendering.cameras import Camera, projected
 from fusedrf_cli.engine.rendering.volume import render_rays
-from fusedrf_cli.engine.selection.cells import Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellGrid, Selection
 from fusedrf_cli.engine.selection.weights import cell_weights
 from fusedrf_cli.engine.settings import current
 
@@ -30,7 +30,7 @@ class VotingConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class MaskedView:
     """A masked picture."""
 
     camera: Camera
@@ -44,12 +44,12 @@ class Look:
 
     def depths(self, of) -> np.ndarray:
         """(H, W) see `depths`."""
-        if not any(known is of for known, _ in self.surfaces):
+        if not any(camera is of for camera, _ in self.surfaces):
             self.surfaces.append((of, depths(of, self.camera)))
-        return next(found for known, found in self.surfaces if known is of)
+        return next(depth for camera, depth in self.surfaces if camera is of)
 
 
-def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
+def chosen_by_masks(lattice: CellGrid, looks: Sequence[MaskedView]) -> Selection:
     """The object that masks show: cells by the majority of votes; those that got none by whether the masks
     leave room for them there and the nearest decided cell is its; smoothed, and in one piece."""
     against, votes = tallied(lattice, looks)
@@ -57,27 +57,27 @@ def chosen_by_masks(lattice: Lattice, looks: Sequence[Look]) -> Selection:
     decided = total > current(VotingConfig).enough
     room, shut = hull(lattice, looks)
     known = decided | shut
-    own = np.where(decided, share > 0.5, False)
-    own |= ~known & room & nearest(lattice, known, own)
-    chosen = lattice.pieces(own, votes)
+    object_cells = np.where(decided, share > 0.5, False)
+    object_cells |= ~known & room & nearest(lattice, known, object_cells)
+    chosen = lattice.pieces(object_cells, votes)
     return Selection(lattice, chosen, agreement(votes, against))
 
 
-def shown_by(field, lattice: Lattice, cameras: Sequence[Camera]) -> np.ndarray:
+def shown_by(field, lattice: CellGrid, cameras: Sequence[Camera]) -> np.ndarray:
     """(M,) how much cameras in the frame see of each cell in a field, which may be the lattice's own without
     something: the largest sum of weights (NeRF, eq. 3) in the cell or one beside it."""
-    found = np.zeros(len(lattice.index))
+    weights = np.zeros(len(lattice.index))
     for camera in cameras:
         rays_o, rays_d = camera.rays()
         met = reaching(lattice, rays_o, rays_d)
         rays_o, rays_d = rays_o[met], rays_d[met]
         half, every = np.full(len(rays_o), 0.5), np.ones(len(rays_o), bool)
         sums = cell_weights(field, rays_o, rays_d, half, every, lattice.grid)
-        found += sums[1][lattice.grid.occupied]
-    return maximum_filter(lattice.spread(found), 3)[lattice.grid.occupied]
+        weights += sums[1][lattice.grid.occupied]
+    return maximum_filter(lattice.spread(weights), 3)[lattice.grid.occupied]
 
 
-def reaching(lattice: Lattice, rays_o: np.ndarray, rays_d: np.ndarray) -> np.ndarray:
+def reaching(lattice: CellGrid, rays_o: np.ndarray, rays_d: np.ndarray) -> np.ndarray:
     """(N,) bool: which rays (N, 3) meet the box around the cells of a lattice."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(corner - rays_o) / rays_d for corner in lattice.bounds])
@@ -86,8 +86,8 @@ def reaching(lattice: Lattice, rays_o: np.ndarray, rays_d: np.ndarray) -> np.nda
 
 def well_shown(selection: Selection, shown: np.ndarray) -> float:
     """How much (`shown_by`, (M,)) cameras see of a cell of a selected object that they see well."""
-    own = shown[selection.chosen & selection.lattice.dense]
-    return float(np.percentile(own, current(VotingConfig).well_seen)) if len(own) else 0.0
+    object_shown = shown[selection.chosen & selection.lattice.dense]
+    return float(np.percentile(object_shown, current(VotingConfig).well_seen)) if len(object_shown) else 0.0
 
 
 def agreement(votes: np.ndarray, against: np.ndarray) -> float:
@@ -97,49 +97,49 @@ def agreement(votes: np.ndarray, against: np.ndarray) -> float:
     return float(np.abs(votes - against).sum() / total) if total else 0.0
 
 
-def tallied(lattice: Lattice, looks: Sequence[Look]) -> np.ndarray:
+def tallied(lattice: CellGrid, looks: Sequence[MaskedView]) -> np.ndarray:
     """(2, M) what the pixels outside and inside of the masks show of each cell: sums of weights (NeRF,
     eq. 3)."""
     config = current(VotingConfig)
-    generator, found = np.random.default_rng(config.seed), 0.0
-    for look in looks:
-        rays_o, rays_d = look.camera.rays()
+    generator, tally = np.random.default_rng(config.seed), 0.0
+    for view in looks:
+        rays_o, rays_d = view.camera.rays()
         jitter, weight = generator.random(len(rays_o)), 1.0
-        asked = reaching(lattice, rays_o, rays_d)
-        if look.counted is not None:
-            asked &= look.counted.ravel()
+        hits = reaching(lattice, rays_o, rays_d)
+        if view.counted is not None:
+            hits &= view.counted.ravel()
             weight = config.pointed
-        rays = rays_o[asked], rays_d[asked], jitter[asked], look.inside.ravel()[asked]
+        rays = rays_o[hits], rays_d[hits], jitter[hits], view.inside.ravel()[hits]
         sums = cell_weights(lattice.field, *rays, lattice.grid)
-        found = found + weight * sums[:, lattice.grid.occupied]
-    return found
+        tally = tally + weight * sums[:, lattice.grid.occupied]
+    return tally
 
 
-def smoothed(lattice: Lattice, against: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def smoothed(lattice: CellGrid, against: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M,) all votes of each cell, and the share of those for it, with those of the cells around it."""
     for_it, not_it = (
         uniform_filter(lattice.spread(sums.astype(np.float32)), 3)[lattice.grid.occupied]
         for sums in (votes, against)
     )
-    own = votes + against
-    share = (votes + for_it) / np.maximum(own + for_it + not_it, 1e-9)
-    return own + for_it + not_it, share
+    total = votes + against
+    share = (votes + for_it) / np.maximum(total + for_it + not_it, 1e-9)
+    return total + for_it + not_it, share
 
 
-def hull(lattice: Lattice, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray]:
+def hull(lattice: CellGrid, looks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
     """(M,) bool: cells that some mask leaves room for and none shuts out; and those that one does, of whose
     picture they lie outside the mask and not hidden behind what it shows."""
     room, shut = np.zeros((2, len(lattice.points)), bool)
-    for look in looks:
-        if look.counted is not None:
+    for view in looks:
+        if view.counted is not None:
             continue
-        pixels, away, shown = projected(look.camera, lattice.points)
+        pixels, away, shown = projected(view.camera, lattice.points)
         row, column = pixels[shown].astype(int).T[::-1]
-        inside = look.inside[row, column]
+        inside = view.inside[row, column]
         room[np.flatnonzero(shown)[inside]] = True
         outside = np.flatnonzero(shown)[~inside]
-        surface = look.depths(lattice.field)[row[~inside], column[~inside]]
-        distance = np.linalg.norm(lattice.points[outside] - look.camera.camera_to_world[:3, 3], axis=1)
+        surface = view.depths(lattice.field)[row[~inside], column[~inside]]
+        distance = np.linalg.norm(lattice.points[outside] - view.camera.camera_to_world[:3, 3], axis=1)
         shut[outside[distance < surface + current(VotingConfig).behind * lattice.widths[outside]]] = True
     return room & ~shut, shut
 
@@ -147,15 +147,15 @@ def hull(lattice: Lattice, looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarra
 def depths(field, camera: Camera) -> np.ndarray:
     """(H, W) how far away what a camera shows is, in the field's frame; inf where it shows nothing."""
     rays = camera.rays()
-    found = render_rays(field, *rays)
-    opacity, depth = found[:, 3], found[:, 4]
+    rendered = render_rays(field, *rays)
+    opacity, depth = rendered[:, 3], rendered[:, 4]
     away = np.where(opacity > 0.5, depth / np.maximum(opacity, 1e-6), np.inf)
     return away.reshape(camera.height, camera.width)
 
 
-def nearest(lattice: Lattice, known: np.ndarray, own: np.ndarray) -> np.ndarray:
+def nearest(lattice: CellGrid, known: np.ndarray, is_object: np.ndarray) -> np.ndarray:
     """(M,) bool: what the nearest known cell is, for each cell."""
     if not known.any():
-        return np.zeros_like(own)
+        return np.zeros_like(is_object)
     at = distance_transform_edt(~lattice.spread(known), return_distances=False, return_indices=True)
-    return lattice.spread(own)[tuple(at)][lattice.grid.occupied]
+    return lattice.spread(is_object)[tuple(at)][lattice.grid.occupied]

@@ -95,15 +95,15 @@ class WeightWaves(Waves):
         """See Waves. A segment that an unbounded instance has alone is a wave of its own."""
         left = self.left
         self.find(left)
-        found, host = self.here(), self.loops.on_host
-        alone = left[found.alone_to[left] > found.alone_from[left]]
+        segments, host = self.here(), self.loops.on_host
+        alone = left[segments.alone_to[left] > segments.alone_from[left]]
         if len(alone):
-            found.begin[alone], found.end[alone] = found.alone_from[alone], found.alone_to[alone]
-            found.instance[alone] = host(self.unbounded)[alone]
-        single = left[found.instance[left] >= 0]
-        found.meeting[single, 0], found.n_meeting[single] = found.instance[single], 1
-        self.segments = self.loops.on_device(found)
-        for part in self.parts(left[found.instance[left] != DONE]):
+            segments.begin[alone], segments.end[alone] = segments.alone_from[alone], segments.alone_to[alone]
+            segments.instance[alone] = host(self.unbounded)[alone]
+        single = left[segments.instance[left] >= 0]
+        segments.meeting[single, 0], segments.n_meeting[single] = segments.instance[single], 1
+        self.segments = self.loops.on_device(segments)
+        for part in self.parts(left[segments.instance[left] != DONE]):
             self.show_shared(part)
         self.left = self.segment_loops.rays_left(left, self.rays, self.segments, self.out, self.early_stop)
         return len(self.left) > 0

@@ -1,24 +1,24 @@
 """The space of a field in a finite box: coordinates are those of the field's frame.
 
 What every space has, as scalar functions that the loops of kernels/loops.py are compiled with. A ray is cut
-into PIECES, on each of which samples lie evenly in u. Where pieces are straight lines in the space's
-coordinates, u is length along them. Where they are not (curved.py), a length of u is at most as long in the
-coordinates, origin and direction of a piece are whatever its `position_at` reads, u begins at 0, and the
-space has a `next_sample` and a `next_change` of its own in place of those of the loops. A kind with an
-`advance` of its own follows straight lines, and cannot lie in such a space.
+into PIECES, on each of which samples lie evenly in t_local. Where pieces are straight lines in the space's
+coordinates, t_local is length along them. Where they are not (curved.py), a length of t_local is at most as
+long in the coordinates, origin and direction of a piece are whatever its `position_at` reads, t_local begins
+at 0, and the space has a `next_sample` and a `next_change` of its own in place of those of the loops. A kind
+with a `next_index` of its own follows straight lines, and cannot lie in such a space.
 """
 
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import along, hit_box
+from fusedrf_cli.engine.kernels.primitives import along, hit_box
 
 PIECES = 1  # of a ray, at most
 STEP_PER_VOXEL = 0.5  # of a field's finest voxel, at which pictures sample it
 
 
 position_at = along
-"""(origin, direction, u): the coordinates at u of a piece."""
+"""(origin, direction, t_local): the coordinates at t_local of a piece."""
 
 
 def point(p):
@@ -43,41 +43,41 @@ def depth_per_coordinate(q):
     return 1.0
 
 
-def entered(o, d, t):
+def first_piece_at(o, d, t):
     """Where the first piece of the ray o + t d begins that is followed from t on."""
     return t
 
 
-def stretch(begun, grid, o, d, far):
-    """(origin, direction, u0, u1, course) of the piece of a ray, in t < far, that begins there, and where the
-    next one begins: positions are position_at(origin, direction, u) for u in [u0, u1), empty where u1 <= u0.
-    `course` is what `distance` and `span` need."""
+def next_piece(piece_begin, grid, o, d, far):
+    """(origin, direction, t_begin, t_end, course) of the piece of a ray, in t < far, that begins there, and
+    where the next one begins: positions are position_at(origin, direction, t_local) for t_local in [t_begin,
+    t_end), empty where t_end <= t_begin. `warp` is what `distance` and `span` need."""
     t0, t1 = hit_box(o, d, grid.lo, grid.hi)
-    return (o, d, max(t0, begun), min(t1, far), 0.0), far
+    return (o, d, max(t0, piece_begin), min(t1, far), 0.0), far
 
 
 def piece(number, grid, o, d, near, far):
-    """The piece of that number of a ray that is followed from `near` to `far`, see `stretch`."""
-    return stretch(entered(o, d, near), grid, o, d, far)[0]
+    """The piece of that number of a ray that is followed from `near` to `far`, see `next_piece`."""
+    return next_piece(first_piece_at(o, d, near), grid, o, d, far)[0]
 
 
-def distance(course, u):
+def distance(warp, t_local):
     """The distance t along the ray, in the field's frame."""
-    return u
+    return t_local
 
 
-def length_at(course, t):
+def length_at(warp, t):
     """Inverse of `distance`, within the piece."""
     return t
 
 
-def interval(course, u, length):
-    """From and to which distance a length of u around `u` stands: `span` is the difference."""
-    return u - 0.5 * length, u + 0.5 * length
+def interval(warp, t_local, length):
+    """From and to which distance a length of t_local around `t_local` stands: `span` is the difference."""
+    return t_local - 0.5 * length, t_local + 0.5 * length
 
 
-def span(course, u, length):
-    """How much of t a length of u around `u` stands for: densities are per t."""
+def span(warp, t_local, length):
+    """How much of t a length of t_local around `t_local` stands for: densities are per t."""
     return length
 
 
@@ -91,12 +91,12 @@ def most_samples(aabb: np.ndarray, step: float) -> int:
     return int(float(np.linalg.norm(aabb[3:] - aabb[:3])) / step) + 2
 
 
-def contracted(points: torch.Tensor) -> torch.Tensor:
+def contract(points: torch.Tensor) -> torch.Tensor:
     """`point` of each of points (N, 3), differentiable."""
     return points
 
 
-def placed(points: torch.Tensor) -> torch.Tensor:
+def inv_contract(points: torch.Tensor) -> torch.Tensor:
     """`frame_point` of each of coordinates (N, 3), differentiable."""
     return points
 

@@ -4,15 +4,15 @@
 A ray is told by its distance b from the origin and by τ, its length from the point there: |x|² = b² + τ².
 Outside the ball it moves in the coordinates, with B = SHELL, by
     √(B² τ² + b² ((1 + B) |x| - B)²) / |x|³ <= c / (b² + τ²),  c = √(B² + (1 + B)² b²)
-for a unit of τ, and the integral of that bound is u: from τ0 on, with q = tan(u b / c) / b,
-    τ(u) = (τ0 + b² q) / (1 - τ0 q).
+for a unit of τ, and the integral of that bound is t_local: from τ0 on, with q = tan(t_local b / c) / b,
+    τ(t_local) = (τ0 + b² q) / (1 - τ0 q).
 """
 
 import math
 
 import torch
 
-from fusedrf_cli.engine.kernels.parts import along
+from fusedrf_cli.engine.kernels.primitives import along
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     CURVED,
     clearance,
@@ -31,9 +31,9 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
     ENDLESS,
     FAR,
     LEARN_FROM,
-    LENT_FROM,
+    LOOK_AT_BOX,
     REST_FROM,
-    SUBJECT,
+    SHARED_COLOUR_FROM,
     WHOLE,
     picture_step,
 )
@@ -90,16 +90,17 @@ def nearest(o, d):
     return middle, b, speed, math.sqrt(max(1.0 - b * b, 0.0)), math.sqrt(max(FAR * FAR - b * b, 0.0))
 
 
-def entered(o, d, t):
+def first_piece_at(o, d, t):
     """See bounded.py; the region at t comes with it."""
     middle, _, speed, edge, _ = nearest(o, d)
     tau = (t - middle) * speed
     return t, INWARDS if tau < -edge else (INSIDE if tau < edge else OUTWARDS)
 
 
-def stretch(begun, grid, o, d, far):
-    """See bounded.py; `course` is (t and τ where it begins; b; b / c, or 0 inside; length in u; 1 / |d|)."""
-    t0, region = begun
+def next_piece(piece_begin, grid, o, d, far):
+    """See bounded.py; `warp` is (t and τ where it begins; b; b / c, or 0 inside; length in t_local; 1 /
+    |d|)."""
+    t0, region = piece_begin
     middle, b, speed, edge, last = nearest(o, d)
     low = -last if region == INWARDS else (-edge if region == INSIDE else edge)
     high = -edge if region == INWARDS else (edge if region == INSIDE else last)
@@ -111,59 +112,59 @@ def stretch(begun, grid, o, d, far):
         length = math.atan2(b * (high - low), b * b + low * high) / per
     if region == BEYOND or high <= low:
         length = -1.0
-    course = middle, low, b, per, length, 1.0 / speed
-    return (o, (d, course), 0.0, length, course), following
+    warp = middle, low, b, per, length, 1.0 / speed
+    return (o, (d, warp), 0.0, length, warp), following
 
 
 def piece(number, grid, o, d, near, far):
     """See bounded.py."""
-    begun = entered(o, d, near)
+    piece_begin = first_piece_at(o, d, near)
     for _ in range(number):
-        begun = stretch(begun, grid, o, d, far)[1]
-    return stretch(begun, grid, o, d, far)[0]
+        piece_begin = next_piece(piece_begin, grid, o, d, far)[1]
+    return next_piece(piece_begin, grid, o, d, far)[0]
 
 
-def distance(course, u):
+def distance(warp, t_local):
     """The distance t along the ray, in the field's frame."""
-    middle, low, b, per, _, slow = course
+    middle, low, b, per, _, slow = warp
     if per == 0.0:
-        return middle + (low + u) * slow
-    q = math.tan(u * per) / b
+        return middle + (low + t_local) * slow
+    q = math.tan(t_local * per) / b
     return middle + (low + b * b * q) / (1.0 - low * q) * slow
 
 
-def length_at(course, t):
+def length_at(warp, t):
     """See bounded.py."""
-    middle, low, b, per, length, slow = course
+    middle, low, b, per, length, slow = warp
     tau = max((t - middle) / slow, low)
     if per == 0.0:
         return min(tau - low, length)
     return min(math.atan2(b * (tau - low), b * b + low * tau) / per, length)
 
 
-def slope(course, u):
+def slope(warp, t_local):
     """The derivative of `distance`."""
-    middle, _, b, per, _, slow = course
-    tau = (distance(course, u) - middle) / slow
+    middle, _, b, per, _, slow = warp
+    tau = (distance(warp, t_local) - middle) / slow
     return slow if per == 0.0 else (b * b + tau * tau) * slow * per / b
 
 
-def ends_of(course, u, length):
-    """From and to which u of a piece a length of u around `u` stands; where there is less than another such
-    length before or behind it in the piece, that is its own too."""
-    low, high = u - 0.5 * length, u + 0.5 * length
-    return 0.0 if u < length else low, course[4] if u + length >= course[4] else high
+def ends_of(warp, t_local, length):
+    """From and to which t_local of a piece a length of t_local around `t_local` stands; where there is less
+    than another such length before or behind it in the piece, that is its own too."""
+    low, high = t_local - 0.5 * length, t_local + 0.5 * length
+    return 0.0 if t_local < length else low, warp[4] if t_local + length >= warp[4] else high
 
 
-def interval(course, u, length):
+def interval(warp, t_local, length):
     """See bounded.py."""
-    low, high = ends_of(course, u, length)
-    return distance(course, low), distance(course, high)
+    low, high = ends_of(warp, t_local, length)
+    return distance(warp, low), distance(warp, high)
 
 
-def span(course, u, length):
+def span(warp, t_local, length):
     """See bounded.py."""
-    low, high = interval(course, u, length)
+    low, high = interval(warp, t_local, length)
     return high - low
 
 
@@ -172,12 +173,12 @@ def most_samples(aabb, step: float) -> int:
     return int((2 + math.pi * math.hypot(SHELL, 1 + SHELL)) / step) + 2 * PIECES
 
 
-def contracted(points: torch.Tensor) -> torch.Tensor:
+def contract(points: torch.Tensor) -> torch.Tensor:
     """`point` of each of points (N, 3), differentiable."""
     return contracted_by(points, points.norm(dim=1, keepdim=True), SHELL)
 
 
-def placed(points: torch.Tensor) -> torch.Tensor:
+def inv_contract(points: torch.Tensor) -> torch.Tensor:
     """`frame_point` of each of coordinates (N, 3), differentiable."""
     return placed_by(points, points.norm(dim=1, keepdim=True), SHELL, FAR)
 
@@ -191,6 +192,6 @@ def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
     """See bounded.py."""
     if not CONTRACTED_DENSITY:
         return points.new_ones(len(points))
-    x = placed(points)
+    x = inv_contract(points)
     n = x.norm(dim=1, keepdim=True)
     return density_rates_by(x, dirs, n, (x * dirs).sum(1, keepdim=True) / n.clamp_min(1), SHELL)

@@ -5,14 +5,15 @@ unbounded scenes. It differs from `unbounded` in that the other coordinates are 
 A ray is cut into the pieces of unbounded.py, but is curved outside the cube. There n and x change evenly
 along a piece, and with B = SHELL and the constants κ_j = n d_j - n' x_j it moves in the coordinates by
     (B d_j + (1 + B - 2 B / n) κ_j) / n²
-for a unit of t; the length of that times n² is largest at one of the two ends, and with this speed u goes.
+for a unit of t; the length of that times n² is largest at one of the two ends, and with this speed t_local
+goes.
 """
 
 import math
 
 import torch
 
-from fusedrf_cli.engine.kernels.parts import along
+from fusedrf_cli.engine.kernels.primitives import along
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
     CURVED,
     clearance,
@@ -31,14 +32,14 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
     CORE,
     FAR,
     LEARN_FROM,
-    LENT_FROM,
+    LOOK_AT_BOX,
     NOWHERE,
     PIECES,
     REST_FROM,
-    SUBJECT,
+    SHARED_COLOUR_FROM,
     WHOLE,
     distance,
-    entered,
+    first_piece_at,
     interval,
     leaving,
     length_at,
@@ -98,9 +99,9 @@ def depth_per_coordinate(q):
     return 1.0 if CONTRACTED_DENSITY != 0.0 or m <= 1.0 else size_before(m) ** 2 / SHELL
 
 
-def stretch(begun, grid, o, d, far):
-    """See bounded.py; `course` is (t0, t1 - t0, n0, n1, 1 / length in u)."""
-    t0, region = begun
+def next_piece(piece_begin, grid, o, d, far):
+    """See bounded.py; `warp` is (t0, t1 - t0, n0, n1, 1 / length in t_local)."""
+    t0, region = piece_begin
     t1, after = t0, NOWHERE
     if region != NOWHERE and t0 < far:
         t1, after = leaving(region, o, d, t0)
@@ -112,23 +113,23 @@ def stretch(begun, grid, o, d, far):
         speed = max(speed_in(region, o, d, n0), speed_in(region, o, d, n1))
     length = speed * (t1 - t0) / (n0 * n1)
     if region == NOWHERE or length <= 0.0 or not n0 < FAR:
-        course = t0, 0.0, 1.0, 1.0, 1.0
-        return (o, (d, course), 0.0, -1.0, course), following
-    course = t0, t1 - t0, n0, n1, 1.0 / length
-    return (o, (d, course), 0.0, length, course), following
+        warp = t0, 0.0, 1.0, 1.0, 1.0
+        return (o, (d, warp), 0.0, -1.0, warp), following
+    warp = t0, t1 - t0, n0, n1, 1.0 / length
+    return (o, (d, warp), 0.0, length, warp), following
 
 
-def slope(course, u):
+def slope(warp, t_local):
     """The derivative of `distance`."""
-    _, length, n0, n1, per = course
-    n = u * per * n0 + (1.0 - u * per) * n1
+    _, length, n0, n1, per = warp
+    n = t_local * per * n0 + (1.0 - t_local * per) * n1
     return length * per * n0 * n1 / (n * n)
 
 
-def ends_of(course, u, length):
-    """From and to which u of a piece a length of u around `u` stands, see `share_of`."""
-    low, high = share_of(course, u, length)
-    return low / course[4], high / course[4]
+def ends_of(warp, t_local, length):
+    """From and to which t_local of a piece a length of t_local around `t_local` stands, see `share_of`."""
+    low, high = share_of(warp, t_local, length)
+    return low / warp[4], high / warp[4]
 
 
 def most_samples(aabb, step: float) -> int:
@@ -138,12 +139,12 @@ def most_samples(aabb, step: float) -> int:
     return int((2 * math.sqrt(3) + slab * (PIECES - 1)) / step) + 2 * PIECES
 
 
-def contracted(points: torch.Tensor) -> torch.Tensor:
+def contract(points: torch.Tensor) -> torch.Tensor:
     """`point` of each of points (N, 3), differentiable."""
     return contracted_by(points, points.abs().amax(1, keepdim=True), SHELL)
 
 
-def placed(points: torch.Tensor) -> torch.Tensor:
+def inv_contract(points: torch.Tensor) -> torch.Tensor:
     """`frame_point` of each of coordinates (N, 3), differentiable."""
     return placed_by(points, points.abs().amax(1, keepdim=True), SHELL, FAR)
 
@@ -157,6 +158,6 @@ def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
     """See bounded.py."""
     if not CONTRACTED_DENSITY:
         return points.new_ones(len(points))
-    x = placed(points)
+    x = inv_contract(points)
     n, axis = x.abs().max(1, keepdim=True)
     return density_rates_by(x, dirs, n, dirs.gather(1, axis) * x.gather(1, axis).sign(), SHELL)

@@ -2,9 +2,9 @@
 size of a point x by some norm, where that is over 1 (Mip-NeRF 360, Barron et al. 2022, eq. 10, has B = 1 and
 the Euclidean norm). With B = SHELL coordinates are up to 1 + SHELL in size.
 
-A piece of a ray o + t d is (o, (d, warp), 0, length, warp): u is a warp of the distance t, such that no
-length of u is shorter than it is in the coordinates. So a sample may go on in u by as much as the nearest
-occupied cell is away along any axis, and none is missed (`next_sample`).
+A piece of a ray o + t d is (o, (d, warp), 0, length, warp): t_local is a warp of the distance t, such that no
+length of t_local is shorter than it is in the coordinates. So a sample may go on in t_local by as much as the
+nearest occupied cell is away along any axis, and none is missed (`next_sample`).
 """
 
 import math
@@ -12,14 +12,14 @@ import math
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import FACE_TOLERANCE, along, cell_of
+from fusedrf_cli.engine.kernels.primitives import FACE_TOLERANCE, along, cell_of
 
 CURVED = True
 
 
-def position_at(origin, way, u):
+def position_at(origin, direction, t_local):
     """See bounded.py."""
-    return point(along(origin, way[0], distance(way[1], u)))
+    return point(along(origin, direction[0], distance(direction[1], t_local)))
 
 
 def scale_of(n):
@@ -32,15 +32,15 @@ def size_before(m):
     return SHELL / max(1.0 + SHELL - m, SHELL / FAR)
 
 
-def optical_length(course, p, d, u, many, steps, step):
+def optical_length(warp, p, d, t_local, many, steps, step):
     """See kernels/loops.py. Where σ is per length of the coordinates, their length at the sample counts: far
     out an interval of t is of no use, since there t goes up manifold in one step."""
     length = steps * many * step
-    middle = u + 0.5 * (length - many * step)
+    middle = t_local + 0.5 * (length - many * step)
     if CONTRACTED_DENSITY == 0.0:
-        return span(course, middle, length)
-    low, high = ends_of(course, middle, length)
-    return rate(p, d) * slope(course, u) * (high - low)
+        return span(warp, middle, length)
+    low, high = ends_of(warp, middle, length)
+    return rate(p, d) * slope(warp, t_local) * (high - low)
 
 
 def clearance(p, lo, hi, cell, index, empty):
@@ -59,14 +59,14 @@ def clearance(p, lo, hi, cell, index, empty):
     return -1.0 if empty == 0 else max(away, 0.0)
 
 
-def next_sample(grid, origin, way, u0, u1, step, k):
-    """See kernels/parts.py; samples are a step apart everywhere."""
+def next_sample(grid, origin, direction, t_begin, t_end, step, k):
+    """See kernels/primitives.py; samples are a step apart everywhere."""
     nx, ny, nz = grid.skip.shape
     while True:
-        u = u0 + k * step
-        if u >= u1:
+        t_local = t_begin + k * step
+        if t_local >= t_end:
             return -1, 1
-        p = position_at(origin, way, u)
+        p = position_at(origin, direction, t_local)
         i = cell_of(p[0], grid.lo[0], grid.cell[0], nx)
         j = cell_of(p[1], grid.lo[1], grid.cell[1], ny)
         m = cell_of(p[2], grid.lo[2], grid.cell[2], nz)
@@ -74,7 +74,7 @@ def next_sample(grid, origin, way, u0, u1, step, k):
         away = clearance(p, grid.lo, grid.hi, grid.cell, (i, j, m), empty)
         if away < 0.0:
             return k, 1
-        k = max(k + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
+        k = max(k + 1, int(math.ceil((t_local + away - t_begin) / step - FACE_TOLERANCE)))
 
 
 def next_change(instances, b, o, d, t, end, gap):
@@ -82,22 +82,24 @@ def next_change(instances, b, o, d, t, end, gap):
     shorter."""
     lo, hi, cell, first = instances.lo[b], instances.hi[b], instances.cell[b], instances.first_cell[b]
     nx, ny, nz = instances.counts[b, 0], instances.counts[b, 1], instances.counts[b, 2]
-    begun, last, least = entered(o, d, t), t, 0.5 * instances.step[b]
+    piece_begin, last, least = first_piece_at(o, d, t), t, 0.5 * instances.step[b]
     for _ in range(PIECES):
-        (origin, way, u, u1, warp), begun = stretch(begun, Box(lo, hi), o, d, end)
-        while u < u1:
-            p = position_at(origin, way, u)
+        (origin, direction, t_local, t_end, warp), piece_begin = next_piece(
+            piece_begin, Box(lo, hi), o, d, end
+        )
+        while t_local < t_end:
+            p = position_at(origin, direction, t_local)
             i, j = cell_of(p[0], lo[0], cell[0], nx), cell_of(p[1], lo[1], cell[1], ny)
             k = cell_of(p[2], lo[2], cell[2], nz)
             empty = int(instances.skip[np.uint64(first + (i * ny + j) * nz + k)])
             away = clearance(p, lo, hi, cell, (i, j, k), empty)
             if away < least and gap < 0.0:
-                return distance(warp, u)
-            if away >= least and gap >= 0.0 and distance(warp, u) > last + gap:
+                return distance(warp, t_local)
+            if away >= least and gap >= 0.0 and distance(warp, t_local) > last + gap:
                 return last
-            u += max(away, least)
+            t_local += max(away, least)
             if away < least:
-                last = distance(warp, min(u, u1))
+                last = distance(warp, min(t_local, t_end))
     return FARTHEST if gap < 0.0 else last
 
 

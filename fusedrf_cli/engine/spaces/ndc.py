@@ -12,13 +12,13 @@ import math
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import along, hit_box
+from fusedrf_cli.engine.kernels.primitives import along, hit_box
 from fusedrf_cli.engine.spaces.bounded import most_samples, picture_step  # noqa: F401
 from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
     FAR,
     LEARN_FROM,
-    LENT_FROM,
     REST_FROM,
+    SHARED_COLOUR_FROM,
     distance,
     interval,
     length_at,
@@ -58,20 +58,20 @@ def depth_per_coordinate(q):
     return 1.0
 
 
-def optical_length(course, p, d, u, many, steps, step):
+def optical_length(warp, p, d, t_local, many, steps, step):
     """See loops.py: exactly, as lines are straight."""
-    low, high = share_of(course, u + 0.5 * (steps - 1) * many * step, steps * many * step)
-    return (high - low) / course[4]
+    low, high = share_of(warp, t_local + 0.5 * (steps - 1) * many * step, steps * many * step)
+    return (high - low) / warp[4]
 
 
-def entered(o, d, t):
+def first_piece_at(o, d, t):
     """See bounded.py."""
     return t
 
 
-def stretch(begun, grid, o, d, far):
-    """See bounded.py; `course` as in unbounded.py, with n = D."""
-    low, high = max(begun, 0.0), min(far, FAR * FAR)
+def next_piece(piece_begin, grid, o, d, far):
+    """See bounded.py; `warp` as in unbounded.py, with n = D."""
+    low, high = max(piece_begin, 0.0), min(far, FAR * FAR)
     if d[2] != 0.0:
         near, end = (-1.0 / FAR - o[2]) / d[2], (-FAR - o[2]) / d[2]
         low, high = max(low, min(near, end)), min(high, max(near, end))
@@ -83,23 +83,23 @@ def stretch(begun, grid, o, d, far):
     length = math.sqrt(x * x + y * y + z * z)
     if length <= 0.0:
         return (o, d, 1.0, 0.0, (low, 0.0, 1.0, 1.0, 1.0)), far
-    way = x / length, y / length, z / length
-    u0, u1 = hit_box(q0, way, grid.lo, grid.hi)
-    return (q0, way, u0, min(u1, length), (low, high - low, n0, n1, 1.0 / length)), far
+    direction = x / length, y / length, z / length
+    t_begin, t_end = hit_box(q0, direction, grid.lo, grid.hi)
+    return (q0, direction, t_begin, min(t_end, length), (low, high - low, n0, n1, 1.0 / length)), far
 
 
 def piece(number, grid, o, d, near, far):
     """See bounded.py."""
-    return stretch(entered(o, d, near), grid, o, d, far)[0]
+    return next_piece(first_piece_at(o, d, near), grid, o, d, far)[0]
 
 
-def contracted(points: torch.Tensor) -> torch.Tensor:
+def contract(points: torch.Tensor) -> torch.Tensor:
     """`point` of each of points (N, 3), differentiable."""
     per = 1 / (-points[:, 2:]).clamp_min(1 / FAR)
     return torch.cat([SCALE_X * points[:, :1] * per, SCALE_Y * points[:, 1:2] * per, 1 - 2 * per], 1)
 
 
-def placed(points: torch.Tensor) -> torch.Tensor:
+def inv_contract(points: torch.Tensor) -> torch.Tensor:
     """`frame_point` of each of coordinates (N, 3), differentiable."""
     away = 2 / (1 - points[:, 2:]).clamp_min(2 / FAR)
     return torch.cat([points[:, :1] * away / SCALE_X, points[:, 1:2] * away / SCALE_Y, -away], 1)

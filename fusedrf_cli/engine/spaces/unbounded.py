@@ -6,9 +6,9 @@ largest magnitude becomes ±(2 - 1/n) and the two others x_j / n (MERF, Reiser e
 coordinates lie in [-2, 2]. In the core and in each of the six slabs around it straight lines stay straight
 and planes flat, so that a ray is a few straight pieces (see bounded.py for what a space has).
 
-A slab's part of a ray from (t0, n0) to (t1, n1) is a line of length L in coordinates; at u along it, with
-s = u / L,
-    t(u) = t0 + (t1 - t0) s n0 / (s n0 + (1 - s) n1),
+A slab's part of a ray from (t0, n0) to (t1, n1) is a line of length L in coordinates; at t_local along it,
+with s = t_local / L,
+    t(t_local) = t0 + (t1 - t0) s n0 / (s n0 + (1 - s) n1),
 and with r = (t - t0) / (t1 - t0)
     s(t) = r n1 / ((1 - r) n0 + r n1).
 """
@@ -18,7 +18,7 @@ import math
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kernels.parts import along, hit_box
+from fusedrf_cli.engine.kernels.primitives import along, hit_box
 
 PIECES = 6  # a straight line meets at most five of the seven regions, and a sixth by rounding at an edge
 STEP_PER_VOXEL = 0.9  # at most: a step of half a voxel shows the same (decision 001) in 1.5 times the time
@@ -27,9 +27,9 @@ ENDLESS = 1e30
 CORE, NOWHERE = 0, -1  # regions; 1 + 2 axis is the slab on the negative side of an axis, 2 + 2 axis the other
 REACH = 2.0  # coordinates lie between -REACH and REACH
 # See loops.py: a ray through a place has some hundred samples that weigh next to nothing.
-LEARN_FROM, LENT_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
+LEARN_FROM, SHARED_COLOUR_FROM, REST_FROM = 3e-3, 1e-2, 1e-2
 WHOLE = np.array([-REACH] * 3 + [REACH] * 3)
-SUBJECT = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
+LOOK_AT_BOX = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all of space look at
 position_at = along
 
 
@@ -117,14 +117,14 @@ def leaving(region, o, d, t):
     return max(end, t), after
 
 
-def entered(o, d, t):
+def first_piece_at(o, d, t):
     """See bounded.py; the region at t comes with it, or NOWHERE behind the last piece."""
     return t, region_at(o, d, t)
 
 
-def stretch(begun, grid, o, d, far):
-    """See bounded.py; `course` is (t0, t1 - t0, n0, n1, 1 / L)."""
-    t0, region = begun
+def next_piece(piece_begin, grid, o, d, far):
+    """See bounded.py; `warp` is (t0, t1 - t0, n0, n1, 1 / L)."""
+    t0, region = piece_begin
     t1, after = t0, NOWHERE
     if region != NOWHERE and t0 < far:
         t1, after = leaving(region, o, d, t0)
@@ -142,18 +142,18 @@ def stretch(begun, grid, o, d, far):
     length = math.sqrt(x * x + y * y + z * z)
     if region == NOWHERE or length <= 0.0 or not n0 < FAR:
         return (q0, d, 1.0, 0.0, (t0, 0.0, 1.0, 1.0, 1.0)), following
-    way = x / length, y / length, z / length
-    u0, u1 = hit_box(q0, way, grid.lo, grid.hi)
-    return (q0, way, u0, min(u1, length), (t0, t1 - t0, n0, n1, 1.0 / length)), following
+    direction = x / length, y / length, z / length
+    t_begin, t_end = hit_box(q0, direction, grid.lo, grid.hi)
+    return (q0, direction, t_begin, min(t_end, length), (t0, t1 - t0, n0, n1, 1.0 / length)), following
 
 
 def piece(number, grid, o, d, near, far):
     """See bounded.py."""
-    begun = entered(o, d, near)
+    piece_begin = first_piece_at(o, d, near)
     for _ in range(number):
-        if begun[1] != NOWHERE:
-            begun = leaving(begun[1], o, d, begun[0])
-    return stretch(begun, grid, o, d, far)[0]
+        if piece_begin[1] != NOWHERE:
+            piece_begin = leaving(piece_begin[1], o, d, piece_begin[0])
+    return next_piece(piece_begin, grid, o, d, far)[0]
 
 
 def in_region(region, p, n):
@@ -168,48 +168,48 @@ def in_region(region, p, n):
     return p[0] / n, p[1] / n, end
 
 
-def distance(course, u):
+def distance(warp, t_local):
     """The distance t along the ray, in the field's frame."""
-    t0, length, n0, n1, per = course
-    s = u * per
+    t0, length, n0, n1, per = warp
+    s = t_local * per
     return t0 + length * s * n0 / (s * n0 + (1.0 - s) * n1)
 
 
-def length_at(course, t):
+def length_at(warp, t):
     """See bounded.py."""
-    t0, length, n0, n1, per = course
+    t0, length, n0, n1, per = warp
     r = min(max((t - t0) / length, 0.0), 1.0)
     return r * n1 / ((1.0 - r) * n0 + r * n1) / per
 
 
-def share_of(course, u, length):
-    """From and to which share of a piece a length of u around `u` stands; where there is less than another
-    such length before or behind it in the piece, that is its own too."""
-    per = course[4]
-    s0, s1 = (u - 0.5 * length) * per, (u + 0.5 * length) * per
-    s0 = 0.0 if (u - length) * per < 0.0 else s0
-    s1 = 1.0 if (u + length) * per >= 1.0 else s1
+def share_of(warp, t_local, length):
+    """From and to which share of a piece a length of t_local around `t_local` stands; where there is less
+    than another such length before or behind it in the piece, that is its own too."""
+    per = warp[4]
+    s0, s1 = (t_local - 0.5 * length) * per, (t_local + 0.5 * length) * per
+    s0 = 0.0 if (t_local - length) * per < 0.0 else s0
+    s1 = 1.0 if (t_local + length) * per >= 1.0 else s1
     return s0, s1
 
 
-def interval(course, u, length):
+def interval(warp, t_local, length):
     """See bounded.py."""
-    s0, s1 = share_of(course, u, length)
-    return distance(course, s0 / course[4]), distance(course, s1 / course[4])
+    s0, s1 = share_of(warp, t_local, length)
+    return distance(warp, s0 / warp[4]), distance(warp, s1 / warp[4])
 
 
-def span(course, u, length):
-    """How much of t a length of u around `u` stands for, see `share_of`. Exact, since far out t goes up
-    manifold in one step."""
-    _, whole, n0, n1, _ = course
-    s0, s1 = share_of(course, u, length)
+def span(warp, t_local, length):
+    """How much of t a length of t_local around `t_local` stands for, see `share_of`. Exact, since far out t
+    goes up manifold in one step."""
+    _, whole, n0, n1, _ = warp
+    s0, s1 = share_of(warp, t_local, length)
     return whole * n0 * n1 * (s1 - s0) / ((s0 * n0 + (1.0 - s0) * n1) * (s1 * n0 + (1.0 - s1) * n1))
 
 
 def picture_step(voxel: float) -> float:
     """At which pictures sample a field with voxels of a size, so that a whole number of steps is as long as a
     slab is thick: a ray straight out then ends with a whole step. Where the last sample lies decides what it
-    stands for, and where all rays ended with a short one, far fog would show too little."""
+    stands for, and where all rays ended with a short one, far floaters would show too little."""
     return 1 / math.ceil(1 / (STEP_PER_VOXEL * voxel))
 
 
@@ -219,7 +219,7 @@ def most_samples(aabb: np.ndarray, step: float) -> int:
     return int((2 * math.sqrt(3) + 3.0 * (PIECES - 1)) / step) + 2 * PIECES
 
 
-def contracted(points: torch.Tensor) -> torch.Tensor:
+def contract(points: torch.Tensor) -> torch.Tensor:
     """`point` of each of points (N, 3), differentiable."""
     n, axis = points.abs().max(1, keepdim=True)
     outside = (points / n.clamp_min(1)).scatter(
@@ -239,7 +239,7 @@ def density_rates(points: torch.Tensor, dirs: torch.Tensor) -> torch.Tensor:
     return rates(points)
 
 
-def placed(points: torch.Tensor) -> torch.Tensor:
+def inv_contract(points: torch.Tensor) -> torch.Tensor:
     """`frame_point` of each of coordinates (N, 3), differentiable."""
     most, axis = points.abs().max(1, keepdim=True)
     n = 1 / (2 - most.clamp_min(1)).clamp_min(1 / FAR)

@@ -9,10 +9,10 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kinds.asking import colours, even_directions
-from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, BrickTree, key_places, node_keys
+from fusedrf_cli.engine.kinds.field_sampling import colours, even_directions
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, BrickTree, key_positions, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseShape
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.kinds.sparse.resample import (
     at_vertices,
     frame_of,
@@ -26,7 +26,7 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 from tests.analytic.fields import Ball, Box, Gaussian, Tint
 from tests.analytic.rays import unit
-from tests.bridge.test_places import fine_walls
+from tests.bridge.test_unbounded import fine_walls
 
 RED = Tint.of(0.8, 0.2, 0.1)
 
@@ -149,7 +149,7 @@ def test_leaves_hold_every_wanted_brick_once(rng):
         covered[tuple(slice(a, a + side) for a in low)] += 1
     assert covered.max() == 1
     for n, keys in enumerate(wanted):
-        for place in key_places(keys):
+        for place in key_positions(keys):
             low, side = place << (2 - n), 1 << (2 - n)
             assert covered[tuple(slice(a, a + side) for a in low)].all()
     assert all(np.isin(wanted[2], node_keys(at[level == 2])))
@@ -178,7 +178,7 @@ def test_one_voxel_of_eight_touches_every_vertex():
     """Once, but for those on the far faces of the box, where no voxel of even places begins."""
     at = np.argwhere(np.ones((2, 2, 2), bool))
     masks = np.ones((8, SIDE, SIDE, SIDE), bool)
-    lattice = Lattice(BrickTree.of(np.zeros(3), 1.0, (2, 2, 2), np.zeros(8, np.uint8), at, masks), SIDE)
+    lattice = VertexLattice(BrickTree.of(np.zeros(3), 1.0, (2, 2, 2), np.zeros(8, np.uint8), at, masks), SIDE)
     chosen = one_of_eight(lattice)
     assert chosen.sum() * 8 == len(chosen) == (2 * SIDE) ** 3
     touched = np.bincount(lattice.corners[chosen].ravel(), minlength=len(lattice.vertices))

@@ -132,7 +132,7 @@ def test_common_shape_holds_all():
     assert common_shape([VMShape(8, 24, 0), VMShape(16, 8, 2)]) == VMShape(16, 24, 2)
 
 
-class Elsewhere(torch.Tensor):
+class SourceFolder(torch.Tensor):
     """Numbers that are not the CPU's: they have no view as an array."""
 
     @property
@@ -150,16 +150,16 @@ class Elsewhere(torch.Tensor):
 def test_numbers_of_another_device_are_truncated_alike(monkeypatch):
     """A GPU's tensors are no arrays; here their place is taken by tensors that refuse to be any."""
     field = random_vm(VMShape(16, 24, 2), dtype=torch.float32)
-    there = field.with_params(field.params.clone().as_subclass(Elsewhere))
+    there = field.with_params(field.params.clone().as_subclass(SourceFolder))
     to = VMField.to
 
     def moved(self, device):
         if torch.device(device).type != "cpu":
-            return self.with_params(self.params.as_subclass(Elsewhere))
+            return self.with_params(self.params.as_subclass(SourceFolder))
         return to(self, device)
 
     monkeypatch.setattr(VMField, "to", moved)
     found = truncated(there, VMShape(8, 16, 1))
-    assert type(found.params) is Elsewhere
+    assert type(found.params) is SourceFolder
     wanted = truncated(field, VMShape(8, 16, 1)).params
     assert torch.equal(found.params.as_subclass(torch.Tensor), wanted)

@@ -14,11 +14,11 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation import distill as module
 from fusedrf_cli.engine.distillation.distill import DistillRun, distill
-from fusedrf_cli.engine.distillation.judging import scattered_judge
+from fusedrf_cli.engine.distillation.evaluation import scattered_evaluator
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.student import pruned
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, texels
-from fusedrf_cli.engine.kinds.student import DistilConfig, finest_within
+from fusedrf_cli.engine.kinds.builder import DistilConfig, finest_within
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import way_of
@@ -50,8 +50,8 @@ def test_a_ball_is_learnt():
     """60 steps give 22 dB on views of its own, where an untrained student has less than 15."""
     told = []
     student = VM.empty(TEACHER, WAY, NUMBERS, torch.Generator().manual_seed(0), "ball")
-    judge = scattered_judge(TEACHER, 3, 32, 77)
-    before = judge(student)
+    evaluator = scattered_evaluator(TEACHER, 3, 32, 77)
+    before = evaluator(student)
     student, report = distill(
         TEACHER,
         student,
@@ -61,7 +61,7 @@ def test_a_ball_is_learnt():
         told.append,
         lambda s, f: told.append(s),
     )
-    assert before < 15 and judge(student) > 22
+    assert before < 15 and evaluator(student) > 22
     assert max(student.resolution) == 32 and student.name == "ball"
     assert report.psnr_before_rgb > 20 and set(report.seconds) == {"teachers", "points", "pictures"}
     assert [t for t in told if isinstance(t, str)] == ["asking the teachers", "points", "pictures"]
@@ -80,7 +80,7 @@ def test_the_same_seed_gives_the_same_bits():
 def test_the_rgb_phase_is_kept_only_if_better(monkeypatch, after, kept):
     brief = replace(SETTINGS, rays=1000, steps=40, rgb_steps=5)
     verdicts = iter([20.0, after, 20.0])
-    monkeypatch.setattr(module, "scattered_judge", lambda *_: lambda student: next(verdicts))
+    monkeypatch.setattr(module, "scattered_evaluator", lambda *_: lambda student: next(verdicts))
     student, report = taught(brief)
     plain, _ = taught(brief, rgb=False)
     assert report.rgb_kept is kept and report.psnr_after_rgb == after and report.psnr_before_rgb == 20
@@ -112,12 +112,12 @@ def test_bad_steps_are_skipped_and_told(monkeypatch):
 
 def test_a_teacher_of_nan_is_an_error(monkeypatch):
     def spoilt(teacher, *words, **more):
-        pool = ask(teacher, *words, **more)
-        pool.points.sigma[:] = float("nan")
-        return pool
+        dataset = ask(teacher, *words, **more)
+        dataset.points.sigma[:] = float("nan")
+        return dataset
 
-    ask = module.ask
-    monkeypatch.setattr(module, "ask", spoilt)
+    ask = module.query_teacher
+    monkeypatch.setattr(module, "query_teacher", spoilt)
     with pytest.raises(FloatingPointError, match="44 steps were not finite, after 3 returns"):
         taught(replace(SETTINGS, rays=100), rgb=False)
 
@@ -227,7 +227,7 @@ def test_a_student_starts_as_the_upright_background(scale):
     source = replace_voxels(source)
     teacher = ComposedField([Placed("ground", source, matrix)])
     plan = VM.plan(teacher.aabb, teacher.voxel_size, WAY, 10**7)
-    student = VM.taken_over(teacher.placed[0], plan, teacher, torch.Generator().manual_seed(0))
+    student = VM.warm_start(teacher.placed[0], plan, teacher, torch.Generator().manual_seed(0))
     inner = teacher.aabb + 0.1 * np.array([1, 1, 1, -1, -1, -1])
     points, dirs = torch.from_numpy(points_in(inner, 2000)), torch.from_numpy(unit(points_in(BOX, 2000)))
     (sigma, rgb), (wanted, colour) = student.query(points, dirs), teacher.query(points, dirs)
@@ -248,7 +248,7 @@ def test_a_turned_background_cannot_be_taken_over(linear):
     for one in (placed, ball):
         scene = ComposedField([one])
         plan = VM.plan(scene.aabb, scene.voxel_size, WAY, NUMBERS)
-        assert VM.taken_over(one, plan, scene, torch.Generator()) is None
+        assert VM.warm_start(one, plan, scene, torch.Generator()) is None
 
 
 def test_resolution_is_the_teachers_or_what_fits():

@@ -16,8 +16,8 @@ from fusedrf_cli.engine.distillation.exposure import (
     undone,
 )
 from fusedrf_cli.engine.distillation.fit import FitRun
-from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
 from fusedrf_cli.engine.distillation.poses import poses_of
+from fusedrf_cli.engine.distillation.ray_dataset import Pictures, RayDataset
 from fusedrf_cli.engine.rendering.cameras import look_at, orbit
 from fusedrf_cli.engine.rendering.metrics import colour_corrected, psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
@@ -26,7 +26,7 @@ from tests.engine.distillation.test_fit import SETTINGS
 
 # Long enough for photos not to differ because the field is not done, and without colours that depend on the
 # view, by which a dozen photos could all be as they are.
-LONG = replace(SETTINGS, steps=800, way=replace(SETTINGS.way, sh_degree=0))
+LONG = replace(SETTINGS, steps=800, storage=replace(SETTINGS.storage, sh_degree=0))
 BALL = Ball(density=40.0, radius=0.7, tint=lambda points, dirs: 0.45 + 0.3 * np.sin(5 * points))
 
 
@@ -135,8 +135,8 @@ def test_photos_of_the_pool_are_sampled_each_alike():
     pixels = np.concatenate([g.integers(0, 256, (24 * 2 + 25, 3)), np.full((73, 1), 255)], 1).astype(np.uint8)
     ignored = g.random(73) < 0.2
     pixels[:5, 3] = 254
-    pool = RayPool(cameras, Pictures(pixels, ignored), torch.Generator())
-    o, d, colours = pool.sample(50, torch.Generator().manual_seed(1))
+    dataset = RayDataset(cameras, Pictures(pixels, ignored), torch.Generator())
+    o, d, colours = dataset.sample(50, torch.Generator().manual_seed(1))
     rays = [camera.rays() for camera in cameras]
     first = [0, 24, 48, 73]
     for i in range(3):

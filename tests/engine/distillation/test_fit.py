@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.config import TrainConfig
+from fusedrf_cli.engine.distillation.depth_points import KnownPoints
 from fusedrf_cli.engine.distillation.fit import FitRun, fit, occupancy_of
-from fusedrf_cli.engine.distillation.keypoints import Known
-from fusedrf_cli.engine.distillation.pixels import Pictures, RayPool
-from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.distillation.ray_dataset import Pictures, RayDataset
+from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -19,7 +19,7 @@ from fusedrf_cli.engine.rendering.volume import render_image, render_rays
 from tests.analytic.export import way_of
 from tests.engine.conftest import BOX, THIRTY_TWO, Ball, random_vm
 
-SETTINGS = TrainConfig(way=way_of(THIRTY_TWO), longest=32, steps=200, samples=1 << 13)
+SETTINGS = TrainConfig(storage=way_of(THIRTY_TWO), longest=32, steps=200, samples=1 << 13)
 
 
 def pictures(cameras) -> np.ndarray:
@@ -53,14 +53,14 @@ def test_a_ball_is_learnt(capture):
     assert list(shares) == sorted(shares) and quality[-1] > quality[0] + 5
 
 
-def known_of(cameras: list[Camera], each: int = 30) -> Known:
+def known_of(cameras: list[Camera], each: int = 30) -> KnownPoints:
     """Points of the ball's front, as each camera sees them."""
     points, rng = [], np.random.default_rng(0)
     for camera in cameras:
         aside = rng.normal(size=(each, 3))
         front = camera.camera_to_world[:3, 3] / np.linalg.norm(camera.camera_to_world[:3, 3]) + 0.3 * aside
         points.append(0.7 * front / np.linalg.norm(front, axis=1, keepdims=True))
-    return Known(np.concatenate(points), np.repeat(np.arange(len(cameras)), each))
+    return KnownPoints(np.concatenate(points), np.repeat(np.arange(len(cameras)), each))
 
 
 def test_known_points_bring_matter_to_where_it_is():
@@ -143,8 +143,8 @@ def test_a_detail_fades_where_photos_say_little_of_it(capture):
     cameras, images = capture
 
     def faded(count: int, rows: int) -> float:
-        way = replace(SETTINGS.way, hashed=Hashed((0.1,), rows, learns_from=2) if rows else None)
-        settings = replace(SETTINGS, way=way, unbounded=True)
+        storage = replace(SETTINGS.storage, hashed=HashGrid((0.1,), rows, learns_from=2) if rows else None)
+        settings = replace(SETTINGS, storage=storage, unbounded=True)
         return FitRun.start(cameras[:count], images[:count], BOX, settings).faded
 
     assert faded(8, 1 << 10) == pytest.approx(SETTINGS.fade * (4 * 1024 / (8 * 24 * 24)) ** 2)
@@ -157,7 +157,7 @@ def test_the_same_seed_gives_the_same_bits(capture):
         return fit(
             *capture,
             BOX,
-            TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=25, samples=1 << 12, seed=seed),
+            TrainConfig(storage=way_of(THIRTY_TWO), longest=24, steps=25, samples=1 << 12, seed=seed),
         ).params
 
     first, again, other = numbers(1), numbers(1), numbers(2)
@@ -170,9 +170,9 @@ def test_every_pixel_comes_once_an_epoch(capture):
     numbered = images.copy()
     numbered.reshape(-1, 4)[:, 0] = np.arange(images[..., 0].size) % 251
     numbered.reshape(-1, 4)[:, 1] = np.arange(images[..., 0].size) // 251
-    pool = RayPool(cameras, numbered, torch.Generator().manual_seed(0))
+    dataset = RayDataset(cameras, numbered, torch.Generator().manual_seed(0))
     size = images[..., 0].size
-    drawn = [pool.draw(size // 4) for _ in range(4)]
+    drawn = [dataset.draw(size // 4) for _ in range(4)]
     found = np.concatenate([np.rint(pixels.numpy()[:, :2] * 255) for _, _, pixels, _ in drawn]) @ [1, 251]
     assert np.array_equal(np.sort(found), np.arange(size))
     everything = [camera.rays() for camera in cameras]
@@ -184,8 +184,8 @@ def test_every_pixel_comes_once_an_epoch(capture):
 
 def test_more_rays_than_pixels_are_as_many_as_there_are(capture):
     cameras, images = capture
-    pool = RayPool(cameras[:1], images[:1], torch.Generator().manual_seed(0))
-    rays_o, rays_d, pixels, _ = pool.draw(5000)
+    dataset = RayDataset(cameras[:1], images[:1], torch.Generator().manual_seed(0))
+    rays_o, rays_d, pixels, _ = dataset.draw(5000)
     assert rays_o.shape == rays_d.shape == (576, 3) and pixels.shape == (576, 4)
     np.testing.assert_allclose(rays_o, np.tile(cameras[0].camera_to_world[:3, 3], (576, 1)))
 
@@ -200,8 +200,8 @@ def test_pictures_of_several_sizes_and_pixels_that_are_ignored():
     count = sum(w * h for w, h in sizes)
     pixels = np.repeat(np.arange(count, dtype=np.uint8)[:, None], 4, 1)
     ignored = np.random.default_rng(0).random(count) < 0.4
-    pool = RayPool(cameras, Pictures(pixels, ignored), torch.Generator().manual_seed(0))
-    rays_o, rays_d, drawn, pictures = pool.draw(1000)
+    dataset = RayDataset(cameras, Pictures(pixels, ignored), torch.Generator().manual_seed(0))
+    rays_o, rays_d, drawn, pictures = dataset.draw(1000)
     found = np.rint(drawn.numpy()[:, 0] * 255).astype(int)
     assert np.array_equal(np.sort(found), np.flatnonzero(~ignored))
     wanted_o, wanted_d = (np.concatenate(part) for part in zip(*[c.rays() for c in cameras], strict=True))

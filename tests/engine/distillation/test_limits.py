@@ -5,7 +5,7 @@ import pytest
 
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
-from fusedrf_cli.engine.distillation.pixels import Pictures
+from fusedrf_cli.engine.distillation.ray_dataset import Pictures
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.rendering.cameras import orbit
 from tests.analytic.export import way_of
@@ -50,7 +50,7 @@ def test_a_fit_stays_inside():
     pixels[:, :3] = 90
     rays = [camera.rays() for camera in cameras]
     away = np.concatenate([np.linalg.norm(np.cross(o, d), axis=1) for o, d in rays])
-    settings = TrainConfig(way=way_of(THIRTY_TWO), longest=24, steps=60, samples=1 << 12)
+    settings = TrainConfig(storage=way_of(THIRTY_TWO), longest=24, steps=60, samples=1 << 12)
     limits = ball(32)
     field = FitRun.start(cameras, Pictures(pixels, away > 0.5), BOX, settings, limits=limits).finish()
     middles = field.occupancy.centres()

@@ -8,7 +8,7 @@ from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.distillation.losses import LossConfig, log_depth, mostly_seen, point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
-from fusedrf_cli.engine.distillation.teacher import Points
+from fusedrf_cli.engine.distillation.teacher import TeacherPoints
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from tests.analytic.export import BANDED
 from tests.analytic.rays import affine, turn
@@ -17,13 +17,13 @@ from tests.engine.conftest import BOX, SIXTY_FOUR, THIRTY_TWO, random_vm, unit
 STEP = 0.05
 
 
-def points_of(teacher, n: int, seed: int) -> Points:
+def points_of(teacher, n: int, seed: int) -> TeacherPoints:
     lo, hi = 0.5 * BOX[:3], 0.5 * BOX[3:]  # turned, it is still in the teacher
     where = torch.from_numpy(lo + np.random.default_rng(seed).random((n, 3)) * (hi - lo))
     dirs = torch.from_numpy(unit(np.random.default_rng(seed + 1).normal(size=(n, 3))))
     sigma, rgb = teacher.query(where, dirs)
     transmittance = torch.from_numpy(np.random.default_rng(seed + 2).random(n).astype(np.float32))
-    return Points(where, dirs, sigma, rgb, transmittance)
+    return TeacherPoints(where, dirs, sigma, rgb, transmittance)
 
 
 def test_the_slope_of_the_density_loss_is_finite_differences():
@@ -47,11 +47,11 @@ def test_the_gradient_of_a_step_is_finite_differences():
     points.sigma = points.sigma.clamp_max(0.9 * LossConfig.opaque / STEP)  # away from the kink
     optimiser = Adam(student, 1)
     point_step(student, points, STEP, optimiser)
-    way = torch.from_numpy(np.random.default_rng(0).normal(size=student.params.shape))
-    found, h = float(optimiser.gradient[0] @ way), 1e-6
+    storage = torch.from_numpy(np.random.default_rng(0).normal(size=student.params.shape))
+    found, h = float(optimiser.gradient[0] @ storage), 1e-6
     start, sides = student.params.clone(), []
     for side in (h, -h):
-        student.params.copy_(start + side * way)
+        student.params.copy_(start + side * storage)
         sides.append(point_step(student, points, STEP, optimiser))
     assert found == pytest.approx((sides[0] - sides[1]) / (2 * h), rel=1e-4)
 

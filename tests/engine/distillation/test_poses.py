@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.fit import FitRun
-from fusedrf_cli.engine.distillation.pixels import RayPool
 from fusedrf_cli.engine.distillation.poses import (
     PoseConfig,
     Poses,
@@ -18,6 +17,7 @@ from fusedrf_cli.engine.distillation.poses import (
     refined,
     turns,
 )
+from fusedrf_cli.engine.distillation.ray_dataset import RayDataset
 from fusedrf_cli.engine.rendering.cameras import orbit
 from tests.engine.conftest import BOX
 from tests.engine.distillation.test_exposure import BALL, LONG
@@ -79,28 +79,30 @@ def test_poses_are_found_again_from_what_a_field_shows(pixels):
     cameras = orbit(BOX, 5, 48, 48)
     truth, images = poses_of(cameras), pictures_of_ball(cameras)
     images[..., 3] = 255 * (images[..., 3] > 250)
-    pool = RayPool(shaken(cameras, pixels), images, torch.Generator())
+    dataset = RayDataset(shaken(cameras, pixels), images, torch.Generator())
 
     def off() -> float:
-        found = [spot(cameras[i], pool.poses, i) - spot(cameras[i], truth, i) for i in range(5)]
+        found = [spot(cameras[i], dataset.poses, i) - spot(cameras[i], truth, i) for i in range(5)]
         return float(np.sqrt(np.mean(np.square(found))))
 
     before, generator = off(), torch.Generator().manual_seed(2)
     for probe in (4.0, 4.0, 3.0, 2.0, 2.0, 1.0, 1.0, 0.5, 0.5, 0.5):
-        *rays, colours = pool.sample(1500, generator)
-        pool.place(changed_each(pool.poses, refined(BALL, rays, colours, 0.0, probe * pool.pixel)))
+        *rays, colours = dataset.sample(1500, generator)
+        dataset.set_poses(
+            changed_each(dataset.poses, refined(BALL, rays, colours, 0.0, probe * dataset.pixel))
+        )
     assert before > 0.3 * pixels and off() < 0.25 * before and off() < 0.25
 
 
 def test_poses_of_which_little_is_seen_stay():
     cameras = orbit(BOX, 3, 24, 24)
     images = pictures_of_ball(cameras)
-    pool = RayPool(shaken(cameras, 3.0), images, torch.Generator())
-    *rays, colours = pool.sample(1500, torch.Generator())
+    dataset = RayDataset(shaken(cameras, 3.0), images, torch.Generator())
+    *rays, colours = dataset.sample(1500, torch.Generator())
     colours[1, PoseConfig.few - 1 :] = torch.nan
     away = rays[0].copy()
     away.reshape(3, 1500, 3)[2] += 100  # from there the field does not show
-    change = refined(BALL, (away, rays[1]), colours, 0.0, pool.pixel)
+    change = refined(BALL, (away, rays[1]), colours, 0.0, dataset.pixel)
     assert change[0].any() and not change[1:].any()
     assert np.isfinite(change).all()
 

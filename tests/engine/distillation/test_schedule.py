@@ -5,7 +5,7 @@ import json
 import pytest
 
 from fusedrf_cli.engine.distillation.schedule import Schedule
-from fusedrf_cli.engine.kinds.student import DistilConfig
+from fusedrf_cli.engine.kinds.builder import DistilConfig
 
 CONFIG = DistilConfig()
 
@@ -13,7 +13,7 @@ CONFIG = DistilConfig()
 def test_a_phase_that_keeps_rising_takes_all_its_time():
     schedule = Schedule(CONFIG)
     for i in range(10):
-        schedule.look(i / 20, 20 + 2 * CONFIG.least_gain * i)
+        schedule.observe(i / 20, 20 + 2 * CONFIG.least_gain * i)
     assert schedule.end == pytest.approx(1)
     assert schedule.factor(0) == schedule.factor(1 - CONFIG.cooling) == 1
     assert schedule.factor(1) == pytest.approx(CONFIG.rate_decay)
@@ -25,24 +25,24 @@ def test_a_phase_that_keeps_rising_takes_all_its_time():
 def test_a_plateau_ends_it_sooner():
     """The fall begins with the look that shows it, and is then `cooling` of what is done in all."""
     schedule = Schedule(CONFIG)
-    schedule.look(0.1, 30.0)
+    schedule.observe(0.1, 30.0)
     for i in range(CONFIG.patience):
         assert schedule.end == pytest.approx(1)
-        schedule.look(0.2 + 0.1 * i, 30.0 + 0.9 * CONFIG.least_gain)
+        schedule.observe(0.2 + 0.1 * i, 30.0 + 0.9 * CONFIG.least_gain)
     at = 0.2 + 0.1 * (CONFIG.patience - 1)
     assert schedule.cooling_from == pytest.approx(at) and schedule.end == pytest.approx(
         at / (1 - CONFIG.cooling)
     )
     assert schedule.factor(at) == 1 and schedule.factor(schedule.end) == pytest.approx(CONFIG.rate_decay)
-    schedule.look(0.45, 50.0)  # what the fall itself brings puts nothing off
-    schedule.look(0.5, 50.0)
+    schedule.observe(0.45, 50.0)  # what the fall itself brings puts nothing off
+    schedule.observe(0.5, 50.0)
     assert schedule.cooling_from == pytest.approx(at)
 
 
 def test_a_better_look_starts_the_count_anew():
     schedule = Schedule(CONFIG)
     for share, psnr in ((0.1, 30.0), (0.2, 30.0), (0.3, 30.0), (0.35, 31.0), (0.4, 31.0), (0.5, 31.0)):
-        schedule.look(share, psnr)
+        schedule.observe(share, psnr)
     assert schedule.end == pytest.approx(1)
 
 
@@ -50,8 +50,8 @@ def test_a_better_look_starts_the_count_anew():
 def test_a_restored_schedule_goes_on_as_it_would_have(looks):
     schedule, again = Schedule(CONFIG), Schedule(CONFIG)
     for i in range(looks):
-        schedule.look(0.1 * i, 30.0)
+        schedule.observe(0.1 * i, 30.0)
     again.restore(json.loads(json.dumps(schedule.state())))
     for one in (schedule, again):
-        one.look(0.55, 30.0)
+        one.observe(0.55, 30.0)
     assert vars(schedule) == vars(again)

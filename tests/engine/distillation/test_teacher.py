@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.distillation.sampler import RaySampler
-from fusedrf_cli.engine.distillation.teacher import TeacherConfig, ask
+from fusedrf_cli.engine.distillation.teacher import TeacherConfig, query_teacher
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.engine.conftest import BOX, Gaussian, Slab
 
@@ -20,17 +20,17 @@ def test_pixels_are_those_of_the_renderer():
     rays_o, rays_d = RaySampler([BOX]).draw(400, seeded())
     wanted = render_rays(field, rays_o, rays_d, step=0.01, early_stop=1e-3)[:, :4]
     for at_once in (1 << 16, 150):
-        pool = ask(field, rays_o, rays_d, 0.01, seeded(3), at_once=at_once)
+        dataset = query_teacher(field, rays_o, rays_d, 0.01, seeded(3), at_once=at_once)
         assert wanted[:, 3].max() > 0.8
-        np.testing.assert_allclose(pool.pixels.numpy(), wanted, atol=3e-3)
-        np.testing.assert_array_equal(pool.rays_o, rays_o)
+        np.testing.assert_allclose(dataset.pixels.numpy(), wanted, atol=3e-3)
+        np.testing.assert_array_equal(dataset.rays_o, rays_o)
 
 
 @pytest.mark.parametrize("at_once", [1 << 14, 30])
 def test_points_are_samples_with_the_teachers_answers(at_once):
     field = Gaussian(density=8.0)
     rays_o, rays_d = RaySampler([BOX]).draw(100, seeded())
-    points = ask(field, rays_o, rays_d, 0.05, seeded(3), everything, at_once).points
+    points = query_teacher(field, rays_o, rays_d, 0.05, seeded(3), everything, at_once).points
     sigma, rgb = field.query(points.where, points.dirs)
     assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
     torch.testing.assert_close(sigma, points.sigma, rtol=1e-4, atol=1e-6)  # places are kept in float32
@@ -44,9 +44,9 @@ def everything(depth, transmittance):
 
 def test_all_matter_is_kept_and_a_share_of_the_emptiness():
     field, rays = Gaussian(density=8.0), RaySampler([BOX]).draw(2000, seeded())
-    whole = ask(field, *rays, 0.05, seeded(3), everything).points
-    kept = ask(field, *rays, 0.05, seeded(3)).points
-    matter = [(points.sigma * 0.05 > TeacherConfig.matter).sum() for points in (whole, kept)]
+    whole = query_teacher(field, *rays, 0.05, seeded(3), everything).points
+    kept = query_teacher(field, *rays, 0.05, seeded(3)).points
+    matter = [(points.sigma * 0.05 > TeacherConfig.occupied_depth).sum() for points in (whole, kept)]
     assert matter[0] == matter[1] > 1000
     assert abs((len(kept) - matter[1]) / (len(whole) - matter[0]) - TeacherConfig.empty_share) < 0.02
 
@@ -54,14 +54,16 @@ def test_all_matter_is_kept_and_a_share_of_the_emptiness():
 def test_transmittance_of_points_is_the_rays():
     """In a medium of σ = 4, behind a length x of it, exp(-4 x) to within the step."""
     rays_o, rays_d = np.array([[-3.0, 0, 0]] * 200), np.array([[1.0, 0, 0]] * 200)
-    points = ask(Slab(density=4.0), rays_o, rays_d, 0.02, seeded(), everything).points
+    points = query_teacher(Slab(density=4.0), rays_o, rays_d, 0.02, seeded(), everything).points
     deep = (points.where[:, 0] + 0.3).clamp(0, 0.7)
     wanted = torch.exp(-4 * deep)
     assert ((points.transmittance / wanted).log().abs() < 4 * 0.021).all()
 
 
 def test_points_come_in_random_order_and_round_again():
-    points = ask(Gaussian(density=8.0), *RaySampler([BOX]).draw(100, seeded()), 0.05, seeded(3)).points
+    points = query_teacher(
+        Gaussian(density=8.0), *RaySampler([BOX]).draw(100, seeded()), 0.05, seeded(3)
+    ).points
     jumps = (points.where[1:] - points.where[:-1]).norm(dim=1)
     assert jumps.mean() > 0.3  # along a ray they would be 0.05 apart
     n, size = len(points), len(points) // 3 + 5
@@ -73,13 +75,13 @@ def test_points_come_in_random_order_and_round_again():
 def test_no_points_behind_what_is_opaque():
     """Behind the wall at x in [-0.3, 0.4] of optical depth 35 nothing is kept of a ray along +x."""
     rays_o, rays_d = np.array([[-3.0, 0, 0]] * 20), np.array([[1.0, 0, 0]] * 20)
-    pool = ask(Slab(density=50.0), rays_o, rays_d, 0.02, seeded())
-    x = pool.points.where[:, 0]
+    dataset = query_teacher(Slab(density=50.0), rays_o, rays_d, 0.02, seeded())
+    x = dataset.points.where[:, 0]
     assert -0.3 < x.max() < -0.1 and x.min() < -0.9
-    assert (pool.pixels[:, 3] > 0.999).all()
+    assert (dataset.pixels[:, 3] > 0.999).all()
 
 
 def test_rays_past_everything_give_no_points():
     rays_o, rays_d = np.array([[-3.0, 0, 5]]), np.array([[1.0, 0, 0]])
-    pool = ask(Slab(), rays_o, rays_d, 0.02, seeded())
-    assert len(pool.points) == 0 and not pool.pixels.any()
+    dataset = query_teacher(Slab(), rays_o, rays_d, 0.02, seeded())
+    assert len(dataset.points) == 0 and not dataset.pixels.any()

@@ -2,7 +2,7 @@
 
 import torch
 
-from fusedrf_cli.engine.fields.base import RadianceField, holds_matter
+from fusedrf_cli.engine.fields.base import RadianceField, is_occupied
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import vm_field
@@ -32,5 +32,5 @@ def test_fields_keep_the_protocol():
 def test_matter_is_what_can_be_seen_through_the_whole_box():
     """An optical depth of 1e-4 along the diagonal is nothing; a thousand times as much is thin fog."""
     for field, found in ((Box(1e-5), False), (Box(1e-2), True), (Ball(), True), (Ball(radius=0.0), False)):
-        assert holds_matter(field) == found
-    assert holds_matter(vm_field(Box(1e-2))) and not holds_matter(vm_field(Box(0.0)))
+        assert is_occupied(field) == found
+    assert is_occupied(vm_field(Box(1e-2))) and not is_occupied(vm_field(Box(0.0)))

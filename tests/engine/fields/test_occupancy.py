@@ -15,7 +15,7 @@ from fusedrf_cli.engine.fields.occupancy import (
     placed_cells,
     transformed_aabb,
 )
-from fusedrf_cli.engine.fields.pace import Pace
+from fusedrf_cli.engine.fields.step_size_grid import StepSizeGrid
 from fusedrf_cli.engine.spaces import unbounded
 from tests.engine.conftest import BOX, points_in
 
@@ -157,7 +157,7 @@ def test_steps_in_a_place_are_parts_of_its_own():
     fine = np.zeros(grid.occupied.shape, bool)
     fine[:4] = True
     for ratio in (1.0, 1.4, 3.3, 20.0):
-        pace = Pace(grid)
+        pace = StepSizeGrid(grid)
         steps = 0.15 / ratio, 0.15
         assert len(list(pace.kept([fine, ~fine], [(grid, np.eye(4))] * 2, steps))) == 2
         found = pace.grid(fine | ~fine)

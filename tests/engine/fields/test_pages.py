@@ -6,15 +6,15 @@ import os
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields import large_pages
 
-MANY = pages.LARGE // 4
+MANY = large_pages.LARGE // 4
 
 
 @pytest.mark.parametrize("count", [0, 7, MANY - 1, MANY, MANY + 5])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_they_are_zeros_that_can_be_written(count, dtype):
-    numbers = pages.zeros(count, dtype)
+    numbers = large_pages.zeros(count, dtype)
     assert numbers.shape == (count,) and numbers.dtype == dtype and numbers.device.type == "cpu"
     assert not numbers.any()
     numbers += 1
@@ -30,10 +30,10 @@ def test_large_ones_are_asked_for_in_large_pages(monkeypatch):
         def madvise(self, *advice):
             asked.append((len(self), *advice))
 
-    monkeypatch.setattr(pages.mmap, "mmap", Memory)
-    pages.zeros(MANY - 1, advice=14)
-    pages.zeros(MANY, advice=14)
-    assert asked == [(pages.LARGE, 14)]
+    monkeypatch.setattr(large_pages.mmap, "mmap", Memory)
+    large_pages.zeros(MANY - 1, advice=14)
+    large_pages.zeros(MANY, advice=14)
+    assert asked == [(large_pages.LARGE, 14)]
 
 
 def test_a_system_without_them_gives_small_ones(monkeypatch):
@@ -41,15 +41,15 @@ def test_a_system_without_them_gives_small_ones(monkeypatch):
         def madvise(self, *advice):
             raise OSError(22, "Invalid argument")
 
-    monkeypatch.setattr(pages.mmap, "mmap", Memory)
-    assert not pages.zeros(MANY, advice=14).any()
-    assert not pages.zeros(MANY, advice=None).any()
+    monkeypatch.setattr(large_pages.mmap, "mmap", Memory)
+    assert not large_pages.zeros(MANY, advice=14).any()
+    assert not large_pages.zeros(MANY, advice=None).any()
 
 
-@pytest.mark.skipif(pages.ADVICE is None, reason="a system without large pages")
+@pytest.mark.skipif(large_pages.ADVICE is None, reason="a system without large pages")
 def test_large_ones_are_not_shared_with_children():
     """Shared memory, which a mapping is unless it says otherwise, stays in small pages on most systems."""
-    numbers = pages.zeros(MANY)
+    numbers = large_pages.zeros(MANY)
     child = os.fork()
     if child == 0:
         numbers.numpy()[:] = 1

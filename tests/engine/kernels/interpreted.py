@@ -14,8 +14,8 @@ from ..conftest import points_in, unit
 
 def interpreted(field) -> dict[str, Callable]:
     """The namespace of a field's loops, as plain functions over numpy arrays."""
-    sizes = field.bodies.sizes(field)
-    names, functions = specialise.namespace(field.bodies, field.space)
+    sizes = field.device_module.sizes(field)
+    names, functions = specialise.namespace(field.device_module, field.space)
     names |= sizes
     for name, value in {**names, **functions}.items():
         function = getattr(value, "py_func", functions.get(name))
@@ -35,7 +35,7 @@ def answer(names, field, p, d):
     scratch, memory = np.zeros(names["SCRATCH"]), np.empty(max(names["KEPT"], 1))
     sigma, _, steps, at = names["density"](field.arrays, field.grid, 0, p, d, scratch)
     assert steps == 1
-    names["begin"](field.arrays, d, scratch)
+    names["ray_setup"](field.arrays, d, scratch)
     return sigma, names["colour"](field.arrays, at, p, d, scratch, memory, 0)
 
 
@@ -61,7 +61,7 @@ def assert_gradients(field, shaded: bool) -> None:
     dirs = dirs[[0, 0, 1, 1, 2, 2]]
     for i in range(0, 6, 2):
         d, scratch = tuple(dirs[i]), np.zeros(names["SCRATCH"])
-        names["begin"](arrays, d, scratch)
+        names["ray_setup"](arrays, d, scratch)
         for k in (i, i + 1):
             p, memory = tuple(points[k]), np.empty(max(names["KEPT"], 1))
             sigma, pre, _, at = names["density"](arrays, grid, 0, p, d, scratch)
@@ -70,7 +70,7 @@ def assert_gradients(field, shaded: bool) -> None:
             rgb = names["colour"](arrays, at, p, d, scratch, memory, 0) if shaded else (0.0, 0.0, 0.0)
             sent = d_sigma[k], shaded, rgb, tuple(d_rgb[k])
             names["backward"](arrays, at, p, d, pre, *sent, scratch, memory, 0, grad)
-        names["end"](arrays, d, scratch, grad)
+        names["ray_backward"](arrays, d, scratch, grad)
     params = field.params.clone().requires_grad_()
     answers = field.reference(params, torch.from_numpy(points), torch.from_numpy(dirs))
     torch.autograd.backward(answers, (torch.from_numpy(d_sigma), torch.from_numpy(d_rgb)))

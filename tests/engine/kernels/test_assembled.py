@@ -20,15 +20,15 @@ from fusedrf_cli.engine.encodings import (
     trunk_features,
 )
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.fields.hashed import Hashed
-from fusedrf_cli.engine.kernels import instances, light, loops, parts, specialise
+from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.kernels import instances, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import OPTIONAL, READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded
 
 from ..conftest import BOX, points_in
 from .interpreted import assert_answers, assert_gradients, interpreted, samples
 
-RUNS = Hashed((0.31, 0.07), 64)
+RUNS = HashGrid((0.31, 0.07), 64)
 HASHED = {"levels": 4, "features": 2, "log2_rows": 6, "base": 3, "growth": 1.7}
 DENSITIES = {
     "line": (line, {"rank": 8}),
@@ -164,8 +164,8 @@ def test_what_is_prefetched_lies_in_the_numbers(field):
     """Also at points outside the box, where nobody answers."""
     names = interpreted(field)
     for p in points_in(BOX, 50, margin=0.05).tolist():
-        names["ahead_density"](field.arrays, field.arrays.params, 0, tuple(p))
-        names["ahead_colour"](field.arrays, field.arrays.params, 0, tuple(p))
+        names["prefetch_density"](field.arrays, field.arrays.params, 0, tuple(p))
+        names["prefetch_colour"](field.arrays, field.arrays.params, 0, tuple(p))
 
 
 def test_a_place_is_made_again_of_what_is_kept_of_it():
@@ -177,12 +177,13 @@ def test_a_place_is_made_again_of_what_is_kept_of_it():
     along = torch.from_numpy(dirs[:1]).expand(30, 3)
     expected = field.reference(field.params, torch.from_numpy(points), along)[1].numpy()
     kept = [
-        names["keep"](names["density"](field.arrays, field.grid, 0, tuple(p), d, scratch)[3]) for p in points
+        names["pack_cell"](names["density"](field.arrays, field.grid, 0, tuple(p), d, scratch)[3])
+        for p in points
     ]
     assert 5 < sum(kept) < 25
-    names["begin"](field.arrays, d, scratch)
+    names["ray_setup"](field.arrays, d, scratch)
     for p, held, colour in zip(points, kept, expected, strict=True):
-        place = names["again"](field.arrays, held, tuple(p))
+        place = names["unpack_cell"](field.arrays, held, tuple(p))
         shown = names["colour"](field.arrays, place, tuple(p), d, scratch, memory, 0)
         np.testing.assert_allclose(shown, colour, atol=1e-10)
 
@@ -195,19 +196,22 @@ def test_one_assembly_and_one_type_of_arrays_for_the_same_parts(field):
 @pytest.mark.parametrize("space", [bounded, unbounded])
 def test_no_two_parts_of_a_namespace_define_one_name(field, space):
     """The namespace is flat and the later name wins: a name of a slot that hides one of the loops, of the
-    space or of kernels/parts.py would be called in its place. Hooks of loops.py are there to be hidden."""
-    bodies = vars(field.bodies)
-    own = {name for name in {*bodies, *field.bodies.sizes(field)} if not name.startswith("__")}
+    space or of kernels/primitives.py would be called in its place. Hooks of loops.py are there to be
+    hidden."""
+    device_module = vars(field.device_module)
+    own = {name for name in {*device_module, *field.device_module.sizes(field)} if not name.startswith("__")}
     hooks = {template.__name__ for template in TEMPLATES} | set(OPTIONAL)
     settings = {"LEARN_FROM", "SHADING_COST"}
-    for module in (loops, space, parts, instances, light):
+    for module in (loops, space, primitives, instances, light):
         allowed = {loops: hooks | settings, space: settings}.get(module, set())
-        others = {name for name in own & set(vars(module)) if bodies.get(name) is not vars(module)[name]}
+        others = {
+            name for name in own & set(vars(module)) if device_module.get(name) is not vars(module)[name]
+        }
         assert others <= allowed
 
 
 def test_names_get_the_prefix_of_their_slot(field):
-    names, functions = specialise.namespace(field.bodies, bounded)
+    names, functions = specialise.namespace(field.device_module, bounded)
     for slot in READS:
         assert {f"{slot}_forward", f"{slot}_summed"} & set(names)
     assert "sigma_activation" in functions["sigma_forward"].__code__.co_names

@@ -9,9 +9,9 @@ import torch
 
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
-from fusedrf_cli.engine.kernels import GridArrays, cpu, loops, plain, reference
-from fusedrf_cli.engine.kernels.loops import Answers, Points
-from fusedrf_cli.engine.kernels.parts import CLIPPED, LINE
+from fusedrf_cli.engine.kernels import GridArrays, cpu, field_free, loops, reference
+from fusedrf_cli.engine.kernels.loops import PointBatch, PointValues
+from fusedrf_cli.engine.kernels.primitives import CLIPPED, LINE
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from fusedrf_cli.engine.rendering.volume import reach_of
 from fusedrf_cli.engine.spaces import bounded
@@ -78,8 +78,8 @@ def test_tasks_dealt_to_threads_are_all_done(count, threads):
     """Whatever the number of threads, of tasks and of items in the last one: each item once, none beyond."""
     field = random_vm(dtype=torch.float32)
     points, dirs = points_in(BOX, count), unit(np.random.default_rng(1).normal(size=(count, 3)))
-    found = Answers(np.full(count + 1, np.nan, np.float32), np.full((count + 1, 3), np.nan, np.float32))
-    asked, run = Points(points, dirs, True), field.loops._over("each", "query_point")
+    found = PointValues(np.full(count + 1, np.nan, np.float32), np.full((count + 1, 3), np.nan, np.float32))
+    asked, run = PointBatch(points, dirs, True), field.loops._over("each", "query_point")
     run(field.arrays, field.grid, asked, count, 10, threads, found)
     sigma, rgb = query(field, points, dirs)
     assert np.array_equal(found.sigma[:count], sigma) and np.array_equal(found.rgb[:count], rgb)
@@ -301,7 +301,7 @@ def test_render_is_the_reference(cells, early_stop):
     rays_d[36:40] *= -1  # and some that miss
     found = render(field, rays_o, rays_d, early_stop=early_stop)
     rays = torch.from_numpy(rays_o), torch.from_numpy(rays_d)
-    cuts = dict(early_stop=early_stop, lending=(loops.COLOUR_FROM, loops.LENT_FROM))
+    cuts = dict(early_stop=early_stop, lending=(loops.COLOUR_FROM, loops.SHARED_COLOUR_FROM))
     wanted = reference.render_rays(field, *rays, 0.0, 0.05, **cuts).numpy()
     assert (wanted[36:40] == 0).all() and (wanted[:36, 3] > 0.01).mean() > 0.3
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
@@ -520,7 +520,7 @@ def test_adam_of_a_slice_stays_in_it(rng):
 @pytest.mark.parametrize("listed", [False, True])
 def test_adam_takes_the_touched_lines_of_many_tasks_and_no_others(rng, listed):
     """By the formula in float64, of all lines or of a list of them; what is not listed keeps its gradient."""
-    lines, f = 3 * plain.LINES_PER_TASK + 5, np.float32
+    lines, f = 3 * field_free.LINES_PER_TASK + 5, np.float32
     size = lines * LINE
     sent = rng.random((2, lines, LINE)) * (rng.random((2, lines, 1)) < 0.15)
     sent[rng.random(sent.shape) < 0.3] = 0

@@ -242,7 +242,7 @@ def test_weights_and_votes_of_cells(dtype):
 @on_a_device
 def test_exposed():
     field = random_sparse(0, depth=1)
-    low, high = (field.fine.places[field.fine.corners[:12, q]] for q in (0, 7))
+    low, high = (field.fine.positions[field.fine.corners[:12, q]] for q in (0, 7))
     for wanted, found in twice(field, lambda f: f.exposed(low, high, np.eye(3), 3.0, 0.01)):
         check(found, wanted)
         assert wanted.any()

@@ -22,7 +22,7 @@ def test_cache_is_the_users_and_named_for_what_is_inlined(tmp_path, monkeypatch)
     assert folder.is_dir() and folder.is_relative_to(tmp_path / "fusedrf")
     read, engine = Path.read_bytes, Path(kernels.__file__).parent.parent
     changed = [
-        *("kernels/parts.py", "kernels/loops.py", "kernels/prefetch.py", "spaces/bounded.py"),
+        *("kernels/primitives.py", "kernels/loops.py", "kernels/prefetch.py", "spaces/bounded.py"),
         *("encodings/line.py", "decoders/sh_basis.py", "encodings/plane_line.py", "encodings/bricks.py"),
     ]
     folders = {folder}
@@ -38,7 +38,7 @@ import numpy as np
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.kernels import cpu
 told = []
-with kernels.telling_of_compilation(lambda: told.append(1)):
+with kernels.report_compilation(lambda: told.append(1)):
     rays = np.zeros((1, 3)), np.ones((1, 3))
     cpu.lens_rays(np.eye(4), 1.0, 1.0, 0.5, 0.5, (0.0,) * 9, False, 1, 0, np.zeros(1, np.int64), *rays)
 print(cpu.__file__)
@@ -143,7 +143,7 @@ locator.PACKAGE = locator.Path(__file__).parent
 import numba
 exec(compile("@numba.njit(cache=True)\\ndef cube(x):\\n    return x**3", __file__, "exec"))
 said, told = [], []
-with kernels.telling_of_compilation(lambda: told.append(1), said.append):
+with kernels.report_compilation(lambda: told.append(1), said.append):
     assert cube(2.0) == 8 and cube(3) == 27
 print(len(told), *said, sep="\\n")
 """

@@ -9,7 +9,7 @@ import pytest
 
 from fusedrf_cli.engine.decoders import density_sum, sh, sh_basis
 from fusedrf_cli.engine.encodings import bricks, line, plane_line
-from fusedrf_cli.engine.kernels import instances, light, loops, parts, specialise
+from fusedrf_cli.engine.kernels import instances, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import assemble
 from fusedrf_cli.engine.spaces import SPACES, bounded
 from tests.engine.kinds.cases import KINDS
@@ -22,7 +22,7 @@ SIZES = {"RANK": 8, "SCRATCH": 1, "KEPT": 0}
 SCRIPT = """
 import numpy as np, sys, torch
 from fusedrf_cli.engine import kernels
-from fusedrf_cli.engine.kernels.loops import Answers, Points
+from fusedrf_cli.engine.kernels.loops import PointValues, PointBatch
 from fusedrf_cli.engine.kernels.specialise import Loops
 from fusedrf_cli.engine.spaces import bounded
 sys.path.insert(0, {folder!r})
@@ -30,10 +30,10 @@ import toy
 told = []
 field, grid = toy.Arrays(np.ones(4)), kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), *np.eye(3))
 grid = grid._replace(lo=np.zeros(3), hi=np.ones(3), cell=np.ones(3))
-with kernels.telling_of_compilation(lambda: told.append(1)):
+with kernels.report_compilation(lambda: told.append(1)):
     for rank in map(int, sys.argv[1:]):
-        found = Answers(np.zeros(1), np.zeros((1, 3)))
-        asked = Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
+        found = PointValues(np.zeros(1), np.zeros((1, 3)))
+        asked = PointBatch(np.full((1, 3), 0.5), np.eye(3)[:1], True)
         sizes = {{"RANK": rank, "SCRATCH": 1, "KEPT": 0}}
         Loops(toy, sizes, bounded).each("query_point", field, grid, asked, 1, found)
         print(found.sigma[0], found.rgb[0, 0])
@@ -42,7 +42,7 @@ print(len(told))
 
 TOY = """
 from typing import NamedTuple
-from fusedrf_cli.engine.kernels.parts import sigmoid
+from fusedrf_cli.engine.kernels.primitives import sigmoid
 class Arrays(NamedTuple):
     params: object
 def sizes(field):
@@ -87,19 +87,19 @@ from types import SimpleNamespace
 from fusedrf_cli.engine import kernels
 from fusedrf_cli.engine.decoders import density_sum, rgb
 from fusedrf_cli.engine.kernels.assembled import assemble
-from fusedrf_cli.engine.kernels.loops import Answers, Points
+from fusedrf_cli.engine.kernels.loops import PointValues, PointBatch
 from fusedrf_cli.engine.kernels.specialise import Loops
 from fusedrf_cli.engine.spaces import bounded
 sys.path.insert(0, {folder!r})
 import flat
-told, bodies = [], assemble(flat, flat, density_sum, rgb)
+told, device_module = [], assemble(flat, flat, density_sum, rgb)
 sizes = {{"density": flat.sizes(), "colour": flat.sizes(), "sigma": density_sum.sizes(), "rgb": rgb.sizes(3)}}
-sizes = bodies.sizes(SimpleNamespace(slots={{name: SimpleNamespace(sizes=s) for name, s in sizes.items()}}))
-field = bodies.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
+sizes = device_module.sizes(SimpleNamespace(slots={{name: SimpleNamespace(sizes=s) for name, s in
+sizes.items()}})) field = device_module.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
 grid = kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), np.zeros(3), np.ones(3), np.ones(3))
-with kernels.telling_of_compilation(lambda: told.append(1)):
-    found, asked = Answers(np.zeros(1), np.zeros((1, 3))), Points(np.full((1, 3), 0.5), np.eye(3)[:1], True)
-    Loops(bodies, sizes, bounded).each("query_point", field, grid, asked, 1, found)
+with kernels.report_compilation(lambda: told.append(1)):
+    found, asked = PointValues(np.zeros(1), np.zeros((1, 3))), PointBatch(np.full((1, 3), 0.5), np.eye(3)[:1],
+    True) Loops(device_module, sizes, bounded).each("query_point", field, grid, asked, 1, found)
 print(found.sigma[0], round(found.rgb[0, 0], 6))
 print(len(told))
 """
@@ -132,8 +132,8 @@ def test_a_changed_file_of_a_plug_in_is_compiled_anew(ask):
     assert ask(8) == ["8.0 0.35", "1"]
 
 
-def tag(bodies: ModuleType = VM, sizes: dict = SIZES, space: ModuleType = bounded) -> str:
-    return specialise.specialised(bodies, sizes, space)[0]
+def tag(device_module: ModuleType = VM, sizes: dict = SIZES, space: ModuleType = bounded) -> str:
+    return specialise.specialised(device_module, sizes, space)[0]
 
 
 def test_kinds_sizes_and_spaces_have_names_of_their_own():
@@ -153,8 +153,8 @@ def test_every_function_carries_the_name():
 
 
 HOOKS = {
-    "begin", "end", "keep", "again", "advance", "known", "ahead_density", "ahead_colour", "COLOUR_FROM",
-    "LEARN_FROM", "LENT_FROM", "REST_FROM", "SHADING_COST",
+    "ray_setup", "ray_backward", "pack_cell", "unpack_cell", "next_index", "is_inside", "prefetch_density",
+    "prefetch_colour", "COLOUR_FROM", "LEARN_FROM", "SHARED_COLOUR_FROM", "REST_FROM", "SHADING_COST",
     "next_sample", "next_change", "optical_length",
 }  # fmt: skip
 """What a kind or a space may have in place of the loops' own, see loops.py."""
@@ -165,10 +165,10 @@ HOOKS = {
 def test_no_name_means_two_things_in_a_namespace(name, space):
     """It is flat, and the later name wins: a template's constant would be a kind's offset in scratch."""
     field = KINDS[name]()
-    ours = [vars(module) for module in (parts, loops, instances, light, space)]
-    theirs = vars(field.bodies)
+    ours = [vars(module) for module in (primitives, loops, instances, light, space)]
+    theirs = vars(field.device_module)
     meanings: dict[str, object] = {}
-    for names in (*ours, theirs, field.bodies.sizes(field)):
+    for names in (*ours, theirs, field.device_module.sizes(field)):
         for key, value in names.items():
             if not key.startswith("__") and key not in HOOKS:
                 assert meanings.setdefault(key, value) is value, key
@@ -176,8 +176,8 @@ def test_no_name_means_two_things_in_a_namespace(name, space):
 
 def test_what_a_kind_leaves_out_has_a_default():
     _, names = specialise.specialised(SPARSE, SIZES, bounded)
-    assert names["end"].py_func.__code__ is SPARSE.end.__code__
-    assert names["advance"].py_func.__code__ is SPARSE.advance.__code__
+    assert names["ray_backward"].py_func.__code__ is SPARSE.ray_backward.__code__
+    assert names["next_index"].py_func.__code__ is SPARSE.next_index.__code__
     _, names = specialise.specialised(CP, SIZES, bounded)
-    assert names["advance"].py_func.__code__ is loops.advance.__code__
-    assert names["end"].py_func.__code__ is CP.end.__code__
+    assert names["next_index"].py_func.__code__ is loops.next_index.__code__
+    assert names["ray_backward"].py_func.__code__ is CP.ray_backward.__code__

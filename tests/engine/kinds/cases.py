@@ -7,11 +7,11 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.box import BoxField
-from fusedrf_cli.engine.fields.hashed import Hashed
+from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.boxes import BoxKind
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.box_kind import BoxKind
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField, untrained
 from tests.analytic.export import with_network
 
@@ -25,7 +25,7 @@ SLOW_TO_COMPILE = {"cp", "dense-mlp", "vm-mlp"}
 def random_detail(**kwargs):
     """A field with a hash grid that about half of its points ask for; 64 rows for thousands of
     vertices."""
-    hashed = Hashed((0.31, 0.07), 64, learns_from=2)
+    hashed = HashGrid((0.31, 0.07), 64, learns_from=2)
     return random_vm(cells=4, hashed=hashed, scale=300.0, shift=-6.0, **kwargs)
 
 
@@ -42,7 +42,7 @@ def random_vm_mlp(dtype=torch.float64, seed=0, cells=None, width=8) -> VMMLPFiel
 def random_boxed(name: str, dtype=torch.float64, seed=0) -> BoxField:
     """A field of a kind over one box, of random numbers under a random occupancy, dense enough to see."""
     kind = registry.kind(name)
-    shape = kind.shape(Way(ranks=(8, 16)))
+    shape = kind.shape(StorageSetting(ranks=(8, 16)))
     if hasattr(shape, "hidden"):
         shape = replace(shape, width=8, hidden=8)
     generator = torch.Generator().manual_seed(seed)

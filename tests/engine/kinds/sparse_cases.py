@@ -6,7 +6,7 @@ import torch
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree, children, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 
 LO, TOP, COUNTS = np.array([-1.0, -0.7, 0.2]), np.array([0.6, 0.7, 0.55]), (3, 2, 3)
 
@@ -37,7 +37,7 @@ def random_sparse(
 ) -> SparseField:
     """A sparse field of random numbers, dense enough to see. Tests ask for degrees 0 and 2 alone, since each
     is compiled."""
-    bare = SparseField(SparseShape(degree), Lattice(random_tree(depth, seed), SIDE), scale)
+    bare = SparseField(SparseShape(degree), VertexLattice(random_tree(depth, seed), SIDE), scale)
     generator = torch.Generator().manual_seed(seed)
     field = bare.with_params(torch.randn(bare.size, generator=generator, dtype=torch.float64).to(dtype))
     held = bare.with_params(torch.zeros_like(field.params))

@@ -10,17 +10,17 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     MAX_LEVEL,
     BrickTree,
     children,
-    key_places,
+    key_positions,
     morton,
     node_keys,
 )
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from tests.engine.kinds.sparse_cases import random_tree
 
 
 def test_keys_keep_places_and_their_order(rng):
     places = rng.integers(0, 1 << 21, (200, 3))
-    np.testing.assert_array_equal(key_places(node_keys(places)), places)
+    np.testing.assert_array_equal(key_positions(node_keys(places)), places)
     order = np.lexsort((places[:, 2], places[:, 1], places[:, 0]))
     np.testing.assert_array_equal(np.argsort(node_keys(places)), order)
 
@@ -35,7 +35,7 @@ def test_a_morton_code_is_the_bits_of_three_numbers_in_turn(rng):
 @pytest.mark.parametrize("n", [4, 2])
 def test_rows_are_stored_in_runs_of_eight_top_cells(n):
     """Every row once, those of a run in the same two top cells per axis, and no two runs in the same."""
-    lattice = Lattice(replace(random_tree(2), phase=(1, 0, 1)), n)
+    lattice = VertexLattice(replace(random_tree(2), phase=(1, 0, 1)), n)
     order, runs = lattice.stored_order
     np.testing.assert_array_equal(np.sort(order), np.arange(lattice.free))
     cells = lattice.vertices[order] // (SIDE << lattice.tree.depth)
@@ -48,12 +48,12 @@ def test_rows_are_stored_in_runs_of_eight_top_cells(n):
 def test_runs_stay_what_they_are_when_the_box_grows():
     """By one top cell, which moves every other one to the other place of its pair, and by two."""
     tree = random_tree(2)
-    lattice = Lattice(tree, SIDE)
+    lattice = VertexLattice(tree, SIDE)
     order, runs = lattice.stored_order
     held = {frozenset(keys) for keys in np.split(order, np.cumsum(runs)[:-1])}
     for cells in ([1, 0, 2], [2, 1, 1], [3, 3, 0]):
         low = tree.lo - (np.array(cells) - 0.5) * tree.top
-        wider = Lattice(tree.extended(np.concatenate([low, tree.aabb[3:]])), SIDE)
+        wider = VertexLattice(tree.extended(np.concatenate([low, tree.aabb[3:]])), SIDE)
         order, runs = wider.stored_order
         assert {frozenset(keys) for keys in np.split(order, np.cumsum(runs)[:-1])} == held
 
@@ -94,7 +94,7 @@ def test_bytes_that_are_no_tree_are_refused(what):
 def test_points_find_their_voxel(n, rng):
     """Against a loop over all bricks."""
     tree = random_tree(2)
-    lattice = Lattice(tree, n)
+    lattice = VertexLattice(tree, n)
     halves = 2 * rng.integers(-2, (np.array(tree.counts) * SIDE << tree.depth) + 2, (300, 3)) + 1
     brick, voxel, active = tree.voxels_at(halves, n, lattice.active)
     for point, b, v, a in zip(halves, brick, voxel, active, strict=True):
@@ -113,7 +113,7 @@ def test_every_place_is_one_vertex(n):
     """Free and hanging rows are different places; corners of active voxels have one, in ascending order of
     need."""
     tree = random_tree(2)
-    lattice = Lattice(tree, n)
+    lattice = VertexLattice(tree, n)
     assert len(np.unique(node_keys(lattice.vertices))) == len(lattice.vertices)
     assert (lattice.corners >= 0).all()
     free = lattice.rows[lattice.rows >= 0]
@@ -125,7 +125,7 @@ def test_every_place_is_one_vertex(n):
 @pytest.mark.parametrize("n", [4, 2])
 def test_hanging_rows_are_averages_of_free_ones(n):
     """Weights are positive, sum to 1, and keep linear functions of the place."""
-    lattice = Lattice(random_tree(3), n)
+    lattice = VertexLattice(random_tree(3), n)
     spread = lattice.spread
     assert spread.shape[0] > 10 and spread.data.min() > 0
     np.testing.assert_allclose(spread.sum(1), 1)

@@ -7,21 +7,21 @@ import torch
 from formats.records import FieldRecord, encode_field
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.encodings.bricks import SIDE
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.registry import kind
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from tests.analytic.rays import points_in, unit
 from tests.engine.kinds.sparse_cases import random_sparse, random_tree
 
 SPARSE = kind("sparse")
-AS_IT_IS = Way()
+AS_IT_IS = StorageSetting()
 
 
-def reduced(field: SparseField, voxel: float, way: Way = AS_IT_IS) -> SparseField:
+def reduced(field: SparseField, voxel: float, storage: StorageSetting = AS_IT_IS) -> SparseField:
     """The field by its kind's reduction; the size told is that of a file, and not far above."""
-    reduction = SPARSE.reduction(SPARSE.outline(field), voxel, way)
+    reduction = SPARSE.reduction(SPARSE.outline(field), voxel, storage)
     made = reduction.make(field)
     for precision in ("float16", "int8"):
         told = BundleSizes().of(reduction.contents, precision)
@@ -38,7 +38,7 @@ def test_voxels_are_as_wide_as_asked_and_hold_all_that_was_held(halvings):
     level, *inner = np.nonzero(tree.mask)
     side = (tree.top / SIDE)[None] / 2.0 ** tree.level[level, None]
     middles = tree.lo + (tree.at[level] * SIDE + np.stack(inner, 1) + 0.5) * side
-    lattice = Lattice(coarse, SIDE)
+    lattice = VertexLattice(coarse, SIDE)
     halves = np.floor((middles - coarse.lo) / coarse.unit).astype(int) * 2 + 1
     brick, _, active = coarse.voxels_at(halves, SIDE, lattice.active)
     assert active.all()
@@ -54,7 +54,7 @@ def uniform(counts=(4, 5, 4), degree: int = 1) -> SparseField:
     at = np.argwhere(np.ones(counts, bool))
     whole = np.ones((len(at), SIDE, SIDE, SIDE), bool)
     tree = BrickTree.of([0.5, 0, 0], 1.0, counts, np.zeros(len(at), np.uint8), at, whole)
-    field = SparseField(SparseShape(degree), Lattice(tree, SIDE), 2.0)
+    field = SparseField(SparseShape(degree), VertexLattice(tree, SIDE), 2.0)
     field.rows[:] = torch.tensor([1.0, 2.0, -1.0, 0.5])
     field.bands[:] = torch.linspace(-0.5, 0.5, field.shape.band_numbers)
     return field
@@ -73,9 +73,9 @@ def test_an_even_box_stays_what_it_is(voxel, rng):
 
 def test_what_is_as_wide_as_asked_stays_as_it_is():
     field = random_sparse(2, dtype=torch.float32)
-    reduction = SPARSE.reduction(SPARSE.outline(field), 0.99 * field.voxel_size, Way(sh_degree=3))
+    reduction = SPARSE.reduction(SPARSE.outline(field), 0.99 * field.voxel_size, StorageSetting(sh_degree=3))
     assert reduction.lossless and reduction.make(field) is field
-    assert not SPARSE.reduction(SPARSE.outline(field), 1.01 * field.voxel_size, Way()).lossless
+    assert not SPARSE.reduction(SPARSE.outline(field), 1.01 * field.voxel_size, StorageSetting()).lossless
 
 
 def test_no_voxel_is_wider_than_a_quarter_of_the_box():
@@ -86,7 +86,7 @@ def test_no_voxel_is_wider_than_a_quarter_of_the_box():
 def test_higher_degrees_that_are_0_are_left_out_without_a_trace(rng):
     field = random_sparse(2, dtype=torch.float32)
     field.bands.view(len(field.bands), 3, 8)[..., 3:] = 0
-    made = reduced(field, 0.0, Way(sh_degree=1))
+    made = reduced(field, 0.0, StorageSetting(sh_degree=1))
     points = torch.from_numpy(points_in(field.aabb, 200))
     dirs = torch.from_numpy(unit(rng.normal(size=(200, 3))))
     for mine, theirs in zip(made.query(points, dirs), field.query(points, dirs), strict=True):

@@ -17,18 +17,18 @@ from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.encodings import plane_line
 from fusedrf_cli.engine.encodings.hash_runs import hashed_row
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, STEPS, Hashed
-from fusedrf_cli.engine.kinds import registry, splitting
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.fields.hash_entries import EMPTY_FROM, STEPS, HashGrid
+from fusedrf_cli.engine.kinds import field_cutting, registry
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
 from fusedrf_cli.engine.kinds.vm.trimming import (
-    asked_rows,
+    queried_rows,
     reshaped,
     truncated,
     without_detail,
-    without_unasked,
+    without_unqueried,
 )
-from fusedrf_cli.engine.selection.cells import Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellGrid, Selection
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, points_in, random_vm, unit
@@ -56,13 +56,13 @@ def by_the_rule(rows: int, i: int, j: int, k: int) -> int:
 @pytest.mark.parametrize("rows", [4, 64, 1 << 20, 1 << 24])
 def test_rows_are_those_of_the_rule(rows):
     vertices = np.random.default_rng(0).integers(-3000, 3000, (500, 3))
-    found = hashed_row(Hashed((1.0,), rows), torch.from_numpy(vertices))
+    found = hashed_row(HashGrid((1.0,), rows), torch.from_numpy(vertices))
     assert found.tolist() == [by_the_rule(rows, *(int(n) for n in vertex)) for vertex in vertices]
 
 
 def test_an_answer_by_the_rule_alone():
     """One level, a tensor that says the same everywhere: σ and colour from eight rows, in a slow loop."""
-    field = random_vm(hashed=Hashed((0.25,), 16), scale=2.0, shift=1.0)
+    field = random_vm(hashed=HashGrid((0.25,), 16), scale=2.0, shift=1.0)
     sections = field.sections()
     for name, view in sections.items():
         if name != DETAIL:
@@ -82,7 +82,7 @@ def test_an_answer_by_the_rule_alone():
 @pytest.mark.parametrize("kwargs", [{"spacings": ()}, {"spacings": (0.0,)}, {"rows": 48}, {"rows": 2}])
 def test_what_the_kernels_cannot_serve_is_refused(kwargs):
     with pytest.raises(ValueError, match="spacings|rows"):
-        Hashed(**({"spacings": (0.1,), "rows": 64} | kwargs))
+        HashGrid(**({"spacings": (0.1,), "rows": 64} | kwargs))
 
 
 def test_it_stays_where_texels_change():
@@ -96,7 +96,7 @@ def test_it_stays_where_texels_change():
 
 def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
     """Whatever is done to the field."""
-    coarse, fine = (random_vm(hashed=Hashed(spacings, 16)) for spacings in ((9.0,), (0.25, 0.01)))
+    coarse, fine = (random_vm(hashed=HashGrid(spacings, 16)) for spacings in ((9.0,), (0.25, 0.01)))
     coarse, fine = (field.with_occupancy(field.occupancy) for field in (coarse, fine))
     assert sampling_step(coarse) == pytest.approx(STEP_PER_VOXEL * coarse.voxel_size)
     smaller = fine.resampled(fine.aabb, (9, 9, 9)).with_occupancy(fine.occupancy)
@@ -106,7 +106,7 @@ def test_pictures_sample_it_by_its_spacing_where_that_is_finer_than_texels():
 
 
 def test_what_is_left_without_it_answers_as_planes_and_lines_do():
-    field = random_vm(resolution=(9, 8, 7), hashed=Hashed((0.05,), 1 << 8), scale=300.0, shift=-6.0)
+    field = random_vm(resolution=(9, 8, 7), hashed=HashGrid((0.05,), 1 << 8), scale=300.0, shift=-6.0)
     bare, there = without_detail(field), field.with_params(field.params.clone())
     there.sections()[DETAIL].zero_()
     assert bare.shape == SIXTY_FOUR and len(bare.params) == len(field.params) - (1 << 10)
@@ -116,11 +116,11 @@ def test_what_is_left_without_it_answers_as_planes_and_lines_do():
 
 def test_a_reduction_says_what_a_file_will_hold_of_it():
     """Of a field cut out of a place, whose rows are few; far fewer texels leave it out."""
-    cut, kind = without_unasked(sparse_detail(1 << 14, torch.float32)), registry.kind("vm")
+    cut, kind = without_unqueried(sparse_detail(1 << 14, torch.float32)), registry.kind("vm")
     outline = kind.outline(cut)
     assert len(outline.params) == 0
     for voxel, hashed in ((0.0, cut.shape.hashed), (0.6, None)):
-        reduction = kind.reduction(outline, voxel, Way())
+        reduction = kind.reduction(outline, voxel, StorageSetting())
         made = reduction.make(cut)
         assert made.shape.hashed == hashed
         for precision in ("float16", "int8"):
@@ -143,7 +143,7 @@ def test_it_comes_back_from_a_file_that_older_readers_refuse():
 def sparse_detail(rows=1 << 9, dtype=torch.float64):
     """A tensor of which few cells are occupied, and in half of those planes and lines say that there is
     nothing."""
-    hashed = Hashed((0.31, 0.07), rows)
+    hashed = HashGrid((0.31, 0.07), rows)
     field = random_vm(cells=12, hashed=hashed, scale=300.0, shift=-6.0, dtype=dtype)
     held = np.random.default_rng(1).random(field.occupancy.occupied.shape) < 0.01
     return field.with_occupancy(replace(field.occupancy, occupied=held))
@@ -160,7 +160,7 @@ def within_cells(field, count=400):
 
 def test_rows_that_no_cell_asks_change_no_answer():
     field = sparse_detail()
-    trimmed = without_unasked(field)
+    trimmed = without_unqueried(field)
     points = within_cells(field)
     dirs = torch.from_numpy(unit(np.random.default_rng(0).normal(size=points.shape)))
     for found, wanted in zip(trimmed.query(points, dirs), field.query(points, dirs), strict=True):
@@ -173,7 +173,7 @@ def test_rows_are_asked_if_and_only_if_a_point_with_matter_is_near():
     """By the rule, of points drawn: every row that one of them reads, and next to none besides."""
     field = sparse_detail(1 << 16)
     hashed = field.shape.hashed
-    found = asked_rows(field, hashed)
+    found = queried_rows(field, hashed)
     points = within_cells(field, 3000)
     low, high = torch.from_numpy(field.aabb).view(2, 3)
     factors, unit_points = field.slot_sections()["density"], (points - low) / (high - low)
@@ -191,15 +191,15 @@ def test_rows_are_asked_if_and_only_if_a_point_with_matter_is_near():
 
 def test_all_rows_of_a_level_that_is_met_everywhere_are_kept():
     field = sparse_detail(4)
-    assert asked_rows(field, field.shape.hashed).all()
+    assert queried_rows(field, field.shape.hashed).all()
 
 
 @pytest.mark.parametrize("precision", ["float32", "float16", "int8", "int4"])
 def test_a_file_holds_the_rows_that_are_asked_alone(monkeypatch, precision):
     """A quarter of the bytes or less, the same numbers as told, and again the same bytes."""
-    monkeypatch.setattr("formats.quantised.LEAST", {2: 512, 3: 4096})  # so that the detail is coded
+    monkeypatch.setattr("formats.quantisation.LEAST", {2: 512, 3: 4096})  # so that the detail is coded
     field = sparse_detail(1 << 14, torch.float32)
-    trimmed = without_unasked(field)
+    trimmed = without_unqueried(field)
     whole, small = (encode_field(FieldRecord("vm", *f.state()), precision) for f in (field, trimmed))
     assert len(small) < 0.25 * len(whole) and b'\\"needs\\":[\\"hashed\\",\\"held\\",\\"runs\\"]' in small
     read = decode_field(small, "somewhere")
@@ -214,18 +214,23 @@ def test_a_file_holds_the_rows_that_are_asked_alone(monkeypatch, precision):
 @pytest.mark.parametrize("precision", ["int8", "int4"])
 def test_cut_numbers_keep_the_codes_that_they_had(monkeypatch, precision):
     """Of a field that was read from 8 or 4 bits, cut to a corner that begins at the eighth texel."""
-    monkeypatch.setattr("formats.quantised.LEAST", {2: 512, 3: 64})
+    monkeypatch.setattr("formats.quantisation.LEAST", {2: 512, 3: 64})
     field = random_vm(
-        THIRTY_TWO, (30, 30, 30), torch.float32, hashed=Hashed((0.31, 0.07), 1 << 14), scale=300.0, shift=-6.0
+        THIRTY_TWO,
+        (30, 30, 30),
+        torch.float32,
+        hashed=HashGrid((0.31, 0.07), 1 << 14),
+        scale=300.0,
+        shift=-6.0,
     )
     field = stored(field, precision)
-    middle, box = Lattice.over(field, field.aabb * 0.4, 8), field.box
-    part = splitting.cut_out(field, box, Selection(middle, np.ones(len(middle.points), bool)))
+    middle, box = CellGrid.over(field, field.aabb * 0.4, 8), field.box
+    part = field_cutting.cut_out(field, box, Selection(middle, np.ones(len(middle.points), bool)))
     first = np.rint(
         (part.aabb[:3] - box[:3]) / ((box[3:] - box[:3]) / (np.array(field.resolution) - 1))
     ).astype(int)
     assert (first % 8 == 0).all() and first.any()
-    cut = without_unasked(part)
+    cut = without_unqueried(part)
     assert torch.equal(stored(cut, precision).params, cut.params)
     own = tuple(slice(a, a + n) for a, n in zip(first[:2], cut.resolution, strict=False))
     plane, whole = cut.sections()["density_plane_0"], field.sections()["density_plane_0"][own]
@@ -247,7 +252,7 @@ HOSTILE_HELD = {
 @pytest.mark.parametrize("name", HOSTILE_HELD)
 def test_held_rows_that_do_not_fit_are_refused(name):
     which, change, said = HOSTILE_HELD[name]
-    arrays, metadata = without_unasked(sparse_detail(1 << 12, torch.float32)).state()
+    arrays, metadata = without_unqueried(sparse_detail(1 << 12, torch.float32)).state()
     changed = change(arrays[f"tensor_0.{which}"])
     arrays = arrays | {f"tensor_0.{which}": changed} if changed is not None else arrays
     if changed is None:
@@ -257,7 +262,7 @@ def test_held_rows_that_do_not_fit_are_refused(name):
 
 
 def test_what_a_small_file_unfolds_to_is_foretold_and_bounded():
-    arrays, metadata = without_unasked(sparse_detail(1 << 14, torch.float32)).state()
+    arrays, metadata = without_unqueried(sparse_detail(1 << 14, torch.float32)).state()
     shapes = {name: array.shape for name, array in arrays.items()}
     assert VMField.needs(metadata, shapes, arrays.get).held >= 2 * (1 << 14) * 16
     metadata["tensors"][0]["resolution"] = [8192] * 3
@@ -306,7 +311,7 @@ def test_it_learns_what_is_finer_than_texels():
     wanted = ((points / 0.2).floor().sum(1) % 2)[:, None].expand(-1, 3).float()
     dirs = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(len(points), 3)
     left = {}
-    for hashed in (None, Hashed((0.2 / 3,), 1 << 16, learns_from=2)):
+    for hashed in (None, HashGrid((0.2 / 3,), 1 << 16, learns_from=2)):
         shape = replace(THIRTY_TWO, hashed=hashed)
         field = VMField.create(shape, BOX, (3, 3, 3), torch.Generator().manual_seed(0))
         for name, view in field.sections().items():

@@ -8,8 +8,8 @@ import torch
 
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.kinds import registry
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.reduction import coarser
-from fusedrf_cli.engine.kinds.student import Way
 from tests.engine.kinds.cases import random_boxed, random_vm, random_vm_mlp
 from tests.engine.kinds.sparse_cases import random_sparse
 
@@ -22,13 +22,13 @@ MAKERS = {
 }
 
 
-PLAIN = Way()
+PLAIN = StorageSetting()
 
 
-def reduced(field, voxel: float, way: Way = PLAIN):
+def reduced(field, voxel: float, storage: StorageSetting = PLAIN):
     """(reduction, field) of a field for a voxel and a way."""
     kind = registry.kind(field.kind)
-    found = kind.reduction(kind.outline(field), voxel, way)
+    found = kind.reduction(kind.outline(field), voxel, storage)
     return found, found.make(field)
 
 
@@ -54,9 +54,9 @@ def test_coarser_texels_are_told_before_they_are_made(kind):
 def test_fewer_bands_are_those_that_the_field_has(kind):
     """Without them it answers as with higher bands that are 0."""
     field = MAKERS[kind]()
-    told, small = reduced(field, 0.0, Way(sh_degree=0))
+    told, small = reduced(field, 0.0, StorageSetting(sh_degree=0))
     assert not told.lossless and small.shape.sh_degree == 0
-    again = reduced(small, 0.0, Way(sh_degree=1))[0]
+    again = reduced(small, 0.0, StorageSetting(sh_degree=1))[0]
     assert again.lossless
     rng = np.random.default_rng(0)
     points = torch.from_numpy(field.aabb[:3] + rng.random((200, 3)) * (field.aabb[3:] - field.aabb[:3]))

@@ -13,7 +13,7 @@ from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.fields import Slow
 from tests.analytic.rays import points_in, rays_at, unit
@@ -39,7 +39,7 @@ def slowly(field: SparseField, point: np.ndarray, direction: np.ndarray):
     return None
 
 
-def mixed(lattice: Lattice, rows: torch.Tensor, brick: int, inside: np.ndarray) -> np.ndarray:
+def mixed(lattice: VertexLattice, rows: torch.Tensor, brick: int, inside: np.ndarray) -> np.ndarray:
     """Rows interpolated at a point (3,) in [0, 1) of a brick."""
     n = lattice.n
     at = inside * n
@@ -74,7 +74,7 @@ def test_levels_join_without_a_crack(degree, rng):
     levels."""
     tree = random_tree(3)
     tree.mask[:] = True
-    bare = SparseField(SparseShape(degree), Lattice(tree, SIDE), 4.0)
+    bare = SparseField(SparseShape(degree), VertexLattice(tree, SIDE), 4.0)
     torn = bare.with_params(torch.from_numpy(rng.normal(size=bare.size)))
     joined = bare.with_params(torn.params.clone())
     joined.settle()
@@ -269,9 +269,9 @@ def test_what_light_reaches():
     tree = BrickTree.of(
         [0, 0, 0], 1.0, (2, 2, 2), np.zeros(8, np.uint8), OCTANTS, np.ones((8, 4, 4, 4), bool)
     )
-    field = SparseField(SparseShape(0), Lattice(tree, SIDE), 1.0)
+    field = SparseField(SparseShape(0), VertexLattice(tree, SIDE), 1.0)
     dirs = np.concatenate([np.eye(3), -np.eye(3)])
-    low, high = (field.fine.places[field.fine.corners[:, q]] for q in (0, 7))
+    low, high = (field.fine.positions[field.fine.corners[:, q]] for q in (0, 7))
     for sigma in (0.3, 30.0):
         field.rows[:, 0] = float(np.log(np.expm1(sigma)))
         clearest, facing = field.exposed(low, high, dirs, 10.0, 1e-9)

@@ -135,7 +135,7 @@ def test_rendering_equals_a_slow_loop():
             trans -= weight
             waiting += weight
             if waiting > enough:
-                shown, enough = colour[0].numpy(), loops.LENT_FROM
+                shown, enough = colour[0].numpy(), loops.SHARED_COLOUR_FROM
                 rgb += waiting * shown
                 waiting = 0.0
         rgb += waiting * shown

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fusedrf_cli.engine.selection.cells import Lattice, Selection
+from fusedrf_cli.engine.selection.cells import CellGrid, Selection
 from tests.analytic.fields import AnalyticField
 
 GREEN, RED, GREENISH = (0.1, 0.8, 0.1), (0.8, 0.1, 0.1), (0.15, 0.75, 0.15)
@@ -35,7 +35,7 @@ def leg(points):
 def test_what_the_object_touches_is_told_by_its_colour(table):
     """A layer of the table below the leg is given back where it looks unlike the leg, and nothing else."""
     field = LegOnTable(table)
-    lattice = Lattice.over(field, field.aabb, 40)
+    lattice = CellGrid.over(field, field.aabb, 40)
     own = leg(lattice.points)
     below = (np.abs(lattice.points[:, :2]) < 0.25).all(1) & (np.abs(lattice.points[:, 2] + 0.025) < 0.01)
     assert below.sum() == 100 and own.sum() == 8 * 8 * 18
@@ -45,6 +45,6 @@ def test_what_the_object_touches_is_told_by_its_colour(table):
 
 def test_an_object_that_stands_free_stays_as_it_is():
     field = LegOnTable(RED)
-    lattice = Lattice.over(field, np.array([-1.0, -1, 0.2, 1, 1, 1]), 40)
+    lattice = CellGrid.over(field, np.array([-1.0, -1, 0.2, 1, 1, 1]), 40)
     chosen = leg(lattice.points)
     assert chosen.any() and np.array_equal(Selection(lattice, chosen).without_foreign().chosen, chosen)

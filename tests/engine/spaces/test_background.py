@@ -10,7 +10,7 @@ from fusedrf_cli.engine.composition.composite import Composite
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.reference import sh_basis
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.rendering.volume import reach_of, render_rays
 from fusedrf_cli.engine.spaces import contracted_linf
 from tests.analytic.export import exported
@@ -25,7 +25,7 @@ CELLS = 16  # so that the layer begins at a size of 4
 def layer(dtype=torch.float64):
     """A `dense` field whose colour is one of spherical harmonics, with a gradient over its upper face."""
     kind, box = registry.kind("dense"), contracted_linf.WHOLE
-    field = kind.create(kind.untrained(box, CELLS + 1, Way()), torch.Generator().manual_seed(0))
+    field = kind.create(kind.untrained(box, CELLS + 1, StorageSetting()), torch.Generator().manual_seed(0))
     occupied = np.ones((CELLS,) * 3, bool)
     occupied[1:-1, 1:-1, 1:-1] = False
     field = field.with_occupancy(OccupancyGrid(box, occupied, contracted_linf))

@@ -68,7 +68,7 @@ def points_of(space, count: int = 300, seed: int = 0) -> np.ndarray:
     """Points near and far; of a box and of NDC, those of their coordinates."""
     rng = np.random.default_rng(seed)
     if space is bounded or "ndc" in space.__name__:
-        return space.placed(torch.from_numpy(rng.uniform(-1.1, 0.95, (count, 3)))).numpy()
+        return space.inv_contract(torch.from_numpy(rng.uniform(-1.1, 0.95, (count, 3)))).numpy()
     return rng.normal(size=(count, 3)) * 10 ** rng.uniform(-1, 2, (count, 1))
 
 
@@ -113,9 +113,9 @@ def test_the_map_is_that_of_others_and_has_an_inverse_in_every_form(name):
     expected = np.array([FORMULAS[name](x) for x in points])
     names = functions_of(space)
     assert np.array([names["point"](tuple(x)) for x in points]) == pytest.approx(expected, abs=1e-12)
-    assert space.contracted(torch.from_numpy(points)).numpy() == pytest.approx(expected, abs=1e-12)
+    assert space.contract(torch.from_numpy(points)).numpy() == pytest.approx(expected, abs=1e-12)
     assert np.array([names["frame_point"](tuple(q)) for q in expected]) == pytest.approx(points, rel=1e-9)
-    assert space.placed(torch.from_numpy(expected)).numpy() == pytest.approx(points, rel=1e-9)
+    assert space.inv_contract(torch.from_numpy(expected)).numpy() == pytest.approx(points, rel=1e-9)
 
 
 def test_rays_of_ndc_are_those_of_nerf():
@@ -135,7 +135,7 @@ def test_rays_of_ndc_are_those_of_nerf():
         d2 = -2 * near / o[2]
         for share in (0.0, 0.3, 0.9):  # t' = 1 - o_z / (o_z + t d_z), eq. 22
             along = o[2] * share / (d[2] * (1 - share))
-            found = space.contracted(torch.from_numpy(o + along * d)[None])[0].numpy()
+            found = space.contract(torch.from_numpy(o + along * d)[None])[0].numpy()
             assert found == pytest.approx(np.array([o0, o1, o2]) + share * np.array([d0, d1, d2]), abs=1e-9)
 
 
@@ -145,11 +145,11 @@ def test_densities_are_per_length_of_the_frame_or_of_the_coordinates(space):
     in NDC per length of the coordinates along the ray: the Jacobian by differences."""
     points, rng = points_of(space), np.random.default_rng(1)
     dirs = unit(rng.normal(size=points.shape))
-    at = space.contracted(torch.from_numpy(points))
+    at = space.contract(torch.from_numpy(points))
     expected = np.ones(len(points))
     if "ndc" in space.__name__ or getattr(space, "CONTRACTED_DENSITY", 0):
         move = 1e-6 * np.linalg.norm(points, axis=1, keepdims=True) * dirs
-        ahead, behind = (space.contracted(torch.from_numpy(points + s * move)) for s in (1, -1))
+        ahead, behind = (space.contract(torch.from_numpy(points + s * move)) for s in (1, -1))
         expected = (ahead - behind).norm(dim=1).numpy() / np.linalg.norm(2 * move, axis=1)
     found = [
         functions_of(space)["rate"](tuple(q), tuple(d))
@@ -163,10 +163,10 @@ def test_densities_are_per_length_of_the_frame_or_of_the_coordinates(space):
 def test_maps_are_differentiable(space):
     points = torch.from_numpy(points_of(space, 20)).requires_grad_()
     dirs = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(20, 3)))).requires_grad_()
-    assert torch.autograd.gradcheck(space.contracted, points, eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(space.contract, points, eps=1e-7, atol=1e-5)
 
     def rates(x, d):
-        return space.density_rates(space.contracted(x), d) * (d.sum() + x.sum())
+        return space.density_rates(space.contract(x), d) * (d.sum() + x.sum())
 
     assert torch.autograd.gradcheck(rates, (points, dirs), eps=1e-7, atol=1e-3, rtol=1e-4)
 
@@ -214,9 +214,7 @@ def test_pieces_follow_each_other_and_are_no_longer_in_the_coordinates_than_in_u
             u = np.linspace(u0, u1, 100)
             t = np.array([names["distance"](course, x) for x in u])
             q = np.array([names["position_at"](origin, way, x) for x in u])
-            assert q == pytest.approx(
-                space.contracted(torch.from_numpy(o + t[:, None] * d)).numpy(), abs=1e-9
-            )
+            assert q == pytest.approx(space.contract(torch.from_numpy(o + t[:, None] * d)).numpy(), abs=1e-9)
             lengths = np.linalg.norm(np.diff(q, axis=0), axis=1)
             assert (lengths <= (u[1] - u[0]) * (1 + 1e-6) + 1e-12).all()
             for k in (1, 37, 98):
@@ -225,9 +223,7 @@ def test_pieces_follow_each_other_and_are_no_longer_in_the_coordinates_than_in_u
             in_u, in_coordinates = in_u + u1, in_coordinates + lengths.sum()
         assert total <= space.most_samples(space.WHOLE, 1e-3) * 1e-3
         if end:
-            assert (
-                float(space.contracted(torch.from_numpy(o + end * d)[None]).norm()) > 1 + 0.99 * space.SHELL
-            )
+            assert float(space.contract(torch.from_numpy(o + end * d)[None]).norm()) > 1 + 0.99 * space.SHELL
     assert in_u < 1.15 * in_coordinates
 
 
@@ -274,7 +270,7 @@ def test_what_is_skipped_is_empty(space):
         if space in NEW.values() and "ndc" in space.__name__:  # whose lattice begins at the box
             full = OccupancyGrid.full(grid.aabb, 1, space)
         every, _ = marched(names, full.arrays, o, d, step)
-        at = space.contracted(torch.from_numpy(o + every[:, None] * d)).numpy()
+        at = space.contract(torch.from_numpy(o + every[:, None] * d)).numpy()
         assert ts == pytest.approx(every[grid.contains(at)], rel=1e-12)
         taken += len(ts)
     assert taken > 100
@@ -315,7 +311,7 @@ class Shape:
     """Nothing to choose."""
 
 
-class Hashed(AssembledField):
+class HashGrid(AssembledField):
     """A hash grid, a trunk and a network for colour, as Instant-NGP's and nerfacto's fields are."""
 
     kind, shape_type = "hashed", Shape
@@ -351,7 +347,7 @@ class Interpreted:
 
     def __init__(self, field):
         self.names = interpreted(field)
-        self.names.update(COLOUR_FROM=0.0, LENT_FROM=0.0, LEARN_FROM=0.0, REST_FROM=0.0)
+        self.names.update(COLOUR_FROM=0.0, SHARED_COLOUR_FROM=0.0, LEARN_FROM=0.0, REST_FROM=0.0)
 
     def each(self, item, field, grid, asked, count, out, per_task=100):
         self.names["item"] = self.names[item]
@@ -362,12 +358,12 @@ class Interpreted:
         self.names["sweep"](field, grid, batch, count, most, grads, loss)
 
 
-def hashed_in(space, dtype=torch.float64, share: float = 0.6) -> Hashed:
+def hashed_in(space, dtype=torch.float64, share: float = 0.6) -> HashGrid:
     """A random field over most of a space, of which some cells are empty. Where σ is per length of the frame
     it is thin, since rays go far."""
     box = 0.85 * getattr(space, "WHOLE", np.array([-1.0] * 3 + [1.0] * 3))
     per_length = space in (contracted_l2, contracted_linf)
-    bare = Hashed(Shape(), box, (12, 12, 12), 0.1 if per_length else 1.0, -1.0)
+    bare = HashGrid(Shape(), box, (12, 12, 12), 0.1 if per_length else 1.0, -1.0)
     generator = torch.Generator().manual_seed(0)
     field = bare.with_params(
         (0.5 * torch.randn(len(bare.params), generator=generator, dtype=torch.float64)).to(dtype)
@@ -418,7 +414,7 @@ def lengths_of(field, o, d, ts, step) -> np.ndarray:
         for i in np.flatnonzero(
             (ts >= names["distance"](course, u0)) & (ts <= names["distance"](course, u1))
         ):
-            q = field.space.contracted(torch.from_numpy(o + ts[i] * d)[None])[0].tolist()
+            q = field.space.contract(torch.from_numpy(o + ts[i] * d)[None])[0].tolist()
             u = names["length_at"](course, ts[i])
             found[i] = names["optical_length"](course, tuple(q), tuple(d), u, 1, 1, step)
     return found
@@ -431,7 +427,7 @@ def pictured(field, params, o, d, jitter, step) -> torch.Tensor:
     for i in range(len(o)):
         ts, _ = marched(names, field.grid, o[i], d[i], step, jitter[i])
         dirs = torch.from_numpy(np.tile(d[i], (len(ts), 1)))
-        at = field.space.contracted(torch.from_numpy(o[i] + ts[:, None] * d[i]))
+        at = field.space.contract(torch.from_numpy(o[i] + ts[:, None] * d[i]))
         sigma, colour = field.reference(params, at, dirs)
         depth = sigma * torch.from_numpy(lengths_of(field, o[i], d[i], ts, step))
         weights = torch.exp(depth - depth.cumsum(0)) * -torch.expm1(-depth)
@@ -476,7 +472,7 @@ def test_fog_is_as_thick_as_its_formula_says(space):
     field.render_rays(o, d, reach_of(6, 0.0, np.inf), 0.01, 0.0, found)
     for i in range(6):
         t = np.concatenate([np.linspace(0, 3, 60_001), np.geomspace(3, 900, 60_000)[1:]])
-        q = space.contracted(torch.from_numpy(o[i] + t[:, None] * d[i])).numpy()
+        q = space.contract(torch.from_numpy(o[i] + t[:, None] * d[i])).numpy()
         middle = 0.5 * (q[1:] + q[:-1])
         inside = ((middle >= box[:3]) & (middle < box[3:])).all(1)
         lengths = np.diff(t)
@@ -492,7 +488,7 @@ def test_fog_is_as_thick_as_its_formula_says(space):
 def test_a_stored_field_keeps_its_space(space):
     field = hashed_in(space, torch.float32)
     assert space_named(name_of(space)) is space
-    back = Hashed.from_state(*field.state())
+    back = HashGrid.from_state(*field.state())
     assert back.space is space
     for name, numbers in field.sections().items():
         assert torch.equal(back.sections()[name], numbers)
@@ -517,13 +513,13 @@ def test_what_is_no_space_is_refused(entry):
 
 
 def test_kinds_that_follow_straight_lines_are_refused_in_curved_spaces():
-    bodies = ModuleType("straight")
+    device_module = ModuleType("straight")
     exec(
         "def advance(field, grid, place, many, steps, k, p, way, u, u0, step):\n    return k + 1",
-        vars(bodies),
+        vars(device_module),
     )
     with pytest.raises(ValueError, match="straight follows straight rays"):
-        specialise.specialised(bodies, {}, contracted_l2)
+        specialise.specialised(device_module, {}, contracted_l2)
     tree = random_sparse().fine
     with pytest.raises(ValueError, match="bricks cannot lie in space 'contracted_linf'"):
         SparseField(SparseShape(0), tree, 1.0, space=contracted_linf)

@@ -8,14 +8,14 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.distillation.visibility import shown_cells
+from fusedrf_cli.engine.distillation.camera_visibility import shown_cells
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels.loops import DEPTH_TOLERANCE
 from fusedrf_cli.engine.kernels.specialise import specialised
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.student import Way
+from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
@@ -143,9 +143,9 @@ def test_the_map_has_an_inverse_in_every_form(radius):
     points *= radius / np.abs(points).max(1, keepdims=True)
     inside = np.array([mapped(x) for x in points])
     assert np.array([SPACE["point"](tuple(x)) for x in points]) == pytest.approx(inside)
-    assert unbounded.contracted(torch.from_numpy(points)).numpy() == pytest.approx(inside)
+    assert unbounded.contract(torch.from_numpy(points)).numpy() == pytest.approx(inside)
     assert np.array([SPACE["frame_point"](tuple(y)) for y in inside]) == pytest.approx(points, rel=1e-9)
-    assert unbounded.placed(torch.from_numpy(inside)).numpy() == pytest.approx(points, rel=1e-9)
+    assert unbounded.inv_contract(torch.from_numpy(inside)).numpy() == pytest.approx(points, rel=1e-9)
 
 
 def even(sigma: float, resolution: int = 64) -> VMField:
@@ -256,7 +256,7 @@ def distortion(field: VMField, *rays) -> float:
     return np.mean(found)
 
 
-def astray(field: VMField, depths: np.ndarray, *rays) -> float:
+def depth_error(field: VMField, depths: np.ndarray, *rays) -> float:
     """The sum over the first rays, whose depths are known, of the light that ends elsewhere or nowhere, over
     the number of all rays."""
     found = 0.0
@@ -294,7 +294,7 @@ def test_a_loss_of_weights_sends_back_its_own_gradient(term):
 
     def wanted(params: torch.Tensor) -> float:
         moved = field.with_params(params)
-        return distortion(moved, *rays) if term == "distortion" else astray(moved, depths, *rays)
+        return distortion(moved, *rays) if term == "distortion" else depth_error(moved, depths, *rays)
 
     for at in np.argsort(-abs(found))[:40:8]:
         change = torch.zeros_like(field.params)
@@ -463,7 +463,7 @@ UP = torch.tensor([[0.0, 0.0, 1.0]]).double().expand(3, 3)
 def stored_and_read(kind: str):
     """A field of all of space as a bundle gives it back."""
     made = registry.kind(kind)
-    field = made.create(made.untrained(WHOLE, 16, Way()), torch.Generator().manual_seed(0))
+    field = made.create(made.untrained(WHOLE, 16, StorageSetting()), torch.Generator().manual_seed(0))
     field = field.with_occupancy(OccupancyGrid.full(WHOLE, 4, unbounded))
     return type(field).from_state(*field.state())
 
@@ -472,7 +472,7 @@ def stored_and_read(kind: str):
 def test_every_kind_keeps_its_space(kind):
     made, back = registry.kind(kind), stored_and_read(kind)
     assert back.space is unbounded and back.occupancy.space is unbounded
-    assert made.grown(back, made.untrained(WHOLE, 20, Way())).space is unbounded
+    assert made.grown(back, made.untrained(WHOLE, 20, StorageSetting())).space is unbounded
     assert (back.answers(back.params, AFAR, UP)[0] > 0).all()
 
 

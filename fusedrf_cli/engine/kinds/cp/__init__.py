@@ -1,6 +1,6 @@
 """The `cp` kind: sums of products of three lines."""
 
-from fusedrf_cli.engine.kinds.boxes import BoxKind
+from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.cp.field import CPField
 
 

@@ -2,10 +2,10 @@
 
 from fusedrf_cli.engine import spaces
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.kinds.asked import AskedStudent
-from fusedrf_cli.engine.kinds.boxes import BoxKind, GridStudent
+from fusedrf_cli.engine.kinds.box_kind import BoxKind, GridBuilder
+from fusedrf_cli.engine.kinds.builder import BuildRequest, DistilledBuilder
 from fusedrf_cli.engine.kinds.dense.field import DenseField
-from fusedrf_cli.engine.kinds.student import Student, StudentRequest
+from fusedrf_cli.engine.kinds.resampled import ResampledBuilder
 
 
 class DenseKind(BoxKind):
@@ -16,10 +16,10 @@ class DenseKind(BoxKind):
     field = DenseField
     takes = frozenset({"sh_degree"})
 
-    def student(self, scene: ComposedField, request: StudentRequest) -> Student:
+    def builder(self, scene: ComposedField, request: BuildRequest) -> DistilledBuilder:
         """See Kind; in unbounded space it learns."""
         bounded = scene.occupancy.space is spaces.bounded
-        return (AskedStudent if bounded else GridStudent)(self, scene, request)
+        return (ResampledBuilder if bounded else GridBuilder)(self, scene, request)
 
 
 KIND = DenseKind()

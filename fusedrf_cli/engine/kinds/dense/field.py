@@ -17,7 +17,7 @@ class DenseConfig:
     """How fast the vertices of a grid learn."""
 
     density_rate: float = 60.0
-    """A vertex is touched seldom; slower ones leave haze for long."""
+    """A vertex is touched seldom; slower ones leave low density for long."""
     colour_rate: float = 10.0
     """Likewise."""
 

@@ -1,6 +1,6 @@
 """The `dense-mlp` kind: a grid of vertices with features, and a small decoder of colours."""
 
-from fusedrf_cli.engine.kinds.boxes import BoxKind
+from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.dense_mlp.field import DenseMLPField
 
 

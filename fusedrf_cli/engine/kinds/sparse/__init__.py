@@ -1,5 +1,5 @@
 """The `sparse` kind: numbers at the vertices of bricks of voxels, which lie where something is."""
 
-from fusedrf_cli.engine.kinds.sparse.students import SparseKind
+from fusedrf_cli.engine.kinds.sparse.builder import SparseKind
 
 KIND = SparseKind()

@@ -116,20 +116,20 @@ class BrickTree:
     def codes(self) -> tuple[np.ndarray, ...]:
         """By level: EMPTY, BRICK or SPLIT of every node, (M,) uint8, in the order of the walk, and where it
         is, (M, 3) int64."""
-        found, nodes = [], np.argwhere(np.ones(self.counts, bool))
+        codes, nodes = [], np.argwhere(np.ones(self.counts, bool))
         for level in range(self.depth + 1):
-            own = node_keys(self.at[self.level == level])
+            level_keys = node_keys(self.at[self.level == level])
             finer = [
                 node_keys(self.at[self.level == deep] >> (deep - level))
                 for deep in range(level + 1, self.depth + 1)
             ]
             keys = node_keys(nodes)
-            code = np.where(np.isin(keys, own), BRICK, EMPTY)
+            code = np.where(np.isin(keys, level_keys), BRICK, EMPTY)
             if finer:
                 code = np.where(np.isin(keys, np.unique(np.concatenate(finer))), SPLIT, code)
-            found.append((code.astype(np.uint8), nodes))
+            codes.append((code.astype(np.uint8), nodes))
             nodes = children(nodes[code == SPLIT])
-        return tuple(found)
+        return tuple(codes)
 
     def packed(self) -> tuple[np.ndarray, np.ndarray]:
         """(bytes of the nodes' codes, two bits each, and of the masks, eight per brick)."""
@@ -147,20 +147,24 @@ class BrickTree:
             )
         code = np.unpackbits(nodes).reshape(-1, 4, 2)
         code = (code[..., 0] * 2 + code[..., 1]).ravel()
-        here, start, levels, places = np.argwhere(np.ones(counts, bool)), 0, [], []
+        here, start, levels, positions = np.argwhere(np.ones(counts, bool)), 0, [], []
         for level in range(MAX_LEVEL + 2):
-            own = code[start : start + len(here)]
-            if len(own) < len(here) or (own > SPLIT).any() or (level > MAX_LEVEL and len(here)):
+            level_codes = code[start : start + len(here)]
+            if (
+                len(level_codes) < len(here)
+                or (level_codes > SPLIT).any()
+                or (level > MAX_LEVEL and len(here))
+            ):
                 raise ValueError("array 'nodes' is no tree of bricks")
             start += len(here)
-            places.append(here[own == BRICK])
-            levels.append(np.full(len(places[-1]), level, np.uint8))
-            here = children(here[own == SPLIT])
+            positions.append(here[level_codes == BRICK])
+            levels.append(np.full(len(positions[-1]), level, np.uint8))
+            here = children(here[level_codes == SPLIT])
             if not len(here):
                 break
         if -(-start // 4) != len(nodes) or code[start:].any():
             raise ValueError(f"array 'nodes' should have {-(-start // 4)} bytes, found {len(nodes)}")
-        level, at = np.concatenate(levels), np.concatenate(places)
+        level, at = np.concatenate(levels), np.concatenate(positions)
         if masks.shape != (8 * len(level),):
             raise ValueError(f"array 'masks' should have shape {[8 * len(level)]}, found {list(masks.shape)}")
         mask = np.unpackbits(masks).reshape(-1, SIDE, SIDE, SIDE).astype(bool)
@@ -178,22 +182,22 @@ class BrickTree:
         them. Raises ValueError where they would be too large."""
         limits = current(BrickLimits)
         depth = np.zeros(self.counts, np.uint8)
-        held = np.zeros(self.counts, bool)
+        is_brick = np.zeros(self.counts, bool)
         for level in range(self.depth + 1):
             cell = tuple((self.at[self.level == level] >> level).T)
-            depth[cell], held[cell] = level, True
-        sizes = np.where(held, 1 << (3 * depth.astype(np.int64)), 0)
+            depth[cell], is_brick[cell] = level, True
+        sizes = np.where(is_brick, 1 << (3 * depth.astype(np.int64)), 0)
         if sizes.sum() > limits.entries:
             raise ValueError(
                 f"bricks so fine in cells so large need {sizes.sum():,} entries, at most {limits.entries:,}"
             )
-        offset = np.where(held, (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape), -1)
+        offset = np.where(is_brick, (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape), -1)
         table = np.empty(int(sizes.sum()), np.int32)
         for level, (code, nodes) in enumerate(self.codes):
             bare = nodes[code == EMPTY]
             fill_cubes(table, offset, depth, level, bare, np.full(len(bare), -1 - level, np.int32))
-            own = np.flatnonzero(self.level == level).astype(np.int32)
-            fill_cubes(table, offset, depth, level, self.at[own], own)
+            bricks = np.flatnonzero(self.level == level).astype(np.int32)
+            fill_cubes(table, offset, depth, level, self.at[bricks], bricks)
         return offset, depth, table
 
     def voxels_at(
@@ -212,13 +216,13 @@ class BrickTree:
         entry = ((halves - cell * span) << deep[:, None]) // span
         entry = (entry[:, 0] << 2 * deep) + (entry[:, 1] << deep) + entry[:, 2] + start
         brick = np.where(inside, table[np.where(inside, entry, 0)], -1)
-        held = brick >= 0
-        safe = np.where(held, brick, 0)
+        in_brick = brick >= 0
+        safe = np.where(in_brick, brick, 0)
         side = span >> self.level[safe].astype(np.int64)
         voxel = (halves - self.at[safe] * side[:, None]) * n // side[:, None]
-        voxel = np.where(held[:, None], voxel, 0)
+        voxel = np.where(in_brick[:, None], voxel, 0)
         voxel = (voxel[:, 0] * n + voxel[:, 1]) * n + voxel[:, 2]
-        return np.where(held, brick, -1), voxel, held & active[safe, voxel]
+        return np.where(in_brick, brick, -1), voxel, in_brick & active[safe, voxel]
 
     def extended(self, aabb: np.ndarray) -> "BrickTree":
         """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where
@@ -237,10 +241,10 @@ class BrickTree:
         fine = max(s for s in range(3) if s == 0 or max(self.counts) << s <= longest)
         occupied = np.zeros(tuple(n << fine for n in self.counts), bool)
         for level in range(self.depth + 1):
-            own = self.level == level
-            brick, *inner = np.nonzero(self.mask[own])
+            at_level = self.level == level
+            brick, *inner = np.nonzero(self.mask[at_level])
             # a cell is at least a voxel of level 0 wide, so a voxel lies in one of them
-            voxel = self.at[own][brick] * SIDE + np.stack(inner, 1)
+            voxel = self.at[at_level][brick] * SIDE + np.stack(inner, 1)
             occupied[tuple((voxel >> (level + 2 - fine)).T)] = True
         return OccupancyGrid(self.aabb, occupied)
 
@@ -280,26 +284,26 @@ def children(nodes: np.ndarray) -> np.ndarray:
     return (2 * nodes[:, None] + OCTANTS).reshape(-1, 3)
 
 
-def node_keys(places: np.ndarray) -> np.ndarray:
+def node_keys(positions: np.ndarray) -> np.ndarray:
     """(M,) one int64 for each of (M, 3) whole numbers from 0 to 2^21 - 1, in their order."""
-    return (places[:, 0] << 42) | (places[:, 1] << 21) | places[:, 2]
+    return (positions[:, 0] << 42) | (positions[:, 1] << 21) | positions[:, 2]
 
 
-def key_places(keys: np.ndarray) -> np.ndarray:
+def key_positions(keys: np.ndarray) -> np.ndarray:
     """Inverse of `node_keys`."""
     low = (1 << 21) - 1
     return np.stack([keys >> 42, keys >> 21 & low, keys & low], 1)
 
 
-def morton(places: np.ndarray) -> np.ndarray:
+def morton(positions: np.ndarray) -> np.ndarray:
     """(M,) uint64: the bits of three whole numbers (M, 3) from 0 to 2^21 - 1, interleaved, x the highest."""
-    found = np.zeros(len(places), np.uint64)
+    codes = np.zeros(len(positions), np.uint64)
     for axis in range(3):
-        bits = places[:, axis].astype(np.uint64)
-        for shift, kept in MORTON_SPREAD:
-            bits = (bits | bits << np.uint64(shift)) & np.uint64(kept)
-        found |= bits << np.uint64(2 - axis)
-    return found
+        bits = positions[:, axis].astype(np.uint64)
+        for shift, mask in MORTON_SPREAD:
+            bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+        codes |= bits << np.uint64(2 - axis)
+    return codes
 
 
 def walk_order(level: np.ndarray, at: np.ndarray, counts) -> np.ndarray:
@@ -330,10 +334,10 @@ def fill_cubes(
         reached = np.flatnonzero((start >= 0) & (deep == level + finer))
         at_once = max(1, limits.entries_at_once >> 3 * finer)
         for first in range(0, len(reached), at_once):
-            own = reached[first : first + at_once]
-            a, b, c = ((nodes[own] - (cell[own] << level)) << finer).T
+            cubes = reached[first : first + at_once]
+            a, b, c = ((nodes[cubes] - (cell[cubes] << level)) << finer).T
             side = np.arange(1 << finer)
             n = 1 << (level + finer)
             entry = ((a[:, None] + side) * n)[:, :, None] + (b[:, None] + side)[:, None, :]
             entry = (entry * n)[..., None] + (c[:, None] + side)[:, None, None, :]
-            table[entry + start[own][:, None, None, None]] = values[own][:, None, None, None]
+            table[entry + start[cubes][:, None, None, None]] = values[cubes][:, None, None, None]

@@ -3,13 +3,13 @@
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.kinds.asking import density_features, dilated
+from fusedrf_cli.engine.kinds.builder import Contents, Section
+from fusedrf_cli.engine.kinds.field_sampling import density_features, dilated
 from fusedrf_cli.engine.kinds.reduction import Reduction
 from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, node_keys
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.filling import density_scale
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
-from fusedrf_cli.engine.kinds.student import Contents, Section
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
+from fusedrf_cli.engine.kinds.sparse.vertex_fit import density_scale
 from fusedrf_cli.engine.spaces import bounded
 
 
@@ -41,20 +41,22 @@ def coarsened(field: SparseField, halvings: int) -> SparseField:
     keeps, and densities that come nearest to its own between them."""
     new = field.fine.coarser(halvings)
     other = SparseField(field.shape, new, density_scale(new.tree), space=field.lies_in)
-    rows, held = kept_rows(field.fine, new, field.rows, halvings)
+    rows, held = stored_rows(field.fine, new, field.rows, halvings)
     sigma = np.where(held, field.scale * np.logaddexp(0, rows[:, 0]), 0)
     # a vertex with a colour of its own counts for little beside one that shows something
     weight = np.where(held, np.maximum(-np.expm1(-sigma * new.finest_voxel), 1e-3), 0)
     other.rows[:, 0] = torch.from_numpy(density_features(field, new, sigma, other.scale))
     other.rows[:, 1:] = torch.from_numpy(dilated(new, rows[:, 1:], weight)[0])
     if other.coarse:
-        bands, held = kept_rows(field.coarse, other.coarse, field.bands, halvings)
+        bands, held = stored_rows(field.coarse, other.coarse, field.bands, halvings)
         other.bands[:] = torch.from_numpy(dilated(other.coarse, bands, held)[0])
     other.settle()
     return other
 
 
-def kept_rows(old: Lattice, new: Lattice, rows: torch.Tensor, halvings: int) -> tuple[np.ndarray, np.ndarray]:
+def stored_rows(
+    old: VertexLattice, new: VertexLattice, rows: torch.Tensor, halvings: int
+) -> tuple[np.ndarray, np.ndarray]:
     """(W, R) rows (V, R) of a lattice at the vertices of a coarser one, and which of these (W,) it has."""
     row, held = old.find(node_keys(new.vertices << (halvings + MAX_LEVEL - old.tree.depth)))
     return rows.numpy()[row], held
@@ -74,7 +76,7 @@ def truncated(field: SparseField, shape: SparseShape) -> SparseField:
     return other
 
 
-def contents_of(lattice: Lattice, shape: SparseShape) -> Contents:
+def contents_of(lattice: VertexLattice, shape: SparseShape) -> Contents:
     """What a field over a lattice is stored with: a run adds a block of scales per column, and its length."""
     held = [("rows", lattice, 4)]
     held += [("bands", lattice.wider, shape.band_numbers)] if shape.sh_degree else []

@@ -18,9 +18,9 @@ import torch
 from fusedrf_cli.engine.decoders import density_sum, sh
 from fusedrf_cli.engine.encodings import bricks
 from fusedrf_cli.engine.encodings.bricks import ROW, SIDE, active_at
-from fusedrf_cli.engine.fields import pages
+from fusedrf_cli.engine.fields import large_pages
 from fusedrf_cli.engine.fields.assembled import Assembled, Slot
-from fusedrf_cli.engine.fields.base import FieldNeeds, SamplingConfig, check_samples
+from fusedrf_cli.engine.fields.base import FieldMemory, SamplingConfig, check_samples
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.fields.computed import (
     PER_CELL,
@@ -32,11 +32,11 @@ from fusedrf_cli.engine.fields.computed import (
 )
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels.light import Exposure, Light
-from fusedrf_cli.engine.kernels.parts import LINE
+from fusedrf_cli.engine.kernels.primitives import LINE
 from fusedrf_cli.engine.kernels.reference import exact as exact_tensor
 from fusedrf_cli.engine.kinds.sparse import training
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickLimits, BrickTree, check_counts, table_entries
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of, space_named
 
@@ -104,7 +104,7 @@ class SparseField(Assembled):
     def __init__(
         self,
         shape: SparseShape,
-        fine: Lattice,
+        fine: VertexLattice,
         scale: float,
         params: torch.Tensor | None = None,
         space: ModuleType = bounded,
@@ -115,27 +115,27 @@ class SparseField(Assembled):
             raise ValueError(f"bricks cannot lie in space {name_of(space)!r}, in which rays are curved")
         self.shape, self.fine, self.scale, self.lies_in = shape, fine, float(scale), space
         self.coarse = fine.wider if shape.sh_degree else None
-        self.params = pages.zeros(self.size) if params is None else params
+        self.params = large_pages.zeros(self.size) if params is None else params
 
     def with_occupancy(self, occupancy: OccupancyGrid) -> "SparseField":
         """The same numbers without the voxels that lie in empty cells alone; itself where that would leave
         none."""
-        lattice = training.within(self.fine, occupancy.contains)
+        lattice = training.occupied_voxels(self.fine, occupancy.contains)
         return self if lattice is None else self.on(lattice, occupancy.space)
 
     def reaching(self, contains: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
         """The same numbers of the voxels that reach where `contains` says so of points (N, 3) of the
         coordinates of the space; None where there is none."""
-        lattice = training.within(self.fine, contains)
+        lattice = training.occupied_voxels(self.fine, contains)
         return None if lattice is None else self.on(lattice, self.lies_in)
 
     def with_voxels(self, holds: Callable[[np.ndarray], np.ndarray]) -> "SparseField | None":
         """The same numbers of the voxels of whose corners (N, 3), in the coordinates of the space, `holds`
         says (N,) that they are kept; None where there is none."""
-        lattice = training.wholly(self.fine, holds)
+        lattice = training.wholly_inside(self.fine, holds)
         return None if lattice is None else self.on(lattice, self.lies_in)
 
-    def on(self, lattice: Lattice, space: ModuleType) -> "SparseField":
+    def on(self, lattice: VertexLattice, space: ModuleType) -> "SparseField":
         """The same numbers on a part of its voxels, in the coordinates of a space."""
         other = SparseField(self.shape, lattice, self.scale, None, space).to(self.params.device)
         other.rows[:] = self.rows[self.fine.find(other.fine.keys)[0]]
@@ -149,7 +149,9 @@ class SparseField(Assembled):
         axis, where this one's cells are occupied. Raises ValueError for a field of several levels."""
         training.check_one_level(self)
         lattice = training.whole_lattice(np.asarray(aabb, np.float64), resolution)
-        return training.carried(self, training.within(lattice, self.occupancy.contains) or lattice)
+        return training.transferred(
+            self, training.occupied_voxels(lattice, self.occupancy.contains) or lattice
+        )
 
     def stored(self, as_stored: StoredAs) -> "SparseField":
         """See ComputedField; where the bricks are stays as it is, and need not be found again."""
@@ -273,9 +275,9 @@ class SparseField(Assembled):
         (K, 3), of length 1 where from one side alone. Light of less than `blocked` counts as none."""
         middles, sides = exact((low + high) / 2), (high - low).min(1)
         light = Light(middles, sides, exact(directions), float(far), float(blocked), self.voxel_size)
-        found = Exposure(np.zeros(len(low)), np.zeros((len(low), 3)))
-        self.loops.each("expose_cube", self.arrays, self.grid, light, len(low), found)
-        return found.clearest, found.facing
+        exposure = Exposure(np.zeros(len(low)), np.zeros((len(low), 3)))
+        self.loops.each("expose_cube", self.arrays, self.grid, light, len(low), exposure)
+        return exposure.clearest, exposure.facing
 
     # -- learning --------------------------------------------------------------------------------------------
 
@@ -301,22 +303,22 @@ class SparseField(Assembled):
                 for row in grads:
                     self.device_loops.sums_of_rows(row, base, width, *edges, target, True)
 
-    def _lattices(self) -> list[tuple[Lattice, int, int]]:
+    def _lattices(self) -> list[tuple[VertexLattice, int, int]]:
         """Each lattice, where its rows begin in params, and how wide they are."""
         fine = [(self.fine, 0, ROW)]
         return fine + ([(self.coarse, self.bands_at, self.shape.band_width)] if self.coarse else [])
 
     # -- storing ---------------------------------------------------------------------------------------------
 
-    def _held(self) -> dict[str, tuple[torch.Tensor, Lattice]]:
+    def _held(self) -> dict[str, tuple[torch.Tensor, VertexLattice]]:
         """What is stored of each lattice: the view whose free rows these are."""
         bands = {"bands": (self.bands, self.coarse)} if self.coarse else {}
         return {"rows": (self.rows, self.fine)} | bands
 
     def state(self) -> tuple[dict[str, np.ndarray], dict]:
         """Arrays and metadata for a bundle: the tree, from which all indices follow, and the free rows run by
-        run (`Lattice.stored_order`), each in blocks of codes of its own, so that an edit elsewhere changes no
-        number of it."""
+        run (`VertexLattice.stored_order`), each in blocks of codes of its own, so that an edit elsewhere
+        changes no number of it."""
         nodes, masks = self.tree.packed()
         arrays = {"nodes": nodes, "masks": masks}
         for name, (view, lattice) in self._held().items():
@@ -335,7 +337,7 @@ class SparseField(Assembled):
         return arrays, metadata
 
     @classmethod
-    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
         """See Kind.field_needs; with the tables that follow from the tree."""
         config = current(BricksConfig)
         (bricks,), counts = shapes["masks"], metadata["counts"]
@@ -343,10 +345,12 @@ class SparseField(Assembled):
         entries, depth = table_entries(array("nodes"), top)
         numbers = sum(math.prod(shapes[name]) for name in ("rows", "bands") if name in shapes)
         cells = config.occupancy_cells**3 if max(counts) < config.occupancy_cells else top
-        held = config.per_brick * bricks + 4 * (numbers + entries) + PER_CELL * cells
-        held += config.per_top_cell * top
-        made = (config.per_brick_made + (config.per_brick_joined if depth else 0)) * bricks
-        return FieldNeeds(held, made + PER_CELL_MADE * cells + config.per_node * 4 * shapes["nodes"][0])
+        resident = config.per_brick * bricks + 4 * (numbers + entries) + PER_CELL * cells
+        resident += config.per_top_cell * top
+        making = (config.per_brick_made + (config.per_brick_joined if depth else 0)) * bricks
+        return FieldMemory(
+            resident, making + PER_CELL_MADE * cells + config.per_node * 4 * shapes["nodes"][0]
+        )
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "SparseField":
@@ -354,20 +358,20 @@ class SparseField(Assembled):
         tree = stored_tree(arrays, metadata)
         shape = SparseShape(whole(metadata["sh_degree"], "sh_degree", 0, 3))
         space = space_named(metadata.get("space", "bounded"))
-        field = cls(shape, Lattice(tree, SIDE), positive(metadata["scale"], "scale"), space=space)
+        field = cls(shape, VertexLattice(tree, SIDE), positive(metadata["scale"], "scale"), space=space)
         in_runs = "runs" in metadata.get("needs", [])
         for name, (view, lattice) in field._held().items():
-            found = arrays.get(name)
+            stored = arrays.get(name)
             expected = (lattice.free, view.shape[1])
-            if found is None or found.shape != expected:
-                have = "nothing" if found is None else list(found.shape)
+            if stored is None or stored.shape != expected:
+                have = "nothing" if stored is None else list(stored.shape)
                 raise ValueError(f"array '{name}' should have shape {list(expected)}, found {have}")
-            if not float(np.abs(found).max(initial=0)) * max(field.scale, MAX_TERMS) <= MAX_ANSWER:
+            if not float(np.abs(stored).max(initial=0)) * max(field.scale, MAX_TERMS) <= MAX_ANSWER:
                 raise ValueError(f"array '{name}' holds numbers whose answers would be beyond {MAX_ANSWER:g}")
             order, runs = lattice.stored_order if in_runs else (slice(lattice.free), None)
             if in_runs and not np.array_equal(arrays.get(runs_of(name)), runs):
                 raise ValueError(f"array '{runs_of(name)}' should hold the runs of its tree's vertices")
-            view[order] = torch.from_numpy(np.ascontiguousarray(found, np.float32))
+            view[order] = torch.from_numpy(np.ascontiguousarray(stored, np.float32))
         field.settle()
         return field
 
@@ -390,8 +394,8 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     if not np.allclose(aabb[3:] - aabb[:3], top * counts, rtol=1e-6):
         raise ValueError("aabb should be as many top cells wide as counts says")
     for name in ("nodes", "masks"):
-        found = arrays.get(name)
-        if found is None or found.dtype != np.uint8 or found.ndim != 1:
+        stored = arrays.get(name)
+        if stored is None or stored.dtype != np.uint8 or stored.ndim != 1:
             raise ValueError(f"array '{name}' should be bytes in one dimension")
     if len(arrays["masks"]) > 8 * limits.bricks:
         raise ValueError(f"there should be at most {limits.bricks} bricks, found {len(arrays['masks']) // 8}")

@@ -8,10 +8,10 @@ from scipy import sparse
 
 from fusedrf_cli.engine.encodings.bricks import COARSE, SIDE
 from fusedrf_cli.engine.kernels.reference import OCTANTS
-from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, BrickTree, key_places, morton, node_keys
+from fusedrf_cli.engine.kinds.sparse.bricks import MAX_LEVEL, BrickTree, key_positions, morton, node_keys
 
 
-class Lattice:
+class VertexLattice:
     """The vertices of a tree's voxels, with n of these along a brick's side: 4, or 2 or 1 of wider ones.
 
     A vertex that lies on an edge or a face of a wider voxel without being its corner *hangs*: its numbers are
@@ -31,7 +31,7 @@ class Lattice:
         self.used = used.reshape(-1, (n + 1) ** 3)
         of_bricks = self._keys()
         keys, first, inverse = np.unique(of_bricks, return_index=True, return_inverse=True)
-        vertices = key_places(keys)
+        vertices = key_positions(keys)
         hanging, parents = self._constraints(vertices, of_bricks)
         rank = np.empty(len(keys), np.int64)
         rank[np.lexsort((first, hanging))] = np.arange(len(keys))
@@ -42,20 +42,20 @@ class Lattice:
         """(V, 3) int64 in units of the tree, free ones first."""
         self.vertices[rank] = vertices
         self.spread = self._spread(keys, rank, hanging, parents)
-        self._coarser: dict[int, Lattice] = {}
+        self._coarser: dict[int, VertexLattice] = {}
 
-    def coarser(self, halvings: int) -> "Lattice":
+    def coarser(self, halvings: int) -> "VertexLattice":
         """The vertices of `BrickTree.coarser`, made once."""
         if not halvings:
             return self
         if halvings not in self._coarser:
-            self._coarser[halvings] = Lattice(self.tree.coarser(halvings), self.n)
+            self._coarser[halvings] = VertexLattice(self.tree.coarser(halvings), self.n)
         return self._coarser[halvings]
 
     @cached_property
-    def wider(self) -> "Lattice":
+    def wider(self) -> "VertexLattice":
         """The vertices of the same tree with COARSE voxels a side of a brick."""
-        return Lattice(self.tree, COARSE)
+        return VertexLattice(self.tree, COARSE)
 
     @property
     def width(self) -> np.ndarray:
@@ -63,7 +63,7 @@ class Lattice:
         return (SIDE // self.n) << (self.tree.depth - self.tree.level.astype(np.int64))
 
     @cached_property
-    def places(self) -> np.ndarray:
+    def positions(self) -> np.ndarray:
         """(V, 3) float64 vertices in the frame of the tree."""
         return self.tree.lo + self.vertices * self.tree.unit
 
@@ -83,8 +83,8 @@ class Lattice:
         """Which free row (F,) each stored one is, and how many of these (R,) int32 lie in each run: the rows
         of 2 x 2 x 2 top cells, as a Morton curve meets them. What changes in one moves no row of another."""
         units = SIDE << MAX_LEVEL  # of the finest level that there may be, along a top cell
-        places = self.vertices[: self.free] << (MAX_LEVEL - self.tree.depth)
-        code = morton(places + np.asarray(self.tree.phase) * units)
+        positions = self.vertices[: self.free] << (MAX_LEVEL - self.tree.depth)
+        code = morton(positions + np.asarray(self.tree.phase) * units)
         order = np.argsort(code)
         eight_cells = (code[order] >> 3 * units.bit_length()).astype(np.int64)
         starts = np.flatnonzero(np.diff(eight_cells, prepend=-1))
@@ -103,9 +103,9 @@ class Lattice:
     def finest_voxel(self) -> np.ndarray:
         """(V,) float64 shortest side of the smallest voxel around each vertex, in the tree's frame."""
         brick = np.broadcast_to(self.width[:, None], self.used.shape)[self.used]
-        found = np.full(len(self.vertices), np.iinfo(np.int64).max)
-        np.minimum.at(found, self.rows[self.used], brick)
-        return found * self.tree.unit.min()
+        finest = np.full(len(self.vertices), np.iinfo(np.int64).max)
+        np.minimum.at(finest, self.rows[self.used], brick)
+        return finest * self.tree.unit.min()
 
     @cached_property
     def spreading(self) -> tuple[np.ndarray, ...]:
@@ -160,12 +160,12 @@ class Lattice:
         tree = self.tree
         span = 2 * SIDE << (tree.depth - tree.level.astype(np.int64))
         everywhere = np.ones((len(tree.level), 1), bool)
-        found = np.zeros(len(tree.level), bool)
+        has_wider = np.zeros(len(tree.level), bool)
         for step in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
             beside = tree.at * span[:, None] + span[:, None] // 2 + step * span[:, None]
             brick, _, _ = tree.voxels_at(beside, 1, everywhere)
-            found |= (brick >= 0) & (tree.level[brick] < tree.level)
-        keys = used[np.repeat(found, self.used.sum(1))]
+            has_wider |= (brick >= 0) & (tree.level[brick] < tree.level)
+        keys = used[np.repeat(has_wider, self.used.sum(1))]
         return np.isin(node_keys(vertices), keys)
 
     def _spread(
@@ -176,11 +176,13 @@ class Lattice:
         count, free = len(rank), self.free
         if not len(keys):
             return sparse.csr_matrix((0, free))
-        wanted, kept = keys[weights > 0], np.nonzero(weights > 0)[0]
-        found = rank[np.searchsorted(known, wanted)]
-        own = rank[hanging] - free
-        whole = sparse.csr_matrix((weights[weights > 0], (own[kept], found)), shape=(count - free, count))
-        direct, through = whole[:, :free], whole[:, free:]
+        needed, indices = keys[weights > 0], np.nonzero(weights > 0)[0]
+        columns = rank[np.searchsorted(known, needed)]
+        hanging_rows = rank[hanging] - free
+        matrix = sparse.csr_matrix(
+            (weights[weights > 0], (hanging_rows[indices], columns)), shape=(count - free, count)
+        )
+        direct, through = matrix[:, :free], matrix[:, free:]
         total, step = direct, direct
         while (
             step := through @ step

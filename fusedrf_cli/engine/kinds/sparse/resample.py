@@ -1,7 +1,8 @@
 """Any field as a sparse one, by asking it: where bricks are needed, and of which level.
 
 A place is about as fine as the object that is densest there needs in world units; where all of that is too
-much, what is finest gives way most. What no camera sees is not held. filling.py says what the vertices get.
+much, what is finest gives way most. What no camera sees is not held. vertex_fit.py says what the vertices
+get.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.kinds.asking import (
-    AskingConfig,
+from fusedrf_cli.engine.kinds.field_sampling import (
+    FieldSamplingConfig,
     density,
     even_directions,
     pieces,
@@ -25,15 +26,15 @@ from fusedrf_cli.engine.kinds.sparse.bricks import (
     BrickLimits,
     BrickTree,
     children,
-    key_places,
+    key_positions,
     node_keys,
     sides,
 )
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
-from fusedrf_cli.engine.kinds.sparse.filling import density_scale, fill, set_density
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
-from fusedrf_cli.engine.kinds.sparse.seen import can_be_cut
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.kinds.sparse.training import of_voxels
+from fusedrf_cli.engine.kinds.sparse.vertex_fit import density_scale, fill, set_density
+from fusedrf_cli.engine.kinds.sparse.visible_cells import is_one_grid
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded
 
@@ -47,7 +48,8 @@ class ResampleConfig:
     give_way: float = 1 / 6
     """Of its distance to the widest, in logarithms, by which a finer placed field gives way."""
     in_place: float = 0.5
-    """Of the widening of a place, in logarithms, that of what stands in it: it takes few bricks."""
+    """Of the widening of an unbounded scene, in logarithms, that of what stands in it: it takes few
+    bricks."""
     deepest: int = 6
     """Levels under the coarsest: where voxels differ by more, the widest are finer than needed."""
     faint: float = 1e-4
@@ -57,7 +59,7 @@ class ResampleConfig:
     most_lost: float = 0.05
     """Optical depth of a voxel that is always held."""
     odd_lines: int = 20
-    """One line of voxels in so many may lose more: a few rays through thin haze decide nothing."""
+    """One line of voxels in so many may lose more: a few rays through thin floaters decide nothing."""
     looked_from: int = 20
     """Directions from which voxels are sought."""
     camera_far: float = 0.1
@@ -77,7 +79,7 @@ class ResampleConfig:
     first_widening: float = 2.0
     """What is tried first is cheap."""
     first_in_place: float = 4.0
-    """The same of a place, of which much more shows."""
+    """The same of an unbounded scene, of which much more shows."""
     usual_slope: float = -2.7
     """Of the logarithm of numbers over that of the widening, as seen."""
     slope_in_place: float = -2.1
@@ -102,39 +104,39 @@ def resampled(
 
 def fitted(
     teacher: RadianceField, shape: SparseShape, max_numbers: int, per_brick: float
-) -> tuple[Lattice, list[np.ndarray]]:
+) -> tuple[VertexLattice, list[np.ndarray]]:
     """The finest lattice found with at most so many numbers, and σ (V,) and facing (V, 3) of its vertices."""
     config = current(ResampleConfig)
-    own, in_place = own_voxels(teacher), teacher.occupancy.space is not bounded
+    voxels, in_place = own_voxels(teacher), teacher.occupancy.space is not bounded
     # No voxel is wider than needed at the least widening.
-    least = 1.0 if in_place else (own.min() / own.max()) ** config.give_way
+    least = 1.0 if in_place else (voxels.min() / voxels.max()) ** config.give_way
     widening, best, tried = config.first_in_place if in_place else max(config.first_widening, least), None, []
     for attempt in range(config.most_attempts):
         if attempt >= config.attempts and best is not None:
             break
         try:
-            found = occupied(teacher, widening)
+            candidate = occupied(teacher, widening)
         except EmptyField:
             if not tried:
                 raise
             break  # so wide that nothing shows
-        count = number_count(found[0], shape) + per_brick * len(found[0].tree.level)
+        count = number_count(candidate[0], shape) + per_brick * len(candidate[0].tree.level)
         tried.append((np.log(widening), np.log(count)))
         if count <= max_numbers and (best is None or widening < best[0]):
-            best = widening, found
+            best = widening, candidate
         if count <= max_numbers and (widening <= least or count >= config.full_enough * max_numbers):
             break
         slope = config.slope_in_place if in_place else config.usual_slope
         if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
             slope = min(-1.5, (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0]))
-        wanted = tried[-1][0] + (np.log(config.aimed * max_numbers) - tried[-1][1]) / slope
-        widening = float(np.exp(np.clip(wanted, np.log(least), tried[-1][0] + 1)))
+        target = tried[-1][0] + (np.log(config.aimed * max_numbers) - tried[-1][1]) / slope
+        widening = float(np.exp(np.clip(target, np.log(least), tried[-1][0] + 1)))
     if best is None:
         raise TooFewNumbers(f"a sparse field of this scene needs more than {max_numbers:,} numbers")
     return best[1]
 
 
-def number_count(lattice: Lattice, shape: SparseShape) -> int:
+def number_count(lattice: VertexLattice, shape: SparseShape) -> int:
     """Numbers of a sparse field over a lattice."""
     count = 4 * lattice.free
     return count + (shape.band_numbers * lattice.wider.free if shape.sh_degree else 0)
@@ -168,44 +170,46 @@ def voxels_wanted(teacher: RadianceField, widening: float) -> np.ndarray:
     """(P,) how wide a voxel may be for each placed field: as its own, or as much wider as a widening says.
 
     What is finer than the widest own voxel gives way a little more: by `give_way` of the distance, in
-    logarithms. What stands in a place gives way less than the place (`in_place`).
+    logarithms. What stands in an unbounded scene gives way less than the place (`in_place`).
     """
     config = current(ResampleConfig)
-    own = own_voxels(teacher)
+    voxels = own_voxels(teacher)
     if teacher.occupancy.space is bounded:
-        return np.maximum(own, widening * own ** (1 - config.give_way) * own.max() ** config.give_way)
-    place = np.array([p.unbounded for p in placed_in(teacher)])
-    return own * np.maximum(1, widening) ** np.where(place, 1, config.in_place)
+        return np.maximum(
+            voxels, widening * voxels ** (1 - config.give_way) * voxels.max() ** config.give_way
+        )
+    is_unbounded = np.array([p.unbounded for p in placed_in(teacher)])
+    return voxels * np.maximum(1, widening) ** np.where(is_unbounded, 1, config.in_place)
 
 
-def occupied(teacher: RadianceField, widening: float) -> tuple[Lattice, list[np.ndarray]]:
-    """The lattice whose active voxels hold all matter that shows, and σ (V,) and facing (V, 3) of its
+def occupied(teacher: RadianceField, widening: float) -> tuple[VertexLattice, list[np.ndarray]]:
+    """The lattice whose active voxels hold all density that shows, and σ (V,) and facing (V, 3) of its
     vertices."""
     lo, top, counts, levels = frame_of(teacher, widening)
-    wanted: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
+    needed: list[list[np.ndarray]] = [[] for _ in range(max(levels) + 1)]
     for placed, level in zip(placed_in(teacher), levels, strict=True):
-        wanted[level].append(demanded(teacher, placed, level, lo, top, counts))
-    level, at = leaves([np.unique(np.concatenate(w)) if w else np.zeros(0, np.int64) for w in wanted])
+        needed[level].append(demanded(teacher, placed, level, lo, top, counts))
+    level, at = leaves([np.unique(np.concatenate(w)) if w else np.zeros(0, np.int64) for w in needed])
     mask = np.ones((len(level), SIDE, SIDE, SIDE), bool)
-    lattice = Lattice(BrickTree.of(lo, top, counts, level, at, mask), SIDE)
-    sigma = density(teacher, lattice.places)
+    lattice = VertexLattice(BrickTree.of(lo, top, counts, level, at, mask), SIDE)
+    sigma = density(teacher, lattice.positions)
     dense = (sigma * lattice.finest_voxel > current(ResampleConfig).faint)[lattice.corners].any(1)
     lattice, (sigma,) = thinned(lattice, dense, sigma)
     field = SparseField(SparseShape(0), lattice, density_scale(lattice.tree), space=teacher.occupancy.space)
     set_density(field, sigma)
-    place = in_a_place(teacher, lattice, levels)
-    kept, facing = shown(field, ~place | one_of_eight(lattice))
-    return thinned(lattice, kept | place, sigma, facing)
+    is_background = is_too_fine_unbounded(teacher, lattice, levels)
+    visible, facing = shown(field, ~is_background | one_of_eight(lattice))
+    return thinned(lattice, visible | is_background, sigma, facing)
 
 
-def in_a_place(teacher: RadianceField, lattice: Lattice, levels: list[int]) -> np.ndarray:
-    """(K,) bool: which active voxels are no finer than a place needs that seen.py has cut down to what its
-    views show, so that there is nothing to be left out of it."""
-    found = [level for p, level in zip(placed_in(teacher), levels, strict=True) if can_be_cut(p)]
-    return np.repeat(lattice.tree.level <= max(found, default=-1), lattice.active.sum(1))
+def is_too_fine_unbounded(teacher: RadianceField, lattice: VertexLattice, levels: list[int]) -> np.ndarray:
+    """(K,) bool: which active voxels are no finer than a place needs that visible_cells.py has cut down to
+    what its views show, so that there is nothing to be left out of it."""
+    finest = [level for p, level in zip(placed_in(teacher), levels, strict=True) if is_one_grid(p)]
+    return np.repeat(lattice.tree.level <= max(finest, default=-1), lattice.active.sum(1))
 
 
-def one_of_eight(lattice: Lattice) -> np.ndarray:
+def one_of_eight(lattice: VertexLattice) -> np.ndarray:
     """(K,) bool: active voxels of which every vertex has one beside it, where all around it are active."""
     i, j, k = np.unravel_index(np.nonzero(lattice.active)[1], (SIDE,) * 3)
     return (i | j | k) % 2 == 0
@@ -215,10 +219,12 @@ class EmptyField(ValueError):
     """Nothing is there to be held."""
 
 
-def thinned(lattice: Lattice, kept: np.ndarray, *values: np.ndarray) -> tuple[Lattice, list[np.ndarray]]:
-    """The lattice of those active voxels of another that are kept (K,), and the values (V, ...) of its
+def thinned(
+    lattice: VertexLattice, mask: np.ndarray, *values: np.ndarray
+) -> tuple[VertexLattice, list[np.ndarray]]:
+    """The lattice of those active voxels of another that are mask (K,), and the values (V, ...) of its
     vertices. Raises EmptyField where there are none."""
-    smaller = of_voxels(lattice, kept)
+    smaller = of_voxels(lattice, mask)
     if smaller is None:
         raise EmptyField("the scene shows nothing")
     at = lattice.find(smaller.keys)[0]
@@ -230,22 +236,22 @@ def shown(field: SparseField, which: np.ndarray | None = None) -> tuple[np.ndarr
     and the mean direction (V, 3) along which each vertex is seen, of length 1 where from one side alone. With
     `which` (K,) bool only those voxels are looked at, and all others shown.
 
-    What is hidden in solids is not held, and of haze as much is left out as no line of sight misses.
+    What is hidden in solids is not held, and of low density as much is left out as no line of sight misses.
     """
     config = current(ResampleConfig)
     lattice = field.fine
     which = np.ones(len(lattice.corners), bool) if which is None else which
     corners, box, feature = lattice.corners[which], field.aabb, field.rows[:, 0].numpy()
     far = config.camera_far * float(np.linalg.norm(box[3:] - box[:3]))
-    low, high = lattice.places[corners[:, 0]], lattice.places[corners[:, 7]]
+    low, high = lattice.positions[corners[:, 0]], lattice.positions[corners[:, 7]]
     clearest, facing = field.exposed(low, high, even_directions(config.looked_from), far, config.blocked)
-    sigma = np.where(feature > current(AskingConfig).least, field.scale * np.logaddexp(0, feature), 0)
+    sigma = np.where(feature > current(FieldSamplingConfig).least, field.scale * np.logaddexp(0, feature), 0)
     depth = sigma[corners].max(1) * (high - low).min(1) * clearest
-    kept = which.copy()
-    kept[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
-    told = np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * kept[which])[:, None]
-    summed = at_vertices(corners, told, len(lattice.places))
-    return kept | ~which, summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
+    mask = which.copy()
+    mask[which] = depth > harmless(depth, lattice.vertices[corners[:, 0]])
+    weighted = np.concatenate([facing, np.ones((len(facing), 1))], 1) * (depth * mask[which])[:, None]
+    summed = at_vertices(corners, weighted, len(lattice.positions))
+    return mask | ~which, summed[:, :3] / np.maximum(summed[:, 3:], 1e-12)
 
 
 def at_vertices(corners: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
@@ -267,22 +273,22 @@ def demanded(
     n = SIDE + 1
     inner = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
     keys, inverse = np.unique(node_keys((bricks[:, None] * SIDE + inner).reshape(-1, 3)), return_inverse=True)
-    places = lo + key_places(keys) * (side / SIDE)
-    own = density(placed, places, space)
-    dense = own * np.min(side) / SIDE > current(ResampleConfig).faint
+    positions = lo + key_positions(keys) * (side / SIDE)
+    sigma = density(placed, positions, space)
+    dense = sigma * np.min(side) / SIDE > current(ResampleConfig).faint
     for other in placed_in(teacher):
-        beside = dense & holds(other, places, space)
+        beside = dense & holds(other, positions, space)
         if other is not placed and beside.any():
-            dense[beside] = own[beside] >= density(other, places[beside], space)
-    kept = dense[inverse].reshape(-1, n**3).any(1)
-    return node_keys(bricks[kept])
+            dense[beside] = sigma[beside] >= density(other, positions[beside], space)
+    needed = dense[inverse].reshape(-1, n**3).any(1)
+    return node_keys(bricks[needed])
 
 
-def holds(placed: Placed, places: np.ndarray, space: ModuleType) -> np.ndarray:
+def holds(placed: Placed, positions: np.ndarray, space: ModuleType) -> np.ndarray:
     """(N,) bool: which places, in the coordinates of a scene's space, lie in a placed field's box."""
     if placed.unbounded:
-        return np.ones(len(places), bool)
-    points = space.placed(torch.from_numpy(places)).numpy()
+        return np.ones(len(positions), bool)
+    points = space.inv_contract(torch.from_numpy(positions)).numpy()
     return (points >= placed.aabb[:3]).all(1) & (points <= placed.aabb[3:]).all(1)
 
 
@@ -304,14 +310,14 @@ def touched(
     last = np.clip(np.floor((placed.aabb[3:] - lo) / side).astype(int) + 1, 0, counts - 1)
     if np.prod(last - first + 1.0) > current(ResampleConfig).most_tried:
         raise ValueError(f"'{placed.name}' is too large for voxels so fine")
-    found = np.zeros(last - first + 1, bool)
+    marked = np.zeros(last - first + 1, bool)
     start = ((corners - lo) / side - first).astype(np.float32)
     fewer, more = sorted((start, (inner / side).astype(np.float32)), key=len)
-    for part in pieces(len(more), current(AskingConfig).at_once):
+    for part in pieces(len(more), current(FieldSamplingConfig).at_once):
         for offset in fewer:
             index = np.clip((more[part] + offset).astype(np.int32), 0, last - first)
-            found[index[:, 0], index[:, 1], index[:, 2]] = True
-    return np.argwhere(found) + first
+            marked[index[:, 0], index[:, 1], index[:, 2]] = True
+    return np.argwhere(marked) + first
 
 
 def touched_in_space(
@@ -324,14 +330,14 @@ def touched_in_space(
         raise ValueError(f"'{placed.name}' is too large for voxels so fine")
     spots = np.linspace(-1 / SIDE, 1 + 1 / SIDE, SIDE if placed.field.voxel_size < np.min(side) else 2)
     inner = np.stack(np.meshgrid(spots, spots, spots, indexing="ij"), -1).reshape(-1, 3)
-    grid, into, found = placed.field.occupancy, np.linalg.inv(placed.object_to_world), []
-    for part in pieces(int(np.prod(last - first + 1)), current(AskingConfig).at_once // len(inner)):
+    grid, into, bricks = placed.field.occupancy, np.linalg.inv(placed.object_to_world), []
+    for part in pieces(int(np.prod(last - first + 1)), current(FieldSamplingConfig).at_once // len(inner)):
         at = np.stack(np.unravel_index(np.arange(part.start, part.stop), last - first + 1), -1) + first
         points = torch.from_numpy((lo + (at[:, None] + inner) * side).reshape(-1, 3))
-        points = space.placed(points).numpy() @ into[:3, :3].T + into[:3, 3]
-        points = grid.space.contracted(torch.from_numpy(points)).numpy()
-        found.append(at[grid.contains(points).reshape(len(at), -1).any(1)])
-    return np.concatenate(found)
+        points = space.inv_contract(points).numpy() @ into[:3, :3].T + into[:3, 3]
+        points = grid.space.contract(torch.from_numpy(points)).numpy()
+        bricks.append(at[grid.contains(points).reshape(len(at), -1).any(1)])
+    return np.concatenate(bricks)
 
 
 def reached(
@@ -343,7 +349,7 @@ def reached(
         return np.zeros(3, int), counts - 1
     grid, matrix = placed.field.occupancy, placed.object_to_world
     centres = torch.from_numpy(grid.centres() @ matrix[:3, :3].T + matrix[:3, 3])
-    centres = space.contracted(centres).numpy()
+    centres = space.contract(centres).numpy()
     # half a cell's diagonal, which the map of space makes twice as long at most
     margin = np.linalg.norm(matrix[:3, :3], 2) * np.linalg.norm(grid.cell) + side
     first = np.clip(np.floor((centres.min(0) - margin - lo) / side).astype(int), 0, counts - 1)
@@ -351,7 +357,7 @@ def reached(
     return first, last
 
 
-def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def leaves(needed: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """(level (N,), place (N, 3)) of the leaves of the tree in which every wanted brick (keys by level) is
     held at its level or a finer one: where a finer brick lies inside, the rest of the wanted one is split
     around it."""
@@ -360,37 +366,37 @@ def leaves(wanted: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
             np.concatenate(
                 [np.zeros(0, np.int64)]
                 + [
-                    node_keys(key_places(keys) >> (deep - level))
-                    for deep, keys in enumerate(wanted)
+                    node_keys(key_positions(keys) >> (deep - level))
+                    for deep, keys in enumerate(needed)
                     if deep > level
                 ]
             )
         )
-        for level in range(len(wanted))
+        for level in range(len(needed))
     ]
-    levels, places = [], []
-    nodes = np.union1d(wanted[0], finer[0])
-    covered = np.isin(nodes, wanted[0])
-    for level in range(len(wanted)):
-        covered = covered | np.isin(nodes, wanted[level])
+    levels, positions = [], []
+    nodes = np.union1d(needed[0], finer[0])
+    covered = np.isin(nodes, needed[0])
+    for level in range(len(needed)):
+        covered = covered | np.isin(nodes, needed[level])
         split = np.isin(nodes, finer[level])
         leaf = covered & ~split
-        places.append(key_places(nodes[leaf]))
-        levels.append(np.full(len(places[-1]), level, np.uint8))
-        nodes, covered = node_keys(children(key_places(nodes[split]))), np.repeat(covered[split], 8)
-    return np.concatenate(levels), np.concatenate(places)
+        positions.append(key_positions(nodes[leaf]))
+        levels.append(np.full(len(positions[-1]), level, np.uint8))
+        nodes, covered = node_keys(children(key_positions(nodes[split]))), np.repeat(covered[split], 8)
+    return np.concatenate(levels), np.concatenate(positions)
 
 
-def harmless(depth: np.ndarray, places: np.ndarray) -> float:
-    """The largest optical depth of a voxel up to which voxels (K,) at places (K, 3) may be left out, when one
-    in `odd_lines` of the axis-parallel lines through them may lose more than `lost_depth`: thin fog is no
-    emptiness."""
+def harmless(depth: np.ndarray, positions: np.ndarray) -> float:
+    """The largest optical depth of a voxel up to which voxels (K,) at positions (K, 3) may be left out, when
+    one in `odd_lines` of the axis-parallel lines through them may lose more than `lost_depth`: thin floaters
+    is no emptiness."""
     config = current(ResampleConfig)
     if not len(depth):
         return 0.0
     lines = []
     for a, b in ((0, 1), (0, 2), (1, 2)):
-        lines.append(np.unique(places[:, a] << 21 | places[:, b], return_inverse=True)[1])
+        lines.append(np.unique(positions[:, a] << 21 | positions[:, b], return_inverse=True)[1])
     for threshold in config.most_lost * 0.5 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)
         most = max(np.quantile(np.bincount(line, lost), 1 - 1 / config.odd_lines) for line in lines)

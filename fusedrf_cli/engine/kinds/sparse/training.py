@@ -10,49 +10,51 @@ from fusedrf_cli.engine.encodings.bricks import SIDE
 from fusedrf_cli.engine.fields.box import DENSITY_SHIFT
 from fusedrf_cli.engine.kernels.reference import OCTANTS
 from fusedrf_cli.engine.kinds.sparse.bricks import BrickTree
-from fusedrf_cli.engine.kinds.sparse.lattice import Lattice
+from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 
 INSIDE = 1e-6  # of a voxel: so far from its corners it is asked whether it lies in an occupied cell
 
 
-def whole_lattice(box: np.ndarray, resolution: tuple[int, int, int]) -> Lattice:
+def whole_lattice(box: np.ndarray, resolution: tuple[int, int, int]) -> VertexLattice:
     """The vertices of a box (6,) in whole bricks of one level, at least as many per axis as asked."""
     counts = -(-(np.asarray(resolution) - 1) // SIDE)
     at = np.argwhere(np.ones(counts, bool))
     mask = np.ones((len(at), SIDE, SIDE, SIDE), bool)
     tree = BrickTree.of(box[:3], (box[3:] - box[:3]) / counts, counts, np.zeros(len(at), np.uint8), at, mask)
-    return Lattice(tree, SIDE)
+    return VertexLattice(tree, SIDE)
 
 
-def within(lattice: Lattice, contains: Callable[[np.ndarray], np.ndarray]) -> Lattice | None:
+def occupied_voxels(
+    lattice: VertexLattice, contains: Callable[[np.ndarray], np.ndarray]
+) -> VertexLattice | None:
     """The lattice of those active voxels in which some of nine points lie where contains((N, 3)) says so;
     None where there is none."""
-    low, high = lattice.places[lattice.corners[:, 0]], lattice.places[lattice.corners[:, 7]]
-    found = contains((low + high) / 2)
+    low, high = lattice.positions[lattice.corners[:, 0]], lattice.positions[lattice.corners[:, 7]]
+    reached = contains((low + high) / 2)
     for octant in INSIDE + (1 - 2 * INSIDE) * OCTANTS:
-        found |= contains(low + (high - low) * octant)
-    return of_voxels(lattice, found)
+        reached |= contains(low + (high - low) * octant)
+    return of_voxels(lattice, reached)
 
 
-def wholly(lattice: Lattice, holds: Callable[[np.ndarray], np.ndarray]) -> Lattice | None:
+def wholly_inside(lattice: VertexLattice, holds: Callable[[np.ndarray], np.ndarray]) -> VertexLattice | None:
     """The lattice of those active voxels of which holds((N, 3)) says that all corners are kept; None where
     there is none."""
-    kept = holds(lattice.places)
-    return of_voxels(lattice, kept[lattice.corners].all(1))
+    mask = holds(lattice.positions)
+    return of_voxels(lattice, mask[lattice.corners].all(1))
 
 
-def of_voxels(lattice: Lattice, found: np.ndarray) -> Lattice | None:
+def of_voxels(lattice: VertexLattice, chosen: np.ndarray) -> VertexLattice | None:
     """The lattice of some of its active voxels, (N,) bool; None of none."""
-    if not found.any():
+    if not chosen.any():
         return None
-    whole, mask = lattice.tree, np.zeros(lattice.active.shape, bool)
-    mask[lattice.active] = found
-    own = mask.any(1)
-    mask = mask[own].reshape(-1, SIDE, SIDE, SIDE)
-    return Lattice(whole.of_same_box(whole.level[own], whole.at[own], mask), SIDE)
+    tree, mask = lattice.tree, np.zeros(lattice.active.shape, bool)
+    mask[lattice.active] = chosen
+    has_voxels = mask.any(1)
+    mask = mask[has_voxels].reshape(-1, SIDE, SIDE, SIDE)
+    return VertexLattice(tree.of_same_box(tree.level[has_voxels], tree.at[has_voxels], mask), SIDE)
 
 
-def on_grid(lattice: Lattice, values: torch.Tensor, missing: torch.Tensor) -> torch.Tensor:
+def on_grid(lattice: VertexLattice, values: torch.Tensor, missing: torch.Tensor) -> torch.Tensor:
     """(1, D, X, Y, Z) rows (V, D) of a lattice of one level, and the row `missing` (D,) where there is
     none."""
     step = SIDE // lattice.n
@@ -63,10 +65,12 @@ def on_grid(lattice: Lattice, values: torch.Tensor, missing: torch.Tensor) -> to
     return dense.permute(3, 0, 1, 2)[None]
 
 
-def interpolated(old: Lattice, values: torch.Tensor, missing: torch.Tensor, new: Lattice) -> torch.Tensor:
+def interpolated(
+    old: VertexLattice, values: torch.Tensor, missing: torch.Tensor, new: VertexLattice
+) -> torch.Tensor:
     """(W, D) rows of a new lattice by interpolating those (V, D) of an old one of one level."""
     box = old.tree.aabb
-    unit = torch.from_numpy((new.places - box[:3]) / (box[3:] - box[:3])).to(values)
+    unit = torch.from_numpy((new.positions - box[:3]) / (box[3:] - box[:3])).to(values)
     at = (2 * unit - 1).flip(1)[None, None, None]  # torch counts axes from the last
     grid = on_grid(old, values, missing)
     return torch.nn.functional.grid_sample(
@@ -74,7 +78,7 @@ def interpolated(old: Lattice, values: torch.Tensor, missing: torch.Tensor, new:
     )[0, :, 0, 0].T.contiguous()
 
 
-def carried(field, lattice: Lattice):
+def transferred(field, lattice: VertexLattice):
     """A field over another lattice of one level with what it holds, interpolated."""
     other = type(field)(field.shape, lattice, field.scale, space=field.space)
     here = field.to("cpu")

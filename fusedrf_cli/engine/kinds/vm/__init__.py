@@ -1,5 +1,5 @@
 """The `vm` kind: TensoRF's vector-matrix decomposition with spherical-harmonic colour."""
 
-from fusedrf_cli.engine.kinds.vm.students import VMKind
+from fusedrf_cli.engine.kinds.vm.builder import VMKind
 
 KIND = VMKind()

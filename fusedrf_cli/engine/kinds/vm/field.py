@@ -16,8 +16,8 @@ from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
-from fusedrf_cli.engine.fields.base import FieldNeeds
-from fusedrf_cli.engine.fields.box import LINE, Part, checked_box, whole_numbers
+from fusedrf_cli.engine.fields.base import FieldMemory
+from fusedrf_cli.engine.fields.box import LINE, ParameterBlock, checked_box, whole_numbers
 from fusedrf_cli.engine.fields.computed import (
     FEW_CELLS,
     PER_CELL,
@@ -26,7 +26,14 @@ from fusedrf_cli.engine.fields.computed import (
     packed_bits,
     runs_of,
 )
-from fusedrf_cli.engine.fields.hashed import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, ROW, Hashed, Held
+from fusedrf_cli.engine.fields.hash_entries import (
+    MAX_LEVELS,
+    MAX_ROWS,
+    MAX_VERTEX,
+    ROW,
+    HashGrid,
+    StoredEntries,
+)
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of
@@ -52,7 +59,7 @@ DETAIL = "density_detail"  # the rows of the hash grid
 class VMShape(RankedShape):
     """Components per mode, and what is finer than the texels."""
 
-    hashed: Hashed | None = None
+    hashed: HashGrid | None = None
 
 
 class VMField(AssembledField):
@@ -102,9 +109,9 @@ class VMField(AssembledField):
         return step if self.shape.hashed is None else min(step, self.shape.hashed.picture_step)
 
     @property
-    def held(self) -> Held | None:
+    def held(self) -> StoredEntries | None:
         """Which rows of its hash grid a file holds; None: it has none, or all."""
-        return Held.of(self.sections()[DETAIL].detach().cpu().numpy()) if self.shape.hashed else None
+        return StoredEntries.of(self.sections()[DETAIL].detach().cpu().numpy()) if self.shape.hashed else None
 
     # -- storing ---------------------------------------------------------------------------------------------
 
@@ -151,7 +158,7 @@ class VMField(AssembledField):
         return arrays | cells, ({"needs": sorted(needs)} if needs else {}) | metadata
 
     @classmethod
-    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldNeeds:
+    def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
         """See Kind.field_needs."""
         own, rows = box_metadata(cls.kind, metadata), cls.stored_name(DETAIL)
         hashed = own["shape"].get("hashed")
@@ -159,7 +166,7 @@ class VMField(AssembledField):
         stored = [shape for name, shape in whole.items() if ".occupancy" not in name]
         numbers = sum(-(-prod(shape) // LINE) * LINE for shape in stored)
         cells = prod(whole_numbers(own["cells"]["counts"], 1, "cells"))
-        return FieldNeeds(4 * numbers + PER_CELL * cells, PER_CELL_MADE * cells)
+        return FieldMemory(4 * numbers + PER_CELL * cells, PER_CELL_MADE * cells)
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], metadata: dict) -> "VMField":
@@ -175,7 +182,7 @@ class VMField(AssembledField):
         field.name = str(metadata["blocks"][0]["name"])
         return field
 
-    def unpack(self, part: Part, stored: torch.Tensor, values: torch.Tensor) -> None:
+    def unpack(self, part: ParameterBlock, stored: torch.Tensor, values: torch.Tensor) -> None:
         """See BoxField; rows of 0 take no memory."""
         if part.name == DETAIL:
             rows = stored.any(1)
@@ -207,7 +214,7 @@ def box_metadata(kind: str, metadata: dict) -> dict:
     return own | {"aabb": aabb, "cells": cells, "shape": shape}
 
 
-def hashed_of(stored: dict, box: np.ndarray) -> Hashed:
+def hashed_of(stored: dict, box: np.ndarray) -> HashGrid:
     """A hash grid as metadata tell it, of a field over a box (6,). Raises ValueError naming what does not
     fit."""
     spacings, rows = stored["spacings"], stored["rows"]
@@ -216,7 +223,7 @@ def hashed_of(stored: dict, box: np.ndarray) -> Hashed:
             f"a hash grid has 1 to {MAX_LEVELS} levels of at most {MAX_ROWS} rows, found {len(spacings)} of "
             f"{rows}"
         )
-    hashed = Hashed(tuple(float(h) for h in spacings), rows)
+    hashed = HashGrid(tuple(float(h) for h in spacings), rows)
     if not np.abs(box).max() <= MAX_VERTEX * min(hashed.spacings):
         raise ValueError(
             f"the vertices of a hash grid should be numbered up to {MAX_VERTEX}, but its box reaches to "
@@ -225,20 +232,20 @@ def hashed_of(stored: dict, box: np.ndarray) -> Hashed:
     return hashed
 
 
-def with_all_rows(arrays: dict[str, np.ndarray], hashed: Hashed | None) -> dict[str, np.ndarray]:
+def with_all_rows(arrays: dict[str, np.ndarray], hashed: HashGrid | None) -> dict[str, np.ndarray]:
     """The arrays with all rows of a hash grid, of which a file may hold few. Raises ValueError naming what
     does not fit."""
     name = VMField.stored_name(DETAIL)
     blocks, runs = (arrays.get(f"{name}_{which}") for which in ("blocks", "held"))
     if hashed is None or blocks is None or runs is None:
         return arrays
-    held = Held.from_state(blocks, runs, hashed.shape[0])
-    lengths, found = arrays.get(runs_of(name)), arrays.get(name)
+    held = StoredEntries.from_state(blocks, runs, hashed.shape[0])
+    lengths, stored = arrays.get(runs_of(name)), arrays.get(name)
     if lengths is None or not np.array_equal(lengths, held.lengths):
         raise ValueError(f"the runs of array '{name}' are not those of its blocks")
-    if found is None or found.shape != (held.count, ROW):
-        have = "nothing" if found is None else list(found.shape)
+    if stored is None or stored.shape != (held.count, ROW):
+        have = "nothing" if stored is None else list(stored.shape)
         raise ValueError(f"array '{name}' should have shape {[held.count, ROW]}, found {have}")
-    whole = np.zeros(hashed.shape, found.dtype)
-    whole[held.rows] = found
+    whole = np.zeros(hashed.shape, stored.dtype)
+    whole[held.rows] = stored
     return arrays | {name: whole}

@@ -10,7 +10,7 @@ import torch
 
 from fusedrf_cli.engine.encodings.hash_runs import hashed_row
 from fusedrf_cli.engine.encodings.plane_line import MODES
-from fusedrf_cli.engine.fields.hashed import EMPTY_FROM, Hashed
+from fusedrf_cli.engine.fields.hash_entries import EMPTY_FROM, HashGrid
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
 from fusedrf_cli.engine.settings import current
 
@@ -67,35 +67,35 @@ def without_unread(field: VMField) -> VMField:
     return trimmed
 
 
-def without_unasked(field: VMField) -> VMField:
+def without_unqueried(field: VMField) -> VMField:
     """The same field with 0 in all rows of its hash grid that no occupied cell asks, and in all unread
     texels: it answers the same there, and a file has the other rows alone."""
     if field.params.device.type != "cpu":
-        return without_unasked(field.to("cpu")).to(field.params.device)
+        return without_unqueried(field.to("cpu")).to(field.params.device)
     trimmed = without_unread(field)
     if field.shape.hashed:
-        trimmed.sections()[DETAIL][torch.from_numpy(~asked_rows(field, field.shape.hashed))] = 0
+        trimmed.sections()[DETAIL][torch.from_numpy(~queried_rows(field, field.shape.hashed))] = 0
     return trimmed
 
 
-def asked_rows(field: VMField, hashed: Hashed) -> np.ndarray:
+def queried_rows(field: VMField, hashed: HashGrid) -> np.ndarray:
     """(R,) bool: the rows of a field's hash grid that some point of an occupied cell asks, where planes and
-    lines say that there may be matter; all of a level of which so many cells are met that most are."""
-    asked, sides, occupied = matter_texels(field), field.box[3:] - field.box[:3], field.occupancy.occupied
-    found = np.zeros(hashed.shape[0], bool)
+    lines say that there may be density; all of a level of which so many cells are met that most are."""
+    texels, sides, occupied = occupied_texels(field), field.box[3:] - field.box[:3], field.occupancy.occupied
+    queried = np.zeros(hashed.shape[0], bool)
     for level, spacing in enumerate(hashed.spacings):
-        own = found[level * hashed.rows : (level + 1) * hashed.rows]
+        own = queried[level * hashed.rows : (level + 1) * hashed.rows]
         if occupied.mean() * (sides / spacing).prod() > current(TrimmingConfig).most_met * hashed.rows:
             own[:] = True
             continue
-        for vertices in met_vertices(field.box, (asked, occupied), spacing):
+        for vertices in met_vertices(field.box, (texels, occupied), spacing):
             own[hashed_row(hashed, torch.from_numpy(vertices)).numpy()] = True
-    return found
+    return queried
 
 
-def matter_texels(field: VMField) -> np.ndarray:
+def occupied_texels(field: VMField) -> np.ndarray:
     """(nx - 1, ny - 1, nz - 1) bool: the cells between texels in which planes and lines may say that there is
-    matter. A product of bilinear and linear is trilinear, so it is largest at a corner."""
+    density. A product of bilinear and linear is trilinear, so it is largest at a corner."""
     sections = field.sections()
     planes, lines = (
         [sections[f"density_{what}_{m}"].double() for m in range(3)] for what in ("plane", "line")
@@ -243,11 +243,11 @@ def leading(plane: np.ndarray, line: np.ndarray, rank: int) -> tuple[np.ndarray,
         return plane, line
     q, r = np.linalg.qr(plane.reshape(-1, plane.shape[-1]))
     left, values, right = np.linalg.svd(r @ line.T, full_matrices=False)
-    found = min(rank, len(values))
-    root = np.sqrt(values[:found])
+    count = min(rank, len(values))
+    root = np.sqrt(values[:count])
     lines, planes = np.zeros((len(line), rank)), np.zeros((*plane.shape[:2], rank))
-    lines[:, :found] = right[:found].T * root
-    planes[..., :found] = (q @ (left[:, :found] * root)).reshape(*plane.shape[:2], found)
+    lines[:, :count] = right[:count].T * root
+    planes[..., :count] = (q @ (left[:, :count] * root)).reshape(*plane.shape[:2], count)
     return planes, lines
 
 

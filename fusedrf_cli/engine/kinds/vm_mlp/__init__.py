@@ -1,5 +1,5 @@
 """The `vm-mlp` kind: the vector-matrix decomposition with a small network for colour."""
 
-from fusedrf_cli.engine.kinds.vm_mlp.students import VMMLPKind
+from fusedrf_cli.engine.kinds.vm_mlp.builder import VMMLPKind
 
 KIND = VMMLPKind()

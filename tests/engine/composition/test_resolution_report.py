@@ -1,0 +1,28 @@
+"""What a fused field says of its objects: voxels, and the price of a stretch."""
+
+import numpy as np
+import pytest
+
+from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.resolution_report import opacity_off, resolution_at_voxel
+from tests.analytic.export import vm_field
+from tests.analytic.fields import Box, Tint
+from tests.analytic.rays import affine
+
+BLOCK = vm_field(Box(40.0, 0.5, tint=Tint.of(0.5, 0.2, 0.1)))
+
+
+@pytest.mark.parametrize("condition", [1.1, 2.0, 4.0, 9.0])
+def test_what_a_stretch_costs_is_the_largest_gap_of_two_exponentials(condition):
+    """Between the extremes of density: sup over τ of exp(-τ) - exp(-κτ)."""
+    tau = np.linspace(0, 20, 200_001)
+    gap = (np.exp(-tau) - np.exp(-tau * condition)).max()
+    assert opacity_off(condition) == pytest.approx(gap, rel=1e-6)
+    assert opacity_off(1.0) == 0
+
+
+def test_voxels_across_are_of_the_fused_field():
+    placed = [Placed("big", BLOCK, np.eye(4)), Placed("flat", BLOCK, affine((0.2, 0.2, 0.1), (2, 0, 0)))]
+    big, flat = resolution_at_voxel(placed, 0.25)
+    assert (big.voxels_across, flat.voxels_across) == (pytest.approx(4), pytest.approx(0.8))
+    assert flat.stretch == pytest.approx(2) and flat.opacity_off > 0.1
