@@ -94,12 +94,14 @@ sys.path.insert(0, {folder!r})
 import flat
 told, device_module = [], assemble(flat, flat, density_sum, rgb)
 sizes = {{"density": flat.sizes(), "colour": flat.sizes(), "sigma": density_sum.sizes(), "rgb": rgb.sizes(3)}}
-sizes = device_module.sizes(SimpleNamespace(slots={{name: SimpleNamespace(sizes=s) for name, s in
-sizes.items()}})) field = device_module.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
+slots = {{name: SimpleNamespace(sizes=s) for name, s in sizes.items()}}
+sizes = device_module.sizes(SimpleNamespace(slots=slots))
+field = device_module.Arrays(np.ones(4), np.zeros(3), np.ones(3), np.array([1.0, 20.0]))
 grid = kernels.GridArrays(np.zeros((1, 1, 1), np.uint8), np.zeros(3), np.ones(3), np.ones(3))
 with kernels.report_compilation(lambda: told.append(1)):
-    found, asked = PointValues(np.zeros(1), np.zeros((1, 3))), PointBatch(np.full((1, 3), 0.5), np.eye(3)[:1],
-    True) Loops(device_module, sizes, bounded).each("query_point", field, grid, asked, 1, found)
+    found = PointValues(np.zeros(1), np.zeros((1, 3)))
+    asked = PointBatch(np.full((1, 3), 0.5), np.eye(3)[:1], True)
+    Loops(device_module, sizes, bounded).each("query_point", field, grid, asked, 1, found)
 print(found.sigma[0], round(found.rgb[0, 0], 6))
 print(len(told))
 """
