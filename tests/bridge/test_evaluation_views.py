@@ -51,7 +51,7 @@ def shown(camera, point) -> tuple[float, float]:
     return column / camera.width, row / camera.height
 
 
-@pytest.mark.parametrize("rig", [None, PLACE])
+@pytest.mark.parametrize("camera_set", [None, PLACE])
 def test_the_whole_and_every_object_are_looked_at(camera_set):
     found = evaluation_views(camera_set, BOX, OBJECTS, 4, (160, 160), 1)
     assert [look.of for look in found[:WHOLE]] == [None] * WHOLE

@@ -103,9 +103,9 @@ def iou(folder, bundle: str) -> float:
 
 @pytest.mark.parametrize("kind", ["blocks", "vm", "sparse", "dense"])
 @pytest.mark.parametrize("way", WAYS)
-def test_the_object_is_it_and_with_the_rest_it_is_the_field(report, folder, kind, storage):
-    said = report("extract", f"{kind}.rfpack", *WAYS[storage], "-o", "object.rfpack")
-    report("extract", f"{kind}.rfpack", *WAYS[storage], "--invert", "-o", "rest.rfpack")
+def test_the_object_is_it_and_with_the_rest_it_is_the_field(report, folder, kind, way):
+    said = report("extract", f"{kind}.rfpack", *WAYS[way], "-o", "object.rfpack")
+    report("extract", f"{kind}.rfpack", *WAYS[way], "--invert", "-o", "rest.rfpack")
     assert iou(folder, "object.rfpack") > (0.9 if kind == "blocks" else 0.8)  # learnt, and coarse
     assert said["sure"] > 0.8 and said["kind"] == ("vm" if kind == "blocks" else kind)
     np.testing.assert_allclose(said["box"], [-0.8, -0.3, -0.3, -0.2, 0.3, 0.3], atol=0.13)

@@ -107,12 +107,12 @@ def test_b1_ties_go_to_the_lower_node(row):
 
 @pytest.mark.parametrize("count", [4, pytest.param(30, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("way", ["composed", "composite"])
-def test_b2_coplanar_faces_do_not_flicker(row, storage, count):
+def test_b2_coplanar_faces_do_not_flicker(row, way, count):
     """Two cubes in one place, densities within ±2 %: which wins is a function of the place alone, so that the
     frames of a camera that turns by 1e-5 rad each look the same."""
     scene = scenes.s4_twins(noise=0.02)
     composed = scene.composed("vm")
-    field = composed if storage == "composed" else as_composite(composed)
+    field = composed if way == "composed" else as_composite(composed)
     frames = []
     for i in range(count):
         angle = 1e-5 * i
@@ -121,7 +121,7 @@ def test_b2_coplanar_faces_do_not_flicker(row, storage, count):
     both = np.mean(np.asarray(frames[0])[12:20, 12:20].std((0, 1)))
     assert both > 0.05  # both colours are there to flicker between
     flicker = float(np.std(frames, axis=0).mean() / LSB)
-    row.check("B2", f"{storage}: flicker of {count} frames, LSB", flicker, 0.5, at_most=True, scene="S4")
+    row.check("B2", f"{way}: flicker of {count} frames, LSB", flicker, 0.5, at_most=True, scene="S4")
 
 
 def test_b2_the_winner_is_that_of_the_rule(row):
@@ -146,10 +146,10 @@ ROD = scene_of(
 
 
 @pytest.mark.parametrize("way", ["composed", "composite"])
-def test_b5_a_rod_through_a_box(row, storage):
+def test_b5_a_rod_through_a_box(row, way):
     """Every winner is that of the analytic union; the pixels along its outlines are reported apart."""
     composed = ROD.composed("vm")
-    field = composed if storage == "composed" else as_composite(composed)
+    field = composed if way == "composed" else as_composite(composed)
     points, dirs = around(ROD, 20_000)
     faces = [
         np.abs(
@@ -164,14 +164,14 @@ def test_b5_a_rod_through_a_box(row, storage):
     off = (np.abs(sigma - truth[0]) > 1e-4 * truth[0]) | (
         (np.abs(rgb - truth[1]).max(1) > 1e-4) & (truth[0] > 0)
     )
-    row.check("B5", f"{storage}: wrong winners", np.count_nonzero(off & clear), 0, at_most=True, scene="S4")
+    row.check("B5", f"{way}: wrong winners", np.count_nonzero(off & clear), 0, at_most=True, scene="S4")
     wanted = ROD.image(EYE)
     found = photo(field, EYE, composed.origin, step=0.004)
     band = outline(wanted)
-    what = f"{storage}: against the truth, away from outlines"
+    what = f"{way}: against the truth, away from outlines"
     row.check("B5", what, psnr(found[~band], wanted[~band]), 50, scene="S4", unit="dB")
     row.check(
-        "B5", f"{storage}: in a band of 4 px", psnr(found[band], wanted[band]), 25, scene="S4", unit="dB"
+        "B5", f"{way}: in a band of 4 px", psnr(found[band], wanted[band]), 25, scene="S4", unit="dB"
     )
 
 
@@ -211,14 +211,14 @@ def test_b3_media_through_each_other(row, kind, rule, depths):
 
 
 @pytest.mark.parametrize("way", ["composed", "composite"])
-def test_b4_fog_around_solids(row, storage):
+def test_b4_fog_around_solids(row, way):
     """The fog does not feel the solids outside their matter: bit for bit where a ray misses them."""
     room = scenes.s6_room()
     inside = Scene(room.parts[:3])  # without the rod, which would move the box that rays start from
     pictures = {}
     for name, scene in (("with", inside), ("without", Scene(room.parts[:1]))):
         composed = scene.composed("vm")
-        field = composed if storage == "composed" else as_composite(composed)
+        field = composed if way == "composed" else as_composite(composed)
         rays_o, rays_d = EYE.rays()
         pictures[name] = render_rays(field, rays_o - composed.origin, rays_d, step=0.05)
     boxes = [p.aabb for p in inside.placed("vm")[1:]]
@@ -227,16 +227,16 @@ def test_b4_fog_around_solids(row, storage):
     fogged = misses & (pictures["without"][:, 3] > 0.05)
     assert fogged.sum() > 100
     changed = np.abs(pictures["with"] - pictures["without"])[fogged, :4]
-    if storage == "composed":
-        row.check("B4", f"{storage}: fog changed beside solids", changed.max(), 0, at_most=True, scene="S6")
+    if way == "composed":
+        row.check("B4", f"{way}: fog changed beside solids", changed.max(), 0, at_most=True, scene="S6")
     else:  # whose steps are as coarse as the block they are in, counted in the finest one's
         figure = -10 * np.log10((changed**2).mean())
-        row.check("B4", f"{storage}: fog beside solids as it was", figure, 40, scene="S6", unit="dB")
+        row.check("B4", f"{way}: fog beside solids as it was", figure, 40, scene="S6", unit="dB")
     composed = room.composed("vm")
-    field = composed if storage == "composed" else as_composite(composed)
+    field = composed if way == "composed" else as_composite(composed)
     found = piecewise_pixels(field, composed.origin, room, rays_o, rays_d)
     off = np.abs(found - room.pixels(rays_o, rays_d)).max()
-    row.check("B4", f"{storage}: room against slab algebra", off, 1e-4, at_most=True, scene="S6")
+    row.check("B4", f"{way}: room against slab algebra", off, 1e-4, at_most=True, scene="S6")
 
 
 @pytest.mark.parametrize("rule", ["max", "add"])
@@ -261,18 +261,18 @@ def test_b6_the_empty_lends_no_colour(row, kind, rule):
 
 
 @pytest.mark.parametrize("way", ["blocks", "vm"])
-def test_b7_fusing_with_an_empty_field_is_fusing_without(row, tmp_path, storage):
+def test_b7_fusing_with_an_empty_field_is_fusing_without(row, tmp_path, way):
     box = ("box", Box(20.0, 0.4, tint=scenes.RED), affine(turn(20)))
     empty = ("empty", scenes.s9_odd()["empty"], affine(1.0, (2, 1, 0)))
     write_bundles(tmp_path, scene_of(box, empty))
     write_bundles(tmp_path, scene_of(box), file="alone.json")
-    words = ("--kind", storage, "--no-finetune", "--max-size", "300kB")
+    words = ("--kind", way, "--no-finetune", "--max-size", "300kB")
     said = done(tmp_path, "fuse", "scene.json", "-o", "both.rfpack", *words)
     done(tmp_path, "fuse", "alone.json", "-o", "alone.rfpack", *words)
     assert any("'empty' is empty" in w for w in said["warnings"])
     both, alone = (read_bundle(tmp_path / f"{n}.rfpack") for n in ("both", "alone"))
     same = list(both.fields) == list(alone.fields)  # members are named for their bytes
-    row.check("B7", f"{storage}: the same field bit for bit", same, 1, scene="S9")
+    row.check("B7", f"{way}: the same field bit for bit", same, 1, scene="S9")
 
 
 def test_b7_nothing_but_empty_fields(row, tmp_path):
@@ -419,9 +419,9 @@ def test_b12_order_changes_no_answer(row, kind, count):
         origin = found["max"].origin
         if all(type(p.field) is VMField for p in placed):
             found["composite"] = as_composite(found["max"])
-        for storage, field in found.items():
+        for way, field in found.items():
             sigma, rgb = answers(field, points, dirs, origin)
-            wanted = first.setdefault(storage, (sigma, rgb))
+            wanted = first.setdefault(way, (sigma, rgb))
             shown = sigma > 0
             differing += np.count_nonzero(sigma != wanted[0]) + np.count_nonzero((rgb != wanted[1])[shown])
     assert np.count_nonzero(first["max"][0]) > 300
