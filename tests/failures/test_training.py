@@ -193,13 +193,13 @@ def test_t7_numbers_that_are_not_finite_never_reach_the_grid(row, images):
     run = FitRun.start(CAMERAS, images, BOX, BRIEF)
     for _ in range(4):
         run.step(0.05)
-    run.guard.renew()
-    run.guard.keep()
+    run.nan_guard.renew()
+    run.nan_guard.keep()
     good = run.field.params.clone()
     run.field.params[11] = float("nan")
     run.steps, run.optimiser.steps = SHOWS, TrainConfig.calm_after
     run.refresh(0.04)
-    assert run.guard.roll_backs == 1 and run.field.params.shape == good.shape
+    assert run.nan_guard.roll_backs == 1 and run.field.params.shape == good.shape
     row.check("T7", "numbers that are not finite", (~torch.isfinite(run.field.params)).sum(), 0, at_most=True)
     assert torch.equal(run.field.params, good)
 
@@ -232,7 +232,7 @@ def test_t9_bad_steps_are_skipped(row, images, unseen_psnr, monkeypatch):
 
         run.step = watched
         figure -= unseen_psnr(run.finish()) / len(clean)
-        assert run.guard.figures() == {"skipped_steps": 8, "roll_backs": 0} and run.steps == 160
+        assert run.nan_guard.figures() == {"skipped_steps": 8, "roll_backs": 0} and run.steps == 160
         assert np.isfinite(run.mse)
     row.check("T9", "PSNR lost to one bad step in twenty", figure, 0.5, at_most=True, unit="dB")
 
@@ -251,7 +251,7 @@ def test_t9_poisoned_numbers_are_recovered_from(row, images, unseen_psnr, value)
 
     run.step = poisoning
     field = run.finish()
-    assert run.guard.roll_backs >= 1 and torch.isfinite(field.params).all()
+    assert run.nan_guard.roll_backs >= 1 and torch.isfinite(field.params).all()
     row.check("T9", "PSNR after factors went bad", unseen_psnr(field), 21, unit="dB")
 
 
@@ -262,7 +262,7 @@ def test_t11_rays_without_samples(row, images):
     before = run.field.params.clone()
     for _ in range(5):
         run.step(0.0)
-    row.check("T11", "steps not finite", run.guard.skipped, 0, at_most=True)
+    row.check("T11", "steps not finite", run.nan_guard.skipped, 0, at_most=True)
     assert torch.equal(run.field.params, before)
 
 
