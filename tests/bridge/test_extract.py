@@ -257,7 +257,7 @@ def test_photos_do_not_teach_what_they_do_not_show(tmp_path):
     write_views(tmp_path / "red")
     capture = read_capture(tmp_path / "red", None)
     cameras = [camera_of(view) for view in capture.train]
-    pictures = part("inpainting").without(FIELDS["red"], capture, cameras, NullProgress())
+    pictures = part("inpainting").photos_without(FIELDS["red"], capture, cameras, NullProgress())
     shown = load_photos(capture.train).pixels[:, 3] > 8
     assert shown.mean() > 0.1 and pictures.ignored[shown].all() and not pictures.ignored.all()
 
