@@ -26,7 +26,7 @@ def reference(
     """See decoders."""
     harmonics = torch_reference.sh_basis(coefficients, dirs).to(features.dtype)
     if apart:
-        rest = features[:, : 3 * (coefficients - 1)].view(-1, 3, coefficients - 1)
+        rest = features[:, : 3 * (coefficients - 1)].view(len(features), 3, coefficients - 1)
         features = torch.cat([features[:, -3:, None], rest], 2)
     else:
         features = features[:, : 3 * coefficients].view(-1, 3, coefficients)
