@@ -198,7 +198,7 @@ def learnt_from(
     run = FitRun.start(cameras, pictures, bounds.box, settings, LEARNT, bounds.cells)
     progress.phase("training", 1.0)
     field = run.finish(lambda share, figures: progress.advance(share, **figures))
-    warn_of_nonfinite(run.guard.figures(), progress)
+    warn_of_nonfinite(run.nan_guard.figures(), progress)
     return field.to("cpu"), {"photos": len(capture.train), "training_psnr": run.psnr}
 
 

@@ -184,7 +184,7 @@ def train(request: TrainRequest, progress) -> dict:
         "exposure": exposure(run),
         "poses": moved(run, cameras, bounds) if settings.poses else None,
         "memory": memory.report(),
-        **run.guard.figures(),
+        **run.nan_guard.figures(),
     }
     reached, target = measured["psnr"] if measured else run.psnr, request.target_psnr
     if target is not None and reached < target:
@@ -369,7 +369,7 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
     with resumable(output, run.checkpoint, lambda: run.held, progress) as uninterrupted:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
     run.forget()
-    warn_of_nonfinite(run.guard.figures(), progress)
+    warn_of_nonfinite(run.nan_guard.figures(), progress)
     if not run.found_matter:
         progress.warn(
             f"{output}: no matter was found, so that all of the box was kept; look at the photos' alpha, "
