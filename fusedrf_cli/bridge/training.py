@@ -180,7 +180,7 @@ def train(request: TrainRequest, progress) -> dict:
         "seconds": {"training": seconds},
         "training_psnr": run.psnr,
         "holdout": measured,
-        "depths_of_points": run.keypoints and len(run.keypoints.points),
+        "depths_of_points": run.depth_points and len(run.depth_points.points),
         "exposure": exposure(run),
         "poses": moved(run, cameras, bounds) if settings.poses else None,
         "memory": memory.report(),
