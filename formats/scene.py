@@ -170,7 +170,7 @@ class SceneGraph:
                 placed = node.name, node.field, node.source, object_to_world, node.background
                 leaves.append(Leaf(*placed, visible, opacity, tint, crops, groups))
             for child in reversed(node.children):
-                all_crops = tuple(crop.in_frame_of(child.node_to_parent) for crop in crops)
+                all_crops = tuple(crop.within(child.node_to_parent) for crop in crops)
                 shown = visible, opacity, tint, all_crops, groups
                 stack.append((child, object_to_world @ child.node_to_parent, *shown))
         return leaves

@@ -90,7 +90,7 @@ class Benchmark:
     memory: Memory
     size: tuple[int, int]
     allow_outside: bool
-    place: str
+    device: str
     box: np.ndarray
     """(6,) of the world, which frames are timed of."""
     cameras: list[Camera]

@@ -89,7 +89,7 @@ def align(field, camera: Camera, truth: np.ndarray, learnt: np.ndarray, near: fl
     for number in range(config.rounds):
         *rays, colours = pool.sample(config.rays, generator)
         probe = first * (last / first) ** (number / (config.rounds - 1)) * pool.pixel
-        pool.device(changed_each(pool.poses, refined(field, rays, colours, near, probe)))
+        pool.set_poses(changed_each(pool.poses, refined(field, rays, colours, near, probe)))
     matrix = camera.camera_to_world.copy()
     matrix[:3, :3], matrix[:3, 3] = pool.rotation[0].numpy(), pool.position[0].numpy()
     return replace(camera, camera_to_world=matrix)

@@ -223,7 +223,7 @@ def test_a_student_of_more_numbers_is_told_more_up_to_twice_as_much():
 
 def test_bricks_learn_from_more_rays_the_more_numbers_they_hold():
     """More numbers than rays say anything of learn those rays by heart."""
-    student = SPARSE.student(SCENE, BuildRequest(BundleSizes(), 10_000_000))
+    student = SPARSE.builder(SCENE, BuildRequest(BundleSizes(), 10_000_000))
     found = [
         student.distil_config_for(n) for n in (1, 3_000_000, 6_000_000, 15_000_000, 21_000_000, 90_000_000)
     ]

@@ -87,7 +87,8 @@ def test_nothing_else_is_left(charted):
 
 def test_people_see_the_frontier(run):
     result = run(*CHART, "--kinds", "blocks", "--budget", "0.05")
-    assert result.exit_code == 0 and "--kind blocks --precision" in result.stdout
+    assert result.exit_code == 0, result.output
+    assert "--kind blocks --precision" in result.stdout
     assert "were left off where --budget 0.05 ended" in result.stderr
 
 

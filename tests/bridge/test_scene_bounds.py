@@ -131,10 +131,10 @@ def test_the_best_quality_is_as_fine_as_the_photos_and_takes_a_long_time_budget(
     words = replace(request(), unbounded=False, aabb=(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0))
     bounds = scene_bounds_of(words, capture, False)
 
-    def found(seconds, quality=None, sharper=1.0, place="cpu"):
+    def found(seconds, quality=None, sharper=1.0, device="cpu"):
         views = tuple(replace(v, fl_x=v.fl_x * sharper, fl_y=v.fl_y * sharper) for v in capture.train)
         asked = replace(words, time_budget=seconds, quality=quality)
-        return quality_of(asked, replace(capture, train=views), bounds, place)
+        return quality_of(asked, replace(capture, train=views), bounds, device)
 
     def longest(*words):
         return found(*words).longest
@@ -183,10 +183,10 @@ def test_a_place_that_has_the_time_and_the_room_gets_a_hashed_detail(in_force):
     ring = [(4 * np.cos(a), 4 * np.sin(a), 1.0) for a in np.linspace(0, 6, 12)]
     capture = photos(ring)
 
-    def settings(kind: str = "vm", bounded: bool = False, place: str = "cpu", **words) -> TrainConfig:
+    def settings(kind: str = "vm", bounded: bool = False, device: str = "cpu", **words) -> TrainConfig:
         asked = replace(request(), precision="int8", unbounded=not bounded, **words)
         bounds = scene_bounds_of(asked, capture, False)
-        return fit_settings(asked, registry.kind(kind), capture, bounds, place)
+        return fit_settings(asked, registry.kind(kind), capture, bounds, device)
 
     plain = settings(time_budget=60.0)
     assert plain.storage.hashed is None

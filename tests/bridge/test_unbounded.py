@@ -214,7 +214,7 @@ def test_bricks_of_a_place_hold_its_colours_from_all_sides():
     thing = ComposedField([Placed("thing", random_vm(dtype=torch.float32, cells=4), np.eye(4))])
     for scene, asked, degree in ((room, None, 2), (thing, None, 1), (room, 1, 1), (thing, 2, 2)):
         request = BuildRequest(BundleSizes(), 10**7, sh_degree=asked)
-        assert registry.kind("sparse").student(scene, request).plain().sh_degree == degree
+        assert registry.kind("sparse").builder(scene, request).plain().sh_degree == degree
 
 
 @pytest.mark.slow
@@ -349,7 +349,7 @@ def test_a_short_time_leaves_a_student_of_a_place_room_to_begin_as_it_is():
 
     def most(scene: ComposedField, seconds: float | None) -> int:
         request = BuildRequest(BundleSizes(), 10_000_000, seconds=seconds)
-        return registry.kind("vm").student(scene, request).largest().allowed
+        return registry.kind("vm").builder(scene, request).largest().allowed
 
     assert most(scene, 0.01) == most(scene, None)
     assert most(ComposedField(objects), 0.01) < most(ComposedField(objects), None)

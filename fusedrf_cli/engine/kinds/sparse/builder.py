@@ -248,8 +248,8 @@ def bricks(resolution: tuple[int, int, int]) -> list[int]:
 
 def bricks_sweep() -> Sweep:
     """From few bricks to more, since many take minutes."""
-    for rgb, size, degree in product((False, True), current(SparseConfig).ladder_bytes, (1, 0)):
-        yield SweepPoint("int8", sh_degree=degree, max_size=size, rgb=rgb)
+    for finetune, size, degree in product((False, True), current(SparseConfig).ladder_bytes, (1, 0)):
+        yield SweepPoint("int8", sh_degree=degree, max_size=size, finetune=finetune)
 
 
 def levels(field: SparseField) -> list[dict]:
