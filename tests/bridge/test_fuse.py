@@ -175,7 +175,7 @@ def test_an_interrupted_fuse_goes_on(run, folder, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("fusedrf_cli.engine.distillation.distill.ask", stop)
+        patch.setattr("fusedrf_cli.engine.distillation.distill.query_teacher", stop)
         assert run("fuse", "pair.json", "-o", "fused.rfpack", *VM).exit_code == 130
     assert not (folder / "fused.rfpack").exists() and (folder / "fused.rfpack.checkpoint").exists()
     for other in (("--max-size", "80kB"), ("--seed", "5"), ("--finetune",), ("--from-scratch",)):
