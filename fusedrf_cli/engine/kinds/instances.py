@@ -83,7 +83,8 @@ class InstancesKind(Kind):
         """What is only made smaller, and what is finished."""
         config = current(InstancesConfig)
         plain = [
-            SweepPoint(p, r, finetune=False) for r, p in product(config.ladder_ranks, config.ladder_precisions)
+            SweepPoint(p, r, finetune=False)
+            for r, p in product(config.ladder_ranks, config.ladder_precisions)
         ]
         finished = [SweepPoint(p, r) for r, p in product(config.ladder_ranks, config.ladder_finished)]
         groups = {self.name: plain, f"{self.name}, finished": finished}
