@@ -175,7 +175,7 @@ def reference_loss(
     reference."""
     out = reference.render_rays(
         field, torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, step, early_stop,
-        torch.from_numpy(jitter), loops.COLOUR_FROM,
+        torch.from_numpy(jitter), (loops.COLOUR_FROM, None),
     )  # fmt: skip
     target, background = torch.from_numpy(target), torch.from_numpy(background)
     shown = out[:, :3] + (1 - out[:, 3:4]) * background
@@ -212,7 +212,7 @@ def test_train_rays_of_photos_of_their_own_exposure_is_autograd():
     params = field.params.clone().requires_grad_()
     out = reference.render_rays(
         field.with_params(params), torch.from_numpy(rays_o), torch.from_numpy(rays_d), 0.0, 0.05, 0.0,
-        torch.from_numpy(jitter), loops.COLOUR_FROM,
+        torch.from_numpy(jitter), (loops.COLOUR_FROM, None),
     )  # fmt: skip
     gain, offset, weight = torch.from_numpy(exposure).unbind(1)
     wanted, behind = torch.from_numpy(target), torch.from_numpy(background)
