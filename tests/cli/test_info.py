@@ -68,7 +68,8 @@ def test_info_lists_the_objects_of_a_fused_bundle(run, folder):
     assert "objects:" not in lines  # which are the nodes
     assert "  deleted  jug" in lines
     lines = run("info", "distilled.rfpack").stdout.splitlines()
-    assert lines[lines.index("objects:") + 2].split() == ["cup", "lamp", "fused", "2.5", "0", "0", "1", "2", "3"]
+    row = lines[lines.index("objects:") + 2].split()
+    assert row == ["cup", "lamp", "fused", "2.5", "0", "0", "1", "2", "3"]
     (cup,) = json.loads(run("info", "distilled.rfpack", "--json").stdout)["objects"]
     assert (cup["name"], cup["bytes"], cup["size"]) == ("cup", None, [1, 2, 3])
 
