@@ -62,7 +62,8 @@ def read_checkpoint(path: Path | str) -> Saved:
         try:
             header = json.loads(file.read(length))
             if (version := header["version"]) != VERSION:
-                raise NewerVersion(
+                older = type(version) is int and version < VERSION
+                raise (OlderVersion if older else NewerVersion)(
                     f"{path}: a checkpoint of version {version}, and this fusedrf reads {VERSION}; go on "
                     f"with the fusedrf that wrote it, or {REMEDY}"
                 )

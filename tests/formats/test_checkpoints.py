@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from formats.checkpoints import MAGIC, read_checkpoint, write_checkpoint
+from formats.checkpoints import MAGIC, VERSION, read_checkpoint, write_checkpoint
 from formats.errors import BadHeader, FormatError, MissingFile, NewerVersion, NotAFile, OlderVersion
 
 ARRAYS = {
@@ -51,7 +51,7 @@ def sealed(header: object, rest: bytes = b"", length: int | None = None) -> byte
 
 
 def of(*arrays, **words) -> bytes:
-    return sealed({"version": 2, "state": {}, "arrays": list(arrays)} | words)
+    return sealed({"version": VERSION, "state": {}, "arrays": list(arrays)} | words)
 
 
 @pytest.mark.parametrize(
@@ -71,9 +71,10 @@ def test_hostile_headers_are_refused_by_a_sentence(path, content):
 
 
 def test_other_versions_are_told(path):
-    path.write_bytes(sealed({"version": 3}))
-    with pytest.raises(NewerVersion, match="version 3"):
-        read_checkpoint(path)
+    for version, error in ((VERSION + 1, NewerVersion), (VERSION - 1, OlderVersion)):
+        path.write_bytes(sealed({"version": version}))
+        with pytest.raises(error, match=f"version {version}"):
+            read_checkpoint(path)
     path.write_bytes((2).to_bytes(8, "little") + b'{"__metadata__":{}}')
     with pytest.raises(OlderVersion, match="no checksum"):
         read_checkpoint(path)

@@ -175,7 +175,7 @@ def test_a_folder_that_cannot_keep_is_found_before(tmp_path, monkeypatch, harm):
     else:
         history_folder(path).mkdir()
         monkeypatch.setattr(os, "access", lambda place, _: place != history_folder(path))
-    with pytest.raises(ResourceError, match="keep-history"):
+    with pytest.raises(ResourceError, match="--undoable"):
         check_history_folder(path, path)
 
 

@@ -284,7 +284,7 @@ def test_no_sample_lies_before_the_next_change_or_behind_the_last(space):
     instances = Instances(
         np.eye(4)[None, :3], grid.aabb[None, :3], grid.aabb[None, 3:], grid.cell[None],
         np.array([grid.occupied.shape]), np.zeros(1, np.int64), grid.skip.ravel(), np.array([step]), zeros,
-        np.zeros(1, np.int64),
+        np.zeros(1, np.int64), np.ones((1, 4)),
     )  # fmt: skip
     for o, d in rays_of(space, 40):
         d = d / np.linalg.norm(d)
@@ -515,7 +515,7 @@ def test_what_is_no_space_is_refused(entry):
 def test_kinds_that_follow_straight_lines_are_refused_in_curved_spaces():
     device_module = ModuleType("straight")
     exec(
-        "def advance(field, grid, place, many, steps, k, p, way, u, u0, step):\n    return k + 1",
+        "def next_index(field, grid, place, many, steps, k, p, way, u, u0, step):\n    return k + 1",
         vars(device_module),
     )
     with pytest.raises(ValueError, match="straight follows straight rays"):
