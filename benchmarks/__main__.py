@@ -91,7 +91,8 @@ def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> 
         else:
             sections = field.with_params(params).slot_sections()["density"]
             features = density.module.reference(field, sections, unit, None, **density.options)
-            reference.density(features.sum(1), field.scale, field.shift).sum().backward()
+            sigma = field.slots["sigma"]
+            sigma.module.reference(field, {}, features, **sigma.options)[0].sum().backward()
 
     what = "query forward and backward, density" + with_colour * " and colour"
     return Row(what, "point", POINTS, ours, theirs, POINTS)

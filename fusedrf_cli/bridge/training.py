@@ -37,7 +37,7 @@ from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, camera_bytes, se
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.ray_dataset import Pictures
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import BuilderConfig, Plan, Section, StorageSetting

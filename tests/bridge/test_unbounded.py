@@ -18,7 +18,7 @@ from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import BuildRequest

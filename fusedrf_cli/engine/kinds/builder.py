@@ -13,8 +13,8 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.resolution_report import ResolutionReport
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.settings import current

@@ -13,6 +13,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.occupancy import PROBES
 from fusedrf_cli.engine.kernels.reference import OCTANTS, sh_basis
 from fusedrf_cli.engine.settings import current
 
@@ -139,9 +140,8 @@ def density_features(
     corners = lattice.corners
     first = lattice.positions[corners[:, 0]]
     extent = lattice.positions[corners[:, 7]] - first
-    spots = 0.25 + 0.5 * OCTANTS
-    weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
-    answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
+    weights = np.where(OCTANTS == 1, PROBES[:, None], 1 - PROBES[:, None]).prod(2)
+    answers = np.stack([density(teacher, first + extent * spot) for spot in PROBES], 1)
     half, deepest = (half_opaque(scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
     targets = np.clip(inverse_softplus(answers / scale), config.least, half + config.reach)
     targets = np.where(

@@ -7,8 +7,8 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.encodings.hash_runs import ROW
 from fusedrf_cli.engine.fields.assembled import MAX_RANK
-from fusedrf_cli.engine.fields.hash_entries import PER_BLOCK, ROW, TOGETHER, StoredEntries
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import (
@@ -21,6 +21,7 @@ from fusedrf_cli.engine.kinds.builder import (
 )
 from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.stored_entries import PER_BLOCK, TOGETHER, StoredEntries
 from fusedrf_cli.engine.kinds.vm.trimming import (
     common_shape,
     components,
