@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.encodings.hash_runs import PRIMES
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.primitives import accumulate
 from fusedrf_cli.engine.kernels.reference import OCTANTS, whole
 
-PRIMES = 2654435761, 805459861  # of y and z
 FILLED = 8  # rows of a level are filled up to a multiple of
 
 

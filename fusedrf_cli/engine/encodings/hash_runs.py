@@ -17,6 +17,7 @@ from fusedrf_cli.engine.kernels.reference import OCTANTS, exact, whole
 
 RUN = 4  # rows that lie side by side along z, so that neighbours share a cache line
 ROW = 4  # numbers of a row: density, then red, green and blue
+PRIMES = 2654435761, 805459861, 3674653429  # that numbers of vertices are multiplied by
 EMPTY_FROM = -6.0  # density before activation, shift included, under which none is asked for
 STEPS = 2.0  # of its finest spacing from one sample of a picture to the next
 MAX_LEVELS, MAX_ROWS = 8, 1 << 24
@@ -100,7 +101,8 @@ def hashed_row(hashed: HashGrid, vertex: torch.Tensor) -> torch.Tensor:
     """(N,) int64: which row of a level the vertices (N, 3) int64 of its lattice have. Products wrap around at
     64 bits; what is kept of them is the same whether they have a sign."""
     i, j, k = vertex.unbind(1)
-    h = (i * 2654435761) ^ (j * 805459861) ^ (k.div(RUN, rounding_mode="floor") * 3674653429)
+    run = k.div(RUN, rounding_mode="floor")
+    h = (i * PRIMES[0]) ^ (j * PRIMES[1]) ^ (run * PRIMES[2])
     h = h ^ (h >> 15)
     return (h & (hashed.rows // RUN - 1)) * RUN + k.remainder(RUN)
 
@@ -115,7 +117,7 @@ def bound(sections: dict, read: None, hashed: HashGrid) -> torch.Tensor:
 
 def run_at(field, level, i, j, run):
     """Where the rows of the `run`-th RUN vertices along z at (i, j) begin."""
-    h = (i * 2654435761) ^ (j * 805459861) ^ (run * 3674653429)  # wraps around at 64 bits
+    h = (i * PRIMES[0]) ^ (j * PRIMES[1]) ^ (run * PRIMES[2])  # wraps around at 64 bits
     return field.table + (level * field.rows + ((h ^ (h >> 15)) & (field.rows // RUN - 1)) * RUN) * ROW
 
 

@@ -65,7 +65,7 @@ class BoxField(ComputedField):
     which touch a voxel that an occupied cell reaches into: no answer depends on the others.
 
     A kind sets `kind`, `device_module` and `shape_type`, a frozen dataclass of whole numbers that refuses
-    what its bodies were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and
+    what its kernels were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and
     `check_answers`.
     """
 
