@@ -31,7 +31,7 @@ from fusedrf_cli.python import open_scene
 from tests.analytic.export import SHAPE, vm_field, way_of
 from tests.analytic.fields import Gaussian, Tint
 from tests.analytic.rays import unit
-from tests.bridge.conftest import blues, done
+from tests.bridge.conftest import TinySettings, blues, done
 from tests.engine.conftest import random_vm
 
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
@@ -49,6 +49,9 @@ def walls(seed: int = 0) -> VMField:
     field = field.with_occupancy(middles.marked(there))
     field.shift = float(np.log(np.expm1(20 / field.scale)))
     return field.with_params(field.params * torch.tensor(2.0))
+
+
+MORE_STEPS = replace(TinySettings(), steps=400, rgb_steps=60, rays=20_000)
 
 
 def fine_walls() -> VMField:
@@ -147,8 +150,9 @@ def test_what_stands_in_a_place_is_learnt_turned_as_most_of_it_is():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 0.6])
-def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report, turn):
+def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report, turn, in_force):
     """The place stays as it is; what is deleted leaves it so, and all others stay."""
+    in_force(MORE_STEPS)
     path = str(folder / "room.rfpack")
     write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
     places = {"room": (0, 0, 0), "red": (-0.5, 0, 0), "blue": (0.7, 0, 0)}
@@ -163,8 +167,7 @@ def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, repor
         for n, at in places.items()
     ]
     write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
-    words = ("fuse", "two.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
-    said = report(*words)
+    said = report("fuse", "two.json", "--kind", "vm", "-o", "one.rfpack")
     assert said["chosen"]["start"] == "'room' as it is" and said["nodes"] == 2
     (entry,) = read_bundle(folder / "one.rfpack").scene.history
     assert entry["objects"] == ["room"] and [n["name"] for n in entry["nodes"]] == ["red", "blue"]
@@ -214,13 +217,14 @@ def test_bricks_of_a_place_hold_its_colours_from_all_sides():
 
 
 @pytest.mark.slow
-def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report):
+def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report, in_force):
     """What stands around stays as it was, and the object comes in, where there are texels for it."""
+    in_force(MORE_STEPS)
     path = str(folder / "room.rfpack")
     write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
     scene = json.loads((folder / "place.json").read_text()) | {"composition": "add"}
     (folder / "place.json").write_text(json.dumps(scene))
-    said = report("fuse", "place.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
+    said = report("fuse", "place.json", "--kind", "vm", "-o", "one.rfpack")
     assert said["chosen"]["start"] == "the weights of 'room'"
     one, wanted = picture("one.rfpack"), picture("place.json")
     red = (wanted[..., 0] > 0.6) & (wanted[..., 2] < 0.4)
@@ -320,8 +324,11 @@ def test_what_masks_exclude_does_not_count(report, folder):
 @pytest.mark.parametrize("x", [-0.5, 4.0])
 def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     """As `sparse`, an object in the core and one far outside of it are there, and edits leave the rest."""
+    write_field(
+        str(fused / "fine.rfpack"), fine_walls(), "room", precision="float16", overwrite=True, origin=LIES
+    )
     nodes = [
-        make_node("room", source="room.rfpack", background=True),
+        make_node("room", source="fine.rfpack", background=True),
         make_node("red", source="red.rfpack", translation=(x, 0, 0), scale=(2, 2, 2)),
     ]
     more = make_node("more", source="red.rfpack", translation=(0.6, 0.5, 0))
