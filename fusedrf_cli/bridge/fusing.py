@@ -75,7 +75,7 @@ def fuse(
         bundle = FusedBundle(request, everything, loaded, kind.field is not None)
         cameras = result_cameras(loaded, progress)
         bundle.shown_as(result_view_box(loaded, scene.composed, cameras), cameras)
-        pixels = current(BuildingConfig).views * DistilConfig.view_size**2
+        pixels = current(BuildingConfig).views * current(DistilConfig).view_size ** 2
         warn_of_work(request.scene, scene.composed, pixels, progress)
         made = best_of(request, scene, kind, bundle.overhead, memory, device, progress, saved)
         entry = {
@@ -96,7 +96,7 @@ def fuse(
             )
             checkpoint_path(request.output).unlink(missing_ok=True)
         reports = made.resolution_reports()
-        warn_of_resolution(reports, remedy(kind, loaded, scene.composed), progress)
+        warn_of_resolution(reports, remedy(kind, scene.composed), progress)
         figures = made.figures()
     report = {
         "output": request.output,
@@ -223,7 +223,7 @@ def best_suited(composed: ComposedField) -> tuple[Kind, str]:
     return kind, suits.why
 
 
-def remedy(kind: Kind, loaded: LoadedScene, composed: ComposedField) -> str:
+def remedy(kind: Kind, composed: ComposedField) -> str:
     """What helps an object that is held too coarsely."""
     best = best_suited(composed)[0]
     return "a larger --max-size" if best is kind else f"--kind {best.name}, or a larger --max-size"

@@ -12,9 +12,9 @@ from formats.bundle import read_bundle
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.builder import DistilledBuilder
 from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
 from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.settings import using
 from fusedrf_cli.requests import FuseRequest
 from fusedrf_cli.verbs import checked
 from tests.bridge.conftest import TinySettings, done, write_scene_of
@@ -28,10 +28,9 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 
 @pytest.fixture(scope="module", autouse=True)
 def short(tiny):  # noqa: F811
-    with pytest.MonkeyPatch.context() as patch:
+    # a network takes its time
+    with pytest.MonkeyPatch.context() as patch, using(TinySettings(points_per_step=1 << 11)):
         patch.setattr(SparseBuilder, "distil_config", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        # a network takes its time
-        patch.setattr(DistilledBuilder, "distil_config", TinySettings(points_per_step=1 << 11))
         yield
 
 

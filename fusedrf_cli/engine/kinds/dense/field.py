@@ -68,7 +68,7 @@ class DenseField(AssembledField):
         }
 
     def fill_vertices(self, index: np.ndarray, features: np.ndarray, colours: np.ndarray) -> None:
-        """See AskedStudent."""
+        """See `ResampledBuilder`."""
         sections, index = self.sections(), torch.from_numpy(index)
         sections["density"].view(-1)[index] = torch.from_numpy(features - self.shift).float()
         sections["colour"].view(-1, self.shape.width)[index, : self.shape.numbers] = torch.from_numpy(colours)

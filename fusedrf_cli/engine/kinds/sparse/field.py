@@ -338,7 +338,7 @@ class SparseField(Assembled):
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs; with the tables that follow from the tree."""
+        """See `Kind.field_memory`; with the tables that follow from the tree."""
         config = current(BricksConfig)
         (bricks,), counts = shapes["masks"], metadata["counts"]
         top, bricks = math.prod(counts), bricks // 8
