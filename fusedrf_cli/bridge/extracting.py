@@ -78,8 +78,7 @@ def extract(request: ExtractRequest, progress) -> dict:
         named_views = views_by_name(request, pieces)
         progress.phase("choosing", None)
         named = named_nodes(request, pieces)
-        object_field, rest, figures = parted(request, pieces, named, named_views, progress)
-        shown = pieces.composed(object_field)
+        object_field, shown, rest, figures = parted(request, pieces, named, named_views, progress)
         box = placed_box(subject(shown), pieces.origin)
         left = pieces.composed(rest) if request.invert or request.preview else None
         if request.invert:
@@ -139,11 +138,12 @@ def named_nodes(request: ExtractRequest, whole: Whole) -> set[str]:
 
 def parted(
     request: ExtractRequest, whole: Whole, named: set[str], named_views: dict[str, View], progress
-) -> tuple[Fields, Fields, dict]:
-    """The object's fields, those that are left, and what the report says of how it was chosen; named: its
-    nodes, where it is those. InvalidInput where there is no such object."""
+) -> tuple[Fields, RadianceField, Fields, dict]:
+    """The object's fields, what they show, those that are left, and what the report says of how it was
+    chosen; named: its nodes, where it is those. InvalidInput where there is no such object."""
     if named:
-        return *whole.named(named), {}
+        objects, rest = whole.named(named)
+        return objects, whole.composed(objects), rest, {}
     extracting = current(ExtractingConfig)
     config = current(SelectingConfig)
     by_name = request.name is not None
@@ -176,7 +176,7 @@ def parted(
     share = seen_share(
         [in_frame(small(view, config.seen_side), whole) for view in some(named_views)], object_shown
     )
-    return objects, rest, {"sure": round(selection.sure, 3), "seen": share}
+    return objects, object_shown, rest, {"sure": round(selection.sure, 3), "seen": share}
 
 
 def cues_by_name(name: str, whole: Whole) -> ObjectCues:

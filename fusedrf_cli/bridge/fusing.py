@@ -72,7 +72,8 @@ def fuse(
         if kind.field is None:
             note_options(request, loaded, progress)
         started = time.monotonic()
-        bundle = FusedBundle(request, everything, loaded, kind.field is not None)
+        bundle = FusedBundle(request, everything, scene, kind.field is not None)
+        warn_of_hidden(bundle.hidden, progress)
         cameras = result_cameras(loaded, progress)
         bundle.shown_as(result_view_box(loaded, scene.composed, cameras), cameras)
         pixels = current(BuildingConfig).views * current(DistilConfig).view_size ** 2
@@ -417,6 +418,13 @@ def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
     if not fields:
         raise InvalidInput(f"{scene}: all its fields are empty; train them again")
     return replace(loaded, fields=fields)
+
+
+def warn_of_hidden(names: list[str], progress) -> None:
+    """Say which nodes are left out because they are hidden."""
+    if names:
+        few = ", ".join(f"'{name}'" for name in names[:5]) + (", …" if len(names) > 5 else "")
+        progress.warn(f"what is hidden was left out: {few}; show it to have it fused")
 
 
 def make_room(memory: Memory, builder: DistilledBuilder, scene: FuseScene, request: FuseRequest) -> bool:

@@ -17,10 +17,10 @@ from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
 from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
 from fusedrf_cli.engine.kinds.instances import InstancesConfig
-from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig
 from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings
+from tests.bundles import field_kinds
 from tests.engine.kinds.cases import SLOW_TO_COMPILE
 
 ROW = re.compile(r"test_([a-z]+\d+)_")
