@@ -25,7 +25,7 @@ from fusedrf_cli.bridge.inpainting import (
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.bridge.scene import load_fields, make_field, showing_of
-from fusedrf_cli.bridge.sources import SourceFolder, leaf_of, source_of
+from fusedrf_cli.bridge.sources import leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.resolution_report import extent
 from fusedrf_cli.engine.fields.base import StoredField
@@ -137,7 +137,7 @@ class Deletion:
     def empty(self, leaf: Leaf, one: Placed, box: np.ndarray) -> float:
         """Empty the cells of a node's field that reach into a box (6,) of the world; the side of such a
         cell."""
-        left = self.part(one, "restricted", lambda at: ((at < box[:3]) | (at > box[3:])).any(1))
+        left = self.part(one, "restricted", lambda at: ~inside(at, box))
         precision = self.draft.fields.headers[leaf.field].precision
         member = None if left is None else self.draft.put(left, precision)
         self.draft.graph = with_field(self.draft.graph, leaf.name, member)
@@ -192,7 +192,7 @@ class Deletion:
         draft, others = self.draft, []
         for name, node in draft.inside.items():
             if name not in self.names:
-                found = source_of(node, leaf_of(node), draft.bundle, SourceFolder(None), self.allow_outside)
+                found = source_of(node, leaf_of(node), draft.bundle, self.allow_outside)
                 sources = [
                     (
                         load_fields(file.path, draft.graph, [(leaf, file, member)], None).placed[0],
@@ -241,7 +241,7 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
     found, else with those that the field has in its box."""
     draft, entry = deletion.draft, deletion.draft.inside[name]
     leaf = replace(leaf_of(entry), name=new_name)
-    own = source_of(entry, leaf, draft.bundle, SourceFolder(None), deletion.allow_outside)
+    own = source_of(entry, leaf, draft.bundle, deletion.allow_outside)
     nodes = []
     for part, file, member in own:
         draft.writer.copy_field(file, member)

@@ -36,7 +36,6 @@ from fusedrf_cli.bridge.selecting import (
     watching,
 )
 from fusedrf_cli.bridge.sources import scene_as_stored
-from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement, squeezed
 from fusedrf_cli.engine.kinds import registry
@@ -79,7 +78,7 @@ def extract(request: ExtractRequest, progress) -> dict:
         progress.phase("choosing", None)
         named = named_nodes(request, pieces)
         object_field, shown, rest, figures = parted(request, pieces, named, named_views, progress)
-        box = placed_box(subject(shown), pieces.origin)
+        box = placed_box(shown.occupancy.look_at_box, pieces.origin)
         left = pieces.composed(rest) if request.invert or request.preview else None
         if request.invert:
             if left is None:
@@ -198,11 +197,6 @@ def cues_by_name(name: str, whole: Whole) -> ObjectCues:
     return ObjectCues(holds, [], [], none, none, touches=True)
 
 
-def subject(field: RadianceField) -> np.ndarray:
-    """(6,) the box of its frame that views of a field look at."""
-    return field.look_at_box if isinstance(field, ComposedField) else field.occupancy.look_at_box
-
-
 # -- what was seen of it -------------------------------------------------------------------------------------
 
 
@@ -221,7 +215,7 @@ def seen_share(capture_views: list[Camera], object_field: RadianceField) -> floa
         return None
     lens = framing_lens(config.seen_side, config.seen_side)
     around = [
-        replace(framing(subject(object_field), lens, azimuth, elevation).camera(lens), name="")
+        replace(framing(object_field.occupancy.look_at_box, lens, azimuth, elevation).camera(lens), name="")
         for elevation in (-0.6, 0.0, 0.6, 1.2)
         for azimuth in np.arange(6) * np.pi / 3
     ]

@@ -14,6 +14,7 @@ from formats.images import read_mask
 from formats.photos import pictures
 from formats.views import View
 from fusedrf_cli.bridge.cutting import Whole
+from fusedrf_cli.bridge.distilled import inside
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placement
@@ -91,8 +92,8 @@ def cues_of(request: ExtractRequest, fused: Whole, named_views: dict[str, View],
     points = {True: [], False: []}
     for look, (view, column, row, shows) in zip(pointed, request.points, strict=True):
         points[shows].append(surface_at(fused.field, look, f"--points {view}:{column:g},{row:g}"))
-    inside, outside = (np.array(points[shows]).reshape(-1, 3) for shows in (True, False))
-    return ObjectCues(in_shapes(request, fused), masks, pointed, inside, outside)
+    shown, hidden = (np.array(points[shows]).reshape(-1, 3) for shows in (True, False))
+    return ObjectCues(in_shapes(request, fused), masks, pointed, shown, hidden)
 
 
 def in_shapes(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -106,12 +107,12 @@ def in_shapes(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], n
 
     def holds(points: np.ndarray) -> np.ndarray:
         at = points @ origin[:3, :3].T + origin[:3, 3]
-        inside = np.ones(len(at), bool)
+        held = np.ones(len(at), bool)
         if len(boxes):
-            inside &= np.any([((at >= b[:3]) & (at <= b[3:])).all(1) for b in boxes], 0)
+            held &= np.any([inside(at, box) for box in boxes], 0)
         if len(spheres):
-            inside &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
-        return inside & hull.contains(at) if hull else inside
+            held &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
+        return held & hull.contains(at) if hull else held
 
     return holds
 
