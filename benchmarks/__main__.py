@@ -1,7 +1,7 @@
 """Kernel speed against the torch reference in the same run: python -m benchmarks (or make bench).
 
-Prints a Markdown table. Ratios are medians over runs that alternate with the reference's, since a bare time
-says little of a shared machine.
+Prints a Markdown table. Ratios are medians over runs that alternate with the reference's, since whatever else
+runs slows both alike.
 """
 
 import statistics

@@ -48,22 +48,22 @@ def times(work: Work) -> dict[str, str]:
     scene = four_objects(work)
     held, rows = course(scene, config.compared), []
 
-    def note(storage: str, path: Path, seconds: float) -> None:
-        rows.append({"way": storage, "seconds": seconds, "psnr": held.quality(path)["psnr"]})
+    def note(way: str, path: Path, seconds: float) -> None:
+        rows.append({"way": way, "seconds": seconds, "psnr": held.quality(path)["psnr"]})
         write_csv(work.out / "times.csv", rows)
         figures.times(rows, config.wanted, work.out / "times.svg")
 
-    for storage, path, seconds in chain(fusings(scene), trainings(scene, held.box)):  # all write one path
-        note(storage, path, seconds)
+    for way, path, seconds in chain(fusings(scene), trainings(scene, held.box)):  # all write one path
+        note(way, path, seconds)
     retraining = seconds_to(rows, "retraining")
     limit = max(r["seconds"] for r in rows if r["way"] == "retraining")
-    ways = [storage for storage in dict.fromkeys(r["way"] for r in rows) if storage != "retraining"]
+    ways = [way for way in dict.fromkeys(r["way"] for r in rows) if way != "retraining"]
     ratios = []
-    for storage in ways:
-        found = seconds_to(rows, storage)
+    for way in ways:
+        found = seconds_to(rows, way)
         if found is not None:
             more = f"{retraining / found:.0f}×" if retraining else f"more than {limit / found:.0f}×"
-            ratios.append(f"{storage} {more}")
+            ratios.append(f"{way} {more}")
     best = max(r["psnr"] for r in rows if r["way"] == "retraining")
     missed = "" if retraining else f"; retraining is at {best:.1f} dB after {limit:.0f} s"
     return {"time": (", ".join(ratios) or f"none reached {config.wanted:g} dB") + missed}
@@ -77,9 +77,9 @@ def fusings(scene: Path):
     for kind in current(FusedConfig).kinds:
         if kind != "vm" and kind not in SIZES:
             yield kind, *fuse(scene, "--kind", kind)
-    for storage, words in DISTILLED.items():
+    for way, words in DISTILLED.items():
         for budget in current(TimesConfig).fusing:
-            yield storage, *fuse(scene, "--kind", "vm", "--time-budget", str(budget), *words)
+            yield way, *fuse(scene, "--kind", "vm", "--time-budget", str(budget), *words)
 
 
 def fuse(scene: Path, *words: str) -> tuple[Path, float]:
@@ -118,12 +118,12 @@ def photograph(scene: Path, box: np.ndarray, folder: Path) -> None:
     write_capture(folder, views, np.stack([to_pixels(shot, None) for shot in shots]), "train")
 
 
-def seconds_to(rows: list[dict], storage: str) -> float | None:
+def seconds_to(rows: list[dict], way: str) -> float | None:
     """Seconds after which a way is at `wanted`, between two of its points by a straight line over the
     logarithm of time; None where it never is.
     """
     config = current(TimesConfig)
-    found = [(r["seconds"], r["psnr"]) for r in rows if r["way"] == storage]
+    found = [(r["seconds"], r["psnr"]) for r in rows if r["way"] == way]
     before = None
     for seconds, psnr in sorted(found):
         if psnr >= config.wanted:

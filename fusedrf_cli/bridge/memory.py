@@ -44,7 +44,7 @@ class MemoryConfig:
     per_sample: int = 300
     """Of a wave through the general renderer: distances, points in each field, σ, colour."""
     per_cell: int = 24
-    """Of an ownership grid: owners, counts, marks, and the distances that are made of them."""
+    """Of an occupancy grid over a scene: counts, marks, and the distances that are made of them."""
     per_segment: int = 400
     """Of a ray of a composite: its segments, their ends, and the numbers that sort them."""
     per_slot: int = 1400

@@ -1,4 +1,4 @@
-"""The twelve scenes, S1 to S12, in which radiance-field methods fail, each with its truth in closed form.
+"""Scenes in which radiance-field methods fail, numbered S1 to S12, each with its truth in closed form.
 
 A scene is a handful of placed analytic fields. `sigma`, `depth` and `pixels` are its truth, computed here in
 float64 and independently of the engine; `placed` and `composed` are the same scene in any field kind.
@@ -217,17 +217,6 @@ def s6_room(fog: float = 0.3) -> Scene:
     )
 
 
-def s7_scales(shift: float = 0.0) -> Scene:
-    """A marble of 1e-3 on a table of 1 in a field of 1e3, all of it moved away by `shift` along the
-    diagonal."""
-    away = np.full(3, shift)
-    return scene_of(
-        ("field", Box(1.0, (500.0, 500.0, 5.0), tint=GREEN), affine(1.0, away - [0, 0, 5.5])),
-        ("table", Box(50.0, (0.5, 0.5, 0.25), tint=SAND), affine(1.0, away - [0, 0, 0.25])),
-        ("marble", Box(8.0, 0.5, tint=RED), affine(1e-3, away + [0, 0, 5e-4])),
-    )
-
-
 def s8_boxes(count: int, degrees: float, seed: int = 0) -> Scene:
     """`count` opaque boxes of different sizes and hues on a jittered lattice, all turned about one axis by an
     angle."""
@@ -305,6 +294,3 @@ def s12_rays(scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         origins = np.tile(centre + at * half, (26, 1))
         o, d, _ = moved_rays(part.object_to_world, origins, DIRECTIONS_26)
         yield what, o, d
-
-
-S12_SIZES = ((1, 1), (1, 9), (9, 1), (7, 13), (257, 3))

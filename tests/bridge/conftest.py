@@ -196,6 +196,11 @@ def picture(folder, report):
     return picture
 
 
+def blues(image: np.ndarray) -> int:
+    """How many pixels of a picture are as blue as the blue box."""
+    return int(((image[..., 2] > 0.6) & (image[..., 0] < 0.4) & (image[..., 1] < 0.45)).sum())
+
+
 @pytest.fixture
 def interrupted_in_step(monkeypatch):
     """with interrupted_in_step(6): SIGINT comes during the 6th step, before it moves the numbers."""

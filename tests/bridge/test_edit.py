@@ -10,7 +10,7 @@ from formats.bundle import BundleWriter, OpenBundle, read_bundle
 from formats.history import distilled
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import FIELDS, PLACES, done, part, write_views
+from tests.bridge.conftest import FIELDS, PLACES, blues, done, part, write_views
 
 VM = ("--kind", "vm", "--no-finetune", "--max-size", "400kB")
 AT = ("--name", "blue", "-t", "0.7,0,0")
@@ -41,10 +41,6 @@ def covered(name: str, grown: float = 0.15) -> np.ndarray:
     with np.errstate(divide="ignore"):
         a, b = (box[:3] - rays_o) / rays_d, (box[3:] - rays_o) / rays_d
     return (np.minimum(a, b).max(1) < np.maximum(a, b).min(1)).reshape(48, 48)
-
-
-def blues(image) -> int:
-    return int(((image[..., 2] > 0.6) & (image[..., 0] < 0.4) & (image[..., 1] < 0.45)).sum())
 
 
 def test_added_and_deleted_is_as_before(report, picture, folder):

@@ -135,7 +135,7 @@ def test_sources_that_do_not_fit_are_read_again(report, folder, picture):
     assert np.array_equal(found, render_rays(load_scene(str(folder / "scene.json")).composed(), *rays))
 
 
-def test_a_shelf_keeps_what_was_asked_for_last():
+def test_a_field_cache_keeps_what_was_asked_for_last():
     field_cache, reads = FieldCache(10), []
     for key in "abacab":
         field_cache.take(key, 5, lambda key=key: reads.append(key) or key)

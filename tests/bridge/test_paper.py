@@ -1,6 +1,7 @@
 """`make bench-paper`, made small: every part runs, what it writes can be read, and the table shows it."""
 
 import csv
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,8 @@ from benchmarks.paper.capacity import CapacityConfig
 from benchmarks.paper.quality import QualityConfig
 from benchmarks.paper.smallest import SmallestConfig
 from benchmarks.paper.times import TimesConfig
-from benchmarks.paper.work import FusedConfig, Work, fusedrf
+from benchmarks.paper.work import FusedConfig, Work, course, fusedrf
+from fusedrf_cli.engine.rendering.cameras import projected
 from tests.bridge.conftest import write_scene_of
 
 SMALL = (
@@ -55,17 +57,26 @@ def test_a_close_up_frames_the_object_alone(work, folder, monkeypatch, in_force)
     box = np.array([-0.8, -0.3, -0.3, -0.2, 0.3, 0.3])  # of red
     monkeypatch.setattr(quality, "with_a_tiny_one", lambda work: (folder / "scene.json", box))
     in_force(BLOCKS)
+    held = []
+    monkeypatch.setattr(quality, "course", lambda *asked: held.append(course(*asked)) or held[-1])
     quality.closeup(work)
+    corners = np.array(list(itertools.product(*box.reshape(2, 3).T)))
+
+    def framed(camera) -> bool:
+        """Whether the box takes most of a picture of 24 x 24 pixels and is hardly cut."""
+        pixels, _, _ = projected(camera, corners)
+        return np.ptp(pixels, axis=0).max() > 14 and pixels.min() > -2 and pixels.max() < 26
+
+    close, whole = ([framed(camera) for camera in benchmark.cameras] for benchmark in held)
+    assert all(close) and not any(whole)
     (row,) = rows_of(work, "closeup")
     assert float(row["psnr"]) > 30 and float(row["psnr of the whole"]) > 30
 
 
 def test_the_chart_of_times_names_every_way(tmp_path):
     """Kinds of any name among them: none has a look of its own."""
-    storage_settings = ("blocks", "background", "scratch", "retraining")
-    rows = [
-        {"way": storage, "seconds": s, "psnr": 30.0 + s} for storage in storage_settings for s in (1.0, 2.0)
-    ]
+    ways = ("blocks", "background", "scratch", "retraining")
+    rows = [{"way": way, "seconds": s, "psnr": 30.0 + s} for way in ways for s in (1.0, 2.0)]
     figures.times(rows, 37.0, tmp_path / "times.svg")
     text = (tmp_path / "times.svg").read_text()
     assert all(name in text for name in ("fuse --kind blocks", "--from-scratch", "then train"))

@@ -10,6 +10,7 @@ from formats.images import read_image
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.rendering import WorkConfig
 from fusedrf_cli.engine.rendering.metrics import psnr
+from tests.bridge.conftest import blues
 
 SMALL = ("--size", "32x24")
 
@@ -105,10 +106,6 @@ def test_a_scene_put_together_shows_what_its_fields_do(report, folder):
 
 def test_the_scene_is_the_sum_of_its_parts(picture):
     """The composed scene shows floor, red and blue; without blue its pixels are no longer blue."""
-
-    def blues(image):
-        return ((image[..., 2] > 0.7) & (image[..., 0] < 0.3)).sum()
-
     assert blues(picture("scene.json")) > 20 and blues(picture("pair.json")) == 0
 
 

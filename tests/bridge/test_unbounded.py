@@ -31,7 +31,7 @@ from fusedrf_cli.python import open_scene
 from tests.analytic.export import SHAPE, vm_field, way_of
 from tests.analytic.fields import Gaussian, Tint
 from tests.analytic.rays import unit
-from tests.bridge.conftest import done
+from tests.bridge.conftest import blues, done
 from tests.engine.conftest import random_vm
 
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
@@ -76,10 +76,6 @@ def fused(shop, tmp_path_factory):
 @pytest.fixture
 def folder(tmp_path, fused):
     return shutil.copytree(fused, tmp_path / "shop")
-
-
-def blues(image: np.ndarray) -> int:
-    return int(((image[..., 2] > 0.6) & (image[..., 0] < 0.4) & (image[..., 1] < 0.45)).sum())
 
 
 def test_a_fused_place_shows_what_its_composition_does(picture, report):

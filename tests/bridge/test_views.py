@@ -53,8 +53,8 @@ def photo(number: int, eye, size=(24, 16), **more) -> View:
     )
 
 
-RIG = camera_set_of([photo(i, eye) for i, eye in enumerate(EYES)], held_out=2)
-OBJECT = replace(RIG, surroundings=False)
+CAMERA_SET = camera_set_of([photo(i, eye) for i, eye in enumerate(EYES)], held_out=2)
+OBJECT = replace(CAMERA_SET, surroundings=False)
 
 
 def keep(folder, name: str, camera_set: CameraSet | None, field: str = "red", **more) -> None:
@@ -69,7 +69,7 @@ def keep(folder, name: str, camera_set: CameraSet | None, field: str = "red", **
 @pytest.fixture(autouse=True)
 def room(folder):
     """room.rfpack, learnt from six photos of all that is around, two of them held out."""
-    keep(folder, "room.rfpack", RIG)
+    keep(folder, "room.rfpack", CAMERA_SET)
 
 
 def views_of(folder, scene: str, **asked) -> list[Camera]:
@@ -115,7 +115,7 @@ def place(folder, file: str, matrix, background: bool = False, *others: str) -> 
 def test_a_capture_is_shown_as_one_of_its_photos(report, folder):
     said = report("render", "room.rfpack", "-o", "a.png")
     assert said["size"] == [24, 16]
-    write_capture(folder / "eye", [RIG.typical], np.zeros((1, 16, 24, 3), np.uint8))
+    write_capture(folder / "eye", [CAMERA_SET.typical], np.zeros((1, 16, 24, 3), np.uint8))
     eye = ("--cameras", "eye/transforms_train.json")
     report("render", "room.rfpack", "-o", "b.png", *eye)
     one, other = (read_image(folder / f).astype(int) for f in ("a.png", "b.png"))
@@ -126,18 +126,18 @@ def test_a_capture_is_shown_as_one_of_its_photos(report, folder):
 
 
 def test_an_orbit_keeps_the_distance_and_the_height_of_the_photos(folder):
-    cameras, up = views_of(folder, "room.rfpack", orbit=8), RIG.up
-    away = np.array([eye_of(camera) for camera in cameras]) - RIG.focus
-    np.testing.assert_allclose(np.linalg.norm(away, axis=1), RIG.distance, atol=1e-6)
-    np.testing.assert_allclose(away @ up, RIG.height(up), atol=1e-6)
+    cameras, up = views_of(folder, "room.rfpack", orbit=8), CAMERA_SET.up
+    away = np.array([eye_of(camera) for camera in cameras]) - CAMERA_SET.focus
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), CAMERA_SET.distance, atol=1e-6)
+    np.testing.assert_allclose(away @ up, CAMERA_SET.height(up), atol=1e-6)
     for camera in cameras:
-        np.testing.assert_allclose(target_of(camera, RIG.distance), RIG.focus, atol=1e-6)
+        np.testing.assert_allclose(target_of(camera, CAMERA_SET.distance), CAMERA_SET.focus, atol=1e-6)
         assert camera.camera_to_world[:3, 0] @ up == pytest.approx(0, abs=1e-7)  # level
         assert camera.camera_to_world[:3, 1] @ up > 0
         assert (camera.width, camera.height, camera.cx, camera.cy) == (24, 16, 12, 8)
     flat = away - np.outer(away @ up, up)
     np.testing.assert_allclose(flat.sum(0), 0, atol=1e-6)  # all around
-    first, typical = flat[0], RIG.typical.camera_to_world[:3, 3] - RIG.focus
+    first, typical = flat[0], CAMERA_SET.typical.camera_to_world[:3, 3] - CAMERA_SET.focus
     assert np.linalg.norm(np.cross(first, typical - (typical @ up) * up)) < 1e-6  # it begins at that photo
 
 
@@ -197,7 +197,7 @@ def test_what_keeps_no_cameras_says_so(run, folder):
         return result.stderr
 
     assert "keeps no cameras" in refused("red.rfpack", "capture")
-    keep(folder, "all.rfpack", camera_set_of(list(RIG.views)))
+    keep(folder, "all.rfpack", camera_set_of(list(CAMERA_SET.views)))
     assert "none of its 6 cameras was held out" in refused("all.rfpack", "heldout")
     place(folder, "two.json", np.eye(4), False, "all")
     assert "'room', 'all' each keep cameras" in refused("two.json", "capture")
@@ -232,7 +232,7 @@ def test_the_rays_of_placed_cameras_are_the_placed_rays(lens):
 
 def test_cameras_are_those_of_the_background_or_of_the_only_source_that_has_any(folder):
     keep(folder, "chair.rfpack", OBJECT, "blue")
-    keep(folder, "other.rfpack", camera_set_of(list(RIG.views)[:3]), "blue")
+    keep(folder, "other.rfpack", camera_set_of(list(CAMERA_SET.views)[:3]), "blue")
 
     def count(*sources: str, background: bool) -> int:
         place(folder, "s.json", np.eye(4), background, *sources)
@@ -255,11 +255,11 @@ def test_fused_converted_and_edited_bundles_keep_the_cameras(report, folder):
     report("delete", "g.rfpack", "blue", "-o", "h.rfpack", *SMALL)
     report("fuse", "h.rfpack", "-o", "i.rfpack", *SMALL)
     kept = cameras_in(folder, "f.rfpack")
-    np.testing.assert_allclose(read_camera_set(kept).poses, RIG.placed(TURNED).poses, atol=1e-6)
+    np.testing.assert_allclose(read_camera_set(kept).poses, CAMERA_SET.placed(TURNED).poses, atol=1e-6)
     assert [cameras_in(folder, f"{name}.rfpack") for name in "ghi"] == [kept] * 3
     assert read_bundle(folder / "f.rfpack").scene.framing is None  # its cameras say what pictures show
     one, *others = (views_of(folder, f"{name}.rfpack")[0] for name in "fghi")
-    assert one.name == RIG.typical.name and all(same(one, other) for other in others)
+    assert one.name == CAMERA_SET.typical.name and all(same(one, other) for other in others)
 
 
 def test_a_stretched_capture_leaves_its_cameras_and_says_so(report, folder):
@@ -273,14 +273,14 @@ def test_compose_leaves_cameras_where_they_are_and_they_are_found(report, folder
     report("compose", "room.rfpack", "--background-node", "-s", "2", "blue.rfpack", "-o", "s.json")
     assert read_scene(folder / "s.json").cameras is None
     (view,) = views_of(folder, "s.json")
-    np.testing.assert_allclose(eye_of(view), 2 * RIG.typical.camera_to_world[:3, 3], atol=1e-7)
+    np.testing.assert_allclose(eye_of(view), 2 * CAMERA_SET.typical.camera_to_world[:3, 3], atol=1e-7)
 
 
 def test_a_scene_saved_from_python_keeps_its_cameras(folder):
     place(folder, "s.json", np.eye(4), True, "blue")
     for name, source in (("a", "room.rfpack"), ("b", "s.json"), ("c", "a.rfpack")):
         open_scene(folder / source).save(folder / f"{name}.rfpack")
-        assert cameras_in(folder, f"{name}.rfpack") == RIG.content()
+        assert cameras_in(folder, f"{name}.rfpack") == CAMERA_SET.content()
 
 
 def test_an_edit_does_not_move_the_view(report, folder):
@@ -362,15 +362,15 @@ def test_which_way_is_up_may_be_said(folder):
     no longer shown as a photo shows it."""
     up = np.array([0.6, 0.0, 0.8])
     cameras = views_of(folder, "room.rfpack", orbit=6, up=tuple(5 * up))
-    away = np.array([eye_of(camera) for camera in cameras]) - RIG.focus
-    np.testing.assert_allclose(away @ up, RIG.height(up), atol=1e-6)
+    away = np.array([eye_of(camera) for camera in cameras]) - CAMERA_SET.focus
+    np.testing.assert_allclose(away @ up, CAMERA_SET.height(up), atol=1e-6)
     assert all(abs(camera.camera_to_world[:3, 0] @ up) < 1e-7 for camera in cameras)
     assert same(views_of(folder, "room.rfpack", up=tuple(5 * up))[0], replace(cameras[0], name="view"))
 
 
 @pytest.mark.parametrize("scene", ["red.rfpack", "room.rfpack"])
 def test_where_to_look_from_and_how_far(folder, scene):
-    up = RIG.up if scene == "room.rfpack" else np.array([0.0, 0, 1])
+    up = CAMERA_SET.up if scene == "room.rfpack" else np.array([0.0, 0, 1])
     target = np.array([0.3, -0.2, 0.1])
     (plain,) = views_of(folder, scene, look_at=tuple(target), size=(40, 30))
     distance = np.linalg.norm(eye_of(plain) - target)

@@ -51,9 +51,7 @@ def test_a_command_and_its_verb_take_the_same(name):
     assert taken == asked(name).keys()
 
 
-@pytest.mark.parametrize(
-    "name", sorted(set(VERBS) - {"compose", "history", "info", "kinds", "undo", "validate"})
-)
+@pytest.mark.parametrize("name", sorted(set(VERBS) - OF_FILES))
 def test_a_command_line_and_a_verb_ask_the_bridge_for_the_same(run, bridge, folder, name):
     """By defaults, with what has none."""
     (folder / "photos").mkdir()

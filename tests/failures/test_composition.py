@@ -551,9 +551,9 @@ def test_b15_surfaces_stay_where_they_were(row, kind):
         for n in (11, 23, 46):
             conversions[f"{n} texels"] = field.resampled(field.aabb, (n, n, n))
     if type(field) is VMField:
-        kind = registry.kind(field.kind)
+        made = registry.kind(field.kind)
         voxel = float((field.box[3:] - field.box[:3]).max()) / 11
-        conversions["shrunk"] = kind.reduction(kind.outline(field), voxel, StorageSetting()).make(field)
+        conversions["shrunk"] = made.reduction(made.outline(field), voxel, StorageSetting()).make(field)
     shifts = {name: abs(surface(f) - wanted) / ramp.voxel_size for name, f in conversions.items()}
     row.check("B15", f"{kind}: surface moved, voxels", max(shifts.values()), 0.05, at_most=True, scene="S3")
 

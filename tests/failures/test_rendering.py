@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 from formats.images import read_image
 from fusedrf_cli.bridge.scene import write_field
@@ -28,11 +27,11 @@ from fusedrf_cli.engine.rendering.metrics import psnr, ssim
 from fusedrf_cli.engine.rendering.volume import RenderConfig, render_image, render_rays
 from fusedrf_cli.engine.settings import using
 from fusedrf_cli.engine.spaces.bounded import STEP_PER_VOXEL
-from fusedrf_cli.main import cli
 from tests.analytic import scenes
 from tests.analytic.export import SHAPE, exported, vm_field, way_of
 from tests.analytic.fields import Box, Gaussian, Slow
 from tests.analytic.rays import affine, turn
+from tests.bridge.conftest import done, invoke
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -492,13 +491,6 @@ def write(folder, name: str, field) -> str:
     return f"{name}.rfpack"
 
 
-def invoke(folder, *words: str):
-    """click's Result of a command line in a folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        return CliRunner().invoke(cli, words)
-
-
 def in_a_process(folder, *words: str) -> dict:
     """The JSON report of a command line in a process of its own."""
     code = "from fusedrf_cli.main import main; main()"
@@ -507,10 +499,3 @@ def in_a_process(folder, *words: str) -> dict:
     return json.loads(
         subprocess.run(words, check=True, cwd=folder, env=environment, capture_output=True).stdout
     )
-
-
-def done(folder, *words: str) -> dict:
-    """The JSON report of a command line that has to succeed."""
-    result = invoke(folder, *words, "--json")
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout)

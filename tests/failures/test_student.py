@@ -9,7 +9,6 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
 
 from formats.bundle import read_bundle, read_headers
 from formats.images import read_image
@@ -22,12 +21,11 @@ from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image, render_rays
-from fusedrf_cli.main import cli
 from tests.analytic import scenes
 from tests.analytic.export import SHAPE, exported, vm_field, way_of
 from tests.analytic.fields import Box, Gaussian, Tint
 from tests.analytic.rays import affine, turn
-from tests.bridge.conftest import TinySettings, tiny  # noqa: F401  (grids, steps and pictures made small)
+from tests.bridge.conftest import TinySettings, done, invoke, tiny  # noqa: F401  (grids, steps and pictures made small)
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 SMALL = ("--size", "48x48")
@@ -39,20 +37,6 @@ PARTS = {
 }
 TRUTH = scenes.scene_of(*[(name, *part) for name, part in PARTS.items()])
 EYE = scenes.camera_at((-2.6, -2.2, 1.4), (0, 0, -0.3), size=48)
-
-
-def invoke(folder, *words: str):
-    """click's Result of a command line in a folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        return CliRunner().invoke(cli, words)
-
-
-def done(folder, *words: str) -> dict:
-    """The JSON report of a command line that has to succeed."""
-    result = invoke(folder, *words, "--json")
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +115,31 @@ def test_c1_what_does_not_fit_the_memory_is_refused_with_the_number(row, folder)
     result = invoke(folder, "add", "pair.rfpack", *words)
     named = "--memory" in result.stderr and "50 MB" in result.stderr and not (folder / "far.rfpack").exists()
     row.check("C1", "exit code beyond --memory, with the numbers", result.exit_code if named else 0, 5)
+
+
+# -- C2: one by one, or at once ------------------------------------------------------------------------------
+
+
+def test_c2_a_chain_of_adds_is_one_fuse(row, folder):
+    """Four sources: the same fields to the byte in the same order, and the same picture."""
+    green = vm_field(Box(60.0, 0.2, tint=scenes.GREEN), (40,) * 3)
+    write_field(str(folder / "green.rfpack"), green, "green", precision="float16", overwrite=False)
+    places = {"floor": (0, 0, -0.7), "red": (-0.5, 0, -0.1), "blue": (0.7, 0, -0.1), "green": (0.1, 0.5, 0.2)}
+    nodes = [make_node(n, source=f"{n}.rfpack", translation=place) for n, place in places.items()]
+    write_scene(folder / "four.json", SceneGraph(tuple(nodes)))
+    write_scene(folder / "one.json", SceneGraph((nodes[0],)))
+    done(folder, "fuse", "four.json", "-o", "four.rfpack")
+    done(folder, "fuse", "one.json", "-o", "chain.rfpack")
+    for name in ("red", "blue", "green"):
+        place = ",".join(map(str, places[name]))
+        words = ("--name", name, "-t", place, "-o", "chain.rfpack", "-w")
+        done(folder, "add", "chain.rfpack", f"{name}.rfpack", *words)
+    found, wanted = (fields(folder / f"{name}.rfpack") for name in ("chain", "four"))
+    assert len(set(wanted)) == 4
+    row.check("C2", "fields bit-equal after three adds", found == wanted, 1)
+    pictures = [picture(folder, f"{name}.rfpack") for name in ("chain", "four")]
+    assert pictures[1].std() > 0.1
+    row.check("C2", "a chain of adds against one fuse", psnr(*pictures), 60.0, unit="dB")
 
 
 # -- C3, C4: deleting ----------------------------------------------------------------------------------------

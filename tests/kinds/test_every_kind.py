@@ -126,9 +126,9 @@ def test_a_target_that_is_easy_takes_few_bytes(report, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_its_ladders_are_keywords_of_fuse(kind):
+def test_its_sweeps_are_keywords_of_fuse(kind):
     groups = registry.kind(kind).sweeps(30.0)
-    first = [asdict(next(ladder)) for found in groups.values() for ladder in found]
+    first = [asdict(next(sweep)) for found in groups.values() for sweep in found]
     words = {"scene": "scene.json", "output": "fused.rfpack", "kind": kind}
     assert first and all(checked(FuseRequest, words | rung) for rung in first)
 

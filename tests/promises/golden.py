@@ -604,8 +604,8 @@ def far_place(folder: Path) -> None:
     lies = LIES.copy()
     lies[:3, :3] *= 1000
     lies[:3, 3] = FAR
-    rig = cameras(scale=2000.0, centre=FAR)
-    write(folder / "kept.rfpack", walls(), "int8", lies, cameras=rig)
+    camera_set = cameras(scale=2000.0, centre=FAR)
+    write(folder / "kept.rfpack", walls(), "int8", lies, cameras=camera_set)
 
 
 def around(unit: float, centre=(0.0, 0.0, 0.0)) -> tuple[float, ...]:

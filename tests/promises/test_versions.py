@@ -69,16 +69,16 @@ def test_kept_packs_render_as_they_did(name, picture):
 def test_kept_cameras_stand_where_they_stood():
     """P1: ring.rfpack has four cameras around z, 2 away and 1 up, of which the third is a fisheye."""
     scene = read_bundle(GOLDEN / "ring.rfpack").scene
-    rig = read_camera_set(scene.cameras)
+    camera_set = read_camera_set(scene.cameras)
     assert (scene.version, scene.framing) == ("1.1", (-1.5, -1.0, -0.5, 1.5, 1.0, 0.75))
-    assert [view.name for view in rig.train] == ["r_0", "r_1", "r_2"] and len(rig.test) == 1
-    for view, place in zip(rig.views, ((2, 0, 1), (0, 2, 1), (-2, 0, 1), (0, -2, 1)), strict=True):
+    assert [view.name for view in camera_set.train] == ["r_0", "r_1", "r_2"] and len(camera_set.test) == 1
+    for view, place in zip(camera_set.views, ((2, 0, 1), (0, 2, 1), (-2, 0, 1), (0, -2, 1)), strict=True):
         np.testing.assert_allclose(view.camera_to_world[:3, 3], place)
         back = np.array(place) / np.sqrt(5)  # it looks at the origin, and its right is level
         np.testing.assert_allclose(view.camera_to_world[:3, 2], back, atol=1e-7)
         np.testing.assert_allclose(view.camera_to_world[2, 0], 0, atol=1e-7)
-    assert [view.fisheye for view in rig.views] == [False, False, True, False]
-    assert rig.views[2].distortion == (0.05, -0.02, 0.006, -0.001)
+    assert [view.fisheye for view in camera_set.views] == [False, False, True, False]
+    assert camera_set.views[2].distortion == (0.05, -0.02, 0.006, -0.001)
 
 
 def test_the_kept_pack_of_a_far_world_lies_where_it_lay():

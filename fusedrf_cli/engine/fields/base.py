@@ -82,8 +82,8 @@ class SamplingConfig:
 
     most_samples: int = 1 << 16
     """Of a ray in a field over one grid: twice as many as one of 8,192 texels a side needs."""
-    most_of_several: int = 1 << 20
-    """The same where several are placed in one field, and most samples of a ray meet none of them."""
+    most_of_bricks: int = 1 << 20
+    """The same of bricks: most samples of a ray meet none of them."""
     nothing: float = 1e-4
     """Optical depth through a whole box under which a field shows nothing."""
     probed_at_once: int = 1 << 16

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from fusedrf_cli.engine.composition.affine import Placed
+from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.resolution_report import opacity_off, resolution_at_voxel
+from fusedrf_cli.engine.kinds import registry
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Box, Tint
 from tests.analytic.rays import affine
@@ -26,3 +28,7 @@ def test_voxels_across_are_of_the_fused_field():
     big, flat = resolution_at_voxel(placed, 0.25)
     assert (big.voxels_across, flat.voxels_across) == (pytest.approx(4), pytest.approx(0.8))
     assert flat.stretch == pytest.approx(2) and flat.opacity_off > 0.1
+    scene = ComposedField(placed)  # nodes as they are: their own voxels, and no price of a stretch
+    big, flat = registry.kind("blocks").resolution_reports(scene, scene)
+    assert flat.held_voxel == flat.own_voxel == placed[1].voxel_size and flat.opacity_off == 0
+    assert (big.voxels_across, flat.stretch) == (pytest.approx(1 / BLOCK.voxel_size), pytest.approx(2))

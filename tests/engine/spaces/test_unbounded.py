@@ -8,6 +8,7 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.composition.composite import as_composite
 from fusedrf_cli.engine.distillation.camera_visibility import shown_cells
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
@@ -176,28 +177,29 @@ def test_fog_is_as_thick_as_its_formula_says(cells):
     assert out[4] == pytest.approx(np.trapezoid(t * np.exp(-depth), depth), rel=0.02)
 
 
-def random_field(seed: int = 0, box: np.ndarray = WHOLE) -> VMField:
-    """A small random field over all of space or a box (6,) of its coordinates, in float64, of which a third
-    of the cells is empty."""
+def random_field(seed: int = 0, box: np.ndarray = WHOLE, share: float = 0.7) -> VMField:
+    """A small random field over all of space or a box (6,) of its coordinates, in float64, of which a share
+    of the cells is occupied."""
     generator = torch.Generator().manual_seed(seed)
     kind = registry.kind("vm")
     field = kind.create(kind.plan_at(box, (9, 9, 9), WAY), generator)
-    occupied = np.random.default_rng(seed).random((8, 8, 8)) < 0.7
+    occupied = np.random.default_rng(seed).random((8, 8, 8)) < share
     numbers = torch.randn(len(field.params), generator=generator, dtype=torch.float64)
     field = field.with_occupancy(OccupancyGrid(box, occupied, unbounded)).with_params(0.5 * numbers)
     field.shift = -4.0  # dense enough to see
     return field
 
 
-def test_waves_and_the_one_pass_show_the_same():
-    field = random_field()
+@pytest.mark.parametrize("share", [0.7, 0.03])  # of cells; the one pass jumps over the others
+def test_waves_and_the_one_pass_show_the_same(share):
+    field = random_field(share=share)
     field.basis.mul_(0.5)  # for colours as far apart as those of trained fields
     o = np.array([o for o, _ in rays(200)])
     d = np.array([d for _, d in rays(200)])
     out = np.zeros((len(o), 5), np.float32)
     march_rays(field, o, d, reach_of(len(o), 0.0, np.inf), 0.02, 1e-3, out)
     whole = render_rays(field, o, d, step=0.02)
-    assert whole[:, 3].max() > 0.5
+    assert whole[:, 3].max() > 0.3
     # up to LENT_FROM of the light is shown in another sample's colour
     assert out[:, :3] == pytest.approx(whole[:, :3], abs=5e-3)
     assert out[:, 3] == pytest.approx(whole[:, 3], abs=2e-3)
@@ -413,9 +415,25 @@ def test_a_place_is_sampled_alike_whatever_stands_in_it(in_force):
     for size in (0.3, 0.06):
         small = Placed("thing", thing, affine(np.eye(3) * size, (0.9, 0.8, 0.9)))
         scene = ComposedField([Placed("place", place, np.eye(4)), small])
-        pictures.append(render_rays(scene, o, d))
-    assert (abs(pictures[0] - pictures[1]).max(1) < 1e-6).mean() > 0.6
-    assert (pictures[0][:, 3] > 0.3).mean() > 0.5
+        pictures.append([render_rays(field, o, d) for field in (scene, as_composite(scene))])
+    for one, other in zip(*pictures, strict=True):
+        assert (abs(one - other).max(1) < 1e-6).mean() > 0.6
+        assert (one[:, 3] > 0.3).mean() > 0.5
+
+
+def test_only_what_is_near_an_object_is_sampled_as_finely_as_it(in_force):
+    """By the naive composition, which shows about what a finer step everywhere does."""
+    in_force(OccupancyConfig(scene_cells=24))
+    place, thing = random_field(1), random_vm(dtype=torch.float64, cells=4)
+    small = Placed("thing", thing, affine(np.eye(3) * 0.1, (0.2, 0.1, 0)))
+    scene = ComposedField([Placed("place", place, np.eye(4)), small])
+    grid = scene.occupancy
+    strides = grid.stride[grid.occupied]
+    assert strides.max() > 5 * strides.min() and (strides < 2 * strides.min()).mean() < 0.1
+    d = unit(np.random.default_rng(0).normal(size=(64, 3)))
+    o = np.array([0.2, 0.1, 0]) - 0.5 * d
+    shown, fine = render_rays(scene, o, d)[:, :4], render_rays(scene, o, d, step=grid.unit / 2)[:, :4]
+    assert abs(shown - fine).mean() < 1e-3
 
 
 @pytest.mark.parametrize("scale", [0.2, 0.08])
@@ -435,6 +453,10 @@ def test_no_sample_of_a_coarse_place_steps_over_a_fine_object(scale):
     wanted = render_rays(every, o, d)
     assert wanted[:, 3].max() > 0.9
     assert render_rays(scene, o, d)[:, :4] == pytest.approx(wanted[:, :4], abs=0.01)
+    alone = [ComposedField([one], origin=np.zeros(3)) for one in scene.placed]
+    passed = [1 - render_rays(as_composite(field), o, d)[:, 3] for field in alone]
+    found = render_rays(as_composite(scene), o, d)[:, 3]  # each by its own step, so what alone they let pass
+    assert found == pytest.approx(1 - passed[0] * passed[1], abs=0.01)
 
 
 def test_gradients_in_points_cross_no_border_wrongly():

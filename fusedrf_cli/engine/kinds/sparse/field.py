@@ -396,7 +396,7 @@ def stored_tree(arrays: dict[str, np.ndarray], metadata: dict) -> BrickTree:
     tree = replace(tree, phase=tuple(whole(n, "phase", 0, 1) for n in phase))
     if not tree.mask.any():
         raise ValueError("array 'masks' should have an active voxel")
-    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", config.most_of_several)
+    check_samples(bounded.most_samples(tree.aabb, tree.unit.min()), "its bricks", config.most_of_bricks)
     tree.tables  # noqa: B018  (made now, so that what is too large is refused here)
     return tree
 
