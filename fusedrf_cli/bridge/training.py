@@ -370,9 +370,9 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
     run.forget()
     warn_of_nonfinite(run.nan_guard.figures(), progress)
-    if not run.found_matter:
+    if not run.found_density:
         progress.warn(
-            f"{output}: no matter was found, so that all of the box was kept; look at the photos' alpha, "
+            f"{output}: no density was found, so that all of the box was kept; look at the photos' alpha, "
             "their poses, and --aabb"
         )
     return field, time.monotonic() - started

@@ -263,7 +263,7 @@ class BoxField(ComputedField):
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs."""
+        """See `Kind.field_memory`."""
         parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
         numbers = sum(map(aligned, parts))
         counts, texels = metadata["cells"]["counts"], metadata["resolution"]

@@ -197,7 +197,7 @@ class ComputedField:
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs."""
+        """See `Kind.field_memory`."""
         return FieldMemory(4 * sum(math.prod(shape) for shape in shapes.values()), 0)
 
     @property

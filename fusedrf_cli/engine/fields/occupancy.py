@@ -189,8 +189,8 @@ class OccupancyGrid:
 
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:
     """The largest optical depth, at most `most`, up to which cells may be left out of a grid of optical
-    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin floaters is
-    no emptiness.
+    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin floaters
+    are no emptiness.
     """
     for threshold in most * 0.25 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)

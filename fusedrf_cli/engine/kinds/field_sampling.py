@@ -65,9 +65,8 @@ def placed_in(teacher: RadianceField) -> list[Placed]:
 
 def density(source, positions: np.ndarray, space: ModuleType | None = None) -> np.ndarray:
     """(N,) float64 σ, per length of a space's coordinates, at positions (N, 3) in them, of a field or a
-    placed
-    one: the mean over three axes where that depends on the direction. The space is a field's own where none
-    is given."""
+    placed one: the mean over three axes where that depends on the direction. The space is a field's own where
+    none is given."""
     space = space or source.occupancy.space
     parts = [source] if isinstance(source, Placed) else placed_in(source)
     stretched = any(p.condition > 1 + 1e-6 for p in parts)
@@ -179,7 +178,7 @@ def inverse_softplus(y: np.ndarray) -> np.ndarray:
 def colours(teacher: RadianceField, positions: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
     """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at positions (N, 3) in the
     coordinates of its space, by least squares over the directions along which they are seen (facing (N, 3),
-    as `around` has it).
+    as `Vertices` have it).
 
     What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
     is exact, however the teacher is turned, but for what `one_sided` leaves.

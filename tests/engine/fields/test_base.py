@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField, SamplingConfig, check_samples, is_occupied
-from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Box
+from tests.bundles import field_kinds
 from tests.engine.conftest import BOX, Ball, points_in, random_vm
 
 

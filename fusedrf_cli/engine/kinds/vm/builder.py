@@ -35,14 +35,6 @@ from fusedrf_cli.engine.kinds.vm.trimming import (
 )
 from fusedrf_cli.engine.settings import current
 
-
-@dataclass(frozen=True)
-class VMConfig:
-    """What a vm field has where nothing else is asked."""
-
-    shape: VMShape = VMShape()
-
-
 MAX_DEGREE = 3
 
 
@@ -50,6 +42,8 @@ MAX_DEGREE = 3
 class VMBuilderConfig:
     """How students of planes and lines begin, and how coarse they get."""
 
+    shape: VMShape = VMShape()
+    """Where nothing else is asked."""
     coarser: float = 1.5
     """Times its own voxel: how coarse a field can get before it is left without its detail."""
     noise: float = 0.03
@@ -76,7 +70,7 @@ class VMKind(BoxKind):
     @property
     def usual(self) -> VMShape:
         """See BoxKind."""
-        return current(VMConfig).shape
+        return current(VMBuilderConfig).shape
 
     def shape(self, storage: StorageSetting) -> VMShape:
         """See BoxKind."""
@@ -84,7 +78,7 @@ class VMKind(BoxKind):
 
     def suits(self, scene: ComposedField) -> Suitability:
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
-        return Suitability(1.0, "one tensor over the scene learns any sources by any rule")
+        return Suitability(1.0, "one vm field over the scene learns any sources by any rule")
 
     def warm_start(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator

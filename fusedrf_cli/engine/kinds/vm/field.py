@@ -153,7 +153,7 @@ class VMField(AssembledField):
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs."""
+        """See `Kind.field_memory`."""
         own, rows = box_metadata(cls.kind, metadata), cls.stored_name(DETAIL)
         hashed = own["shape"].get("hashed")
         whole = dict(shapes) | ({} if hashed is None else {rows: hashed.shape})  # a file may have few of them
