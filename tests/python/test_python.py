@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-import fusedrf_cli
 from formats.errors import FormatError, OutputExists
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import load_scene, write_field
@@ -194,7 +193,7 @@ def test_what_cannot_be_done_is_said():
 
 @pytest.mark.parametrize(
     ("asked", "found"),
-    [({}, fusedrf_cli.SHORT_WAIT), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
+    [({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
 )
 def test_how_long_threads_wait_is_settled_before_torch_is_loaded_unless_the_user_has_said_it(asked, found):
     code = "import fusedrf_cli, os, sys; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"

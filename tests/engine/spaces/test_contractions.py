@@ -20,7 +20,8 @@ from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.differentiable import query
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid
 from fusedrf_cli.engine.kernels import specialise
-from fusedrf_cli.engine.kernels.instances import FARTHEST, Instances
+from fusedrf_cli.engine.kernels.instances import Instances
+from fusedrf_cli.engine.kernels.primitives import FARTHEST
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.engine.spaces import (
