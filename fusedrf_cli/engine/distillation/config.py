@@ -2,9 +2,6 @@
 
 from dataclasses import dataclass
 
-from fusedrf_cli.engine.distillation.depth_points import DepthConfig
-from fusedrf_cli.engine.distillation.exposure import ExposureConfig
-from fusedrf_cli.engine.distillation.poses import PoseConfig
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting
 
@@ -48,12 +45,6 @@ class TrainConfig:
     seed: int = 0
     device: str = "cpu"
     """Where the field is trained, "cpu" or "cuda"."""
-
-    # the parts of the method that have numbers of their own
-
-    exposures: ExposureConfig = ExposureConfig()
-    refining: PoseConfig = PoseConfig()
-    depths: DepthConfig = DepthConfig()
 
     # the optimiser
 

@@ -354,9 +354,9 @@ class Interpreted:
         self.names["item"] = self.names[item]
         self.names["each"](field, grid, asked, count, per_task, 1, out)
 
-    def sweep(self, item, field, grid, batch, count, most, grads, loss):
+    def sweep(self, item, field, grid, batch, count, most, out):
         self.names["item"] = self.names[item]
-        self.names["sweep"](field, grid, batch, count, most, grads, loss)
+        self.names["sweep"](field, grid, batch, count, most, *out)
 
 
 def hashed_in(space, dtype=torch.float64, share: float = 0.6) -> HashGrid:

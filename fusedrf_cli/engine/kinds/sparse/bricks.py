@@ -192,13 +192,12 @@ class BrickTree:
         return offset, depth, table
 
     def voxels_at(
-        self, halves: np.ndarray, n: int, active: np.ndarray, finest: int | None = None
+        self, halves: np.ndarray, n: int, active: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(brick, or -1; voxel in it, counted along its n a side; whether that is active) at points (M, 3)
-        int64 given in odd halves of a unit, which is a voxel of level `finest`; None: of this tree's own
-        depth."""
+        int64 given in odd halves of a unit, which is a finest voxel."""
         offset, depth, table = self.tables
-        span = 2 * SIDE << (self.depth if finest is None else finest)
+        span = 2 * SIDE << self.depth
         cell = halves // span
         inside = ((cell >= 0) & (cell < np.asarray(self.counts))).all(1)
         cell = np.where(inside[:, None], cell, 0)
