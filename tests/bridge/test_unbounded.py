@@ -336,13 +336,13 @@ def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     write_scene(fused / "two.json", SceneGraph((*nodes, more)), overwrite=True)
     words = ("--kind", "sparse", "--no-finetune", "--max-size", "3MB", "-w")
     said = done(fused, "fuse", "one.json", *words, "-o", "bricks.rfpack")
-    assert said["psnr"]["stored"] > 34  # a place's colours take nine numbers each of the 3 MB
+    assert said["psnr"]["stored"] > 32  # the room's colours take nine numbers each of the 3 MB; steps show
     place = ("red.rfpack", "--name", "more", "-t", "0.6,0.5,0")
     done(fused, "add", "bricks.rfpack", *place, "-o", "more.rfpack", "-w")
     done(fused, "delete", "more.rfpack", "more", "-o", "less.rfpack", "-w")
     for bundle, against in (("more.rfpack", "two.json"), ("less.rfpack", "one.json")):
         like = done(fused, "eval", bundle, "--against", against, "--size", "48x48")["mean"]
-        assert like["psnr"] > 34
+        assert like["psnr"] > 32
 
 
 def test_a_short_time_leaves_a_student_of_a_place_room_to_begin_as_it_is():
