@@ -58,8 +58,8 @@ def as_trained(field):
     """
     if isinstance(field, VMMLPField):
         wide = VMMLPField(
-            replace(field.shape, width=VMMLPShape.width), field.box, field.resolution, field.scale, field.shift,
-            occupancy=field.occupancy,
+            replace(field.shape, width=VMMLPShape.width), field.box, field.resolution, field.scale,
+            field.shift, occupancy=field.occupancy,
         )  # fmt: skip
         factors = field.params[: int(field.starts[12]) + field.basis.numel()]
         wide.params[: len(factors)] = factors
