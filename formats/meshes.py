@@ -15,7 +15,7 @@ import numpy as np
 
 from formats.errors import BadMesh, FormatError
 from formats.other_files import not_a_mesh
-from formats.points import MAX_HEADER
+from formats.ply_elements import MAX_HEADER
 from formats.safe_input import open_input
 from formats.surfaces.gltf import read_gltf
 from formats.surfaces.obj import read_obj
