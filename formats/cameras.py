@@ -13,9 +13,10 @@ from pathlib import Path, PurePosixPath
 
 from formats.errors import BadIntrinsics, BadJson, BadSchema, LimitExceeded, NoViews, UnsupportedCamera
 from formats.images import MAX_SIDE, read_image_header
+from formats.matching import Listings
 from formats.names import distinct_names
 from formats.other_files import foreign_json
-from formats.photos import find_photo, split_ending
+from formats.photos import split_ending
 from formats.safe_input import decoded, read_input
 from formats.views import View, checked_pose
 
@@ -103,11 +104,6 @@ def read_frames(path: Path, document: dict, key: str = "frames") -> list[dict]:
     return [frame if isinstance(frame, dict) else {} for frame in frames]
 
 
-def frame_photo(path: Path, frame: dict) -> Path | None:
-    """The frame's photo, under the extension it has on disk; None if it is not there."""
-    return find_photo(path.parent, frame_file(frame))
-
-
 def frame_file(frame: dict) -> str:
     """The frame's `file_path` with forward slashes and without a leading "./"; empty where there is none."""
     return written_path(frame, "file_path")
@@ -143,7 +139,7 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
         raise BadIntrinsics(
             f"{where}: no focal length; expected fl_x, x_fov or camera_angle_x here or in the file"
         )
-    cx, cy = _number(sources, "cx", where, width / 2), _number(sources, "cy", where, height / 2)
+    cx, cy = stated_number(sources, "cx", where, width / 2), stated_number(sources, "cy", where, height / 2)
     if min(width, height) > SMALL and 0 < cx <= 1 and 0 < cy <= 1:
         raise BadIntrinsics(
             f"{where}: cx and cy are {cx:g} and {cy:g}, shares of the picture; give cx, cy, fl_x and fl_y in "
@@ -172,7 +168,9 @@ def frame_where(path: Path, index: int, frame: dict) -> str:
 
 def _frame_views(path: Path, document: dict, size: tuple[int, int] | None) -> tuple[View, ...]:
     frames = read_frames(path, document)
-    first_photo = next((photo for photo in (frame_photo(path, frame) for frame in frames) if photo), None)
+    listings, files = Listings(), [path.parent / file for file in map(frame_file, frames) if file]
+    photos = (file.with_name(name) for file in files for _, name in listings.find(file.parent, file.name))
+    first_photo = next(photos, None)
     photo_size = read_image_header(first_photo)[:2] if first_photo else size
     named = enumerate(zip(frames, frame_names(frames), strict=True))
     views = [frame_view(frame_where(path, i, f), document, f, name, photo_size) for i, (f, name) in named]
@@ -180,7 +178,7 @@ def _frame_views(path: Path, document: dict, size: tuple[int, int] | None) -> tu
 
 
 def _size(sources: tuple[dict, dict], size: tuple[int, int] | None, where: str) -> tuple[int, int]:
-    stated = [_number(sources, key, where, None) for key in ("w", "h")]
+    stated = [stated_number(sources, key, where, None) for key in ("w", "h")]
     width, height = (round(side) for side in stated) if None not in stated else size or (None, None)
     if width is None:
         raise BadIntrinsics(
@@ -199,11 +197,11 @@ def checked_size(width: int, height: int, where: str) -> tuple[int, int]:
 def _focal(sources: tuple[dict, dict], axis: str, side: int, where: str) -> float | None:
     """Pixels; None where neither source says."""
     for source in sources:
-        if (degrees := _number((source,), f"{axis}_fov", where, None)) is not None:
+        if (degrees := stated_number((source,), f"{axis}_fov", where, None)) is not None:
             return fov_focal(math.radians(degrees), side, where)
-        if (pixels := _number((source,), f"fl_{axis}", where, None)) is not None:
+        if (pixels := stated_number((source,), f"fl_{axis}", where, None)) is not None:
             return checked_focal(pixels, where)
-        if (radians := _number((source,), f"camera_angle_{axis}", where, None)) is not None:
+        if (radians := stated_number((source,), f"camera_angle_{axis}", where, None)) is not None:
             return fov_focal(radians, side, where)
     return None
 
@@ -226,7 +224,8 @@ def checked_focal(pixels: float, where: str) -> float:
     return pixels
 
 
-def _number(sources: tuple[dict, ...], key: str, where: str, default: float | None) -> float | None:
+def stated_number(sources: tuple[dict, ...], key: str, where: str, default: float | None) -> float | None:
+    """What the first source that knows it says, a finite number; else the default."""
     number = next((source[key] for source in sources if source.get(key) is not None), default)
     if number is None:
         return None
@@ -246,7 +245,7 @@ def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ..
     where it divides.
     """
     model = str(next((source["camera_model"] for source in sources if "camera_model" in source), "")).upper()
-    numbers = {key: _number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
+    numbers = {key: stated_number(sources, key, where, 0.0) for key in (*BENDS, *RATIONAL_BENDS)}
     if model in FISHEYE or any(source.get("is_fisheye") for source in sources):
         if numbers["p1"] or numbers["p2"]:
             raise UnsupportedCamera(
@@ -272,7 +271,9 @@ def _path_views(path: Path, document: dict, size: tuple[int, int] | None) -> tup
     if kind != "perspective":
         raise UnsupportedCamera(f"{path}: camera_type {kind[:40]!r}, expected perspective")
     if not size:
-        sides = [_number((document,), f"render_{side}", str(path), None) for side in ("width", "height")]
+        sides = [
+            stated_number((document,), f"render_{side}", str(path), None) for side in ("width", "height")
+        ]
         if None in sides:
             raise BadIntrinsics(f"{path}: no render_width and render_height; give the size of the pictures")
         size = checked_size(*(round(side) for side in sides), str(path))
@@ -283,7 +284,7 @@ def _path_views(path: Path, document: dict, size: tuple[int, int] | None) -> tup
 def _path_view(where: str, frame: dict, name: str, size: tuple[int, int]) -> View:
     """nerfstudio's `fov` is the vertical one, in degrees."""
     width, height = size
-    degrees = _number((frame,), "fov", where, None)
+    degrees = stated_number((frame,), "fov", where, None)
     if degrees is None:
         raise BadIntrinsics(f"{where}: no fov; expected the vertical field of view in degrees")
     focal = fov_focal(math.radians(degrees), height, where)

@@ -52,20 +52,11 @@ MODELS = {
 }
 """Parameters of the models that can be rendered, in COLMAP's order. FULL_OPENCV's last three are OpenCV's k4,
 k5 and k6."""
-NUMBERS = [
-    *(
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "FULL_OPENCV",
-        "FOV",
-    ),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
-    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
-]
+NUMBERS = (
+    "SIMPLE_PINHOLE PINHOLE SIMPLE_RADIAL RADIAL OPENCV OPENCV_FISHEYE FULL_OPENCV FOV SIMPLE_RADIAL_FISHEYE "
+    "RADIAL_FISHEYE THIN_PRISM_FISHEYE RAD_TAN_THIN_PRISM_FISHEYE SIMPLE_DIVISION DIVISION SIMPLE_FISHEYE "
+    "FISHEYE EUCM EQUIRECTANGULAR"
+).split()
 """Names of the models by their number in binary files."""
 MODELS_IN = ("sparse", "colmap")
 """Folders that models lie in, in the folder of their capture."""

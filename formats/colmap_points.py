@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.colmap_text import check_count, number, numbered_lines
-from formats.errors import (
-    BadModel,
-)
+from formats.errors import BadModel
 from formats.points import SparsePoints, stride
 
 MOST_ERROR = 1.5

@@ -258,7 +258,7 @@ def _decoded(path: Path | str) -> Iterator:
 
 @contextmanager
 def _opened(path: Path | str) -> Iterator:
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     with open_input(path) as file:
         try:
@@ -269,13 +269,13 @@ def _opened(path: Path | str) -> Iterator:
             yield image
         except Image.DecompressionBombError as error:
             raise LimitExceeded(f"{path}: the picture has too many pixels to be decoded safely") from error
-        except DECODING_ERRORS as error:
-            if not _unidentified(error):
-                raise BadImage(
-                    f"{path}: the picture cannot be decoded ({error}); replace or remove it"
-                ) from error
+        except UnidentifiedImageError as error:
             file.seek(0)
             raise _unread(path, file.read(HEAD)) from error
+        except DECODING_ERRORS as error:
+            raise BadImage(
+                f"{path}: the picture cannot be decoded ({error}); replace or remove it"
+            ) from error
 
 
 @cache
@@ -289,10 +289,6 @@ def _readable() -> tuple[str, ...]:
 
         register_heif_opener()
     return tuple(name for name in FORMATS if name in Image.OPEN)
-
-
-def _unidentified(error: Exception) -> bool:
-    return type(error).__name__ == "UnidentifiedImageError"
 
 
 def _unread(path: Path | str, head: bytes) -> FormatError:

@@ -23,6 +23,7 @@ from formats.photos import (
     is_hidden,
     is_picture,
     natural,
+    smaller_copies,
     split_ending,
 )
 
@@ -135,14 +136,8 @@ class Listings:
     def copies(self, folder: Path) -> list[Folder]:
         """As `formats.photos.copies`."""
         if folder.parent not in self._copies:
-            named = defaultdict(list)
-            for entry in _entries(folder.parent):
-                plain, _, factor = entry.name.rpartition("_")
-                if factor.isdecimal() and int(factor) > 0 and _is_folder(entry):
-                    named[plain].append(Folder(folder.parent / entry.name, int(factor)))
-            self._copies[folder.parent] = dict(named)
-        beside = self._copies[folder.parent].get(folder.name, [])
-        return [Folder(folder), *sorted(beside, key=lambda copy: copy.factor)]
+            self._copies[folder.parent] = smaller_copies(folder.parent)
+        return [Folder(folder), *self._copies[folder.parent].get(folder.name, [])]
 
     def of(self, folder: Path) -> dict[str, list[str]]:
         """Names of a folder's pictures by `stem_key`; hidden and empty files are none."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from formats.errors import FormatError
-from formats.surfaces.lines import numbers_in
+from formats.surfaces.lines import table, within
 
 MAX_HEADER = 1 << 16
 KINDS = {
@@ -233,11 +233,7 @@ class _Text:
 
     def _columns(self, element: Element, rows: list[str]) -> dict:
         columns, offsets = {}, np.zeros(len(rows), int)
-        widths = np.array([len(row.split()) for row in rows], int)
-        flat = numbers_in(" ".join(rows))
-        if len(flat) != widths.sum():
-            raise ValueError("words that are no numbers")
-        starts = np.cumsum(widths) - widths
+        flat, widths, starts = table(rows)
         for each in element.properties:
             if (offsets >= widths).any():
                 raise ValueError("too few numbers")
@@ -249,8 +245,7 @@ class _Text:
             counts = values.astype(int)
             if (counts < 0).any() or (counts != values).any() or (offsets + counts > widths).any():
                 raise ValueError("a list is longer than its line")
-            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-            row_values = flat[np.repeat(starts + offsets, counts) + within]
+            row_values = flat[np.repeat(starts + offsets, counts) + within(counts)]
             columns[each.name] = Lists(counts, _as_stored(row_values, each.kind))
             offsets = offsets + counts
         return columns

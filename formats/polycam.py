@@ -5,7 +5,7 @@ Its world has y up; rows are cycled so that z is up, as nerfstudio does.
 
 from pathlib import Path
 
-from formats.cameras import MOST_PIXELS, checked_focal, checked_size, read_document
+from formats.cameras import checked_focal, checked_size, read_document, stated_number
 from formats.errors import BadIntrinsics, BadPose
 from formats.photos import is_hidden, natural
 from formats.views import View, checked_pose
@@ -41,15 +41,10 @@ def read_camera(path: Path, size: tuple[int, int]) -> View:
         raise BadPose(f"{path}: expected its pose as twelve numbers t_00 to t_23; export it again")
     if document.get("width") is None or document.get("height") is None:
         document |= dict(zip(("width", "height"), size, strict=True))
-    numbers = {}
-    for key in ("fx", "fy", "cx", "cy", "width", "height"):
-        numbers[key] = document.get(key)
-        if isinstance(numbers[key], bool) or not isinstance(numbers[key], int | float):
-            raise BadIntrinsics(f"{path}: expected {key} to be a number; export it again")
-        if not abs(numbers[key]) <= MOST_PIXELS:
-            raise BadIntrinsics(
-                f"{path}: {key} is {str(numbers[key])[:40]}, expected a number up to {MOST_PIXELS:g}"
-            )
+    keys = ("fx", "fy", "cx", "cy", "width", "height")
+    numbers = {key: stated_number((document,), key, str(path), None) for key in keys}
+    if None in numbers.values():
+        raise BadIntrinsics(f"{path}: expected {', '.join(keys)} to be numbers; export it again")
     inner = [float(numbers[key]) for key in ("fx", "fy", "cx", "cy")]
     for focal in inner[:2]:
         checked_focal(focal, str(path))

@@ -40,9 +40,7 @@ from formats.nodes import (
     multiplied,
     within,
 )
-from formats.nodes import (
-    make_node as make_node,
-)
+from formats.nodes import make_node as make_node
 from formats.safe_input import parse_json, read_input
 
 FORMAT = "rfpack"
@@ -109,9 +107,7 @@ class SceneSchema(msgspec.Struct, omit_defaults=True):
 
 NODE_KEYS = NodeSchema.__struct_fields__
 SHOWING_KEYS = ("visible", "crop", "opacity", "tint")
-SCENE_KEYS = (
-    "format", "version", "requires", "generator", "composition", "nodes", "history", "framing", "cameras",
-)  # fmt: skip
+SCENE_KEYS = SceneSchema.__struct_fields__
 
 
 @dataclass(frozen=True)

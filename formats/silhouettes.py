@@ -74,10 +74,8 @@ class Outline:
     """Left, top, right, bottom around it, in pixels of the view; None where nothing of it is shown."""
     filled: float
     """Share of that box."""
-    share: float
-    """Of the photo's pixels."""
     border: float
-    """Of the pixels along its borders."""
+    """Share of the pixels along the photo's borders."""
     middle: float
     """Opaque ones, of the pixels of its middle, half as wide and high."""
     soft: float = 0.0
@@ -102,7 +100,7 @@ class Outline:
             left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
             box = tuple(float(side) * scale for side in (left, top, right, bottom))
             filled = float(mask[top:bottom, left:right].mean())
-        return cls(box, filled, *(float(part.mean()) for part in (mask, border, middle)), **shares)
+        return cls(box, filled, *(float(part.mean()) for part in (border, middle)), **shares)
 
 
 def alpha_outline(view: View) -> Outline:

@@ -254,7 +254,7 @@ class Sparse:
             return tuple(replace(view, seen=None) for view in views)
         few, with_ranges = _sample(self.points), []
         for view in views:
-            near, far = depth_range(view.camera_to_world, few[_seen(view, few)])
+            near, far = depth_range(view.camera_to_world, few[view.shown(few)[3]])
             seen = view.seen if self.seen is None else self.seen.get(_photo_key(view))
             if seen is not None and self.seen is None and self.points.thinned > 1:
                 seen = seen[seen % self.points.thinned == 0] // self.points.thinned
@@ -318,7 +318,7 @@ def _agreeing(sparse: Sparse, views: tuple[View, ...]) -> Sparse:
     seen_by_view = [(view, seen) for view, seen in seen_by_view if seen is not None and len(seen)]
     if sparse.points is None or not seen_by_view:
         return replace(sparse, seen=None)
-    shown = np.concatenate([_seen(view, sparse.points.positions[seen]) for view, seen in seen_by_view])
+    shown = np.concatenate([view.shown(sparse.points.positions[seen])[3] for view, seen in seen_by_view])
     return sparse if shown.mean() > AGREEING else replace(sparse, seen=None)
 
 
@@ -340,14 +340,6 @@ def _sample(points: SparsePoints) -> np.ndarray:
     return points.positions[:: max(1, len(points.positions) // MAX_PROJECTED)]
 
 
-def _seen(view: View, positions: np.ndarray) -> np.ndarray:
-    """Which of (N, 3) positions a view shows, if nothing hides them; distortion is left out."""
-    x, y, back = ((positions - view.camera_to_world[:3, 3]) @ view.camera_to_world[:3, :3]).T
-    depth = np.where(back < 0, -back, np.inf)
-    column, row = view.cx + view.fl_x * x / depth, view.cy - view.fl_y * y / depth
-    return (back < 0) & (abs(column * 2 / view.width - 1) <= 1) & (abs(row * 2 / view.height - 1) <= 1)
-
-
 def _seen_share(points: SparsePoints, views: tuple[View, ...]) -> float:
     few = _sample(points)[::10]
-    return float(np.mean([_seen(view, few).mean() for view in views[:: max(1, len(views) // 20)]]))
+    return float(np.mean([view.shown(few)[3].mean() for view in views[:: max(1, len(views) // 20)]]))

@@ -185,9 +185,7 @@ class _Reader:
         """Nodes of the default scene, without those that are hidden."""
         document = self.document
         if document.scene is None and not document.scenes:
-            roots = set(range(len(document.nodes))) - {
-                child for node in document.nodes for child in node.children
-            }
+            roots = set(order) - {child for node in document.nodes for child in node.children}
         else:
             chosen = document.scene or 0
             scene = self.buffers.item("scenes", chosen)
@@ -272,16 +270,17 @@ class _Shape:
 
     def __init__(self, reader: _Reader, primitive: schema.Primitive, where: str):
         self.reader, self.buffers, self.primitive, self.where = reader, reader.buffers, primitive, where
+        self.called = where.removeprefix(f"{reader.path}: ")
         self.unpacked = self._draco()
         if "POSITION" not in primitive.attributes:
             self.faces, self.chosen = np.empty((0, 3), np.int32), np.empty(0, np.int64)
-            reader.notes.add("has no positions and is left out", where.removeprefix(f"{reader.path}: "))
+            reader.notes.add("has no positions and is left out", self.called)
             return
         count = self._count()
         indices, mode = self._indices(count), TRIANGLES if self.unpacked else primitive.mode
         if mode == TRIANGLES and len(indices) % 3:
             left = "counts corners that are no whole triangles; the last ones are left out"
-            reader.notes.add(left, where.removeprefix(f"{reader.path}: "))
+            reader.notes.add(left, self.called)
         faces = _triangles(indices, mode)
         check_indices(where, faces.reshape(-1), count)
         used = np.zeros(count, bool)
@@ -305,7 +304,7 @@ class _Shape:
             raise BadMesh(f"{self.where}: its indices are {rows.dtype}, expected whole numbers without sign")
         if len(rows) and rows.max() == np.iinfo(rows.dtype).max:
             reserved = "counts up to the index that glTF reserves; it is shown as a vertex like others"
-            self.reader.notes.add(reserved, self.where.removeprefix(f"{self.reader.path}: "))
+            self.reader.notes.add(reserved, self.called)
         return rows[:, 0].astype(np.int64)
 
     def _draco(self) -> dict[str, np.ndarray]:
@@ -388,7 +387,7 @@ class _Shape:
         uv = self._morphed(f"TEXCOORD_{slot.tex_coord}", (2,), weights)
         if uv is None:
             lost = f"has a texture, but no TEXCOORD_{slot.tex_coord} for it; its upper left corner is shown"
-            self.reader.notes.add(lost, self.where.removeprefix(f"{self.reader.path}: "))
+            self.reader.notes.add(lost, self.called)
             uv = np.zeros((len(self.chosen), 2), np.float32)
         if slot.transform is not None:
             uv = uv @ slot.transform[:, :2].T + slot.transform[:, 2]

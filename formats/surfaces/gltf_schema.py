@@ -133,14 +133,12 @@ class Sourced(Part):
 
 class Sampler(Named):
     mag_filter: int | None = None
-    min_filter: int | None = None
     wrap_s: int = 10497
     wrap_t: int = 10497
 
 
 class Image(Named):
     uri: str | None = None
-    mime_type: str = ""
     buffer_view: Index | None = None
 
 

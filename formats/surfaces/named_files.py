@@ -2,11 +2,11 @@
 
 import os
 import re
-import unicodedata
 from pathlib import Path
 from urllib.parse import unquote
 
 from formats.errors import FormatError, LimitExceeded, MissingFile, OutsideFolder
+from formats.names import folded
 from formats.safe_input import read_input
 from formats.surfaces.lines import western, without_comment
 
@@ -79,7 +79,7 @@ class Beside:
                 self._check(where)
                 continue
             if not os.path.lexists(there):
-                same = [entry for entry in _entries(where) if _key(entry) == _key(part)]
+                same = [entry for entry in _entries(where) if folded(entry) == folded(part)]
                 if not same:
                     return None
                 there = where / min(same)
@@ -91,11 +91,6 @@ class Beside:
         real = os.path.realpath(path)
         if os.path.commonpath([real, self.root]) != self.root:
             raise OutsideFolder(f"{path}: lies outside of {self.root}; put it beside the mesh")
-
-
-def _key(name: str) -> str:
-    """Equal for names that differ in case, or in how accents are put together."""
-    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _entries(folder: Path) -> list[str]:

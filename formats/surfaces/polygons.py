@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from formats.surfaces.lines import within
+
 MAX_CORNERS = 1000
 MAX_LOOKS = 300_000
 """Corners that are looked at for ears, which takes seconds; polygons beyond, and larger ones, stay fans."""
@@ -20,7 +22,7 @@ def triangulated(
     starts = np.cumsum(counts) - counts
     n = np.maximum(counts - 2, 0)
     polygon = np.repeat(np.arange(len(counts)), n)
-    step = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    step = within(n)
     first = starts[polygon]
     fans = np.stack([first, first + step + 1, first + step + 2], 1)
     if (counts <= 3).all():
