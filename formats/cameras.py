@@ -9,6 +9,7 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from formats.errors import BadIntrinsics, BadJson, BadSchema, LimitExceeded, NoViews, UnsupportedCamera
@@ -115,9 +116,9 @@ def written_path(keys: dict, key: str) -> str:
     return str(PurePosixPath(written.replace("\\", "/"))) if isinstance(written, str) and written else ""
 
 
-def frame_names(frames: list[dict]) -> list[str]:
-    """A distinct name per frame: the file stem, or the path joined by _ where two frames share a stem."""
-    files = [PurePosixPath(frame_file(frame) or f"{i:05d}") for i, frame in enumerate(frames)]
+def frame_names(files: Sequence[str]) -> list[str]:
+    """A distinct name per file: its stem, or the path joined by _ where two share a stem."""
+    files = [PurePosixPath(file or f"{i:05d}") for i, file in enumerate(files)]
     stems = [split_ending(file.name)[0] for file in files]
     shared = Counter(stems)
     names = [
@@ -168,11 +169,12 @@ def frame_where(path: Path, index: int, frame: dict) -> str:
 
 def _frame_views(path: Path, document: dict, size: tuple[int, int] | None) -> tuple[View, ...]:
     frames = read_frames(path, document)
-    listings, files = Listings(), [path.parent / file for file in map(frame_file, frames) if file]
-    photos = (file.with_name(name) for file in files for _, name in listings.find(file.parent, file.name))
+    listings, files = Listings(), [frame_file(frame) for frame in frames]
+    paths = (path.parent / file for file in files if file)
+    photos = (at.with_name(name) for at in paths for _, name in listings.find(at.parent, at.name))
     first_photo = next(photos, None)
     photo_size = read_image_header(first_photo)[:2] if first_photo else size
-    named = enumerate(zip(frames, frame_names(frames), strict=True))
+    named = enumerate(zip(frames, frame_names(files), strict=True))
     views = [frame_view(frame_where(path, i, f), document, f, name, photo_size) for i, (f, name) in named]
     return tuple(view.reframed(*size) if size else view for view in views)
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from formats.capture_frame import box_around, default_box, scene_frame
 from formats.errors import NoViews, printable
+from formats.listed_photos import SplitPart
 from formats.masks import with_masks_beside
 from formats.photos import alike_turned
 from formats.points import SparsePoints
 from formats.silhouettes import AMISS, AMISS_ON_WHITE, by_alpha, by_ground, by_masks, outline_box
-from formats.transforms import SplitPart
 from formats.upright import upward_doubt
 from formats.views import LEAST_VIEWS, Capture, View
 

@@ -8,7 +8,7 @@ World axes and units stay as the file has them: nothing is recentred, turned or 
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +16,13 @@ import numpy as np
 
 from formats import colmap, llff, opensfm, polycam
 from formats.atomic import atomic_writer
-from formats.cameras import frame_names, read_cameras, read_document
+from formats.cameras import read_cameras, read_document
 from formats.capture_of import capture_of
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
 from formats.frame_list import read_sound, repair_notes
 from formats.images import read_image_header, write_png
-from formats.matching import PHOTO_FOLDERS, gone, match_photos
+from formats.listed_photos import SplitPart, read_listed
+from formats.matching import PHOTO_FOLDERS, gone
 from formats.meshes import is_mesh, mesh_capture
 from formats.other_files import is_json, not_a_capture, other_cameras
 from formats.photos import (
@@ -43,7 +44,6 @@ from formats.photos import (
 from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
 from formats.transforms import (
     BLENDER_FILE,
-    SplitPart,
     read_part,
     read_splits,
     sparse_points,
@@ -169,7 +169,7 @@ def _read_folder(path: Path, downscale: int | None) -> Capture:
     if (model := colmap.model_folder(path)) is not None:
         try:
             return _read_colmap(path, model, downscale)
-        except MissingFile as error:
+        except NoViews as error:
             # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
             if not is_file(path / llff.NAME):
                 raise
@@ -242,8 +242,8 @@ def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
     try:
         notes = (*others, *model.notes)
         return _read_model(path, "colmap", model, base, (*colmap.PHOTOS_IN, ""), downscale, notes)
-    except MissingFile as error:
-        raise MissingFile("; ".join([str(error), *others])) from error
+    except NoViews as error:
+        raise NoViews("; ".join([str(error), *others])) from error
 
 
 def _read_model(
@@ -257,44 +257,10 @@ def _read_model(
 ) -> Capture:
     """A model whose photos lie in one of `homes` in the folder `base`."""
     images = [(image.name.replace("\\", "/"), image) for image in model.images]
-    part = _read_listed(
-        model.folder, base, images, lambda image, size: (image.where, image.view), downscale, homes
+    parts = read_listed(
+        model.folder, base, [images], lambda image, *_: (image.where, image.view, None), downscale, homes
     )
-    return capture_of(path, kind, part, SplitPart(), None, model.points, tuple(notes))
-
-
-def _read_listed(
-    where: Path,
-    base: Path,
-    listed: Sequence[tuple[str, object]],
-    camera: Callable[[object, tuple[int, int]], tuple[str, View]],
-    downscale: int | None,
-    homes: Sequence[str] = ("",),
-) -> SplitPart:
-    """The photos of names, with what stands for each; `camera` makes of this and the photo's size how errors
-    name it, and its view. `where` lists them, and the photos lie in one of `homes` in `base`."""
-    matched = match_photos(where, base, [file for file, _ in listed], downscale, homes)
-    if not matched.photos:
-        named = min((file for file, _ in listed), key=natural)
-        raise MissingFile(
-            f"{where}: names {len(listed)} photos such as {named}, but none of them is there: {matched.hint}"
-        )
-    items = sorted((item for item in listed if item[0] in matched.photos), key=lambda item: natural(item[0]))
-    names = frame_names([{"file_path": file} for file, _ in items])
-
-    def read(numbered: tuple[int, tuple]) -> View:
-        i, (file, item) = numbered
-        photo, folder = matched.photos[file]
-        header = read_image_header(photo)
-        camera_where, view = camera(item, header[:2])
-        view = replace(view, name=names[i])
-        return on_photo(view, photo, header, camera_where, reduction=folder.reduction(header, downscale))
-
-    views, broken = read_sound(
-        where, list(enumerate(items)), read, lambda item: str(matched.photos[item[1][0]][0])
-    )
-    notes = (*matched.notes, *broken, *repair_notes(where, views))
-    return SplitPart(tuple(views), matched.missing, notes)
+    return capture_of(path, kind, *parts, SplitPart(), None, model.points, tuple(notes))
 
 
 def _other_models(path: Path, folder: Path) -> list[str]:
@@ -348,30 +314,29 @@ def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
 
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
     files = [(file.stem, file) for file in polycam.camera_files(cameras)]
-    part = _read_listed(
-        cameras, images, files, lambda file, size: (str(file), polycam.read_camera(file, size)), downscale
+    parts = read_listed(
+        cameras,
+        images,
+        [files],
+        lambda file, header, _: (str(file), polycam.read_camera(file, header[:2]), None),
+        downscale,
     )
     photos, poses = polycam.FOLDERS[0]
     lost = images.name != photos and (images.parent / poses).is_dir()
     uncorrected = [f"{images.parent}: {poses} is not used, since there is no {photos}"] if lost else []
-    return capture_of(path, "polycam", part, SplitPart(), None, notes=tuple(uncorrected))
+    return capture_of(path, "polycam", *parts, SplitPart(), None, notes=tuple(uncorrected))
 
 
 def _read_pose_files(path: Path, files: PoseFiles, downscale: int | None) -> Capture:
     lens, notes = read_lens(files)
     *names, unused = splits(list(files.poses))
-    parts = [
-        _read_listed(
-            files.folder,
-            files.photos,
-            [(name, files.poses[name]) for name in part],
-            lambda file, size: (str(file), read_view(file, lens, size)),
-            downscale,
-        )
-        if part
-        else SplitPart()
-        for part in names
-    ]
+    parts = read_listed(
+        files.folder,
+        files.photos,
+        [[(name, files.poses[name]) for name in split] for split in names],
+        lambda file, header, _: (str(file), read_view(file, lens, header[:2]), None),
+        downscale,
+    )
     notes += [f"{path}: {unused}"] if unused else []
     return capture_of(path, "pose files", *parts, read_box(files), notes=tuple(notes))
 

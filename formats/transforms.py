@@ -1,7 +1,6 @@
 """Captures whose cameras stand in `transforms*.json`: Blender's, instant-ngp's and nerfstudio's."""
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,6 @@ import numpy as np
 from formats import colmap
 from formats.cameras import (
     frame_file,
-    frame_names,
     frame_view,
     frame_where,
     read_document,
@@ -21,10 +19,10 @@ from formats.cameras import (
 )
 from formats.capture_frame import depth_range
 from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError, counted
-from formats.frame_list import once, read_sound, repair_notes
-from formats.images import Header, read_image_header
-from formats.matching import MatchedPhotos, find_file, match_photos, stem_key
-from formats.photos import natural, on_photo
+from formats.images import Header
+from formats.listed_photos import SplitPart, read_listed
+from formats.matching import find_file, stem_key
+from formats.photos import Folder, natural
 from formats.points import MAX_POINTS, SparsePoints, points_notes, read_ply_points
 from formats.views import View
 
@@ -34,15 +32,6 @@ MAX_PROJECTED = 20_000
 """At most so many points are projected into each view."""
 AGREEING = 0.95
 """Share of a model's observations that lie in the pictures that they are of, if it is of this capture."""
-
-
-@dataclass(frozen=True)
-class SplitPart:
-    """The views of one split, the missing photos, and notes on where photos are read from."""
-
-    views: tuple[View, ...] = ()
-    missing: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
 
 def read_part(path: Path, downscale: int | None) -> SplitPart:
@@ -79,57 +68,34 @@ def _frames(path: Path, document: dict) -> list[Numbered]:
 
 def _views(
     path: Path, document: dict, base: Path, splits: Sequence[list[Numbered]], downscale: int | None
-) -> tuple[SplitPart, ...]:
-    """Views of the frames of each split whose photo exists, their cameras scaled to what is read of it."""
-    splits = [sorted(frames, key=lambda item: natural(_file(item))) for frames in splits]
-    files = [_file(item) for part in splits for item in part]
-    homes = (str(path.parent.relative_to(base)), "") if path.parent != base else ("",)
-    matched = match_photos(path, base, files, downscale, homes)
-    if not matched.photos:
-        named = matched.missing[0] if matched.missing else "none"
-        raise NoViews(
-            f"{path}: no view is left, none of its {len(matched.missing)} photos such as {named} is there: "
-            f"{matched.hint}"
-        )
-    parts = [_part(path, document, frames, matched, downscale) for frames in splits]
-    notes = list(matched.notes)
-    if nameless := sum(not _file(item) for frames in splits for item in frames):
-        notes.append(f"{path}: {counted(nameless, 'frame has', 'frames have')} no file_path and no photo")
-    return (replace(parts[0], notes=(*notes, *parts[0].notes)), *parts[1:])
+) -> list[SplitPart]:
+    """Views of the frames of each split whose photo exists."""
+    unsure: list[str] = []
 
-
-def _part(
-    path: Path, document: dict, frames: list[Numbered], matched: MatchedPhotos, downscale: int | None
-) -> SplitPart:
-    def photo_of(item: Numbered) -> str:  # however its path is written
-        return os.path.normpath(matched.photos[_file(item)][0])
-
-    items = [item for item in frames if _file(item) in matched.photos]
-    items, notes = once(path, items, photo_of, lambda item: json.dumps(item[1].get("transform_matrix")))
-    unsure = []
-    names = dict(zip((i for i, _ in items), frame_names([frame for _, frame in items]), strict=True))
-
-    def read(item: Numbered) -> View:
-        (i, frame), where = item, frame_where(path, *item)
-        photo, folder = matched.photos[_file(item)]
-        header = read_image_header(photo)
+    def camera(item: Numbered, header: Header, folder: Folder) -> tuple[str, View, Path | None]:
+        frame, where = item[1], frame_where(path, *item)
         size, sure = _unstated_size(header, frame, document)
         if not sure:
-            unsure.append(photo.name)
-        view = frame_view(where, document, frame, names[i], size)
+            unsure.append(PurePosixPath(_file(item)).name)
+        view = frame_view(where, document, frame, "", size)
         mask = _mask(path, folder.factor, frame, where)
-        view = replace(view, seen=_stated_points(where, frame))
-        return on_photo(view, photo, header, where, mask, folder.reduction(header, downscale))
+        return where, replace(view, seen=_stated_points(where, frame)), mask
 
-    views, broken = read_sound(path, items, read, photo_of)
-    missing = tuple(_file(item) for item in frames if _file(item) not in matched.photos)
-    turned = [
-        f"{path}: EXIF turns {counted(len(unsure), 'photo', 'photos')}, such as {name}, and without w and h "
-        "nothing tells whether the poses are of them so: they are read as stored"
-        for name in unsure[:1]
-    ]
-    notes = (*notes, *broken, *turned, *repair_notes(path, views))
-    return SplitPart(tuple(views), missing, notes)
+    def pose_of(item: Numbered) -> str:
+        return json.dumps(item[1].get("transform_matrix"))
+
+    homes = (str(path.parent.relative_to(base)), "") if path.parent != base else ("",)
+    listed = [[(_file(item), item) for item in frames] for frames in splits]
+    parts = read_listed(path, base, listed, camera, downscale, homes, pose_of)
+    notes = []
+    if nameless := sum(not file for frames in listed for file, _ in frames):
+        notes.append(f"{path}: {counted(nameless, 'frame has', 'frames have')} no file_path and no photo")
+    if unsure:
+        notes.append(
+            f"{path}: EXIF turns {counted(len(unsure), 'photo', 'photos')}, such as {unsure[0]}, and without "
+            "w and h nothing tells whether the poses are of them so: they are read as stored"
+        )
+    return [replace(parts[0], notes=(*parts[0].notes, *notes)), *parts[1:]]
 
 
 def _unstated_size(header: Header, frame: dict, document: dict) -> tuple[tuple[int, int], bool]:

@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from formats.errors import FormatError
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import Buffers, data_uri, is_data
-from formats.surfaces.pictures import read_picture, share_of
+from formats.surfaces.pictures import Pictures
 from formats.surfaces.surface import Notes, Texture, listed
 
 GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
@@ -55,10 +54,9 @@ class Materials:
     def __init__(self, document: schema.Document, buffers: Buffers, notes: Notes):
         self.document, self.buffers, self.notes = document, buffers, notes
         self.looks: dict[int, Appearance] = {}
-        self.pictures: dict[int, np.ndarray | None] = {}
         self.used: set[int] = set()
         """Of the document's images, those that are shown."""
-        self.share = share_of(len(document.images), notes)
+        self.pictures = Pictures(len(document.images), notes)
 
     def look(self, index: int | None) -> Appearance:
         """What material `index` shows. Raises BadMesh."""
@@ -137,26 +135,17 @@ class Materials:
 
     def _picture(self, index: int, name: str) -> np.ndarray | None:
         """The pixels of an image, or None and a note where it cannot be read."""
-        if index not in self.pictures:
-            image = self.buffers.item("images", index)
-            label = image_label(image, index)
-            try:
-                data, label = self._image_bytes(image, index, label)
-                self.pictures[index] = read_picture(data, label, self.share, self.notes)
-            except FormatError as error:
-                self.pictures[index] = None
-                self.notes.add(f"has a texture that is not shown: {error}", name)
-        return self.pictures[index]
+        image = self.buffers.item("images", index)
+        return self.pictures.get(index, lambda: self._image_bytes(image, image_label(image, index)), name)
 
-    def _image_bytes(self, image: schema.Image, index: int, label: str) -> tuple[bytes, str]:
+    def _image_bytes(self, image: schema.Image, label: str) -> tuple[bytes, str]:
         if image.buffer_view is not None:
             return bytes(self.buffers.view(image.buffer_view)), label
         if image.uri is None:
             return b"", label
         if is_data(image.uri):
             return data_uri(image.uri, label), label
-        data, path = self.buffers.beside.read(image.uri, uri=True)
-        return data, path.name
+        return self.buffers.beside.read(image.uri, uri=True)
 
     # --- notes ----------------------------------------------------------------------------------------------
 
@@ -183,7 +172,7 @@ class Materials:
         unused = [material.name or f"material {i}" for i, material in materials if i not in self.looks]
         if unused:
             self.notes.add(f"materials that nothing shown has: {listed(unused)}")
-        tried = self.used | {index for index, pixels in self.pictures.items() if pixels is None}
+        tried = self.used | {index for index, pixels in self.pictures.pixels.items() if pixels is None}
         unused = [image_label(i, n) for n, i in enumerate(self.document.images) if n not in tried]
         if unused:
             self.notes.add(f"pictures that no shown colour uses: {listed(unused)}")

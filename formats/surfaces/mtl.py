@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from formats.errors import FormatError
 from formats.surfaces.lines import lines_of
 from formats.surfaces.named_files import Beside
-from formats.surfaces.pictures import read_picture, share_of
+from formats.surfaces.pictures import Pictures
 from formats.surfaces.surface import Notes, Paint, Texture, listed, opaque
 
 ONE_WORD = ("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type")
@@ -169,11 +168,10 @@ class Appearances:
 
     def __init__(self, materials: dict[str, Material], beside: Beside, notes: Notes):
         self.materials, self.beside, self.notes = materials, beside, notes
-        self.pictures: dict[str, np.ndarray | None] = {}
         self.looks: dict[str, Appearance] = {}
         maps = [item for material in materials.values() for item in material.maps.items()]
         named = {m.name for word, m in maps if word in SHOWN}
-        self.share = share_of(len(named), notes)
+        self.pictures = Pictures(len(named), notes)
 
     def look(self, name: str) -> Appearance:
         if name not in self.looks:
@@ -233,14 +231,7 @@ class Appearances:
     def _texture(self, picture: Map | None, called: str) -> Texture | None:
         if picture is None:
             return None
-        if picture.name not in self.pictures:
-            try:
-                data, path = self.beside.read(picture.name)
-                self.pictures[picture.name] = read_picture(data, path.name, self.share, self.notes)
-            except FormatError as error:
-                self.pictures[picture.name] = None
-                self.notes.add(f"has a texture that is not shown: {error}", called)
-        pixels = self.pictures[picture.name]
+        pixels = self.pictures.get(picture.name, lambda: self.beside.read(picture.name), called)
         wrap = "clamp" if picture.options.get("-clamp", ["off"])[0].lower() == "on" else "repeat"
         return None if pixels is None else Texture(pixels, (wrap, wrap))
 

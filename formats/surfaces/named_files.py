@@ -27,8 +27,8 @@ class Beside:
         self.root = os.path.realpath(self.folder / os.pardir)
         self.bytes_read = 0
 
-    def read(self, name: str, *, uri: bool = False) -> tuple[bytes, Path]:
-        """The bytes of a named file and where it was found.
+    def read(self, name: str, *, uri: bool = False) -> tuple[bytes, str]:
+        """The bytes of a named file and the name that it has.
 
         A `uri` is percent-decoded. Where the path is not there, its last part is looked for in the mesh's own
         folder, since paths are often those of another computer; letters may be in another case. Raises
@@ -41,7 +41,7 @@ class Beside:
             raise LimitExceeded(
                 f"{name}: the files that the mesh names have more than {2 * MAX_FILE:,} bytes"
             )
-        return data, path
+        return data, path.name
 
     def find(self, name: str, *, uri: bool = False) -> Path:
         if len(name) > MAX_NAME:

@@ -299,8 +299,7 @@ def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> li
         lost = []
         for name in names:
             try:
-                data, file = beside.read(name)
-                paths.append((data, file.name))
+                paths.append(beside.read(name))
             except FormatError as error:
                 lost.append(f"the library of materials {name!r} is not read: {error}")
         if paths:
@@ -309,9 +308,8 @@ def _libraries(named: str, beside: Beside, path: Path | str, notes: Notes) -> li
         notes.add(sentence)
     if not paths:
         try:
-            data, file = beside.read(Path(path).with_suffix(".mtl").name)
+            paths.append(beside.read(Path(path).with_suffix(".mtl").name))
         except FormatError:
             return []
-        notes.add(f"{file.name} is taken for its materials")
-        paths.append((data, file.name))
+        notes.add(f"{paths[0][1]} is taken for its materials")
     return paths

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, FormatError
+from formats.errors import BadMesh
 from formats.ply_elements import AXES, HUES, Lists, read_elements, rgb_of
 from formats.safe_input import read_input
 from formats.surfaces.named_files import Beside
-from formats.surfaces.pictures import read_picture, share_of
+from formats.surfaces.pictures import Pictures
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import (
     Notes,
@@ -119,15 +119,11 @@ def _one_colour(colours, face_colours, polygon, notes: Notes) -> dict:
 
 def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Notes) -> list[Surface]:
     """A surface for each picture; every corner becomes a vertex of its own."""
-    beside, share, surfaces = Beside(path), share_of(len(textures), notes), []
+    beside, surfaces = Beside(path), []
     numbers = np.where((numbers >= 0) & (numbers < len(textures)), numbers, 0)
-    pictures: dict[int, np.ndarray] = {}
-    for number in np.unique(numbers):
-        try:
-            data, file = beside.read(textures[number])
-            pictures[number] = read_picture(data, file.name, share, notes)
-        except FormatError as error:
-            notes.add(f"a texture is not shown: {error}")
+    reader = Pictures(len(textures), notes)
+    pictures = {n: reader.get(n, lambda n=n: beside.read(textures[n])) for n in np.unique(numbers)}
+    pictures = {number: pixels for number, pixels in pictures.items() if pixels is not None}
     if pictures and (rest["colours"] is not None or rest["face_colours"] is not None):
         notes.add("colours of vertices and faces are not used where there is a picture")
     for number in np.unique(numbers):

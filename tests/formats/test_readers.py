@@ -201,7 +201,7 @@ def test_colmap_without_the_full_size_photos(tmp_path):
     LLFF's own poses are there, which go by their order."""
     binary_model(tmp_path / "sparse/0", ("IMG_9.JPG", "IMG_10.JPG"))
     photos(tmp_path / "images_2", ("image000.png", "image001.png"), (50, 40))
-    with pytest.raises(MissingFile, match=r"photos such as IMG_9\.JPG.* 2 others, such as images_2/image000"):
+    with pytest.raises(NoViews, match=r"photos such as IMG_9\.JPG.* 2 others, such as images_2/image000"):
         read_capture(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
     capture = read_capture(tmp_path)
@@ -210,7 +210,7 @@ def test_colmap_without_the_full_size_photos(tmp_path):
 
 def test_colmap_photos_that_are_missing(tmp_path):
     binary_model(tmp_path / "sparse/0")
-    with pytest.raises(MissingFile, match=r"3 photos such as 10\.png"):
+    with pytest.raises(NoViews, match=r"3 photos such as 10\.png"):
         read_capture(tmp_path)
     photos(tmp_path / "images", NAMES[:2])
     capture = read_capture(tmp_path)
