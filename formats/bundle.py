@@ -30,7 +30,6 @@ from formats.records import (
     decode_field,
     decode_header,
     encode_field,
-    mapped_array,
     member_name,
     sha256_of_bytes,
 )
@@ -95,10 +94,6 @@ class FieldSet:
             shared = decode_field(self.views[name], f"{self.path}: {name}")
             record.arrays.update({f"{part}.{key}": array for key, array in shared.arrays.items()})
         return record
-
-    def array(self, member: str, name: str) -> np.ndarray:
-        """One array of a field as it is stored, read-only. Raises MissingMember and KeyError."""
-        return mapped_array(self.data(member), self.headers[member].specs[name])
 
 
 class OpenBundle(FieldSet):

@@ -25,7 +25,7 @@ MAX_JSON = 256 * 2**20
 PERSPECTIVE = {"", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "OPENCV"}
 RATIONAL = "FULL_OPENCV"
 FISHEYE = {"FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
-BENDS = ("k1", "k2", "k3", "p1", "p2")
+BENDS, FISHEYE_BENDS = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 RATIONAL_BENDS = ("k4", "k5", "k6")
 SMALL = 16
 """Pixels a side of pictures so small that a centre of less than one pixel may be meant."""
@@ -147,19 +147,7 @@ def frame_view(where: str, document: dict, frame: dict, name: str, size: tuple[i
             "pixels"
         )
     pose, repair = checked_pose(frame.get("transform_matrix"), where)
-    return View(
-        name=name,
-        camera_to_world=pose,
-        fl_x=x or y,
-        fl_y=y or x,
-        cx=cx,
-        cy=cy,
-        width=width,
-        height=height,
-        distortion=distortion,
-        fisheye=fisheye,
-        repair=repair,
-    )
+    return View(name, pose, x or y, y or x, cx, cy, width, height, distortion, fisheye, repair=repair)
 
 
 def frame_where(path: Path, index: int, frame: dict) -> str:
@@ -253,7 +241,7 @@ def _lens(sources: tuple[dict, dict], where: str) -> tuple[bool, tuple[float, ..
             raise UnsupportedCamera(
                 f"{where}: a fisheye with p1 or p2, expected k1 to k4; undistort the photos"
             )
-        return True, tuple(numbers[key] for key in ("k1", "k2", "k3", "k4"))
+        return True, tuple(numbers[key] for key in FISHEYE_BENDS)
     if model not in PERSPECTIVE | {RATIONAL}:
         raise UnsupportedCamera(
             f"{where}: a camera with {model[:40]}, expected a pinhole or a fisheye with OpenCV's distortion; "

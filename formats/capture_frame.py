@@ -82,7 +82,7 @@ def _spread(looks: np.ndarray) -> float:
 def _crossings(eyes: np.ndarray, looks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to both axes (P, 3) of the pairs that cross at an angle, and whether it lies before
     both cameras (P,)."""
-    chosen = np.unique(np.linspace(0, len(eyes) - 1, min(len(eyes), PAIRS_FROM)).astype(int))
+    chosen = evenly(len(eyes), PAIRS_FROM)
     eyes, looks = eyes[chosen], looks[chosen]
     i, j = np.triu_indices(len(eyes), 1)
     cosine = np.einsum("pk,pk->p", looks[i], looks[j])
@@ -128,6 +128,11 @@ def box_around(points: np.ndarray) -> np.ndarray:
     low, high = points.min(0), points.max(0)
     margin = BORDER * (high - low).max()
     return np.concatenate([low - margin, high + margin])
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most so many of 0 to count - 1, evenly spaced, rising."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 def sphere(count: int) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from formats.capture_frame import box_around, default_box, scene_frame
 from formats.errors import NoViews, printable
-from formats.listed_photos import SplitPart
+from formats.frame_list import SplitPart
 from formats.masks import with_masks_beside
 from formats.photos import alike_turned
 from formats.points import SparsePoints

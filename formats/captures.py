@@ -8,20 +8,20 @@ World axes and units stay as the file has them: nothing is recentred, turned or 
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from formats import colmap, llff, opensfm, polycam
 from formats.atomic import atomic_writer
-from formats.cameras import read_cameras, read_document
+from formats.cameras import BENDS, FISHEYE_BENDS, read_cameras, read_document
 from formats.capture_of import capture_of
 from formats.errors import BadModel, FormatError, MissingFile, NoPoses, NotACapture, NoViews, printable
-from formats.frame_list import read_sound, repair_notes
+from formats.frame_list import SplitPart, read_listed, read_sound, repair_notes
 from formats.images import read_image_header, write_png
-from formats.listed_photos import SplitPart, read_listed
 from formats.matching import PHOTO_FOLDERS, gone
 from formats.meshes import is_mesh, mesh_capture
 from formats.other_files import is_json, not_a_capture, other_cameras
@@ -44,7 +44,6 @@ from formats.photos import (
 from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
 from formats.transforms import (
     BLENDER_FILE,
-    read_part,
     read_splits,
     sparse_points,
     stated_aabb,
@@ -88,14 +87,7 @@ def is_capture(path: Path | str) -> bool:
 
 def _has_poses(path: Path) -> bool:
     """Whether cameras lie in a folder as one of the layouts has them."""
-    return (
-        any(path.glob("transforms*.json"))
-        or colmap.model_folder(path) is not None
-        or is_file(path / llff.NAME)
-        or polycam.keyframes(path) is not None
-        or pose_files(path) is not None
-        or opensfm.reconstruction(path) is not None
-    )
+    return any(path.glob("transforms*.json")) or _layout(path) is not None
 
 
 def _captures_below(path: Path) -> list[Path]:
@@ -157,32 +149,32 @@ def read_capture(path: Path | str, downscale: int | None = None) -> Capture:
     return _read_transforms(path, downscale)
 
 
-def _read_folder(path: Path, downscale: int | None) -> Capture:
+def _layout(path: Path) -> Callable[[int | None], Capture] | None:
+    """What reads the poses in a folder, at a scale, by its layout; None where none lie there."""
     train, val, test, single = (path / f"transforms{split}.json" for split in ("_train", "_val", "_test", ""))
     if train.exists() or val.exists():
         known = train if train.exists() else val
-        return _read_blender(path, downscale, known, test if test.exists() else None)
+        return partial(_read_blender, path, train=known, test=test if test.exists() else None)
     if single.exists():
-        return _read_transforms(single, downscale)
+        return partial(_read_transforms, single)
     if test.exists():
-        return _read_blender(path, downscale, test=test)
+        return partial(_read_blender, path, test=test)
     if (model := colmap.model_folder(path)) is not None:
-        try:
-            return _read_colmap(path, model, downscale)
-        except NoViews as error:
-            # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
-            if not is_file(path / llff.NAME):
-                raise
-            capture = _read_llff(path / llff.NAME, downscale)
-            return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
+        return partial(_read_colmap, path, model)
     if is_file(path / llff.NAME):
-        return _read_llff(path / llff.NAME, downscale)
+        return partial(_read_llff, path / llff.NAME)
     if (places := polycam.keyframes(path)) is not None:
-        return _read_polycam(path, *places, downscale)
+        return partial(_read_polycam, path, *places)
     if (files := pose_files(path)) is not None:
-        return _read_pose_files(path, files, downscale)
+        return partial(_read_pose_files, path, files)
     if (file := opensfm.reconstruction(path)) is not None:
-        return _read_opensfm(path, file, downscale)
+        return partial(_read_opensfm, path, file)
+    return None
+
+
+def _read_folder(path: Path, downscale: int | None) -> Capture:
+    if (read := _layout(path)) is not None:
+        return read(downscale)
     if len(below := list(path.glob("*/transforms.json"))) == 1:
         return _read_transforms(below[0], downscale, path)
     below = _captures_below(path)
@@ -213,17 +205,15 @@ def _read_below(path: Path, below: Path, downscale: int | None) -> Capture:
 def _read_blender(
     path: Path, downscale: int | None, train: Path | None = None, test: Path | None = None
 ) -> Capture:
-    first = train or test
-    parts, notes = [read_part(first, downscale)], ()
+    first, notes = train or test, ()
+    document, part, _ = read_splits(first, first.parent, downscale)
+    parts = [part, SplitPart()] if train else [SplitPart(), part]
     if train and test:
         try:
-            parts.append(read_part(test, downscale))
+            parts[1] = read_splits(test, test.parent, downscale)[1]
         except NoViews as error:
-            parts.append(SplitPart())
             notes = (f"{error}; none are held out by it",)
-    parts = [*parts, SplitPart()] if train else [SplitPart(), *parts]
-    stated = stated_aabb(first, read_document(first))
-    return capture_of(path, "blender", *parts[:2], stated=stated, notes=notes)
+    return capture_of(path, "blender", *parts, stated_aabb(first, document), notes=notes)
 
 
 def _read_transforms(path: Path, downscale: int | None, base: Path | None = None) -> Capture:
@@ -243,7 +233,11 @@ def _read_colmap(path: Path, folder: Path, downscale: int | None) -> Capture:
         notes = (*others, *model.notes)
         return _read_model(path, "colmap", model, base, (*colmap.PHOTOS_IN, ""), downscale, notes)
     except NoViews as error:
-        raise NoViews("; ".join([str(error), *others])) from error
+        # The smaller copies of LLFF's scenes have other names than COLMAP's model of them.
+        if not is_file(path / llff.NAME):
+            raise NoViews("; ".join([str(error), *others])) from error
+        capture = _read_llff(path / llff.NAME, downscale)
+        return replace(capture, notes=(f"{error}; {llff.NAME} is read instead", *capture.notes))
 
 
 def _read_model(
@@ -392,13 +386,13 @@ def _intrinsics(view: View, more: bool) -> dict:
     keys = ("fl_x", "fl_y", "cx", "cy")
     inner = {key: getattr(view, key) for key in keys} | {"w": view.width, "h": view.height}
     if view.fisheye:
-        model, bends = "OPENCV_FISHEYE", dict(zip(("k1", "k2", "k3", "k4"), view.distortion, strict=True))
+        model, bends = "OPENCV_FISHEYE", dict(zip(FISHEYE_BENDS, view.distortion, strict=True))
     else:
         *low, k4, d1, d2, d3 = (*view.distortion, *(0.0,) * (9 - len(view.distortion)))
-        bends = dict(zip(("k1", "k2", "k3", "p1", "p2"), low, strict=True))
+        bends = dict(zip(BENDS, low, strict=True))
         model = "FULL_OPENCV" if d1 or d2 or d3 else "OPENCV"
         bends |= {"k4": d1, "k5": d2, "k6": d3} if model == "FULL_OPENCV" else {"k4": k4}
-    bends = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), 0.0) | bends
+    bends = dict.fromkeys(BENDS, 0.0) | bends
     if not more:
         return inner | {key: value for key, value in bends.items() if key != "k4"}
     return {**inner, "camera_model": model, **dict.fromkeys(("k4", "k5", "k6"), 0.0), **bends}

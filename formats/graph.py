@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from formats.errors import FormatError
+from formats.errors import BadSchema, FormatError
 from formats.nodes import WHITE, check_name, multiplied
 from formats.scene import Node, SceneGraph
 
@@ -90,6 +90,21 @@ def without(scene: SceneGraph, names: Container[str]) -> SceneGraph:
 def with_nodes(scene: SceneGraph, nodes: Iterable[Node]) -> SceneGraph:
     """The scene with more nodes, behind those it has."""
     return replace(scene, nodes=(*scene.nodes, *nodes))
+
+
+def holding(node: Node, nodes: tuple[Node, ...], rule: str, own_rule: str) -> Node:
+    """A node among others of a rule that holds nodes in place of its source, which are one by a rule of their
+    own. Raises BadSchema where it has children of the other rule."""
+    if own_rule != rule and node.children:
+        raise BadSchema(
+            f"node {node.name!r}: the composition of its source is {own_rule!r}, but that of its children "
+            f"{rule!r}; put them into a group of their own"
+        )
+    if node.background:
+        nodes = tuple(replace(one, background=True) for one in nodes)
+    composition = node.composition if own_rule == rule else own_rule
+    nodes = (*nodes, *node.children)
+    return replace(node, source=None, background=False, children=nodes, composition=composition)
 
 
 def lifted(node: Node, kept: Container[str] = ()) -> Node:

@@ -12,7 +12,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, MixedSizes
+from formats.errors import BadImage, FormatError, LimitExceeded, MixedSizes
 from formats.other_files import HEAD, identify
 from formats.png import png_writer
 from formats.safe_input import open_input
@@ -298,8 +298,7 @@ def _unread(path: Path | str, head: bytes) -> FormatError:
         return BadImage(
             f"{path}: the picture cannot be decoded (damaged, or in no known format); replace or remove it"
         )
-    kind = MissingExtra if other.extra else BadImage
-    return kind(f"{path}: is {other.what}, which is not read as a photo; {other.cure}")
+    return other.error(f"{path}: is {other.what}, which is not read as a photo", BadImage)
 
 
 def _check_header(image, path: Path | str) -> None:

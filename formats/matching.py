@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
-from formats.errors import counted
+from formats.errors import counted, listed
 from formats.photos import (
     HEIF,
     Folder,
@@ -400,9 +400,8 @@ def gone(missing: Sequence[str]) -> list[str]:
     """A sentence about photos that are left out since they are not there or of 0 bytes."""
     if not missing:
         return []
-    more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
     count = counted(len(missing), "photo is not there or empty", "photos are not there or empty")
-    return [f"{count} and left out: {', '.join(missing[:NAMED])}{more}"]
+    return [f"{count} and left out: {listed(missing, NAMED)}"]
 
 
 def _differs(file: str, photo: Path) -> bool:

@@ -4,7 +4,7 @@ import unicodedata
 from collections.abc import Iterable
 
 MAX_NAME_BYTES = 200
-"""A picture is written under the name of its camera, with an ending."""
+"""A picture is written under the name of its camera, with an ending: file systems end at 255."""
 SHORT = 40
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.cameras import MAX_JSON, checked_focal, checked_size, stated_number
+from formats.cameras import BENDS, FISHEYE_BENDS, MAX_JSON, checked_focal, checked_size, stated_number
 from formats.colmap import Image, Model
 from formats.errors import BadJson, BadModel, BadPose, FormatError, UnsupportedCamera
 from formats.frame_list import read_sound
@@ -25,7 +25,6 @@ NAME, PROJECT = "reconstruction.json", "opensfm"
 """The file, and the folder that OpenDroneMap keeps it in beside its photos."""
 PINHOLES = ("perspective", "simple_radial", "radial", "brown")
 FISHEYES = ("fisheye", "fisheye_opencv")
-BENDS = ("k1", "k2", "k3", "p1", "p2")
 HEAD = 1 << 16
 
 
@@ -100,7 +99,7 @@ def _view(where: str, camera: dict, shot: dict) -> View:
         checked_focal(longer * (numbers[key] or numbers["focal"]), where) for key in ("focal_x", "focal_y")
     ]
     centre = width / 2 + longer * numbers["c_x"], height / 2 + longer * numbers["c_y"]
-    bends = ("k1", "k2", "k3", "k4") if kind in FISHEYES else BENDS
+    bends = FISHEYE_BENDS if kind in FISHEYES else BENDS
     bends = tuple(numbers[key] for key in bends)
     return View("", pose, *focals, *centre, width, height, bends, kind in FISHEYES, repair=repair)
 

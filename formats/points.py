@@ -10,7 +10,6 @@ from formats.errors import BadModel, counted
 from formats.ply_elements import AXES, read_elements, rgb_of
 from formats.safe_input import read_input
 
-MAX_BYTES = 2**31
 MAX_POINTS = 5_000_000
 """Of more points every second, third and so on is read."""
 
@@ -58,7 +57,7 @@ def read_ply_points(path: Path | str, most: int = MAX_POINTS) -> SparsePoints:
 
     Raises BadModel, LimitExceeded (before anything is allocated), MissingFile.
     """
-    _, elements = read_elements(path, read_input(path, MAX_BYTES), BadModel)
+    _, elements = read_elements(path, read_input(path), BadModel)
     columns = next((columns for name, columns in elements if name == "vertex"), {})
     if not all(isinstance(columns.get(axis), np.ndarray) for axis in AXES):
         raise BadModel(f"{path}: its vertices lack x, y or z; export the points again")

@@ -106,9 +106,7 @@ class FieldHeader:
 
     @property
     def precision(self) -> str:
-        """The one of PRECISIONS that it was written with, as its arrays show: the most exact one where
-        another program mixed several.
-        """
+        """The one of PRECISIONS that it was written with, as its arrays show; of several the most exact."""
         if any(self.specs[name].dtype == DTYPES["F32"] for name in self.plain):
             return "float32"
         bits = max((spec.bits for spec in self.coded.values()), default=None)

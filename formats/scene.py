@@ -276,15 +276,6 @@ def is_scene(path: Path | str) -> bool:
     return isinstance(content, dict) and content.get("format") == FORMAT
 
 
-def scene_schema() -> dict:
-    """JSON Schema (draft 2020-12) of scene.json, the one in `formats/scene.schema.json`."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "rfpack scene graph",
-        **msgspec.json.schema(SceneSchema),
-    }
-
-
 def _check_version(content: object, where: str) -> bool:
     """Whether a minor version newer than ours wrote `content`."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -344,15 +335,13 @@ def _check_extent(nodes: object, where: str) -> None:
 
 
 def _known(nodes: object) -> object:
-    """`nodes` without the keys that a newer minor version may have added."""
-    if not isinstance(nodes, list):
+    """Nodes without the keys that a newer minor version may have added."""
+    if isinstance(nodes, list):
+        return [_known(node) for node in nodes]
+    if not isinstance(nodes, dict):
         return nodes
-    return [_known_node(node) if isinstance(node, dict) else node for node in nodes]
-
-
-def _known_node(node: dict) -> dict:
-    known = {key: value for key, value in node.items() if key in NODE_KEYS}
-    return known | {"children": _known(node["children"])} if "children" in node else known
+    known = {key: value for key, value in nodes.items() if key in NODE_KEYS}
+    return known | {"children": _known(known["children"])} if "children" in known else known
 
 
 def _build_node(content: dict) -> Node:

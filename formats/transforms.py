@@ -18,9 +18,9 @@ from formats.cameras import (
     written_path,
 )
 from formats.capture_frame import depth_range
-from formats.errors import BadSchema, FormatError, MissingFile, NoViews, ResourceError, counted
+from formats.errors import BadSchema, MissingFile, NoViews, counted, noted
+from formats.frame_list import SplitPart, read_listed
 from formats.images import Header
-from formats.listed_photos import SplitPart, read_listed
 from formats.matching import find_file, stem_key
 from formats.photos import Folder, natural
 from formats.points import MAX_POINTS, SparsePoints, points_notes, read_ply_points
@@ -34,18 +34,14 @@ AGREEING = 0.95
 """Share of a model's observations that lie in the pictures that they are of, if it is of this capture."""
 
 
-def read_part(path: Path, downscale: int | None) -> SplitPart:
-    """All frames of a file."""
-    document = read_document(path)
-    (part,) = _views(path, document, path.parent, [_frames(path, document)], downscale)
-    return part
-
-
 def read_splits(path: Path, base: Path, downscale: int | None) -> tuple[dict, SplitPart, SplitPart]:
     """The document of a nerfstudio or instant-ngp file in a capture's folder `base` or below it, and its
     frames to train on and to test with."""
     document = read_document(path)
-    frames = _frames(path, document)
+    if not (frames := list(enumerate(read_frames(path, document)))):
+        raise NoViews(
+            f'{path}: its list of "frames" is empty, expected one per photo; export the poses again'
+        )
     *splits, notes = _split(path, document, frames)
     train, test = _views(path, document, base, splits, downscale)
     return document, replace(train, notes=(*train.notes, *notes)), test
@@ -55,15 +51,6 @@ def read_splits(path: Path, base: Path, downscale: int | None) -> tuple[dict, Sp
 
 Numbered = tuple[int, dict]
 """A frame and its place in the file."""
-
-
-def _frames(path: Path, document: dict) -> list[Numbered]:
-    frames = read_frames(path, document)
-    if not frames:
-        raise NoViews(
-            f'{path}: its list of "frames" is empty, expected one per photo; export the poses again'
-        )
-    return list(enumerate(frames))
 
 
 def _views(
@@ -241,30 +228,21 @@ def sparse_points(path: Path, document: dict, views: tuple[View, ...], most: int
     """The points of the COLMAP model that the capture was made from, where it lies beside and is of the same
     photos, or else those that `ply_file_path` names, at most so many; and a note where they were to be there
     but are not."""
-    written, sparse = written_path(document, "ply_file_path"), Sparse()
-    ply = find_file(path.parent, written) if written else None
+    written, notes, model, cloud = written_path(document, "ply_file_path"), [], None, None
+    points, seen, ply = None, None, find_file(path.parent, written) if written else None
     if "applied_transform" in document and (folder := colmap.model_folder(path.parent)) is not None:
-        try:
-            points, seen = colmap.read_points(folder, most)
-        except ResourceError:
-            raise
-        except FormatError as error:
-            sparse = Sparse(notes=(f"{error}; {path} is read without that model",))
-        else:
-            sparse = _agreeing(Sparse(_placed(path, document, points, views), seen), views)
-    if sparse.seen is None and ply:
-        try:
-            points = read_ply_points(ply, most)
-        except ResourceError:
-            raise
-        except FormatError as error:
-            sparse = replace(sparse, notes=(*sparse.notes, f"{error}; {path} is read without these points"))
-        else:
-            sparse = Sparse(_placed(path, document, points, views), None, sparse.notes)
-    elif sparse.points is None and written:
-        missing = f"{path}: its sparse points {written} do not exist and are not used"
-        sparse = Sparse(notes=(*sparse.notes, missing))
-    return replace(sparse, notes=(*sparse.notes, *points_notes(ply or path, sparse.points)))
+        with noted(notes, f"{path} is read without that model"):
+            model = colmap.read_points(folder, most)
+    if model is not None:
+        points = _placed(path, document, model[0], views)
+        seen = model[1] if points is not None and _agrees(points, model[1], views) else None
+    if seen is None and ply:
+        with noted(notes, f"{path} is read without these points"):
+            cloud = read_ply_points(ply, most)
+        points = points if cloud is None else _placed(path, document, cloud, views)
+    elif points is None and written:
+        notes.append(f"{path}: its sparse points {written} do not exist and are not used")
+    return Sparse(points, seen, (*notes, *points_notes(ply or path, points)))
 
 
 def _placed(
@@ -278,14 +256,14 @@ def _placed(
     return max(candidates, key=lambda moved: _seen_share(moved, views))
 
 
-def _agreeing(sparse: Sparse, views: tuple[View, ...]) -> Sparse:
-    """Points without what a model says of photos that do not show them so: it is of others, or posed anew."""
-    seen_by_view = [(view, sparse.seen.get(_photo_key(view))) for view in views]
-    seen_by_view = [(view, seen) for view, seen in seen_by_view if seen is not None and len(seen)]
-    if sparse.points is None or not seen_by_view:
-        return replace(sparse, seen=None)
-    shown = np.concatenate([view.shown(sparse.points.positions[seen])[3] for view, seen in seen_by_view])
-    return sparse if shown.mean() > AGREEING else replace(sparse, seen=None)
+def _agrees(points: SparsePoints, seen: Mapping[str, np.ndarray], views: tuple[View, ...]) -> bool:
+    """Whether photos show the points that a model says they do: if not, it is of others, or posed anew."""
+    shown = [
+        view.shown(points.positions[indices])[3]
+        for view in views
+        if (indices := seen.get(_photo_key(view))) is not None and len(indices)
+    ]
+    return bool(shown) and np.concatenate(shown).mean() > AGREEING
 
 
 def _applied(path: Path, document: dict) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, LimitExceeded, MissingExtra
+from formats.errors import BadMesh, LimitExceeded, MissingExtra, listed
 from formats.rotations import matrices
 from formats.safe_input import read_input
 from formats.surfaces import gltf_schema as schema
@@ -33,7 +33,6 @@ from formats.surfaces.surface import (
     check_budget,
     check_indices,
     laid,
-    listed,
     sound_colours,
 )
 

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from formats.errors import listed
 from formats.surfaces import gltf_schema as schema
 from formats.surfaces.accessors import Buffers, data_uri, is_data
 from formats.surfaces.pictures import Pictures
-from formats.surfaces.surface import Notes, Texture, listed
+from formats.surfaces.surface import Notes, Texture
 
 GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 TRANSFORM = "KHR_texture_transform"

@@ -10,10 +10,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from formats.errors import listed
 from formats.surfaces.lines import lines_of
 from formats.surfaces.named_files import Beside
 from formats.surfaces.pictures import Pictures
-from formats.surfaces.surface import Notes, Paint, Texture, listed, opaque
+from formats.surfaces.surface import Notes, Paint, Texture, opaque
 
 ONE_WORD = ("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type")
 ARGUMENTS = {**dict.fromkeys(ONE_WORD, 1), "-mm": 2}

@@ -7,14 +7,13 @@ from urllib.parse import unquote
 
 from formats.errors import FormatError, LimitExceeded, MissingFile, OutsideFolder
 from formats.names import folded
-from formats.safe_input import read_input
+from formats.safe_input import MAX_BYTES, read_input
 from formats.surfaces.lines import western, without_comment
 
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 """One letter alone is a drive of Windows."""
 LOCAL = re.compile(r"file:(?=/)", re.IGNORECASE)
 ABSOLUTE = re.compile(r"[A-Za-z]:|/|\\")
-MAX_FILE = 2**31
 MAX_NAME = 1024
 
 
@@ -35,11 +34,11 @@ class Beside:
         MissingFile, OutsideFolder, and what `read_input` raises.
         """
         path = self.find(name, uri=uri)
-        data = read_input(path, MAX_FILE)
+        data = read_input(path)
         self.bytes_read += len(data)
-        if self.bytes_read > 2 * MAX_FILE:
+        if self.bytes_read > 2 * MAX_BYTES:
             raise LimitExceeded(
-                f"{name}: the files that the mesh names have more than {2 * MAX_FILE:,} bytes"
+                f"{name}: the files that the mesh names have more than {2 * MAX_BYTES:,} bytes"
             )
         return data, path.name
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh, FormatError
+from formats.errors import BadMesh, FormatError, listed
 from formats.safe_input import read_input
 from formats.surfaces.lines import lines_of, numbers_in, table, western, without_comment
 from formats.surfaces.mtl import FIRST_TILE, TILES_ACROSS, Appearances, Material, check_repeated, parse_mtl
@@ -18,11 +18,9 @@ from formats.surfaces.surface import (
     check_budget,
     check_indices,
     laid,
-    listed,
     sound_colours,
 )
 
-MAX_FILE = 2**31
 AT_ONCE = 1 << 18
 """Corners of faces that are kept as text."""
 FREE_FORM = ("curv", "curv2", "surf", "cstype", "parm", "bzp", "bsp", "cdc", "cdp")
@@ -39,7 +37,7 @@ POLYPAINT = re.compile(rb"^#MRGB +([0-9a-fA-F]+)", re.MULTILINE)
 
 def read_obj(path: Path | str, notes: Notes) -> list[Surface]:
     """All faces, a surface for each material. Raises BadMesh, LimitExceeded, MissingFile."""
-    data = read_input(path, MAX_FILE)
+    data = read_input(path)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise BadMesh(f"{path}: is text in UTF-16; save the mesh in UTF-8")
     text = _Text(path, notes)

@@ -11,14 +11,13 @@ from formats.surfaces.lines import table, within
 from formats.surfaces.polygons import triangulated
 from formats.surfaces.surface import Notes, Surface, check_budget, check_indices, sound_colours
 
-MAX_FILE = 2**30
 KEYWORD = re.compile(r"(ST)?(C)?(N)?OFF$")
 OTHER = re.compile(r"(ST)?C?N?(4|4?n)OFF$")
 
 
 def read_off(path: Path | str, notes: Notes) -> list[Surface]:
     """All faces. Raises BadMesh, LimitExceeded, MissingFile."""
-    data = read_input(path, MAX_FILE)
+    data = read_input(path)
     rows = (line.partition("#")[0].strip() for line in data.decode("latin-1").splitlines())
     lines = [row for row in rows if row]
     keyword, n_points, n_faces, at = _header(path, lines)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.errors import BadMesh
+from formats.errors import BadMesh, listed
 from formats.ply_elements import AXES, HUES, Lists, read_elements, rgb_of
 from formats.safe_input import read_input
 from formats.surfaces.named_files import Beside
@@ -19,12 +19,10 @@ from formats.surfaces.surface import (
     check_budget,
     check_indices,
     laid,
-    listed,
     opaque,
     sound_colours,
 )
 
-MAX_FILE = 2**31
 TEXTURE = re.compile(r"comment +texturefile:? +(.+)", re.IGNORECASE)
 CORNERS = ("vertex_indices", "vertex_index")
 COORDINATES = tuple(
@@ -40,7 +38,7 @@ OF_NO_LOOKS = ("camera", "range_grid")
 
 def read_ply(path: Path | str, notes: Notes) -> list[Surface]:
     """Faces and strips. Raises BadMesh, LimitExceeded (before anything is allocated), MissingFile."""
-    data = read_input(path, MAX_FILE)
+    data = read_input(path)
     lines, elements = read_elements(path, data, BadMesh)
     read = {}
     for element, columns in elements:
@@ -130,15 +128,14 @@ def _textured(path, positions, corners, uv, numbers, textures, rest, notes: Note
         chosen = numbers == number
         flat = corners[chosen].reshape(-1)
         faces = np.arange(len(flat), dtype=np.int32).reshape(-1, 3)
+        look = {
+            "colours": None if rest["colours"] is None else rest["colours"][flat],
+            "face_colours": None if rest["face_colours"] is None else rest["face_colours"][chosen],
+        }
         if number in pictures:
-            texture = Texture(opaque(pictures[number]))
-            paint = laid(Paint(np.ones(4, np.float32), texture), uv[chosen].reshape(-1, 2))
-            surfaces.append(Surface(positions[flat], faces, paint))
-            continue
-        colours, face_colours = rest["colours"], rest["face_colours"]
-        colours = None if colours is None else colours[flat]
-        face_colours = None if face_colours is None else face_colours[chosen]
-        surfaces.append(Surface(positions[flat], faces, colours=colours, face_colours=face_colours))
+            paint = Paint(np.ones(4, np.float32), Texture(opaque(pictures[number])))
+            look = {"paint": laid(paint, uv[chosen].reshape(-1, 2))}
+        surfaces.append(Surface(positions[flat], faces, **look))
     return surfaces
 
 
