@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from benchmarks.commit import commit_line
 from fusedrf_cli.engine.distillation.losses import point_step
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.distillation.teacher import TeacherPoints
@@ -91,7 +92,8 @@ def query_row(field: VMField, generator: torch.Generator, with_colour: bool) -> 
         else:
             sections = field.with_params(params).slot_sections()["density"]
             features = density.module.reference(field, sections, unit, None, **density.options)
-            reference.density(features.sum(1), field.scale, field.shift).sum().backward()
+            sigma = field.slots["sigma"]
+            sigma.module.reference(field, {}, features, **sigma.options)[0].sum().backward()
 
     what = "query forward and backward, density" + with_colour * " and colour"
     return Row(what, "point", POINTS, ours, theirs, POINTS)
@@ -202,6 +204,7 @@ def main() -> None:
     full = VMField.create(VMShape(), BOX, (TEXELS,) * 3, generator)
     shell = shell_field(generator)
     rays = rays_through(generator)
+    print(f"{commit_line()}\n")
     print(f"{TEXELS} texels per axis, ranks 16 and 24, SH degree 2; {torch.get_num_threads()} threads\n")
     print("| work | rate | times faster than torch |")
     print("|---|---|---|")

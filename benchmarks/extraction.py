@@ -21,6 +21,7 @@ import trimesh
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion
 
+from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import Kept, fusedrf, tell
 from formats.captures import read_cameras, read_capture
@@ -32,7 +33,8 @@ from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import render_image
 
 ABOUT = (
-    "Written by `python -m benchmarks.extraction DATA`. *IoU* is that of the object's silhouette (half "
+    "Written by `python -m benchmarks.extraction DATA`; parts that a run leaves out stay, each with its "
+    "*commit*. *IoU* is that of the object's silhouette (half "
     "opaque) and the true one, mean and worst of the views whose masks were not given; *together* is the "
     "PSNR of object and rest, composed, against the field before, over whole 8-bit pictures; *seconds* are "
     "those of the whole command; *rim* is the mean difference of colours, of 255, within three pixels of the "
@@ -313,7 +315,7 @@ def write_page(out: Path, found: dict[str, list[dict]]) -> None:
     found = (json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}) | found
     path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     rows = [row for part in PARTS if part in found for row in found[part]]
-    text = f"# Objects cut out of fields\n\n{ABOUT}\n\n{markdown(rows)}"
+    text = f"# Objects cut out of fields\n\n{commit_line()}\n\n{ABOUT}\n\n{markdown(rows)}"
     (out / "extraction.md").write_text(text, encoding="utf-8")
 
 
@@ -342,6 +344,7 @@ def main() -> None:
         for part in asked.part or PARTS:
             measure, seconds = PARTS[part]
             rows = measure(folder, asked.data.resolve(), seconds * asked.share)
+            rows = [row | commit_column() for row in rows]
             write_page(asked.out, {part: rows})
 
 

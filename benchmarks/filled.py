@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.commit import commit_line
 from benchmarks.paper.sources import PLACES, make, write_scene
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, tell
@@ -238,6 +239,7 @@ def main() -> None:
         folder = (asked.keep or Path(name)).resolve()
         folder.mkdir(parents=True, exist_ok=True)
         train(folder, asked.data.resolve())
+        print(f"{commit_line()}\n")
         for frames in [filled_frames(folder), *crowded_frames(folder)]:
             print(markdown(rows(frames, asked.frames, asked.naive)), flush=True)
         for wanted, measure in ((asked.first, first_frames), (asked.fused, fused_alike)):

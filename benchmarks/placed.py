@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, stored_rows, tell, write_csv
 from fusedrf_cli.bridge.capture_cameras import camera_set_of
@@ -43,7 +44,8 @@ KINDS = ("blocks", "vm", "sparse")
 MOST = "50MB"
 FRAME, FRAMES = (800, 533), 9
 ABOUT = (
-    "Written by `make bench-real`. The chair, the tankard and the bottle stand on the bear's rock; PSNR is "
+    "Written by `make bench-real`; rows that a run leaves out stay, each with its *commit*. "
+    "The chair, the tankard and the bottle stand on the bear's rock; PSNR is "
     "that of the fused field against the composition, mean of views from where the photos were taken and of "
     "views of each object from where it was photographed, none of which anything was learnt from; *the worst "
     f"object* is the mean of its own views. *frame* is the median of {FRAMES} pictures of "
@@ -100,7 +102,8 @@ def measured(folder: Path, kind: str) -> dict:
         "frame, s": own,
         "over the background's": own / alone,
     }
-    return {"kind": kind} | {k: "" if v is None else f"{v:.3g}" for k, v in figures.items()}
+    row = {k: "" if v is None else f"{v:.3g}" for k, v in figures.items()}
+    return {"kind": kind} | row | commit_column()
 
 
 def frame_seconds(bundles: list[Path]) -> list[float]:
@@ -123,7 +126,7 @@ def write_page(out: Path, rows: list[dict]) -> None:
     rows = rows + stored_rows(path, "kind", {row["kind"] for row in rows})
     rows.sort(key=lambda row: KINDS.index(row["kind"]))
     write_csv(path, rows)
-    text = f"# Objects on a real background\n\n{ABOUT}\n\n{markdown(rows)}"
+    text = f"# Objects on a real background\n\n{commit_line()}\n\n{ABOUT}\n\n{markdown(rows)}"
     (out / "placed.md").write_text(text, encoding="utf-8")
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper.figures import over_time
 from benchmarks.paper.table import markdown
 from benchmarks.paper.work import fusedrf, stored_rows, tell, write_csv
@@ -53,7 +54,8 @@ SHOWN_WIDTH = 320
 QUALITY = 80
 """Of JPEG: some 20 kB a picture."""
 ABOUT = (
-    f"Written by `make bench-real`. Every {EVERY}th photo is held out. PSNR is the mean over those photos, "
+    "Written by `make bench-real`; rows that a run leaves out stay, each with its *commit*. "
+    f"Every {EVERY}th photo is held out. PSNR is the mean over those photos, "
     "in the pixels that masks keep; *corrected* is after the affine map of colours that suits each photo "
     "best, which the photo itself tells; *gap* is the training PSNR less the held-out one; *mean colour* and "
     "*nearest photo* are what the mean colour of the training photos and a copy of the nearest one reach. "
@@ -102,7 +104,7 @@ def measured(folder: Path, name: str, capture: Capture, seconds: float, field: P
         "MB": report["bytes"] / 1e6,
         "seconds": total,
         "frame, s": frame_seconds(field, capture.test[len(capture.test) // 2]),
-    }
+    } | commit_column()
 
 
 def frame_seconds(field: Path, view: View) -> float:
@@ -150,7 +152,7 @@ def write_page(out: Path, rows: list[dict]) -> None:
     write_csv(out / "real.csv", rows)
     chart(rows, out / "psnr.svg")
     with (out / "real.csv").open(newline="", encoding="utf-8") as file:
-        text = f"# Real captures\n\n{ABOUT}\n\n{markdown(list(csv.DictReader(file)))}"
+        text = f"# Real captures\n\n{commit_line()}\n\n{ABOUT}\n\n{markdown(list(csv.DictReader(file)))}"
     text += "\n![PSNR over minutes](psnr.svg)\n\n## Held-out photos, and the field's pictures of them\n"
     for name in dict.fromkeys(row["capture"] for row in rows):
         if (out / f"{name}.jpg").exists():

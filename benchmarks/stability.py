@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from math import inf, log10
 from pathlib import Path
 
+from benchmarks.commit import commit_line
+
 PRESETS = ("draft", "normal", "high")
 COLOURS = {"draft": "#9ecae1", "normal": "#4292c6", "high": "#084594", "": "#7f7f7f"}
 COUNTS = {"A": 9, "B": 16, "C": 11, "D": 11}
@@ -78,6 +80,8 @@ def table(rows: dict[str, RowResult]) -> str:
     held = [r for r in ran if r.verdict == "pass"]
     lines = [
         "# Stability where methods fail",
+        "",
+        commit_line(),
         "",
         "Written by `make stability`. Each row is a situation in which radiance-field methods fail, with an "
         "adversarial scene whose truth is known in closed form (`tests/analytic`), the check that is nearest "

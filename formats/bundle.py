@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.archive import MAGIC, parse_archive, read_archive, write_archive
+from formats.archive import MAGIC, read_archive, write_archive
 from formats.atomic import atomic_writer, check_writable
 from formats.blocks import Instance, Unfolded, unfolded
 from formats.camera_set import read_camera_set
@@ -34,7 +34,7 @@ from formats.records import (
     sha256_of_bytes,
 )
 from formats.safe_input import open_input
-from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, make_node, parse_scene, read_scene
+from formats.scene import FORMAT, MEMBER, SceneGraph, dump_scene, parse_scene, read_scene
 
 SCENE = "scene.json"
 SHARED = "shared"  # of a field's metadata: its parts that are members of their own
@@ -129,8 +129,7 @@ class BundleWriter:
     >>> writer.write("chair.rfpack", SceneGraph((make_node("chair", field=member),)))
     """
 
-    def __init__(self, scene: SceneGraph | None = None):
-        self.scene = scene
+    def __init__(self):
         self.members: dict[str, bytes | memoryview] = {}
 
     def add_field(self, record: FieldRecord, precision: str = "float16") -> str:
@@ -172,33 +171,17 @@ class BundleWriter:
         self.members = read.views
         return read.scene
 
-    def write(self, path: Path | str, scene: SceneGraph | None = None, *, overwrite: bool = False) -> None:
-        """The bundle at `path`, whole or not at all; `scene` defaults to the writer's own.
+    def write(self, path: Path | str, scene: SceneGraph, *, overwrite: bool = False) -> None:
+        """The bundle of a scene at `path`, whole or not at all.
 
         Raises MissingMember (a node names a field not added), OutputExists, ResourceError, LimitExceeded.
         """
-        scene = scene or self.scene
         check_fields(scene, self.members, str(path))
         content = dump_scene(scene)
         check_writable(path, overwrite)
         members = [(SCENE, content), *sorted(self.members.items())]
         with atomic_writer(path, reserve=sum(len(data) for _, data in members)) as file:
             write_archive(file, members)
-
-
-def single_field_bundle(
-    record: FieldRecord,
-    name: str,
-    *,
-    precision: str = "float16",
-    history: Iterable[dict] = (),
-    generator: str = "fusedrf",
-) -> BundleWriter:
-    """A writer whose scene is one node `name` that holds one field; its `write(path)` needs no more."""
-    writer = BundleWriter()
-    member = writer.add_field(record, precision)
-    writer.scene = SceneGraph((make_node(name, field=member),), history=tuple(history), generator=generator)
-    return writer
 
 
 def field_member(record: FieldRecord, precision: str = "float16") -> tuple[str, bytes]:
@@ -235,11 +218,6 @@ def shared_members(
         if name not in members or name == member:
             raise MissingMember(f"{where}: {member} shares {part!r} as {name!r}, no member of this bundle")
     return parts
-
-
-def parse_bundle(data: bytes | memoryview, where: str) -> Bundle:
-    """As `read_bundle`, of bytes."""
-    return _bundle(parse_archive(memoryview(data), where), where, verify=True)
 
 
 def read_summary(path: Path | str) -> dict:

@@ -317,6 +317,15 @@ class KindType(click.ParamType):
         return value
 
 
+class FieldKindType(KindType):
+    """The name of a kind that fields are of."""
+
+    def names(self) -> list[str]:
+        from fusedrf_cli.engine.kinds import registry
+
+        return [name for name in registry.names() if name not in registry.WAYS]
+
+
 class KindsType(KindType):
     """'a,b' -> those kinds, in the order of their names."""
 

@@ -7,7 +7,7 @@ from fusedrf_cli import plots
 NAMES = {  # of the ways that are no kind to fuse with
     "background": "fuse --kind vm, from the background",
     "scratch": "fuse --kind vm --from-scratch --no-finetune",
-    "retraining": "100 views of the composition, then train",
+    "retraining": "views of the composition, then train",
 }
 
 

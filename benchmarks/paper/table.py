@@ -4,6 +4,7 @@ import csv
 import os
 from pathlib import Path
 
+from benchmarks.commit import commit_line
 from benchmarks.paper.work import write_csv
 
 MEASURES = {
@@ -36,7 +37,7 @@ ABOUT = (
     "Written by `make bench-paper` on {cores} CPU cores. PSNR and SSIM are against the naive composition, "
     "mean over views that nothing was trained or chosen on: of the whole scene, and of each object from "
     "where and as large as it was photographed. *Covered* is the PSNR of the pixels that the scene covers, "
-    "*covered share* how many of all they are."
+    "*covered share* how many of all they are. Parts that a run leaves out stay as they were."
 )
 PLOTS = {"capacity": "capacity", "times": "times", "smallest": "chart"}
 
@@ -57,7 +58,8 @@ def update(out: Path, seen: dict[str, str]) -> None:
 def page(out: Path, rows: list[dict]) -> str:
     """table.md of the measures and of the CSVs that are there."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    text = f"# The paper's experiments\n\n{ABOUT.format(cores=cores)}\n\n" + markdown(rows)
+    text = f"# The paper's experiments\n\n{commit_line()}\n\n{ABOUT.format(cores=cores)}\n\n"
+    text += markdown(rows)
     for part, what in PARTS.items():
         path = out / f"{part}.csv"
         if path.exists():

@@ -117,7 +117,7 @@ class Maker:
         self.builder, self.scene, self.request, self.background = builder, scene, request, background
         self.device, self.progress = device, progress
         self.budget = Budget(request.time_budget)
-        distil_config = builder.distil_config or DistilConfig()
+        distil_config = builder.distil_config or current(DistilConfig)
         compares = request.target_psnr is not None and builder.distil_config is None
         self.views = current(BuildingConfig).views if compares else distil_config.views
         size = distil_config.view_size, distil_config.view_size
@@ -285,13 +285,13 @@ class Maker:
         changed = [(source, one) for source, one in pairs if one is not source]
         learnt = {}
         for source, one in changed:
-            distil_config = self.distil_config_for(source, len(changed))
+            rays = self.rays_of(source, len(changed))
             learnt[id(one)] = own = one.with_params(one.params.clone())
             with self.budget.learning():
-                distil_config.teach(own, seconds=None if seconds is None else seconds / len(changed))
+                rays.teach(own, seconds=None if seconds is None else seconds / len(changed))
         return scene.with_fields(lambda one: learnt.get(id(one), one))
 
-    def distil_config_for(self, source: StoredField, count: int) -> FinetuneRays:
+    def rays_of(self, source: StoredField, count: int) -> FinetuneRays:
         """What there is to learn from of a source, one of so many; drawn once."""
         if (id(source), count) not in self.lessons:
             leaf = next(p for p in self.scene.composed.leaves() if p.field is source)
@@ -371,7 +371,7 @@ class Maker:
         warn_of_nonfinite(did.numeric, self.progress)
         if did.found_nothing:
             self.progress.warn(
-                "the student holds no matter yet; no cell was given up. Give it more --time-budget"
+                "the student has no density yet; no cell was given up. Give it more --time-budget"
             )
         return student, did
 

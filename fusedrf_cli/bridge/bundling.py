@@ -2,7 +2,7 @@
 history that tells what they were made of."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from formats.records import FieldRecord
 from formats.scene import Leaf, Node, SceneGraph
 from fusedrf_cli import __version__
 from fusedrf_cli.bridge.background import LEARNT, Background
-from fusedrf_cli.bridge.building import BestTrial
+from fusedrf_cli.bridge.building import BestTrial, FuseScene
 from fusedrf_cli.bridge.scene import NO_MEMBER, LoadedScene, SourceField, history_nodes, showing_of
 from fusedrf_cli.bridge.sizes import graph_bytes
 from fusedrf_cli.engine.composition.composed import ComposedField
@@ -30,15 +30,17 @@ from fusedrf_cli.requests import FuseRequest
 class FusedBundle:
     """What a scene is fused to, but for its numbers."""
 
-    def __init__(self, request: FuseRequest, everything: LoadedScene, loaded: LoadedScene, learnt: bool):
+    def __init__(self, request: FuseRequest, everything: LoadedScene, scene: FuseScene, learnt: bool):
         """everything: the scene with those of its fields that show nothing, which are left out; learnt:
         whether one field is learnt from it, and its sources are no nodes. Raises the FormatError of a scene
         that cannot be written."""
-        self.request, self.loaded, self.learnt = request, loaded, learnt
-        self.kept = {f.member: f.bundle for f in loaded.fields} if request.keep_sources else {}
-        self.nodes = history_nodes(loaded, request.output, self.kept)
-        self.composed = loaded.composed()
-        self.graph = named_graph(request, everything, loaded)
+        self.request, self.loaded, self.composed, self.learnt = request, scene.loaded, scene.composed, learnt
+        self.kept = {f.member: f.bundle for f in self.loaded.fields} if request.keep_sources else {}
+        self.nodes = history_nodes(self.loaded, request.output, self.kept)
+        whole = named_graph(request, everything)
+        self.hidden = [leaf.name for leaf in whole.leaves() if not leaf.visible]
+        """Nodes that are left out."""
+        self.graph = with_shown(whole, everything, self.loaded)
         self.framing: tuple[float, ...] | None = None
         self.cameras: dict | None = None
 
@@ -101,8 +103,8 @@ class FusedBundle:
         leaf = next(leaf for leaf, f in self.leaves if f is source)
         at = placement_of(leaf.object_to_world)
         node = Node(name, own, None, at, True, showing=showing_of(stays))
-        device = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
-        return SceneGraph((node, Node(LEARNT, member, None, device)))
+        at = placement_of(placement(self.composed.origin) @ learnt.object_to_world)
+        return SceneGraph((node, Node(LEARNT, member, None, at)))
 
     def of_instances(self, writer: BundleWriter, made: BestTrial) -> SceneGraph:
         """The scene's graph with the fields that were made of its own."""
@@ -162,17 +164,24 @@ def add(writer: BundleWriter, field: StoredField, precision: str) -> str:
 class Named(Embedding):
     """A scene whose nodes name all fields by the members of the bundles that they are in."""
 
-    def __init__(self, allow_outside: bool):
+    def __init__(self, allow_outside: bool, bundles: Iterable[OpenBundle]):
+        """bundles: that are open already."""
         super().__init__(BundleWriter(), allow_outside)
+        self.bundles = {bundle.path: bundle for bundle in bundles}
 
     def member(self, bundle: OpenBundle, member: str) -> str:
         """See Embedding: its own name, which is made of its bytes."""
         return member
 
 
-def named_graph(request: FuseRequest, everything: LoadedScene, loaded: LoadedScene) -> SceneGraph:
-    """The graph of a scene with the nodes of all its sources, but for those that show nothing."""
-    graph = Named(request.allow_outside).of(everything.graph, everything.path)
+def named_graph(request: FuseRequest, everything: LoadedScene) -> SceneGraph:
+    """The graph of a scene with the nodes of all its sources."""
+    bundles = (f.bundle for f in everything.fields)
+    return Named(request.allow_outside, bundles).of(everything.graph, everything.path)
+
+
+def with_shown(graph: SceneGraph, everything: LoadedScene, loaded: LoadedScene) -> SceneGraph:
+    """The graph of all of a scene without the nodes that are hidden, and those whose fields show nothing."""
     shown = {id(f) for f in loaded.fields}
     visible = iter([leaf.visible for leaf in graph.leaves()])
     fields = iter(everything.fields)

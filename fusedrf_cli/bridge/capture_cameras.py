@@ -77,5 +77,4 @@ def view_box_in_frame(scene: LoadedScene, field, origin: np.ndarray) -> np.ndarr
     frame lies at `origin` (see `render_image`)."""
     if scene.graph.framing is not None:
         return np.asarray(scene.graph.framing)
-    subject = field.look_at_box if isinstance(field, ComposedField) else field.occupancy.look_at_box
-    return placed_box(subject, origin)
+    return placed_box(field.occupancy.look_at_box, origin)

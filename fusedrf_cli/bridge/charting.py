@@ -43,8 +43,8 @@ class ChartConfig:
     """How fused fields are compared, and in which order they are tried."""
 
     views: int = 8
-    held_out: tuple[int, int] = (EvaluatorConfig.judged_seed, 2)
-    """A pair seeds a stream that no single number, as of --seed, does."""
+    stream: int = 2
+    """Of views, beside `judged_seed`: a pair seeds a stream that no single number, as of --seed, does."""
     rounds: int = 5
     """Of frames, all fields taking turns."""
     per_pixel_kept: int = 12
@@ -115,18 +115,18 @@ class Benchmark:
         given a box (6,) of the world, from all around that."""
         chart = current(ChartConfig)
         config = current(EvaluatorConfig)
+        held_out = config.judged_seed, chart.stream
         loaded = load_scene(scene, allow_outside, memory, device)
         needed = sources(loaded.sizes) | frame_memory(None, *size) | measured(*size)
         composed = composite_of(loaded, memory, needed)
         needed |= frame_memory(composed, *size)
         if box is None:
             cameras = [
-                look.camera
-                for look in evaluation_views_of(loaded, composed, chart.views, size, chart.held_out)
+                look.camera for look in evaluation_views_of(loaded, composed, chart.views, size, held_out)
             ]
             box = placed_box(composed.occupancy.look_at_box, composed.origin)
         else:
-            cameras = scattered(box, chart.views, *size, seed=chart.held_out)
+            cameras = scattered(box, chart.views, *size, seed=held_out)
         needed["the pictures to compare with"] = len(cameras) * size[0] * size[1] * chart.per_pixel_kept
         memory.expect(needed, advice="give a smaller --size")
         shots = [render_image(composed, c, origin=composed.origin) for c in cameras]

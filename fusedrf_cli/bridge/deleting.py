@@ -4,6 +4,7 @@ nodes, where they are known. No number is changed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from fusedrf_cli.bridge.inpainting import (
 from fusedrf_cli.bridge.rendering import renderable
 from fusedrf_cli.bridge.runtime import engine
 from fusedrf_cli.bridge.scene import load_fields, make_field, showing_of
-from fusedrf_cli.bridge.sources import SourceFolder, leaf_of, source_of
+from fusedrf_cli.bridge.sources import leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.resolution_report import extent
 from fusedrf_cli.engine.fields.base import StoredField
@@ -53,9 +54,8 @@ def delete(request: DeleteRequest, progress) -> dict:
             raise nothing_left(request.fused, request.names)
         deletion = Deletion(edit, request.names, request.allow_outside)
         deletion.drop()
-        if deletion.inside:
-            deletion.cut(request)
-        elif request.refit:
+        deletion.cut(request)
+        if request.refit and "photos" not in deletion.told:
             progress.warn("--refit is not needed: what the deleted objects hid is known")
         if not draft.graph.leaves():
             raise nothing_left(request.fused, request.names)
@@ -82,12 +82,16 @@ class Deletion:
         self.names, self.progress = set(names), edit.progress
         self.inside = {name: node for name, node in self.draft.inside.items() if name in self.names}
         """Those that were distilled into a field."""
+        self.unnamed = {leaf.name for leaf in holders_in(self.draft.graph)}
+        """The nodes of the fields that they were distilled into."""
         self.boxes: list[np.ndarray] = []
         """(6,) in the world, each: what was touched."""
         self.restored = True
         """Whether what they hid is shown."""
         self.told: dict = {}
         """For the report."""
+        self.learnt: list[tuple[Placed, str]] | None = None
+        """What photos show, and the precision to store it in."""
 
     def drop(self) -> None:
         """Take out those that are nodes."""
@@ -101,38 +105,39 @@ class Deletion:
         for name, node in self.inside.items():
             self.progress.phase(f"deleting {name}", None)
             box = np.asarray(node["aabb"], np.float64)
-            rest = self.remaining(box)
             holders = self.holders(box)
+            if not holders:
+                self.boxes.append(box)
+                continue
+            rest = self.remaining(box)
             if rest is None and request is not None and request.refit:
-                rest = self.from_photos(request, holders[0])
+                rest = self.from_photos(request, *holders[0])
             elif rest is None:
                 self.progress.warn(
                     "what the deleted objects hid stays empty; --refit PHOTOS learns it from photos, --fill "
                     "goes on smoothly with what is seen around it"
                 )
             self.restored &= rest is not None
-            widest = max(self.empty(leaf, box) for leaf in holders)
+            widest = max(self.empty(leaf, one, box) for leaf, one in holders)
             self.boxes.append(box + widest * np.repeat([-1.0, 1.0], 3))
             for one, precision in rest or ():
                 self.fill(one, precision, box, widest)
-        if request is not None and request.refit and "photos" not in self.told:
-            self.progress.warn("--refit is not needed: what the deleted objects hid is known")
 
-    def holders(self, box: np.ndarray) -> list[Leaf]:
-        """Of `holders_in` those that reach into a box (6,) of the world."""
-        unnamed = holders_in(self.draft.graph)
-        return [leaf for leaf in unnamed if self.placed(leaf).reaches(box)] or unnamed[:1]
+    def holders(self, box: np.ndarray) -> list[tuple[Leaf, Placed]]:
+        """The nodes that reach into a box (6,) of the world, of those of the fields that objects were
+        distilled into and of what filled earlier cuts, and their fields as they are stored."""
+        holders = []
+        for leaf in self.draft.graph.leaves():
+            if leaf.field is not None and (leaf.name in self.unnamed or belongs(leaf.name, (RESTORED,))):
+                field = make_field(self.draft.fields.field(leaf.field), self.draft.path)
+                one = Placed(leaf.name, field, leaf.object_to_world)
+                holders += [(leaf, one)] if one.reaches(box) else []
+        return holders
 
-    def placed(self, leaf: Leaf) -> Placed:
-        """A node's field in the world, as it is stored."""
-        field = make_field(self.draft.fields.field(leaf.field), self.draft.path)
-        return Placed(leaf.name, field, leaf.object_to_world)
-
-    def empty(self, leaf: Leaf, box: np.ndarray) -> float:
+    def empty(self, leaf: Leaf, one: Placed, box: np.ndarray) -> float:
         """Empty the cells of a node's field that reach into a box (6,) of the world; the side of such a
         cell."""
-        one = self.placed(leaf)
-        left = self.part(one, "restricted", lambda at: ((at < box[:3]) | (at > box[3:])).any(1))
+        left = self.part(one, "restricted", lambda at: ~inside(at, box))
         precision = self.draft.fields.headers[leaf.field].precision
         member = None if left is None else self.draft.put(left, precision)
         self.draft.graph = with_field(self.draft.graph, leaf.name, member)
@@ -142,12 +147,16 @@ class Deletion:
         """Add a node that shows what a field has in a box (6,) of the world, and in cells that reach into it;
         widest: the side of those that were emptied."""
         # Two cells beyond the cut: those are kept that lie wholly inside.
-        grown = box + (widest + 2 * side_of(one)) * np.repeat([-1, 1], 3)
-        part = self.part(one, "cropped", lambda at: inside(at, grown))
+        part = self.part_in(one, box, widest + 2 * side_of(one))
         if part is not None:
-            part = registry.kind(part.kind).trimmed(part)
             name = one.name if belongs(one.name, (RESTORED,)) else f"{RESTORED}/{one.name}"
             self.draft.add_node(name, part, one.object_to_world, precision)
+
+    def part_in(self, one: Placed, box: np.ndarray, beside: float) -> StoredField | None:
+        """What a field has in a box (6,) of the world, and so far beside it."""
+        grown = box + beside * np.repeat([-1, 1], 3)
+        part = self.part(one, "cropped", lambda at: inside(at, grown))
+        return part and registry.kind(part.kind).trimmed(part)
 
     def part(self, one: Placed, how: str, holds: Callable[[np.ndarray], np.ndarray]) -> StoredField | None:
         """What of a field lies where `holds` says so of points (N, 3) of the world: `cropped` or `restricted`
@@ -162,31 +171,48 @@ class Deletion:
         """The other objects that were distilled, as far as they reach into a box (6,) of the world, and the
         precisions that they are stored in: from inside the bundle or from their files. None, with a warning,
         where one of them is not found as it was."""
-        sources_left, draft = [], self.draft
-        for name, node in draft.inside.items():
-            if name in self.names:
-                continue
-            sources = source_of(node, leaf_of(node), draft.bundle, SourceFolder(None), self.allow_outside)
+        left = []
+        for name, node, sources in self.others:
             if not sources and (node.get("background") or boxes_overlap(np.asarray(node["aabb"]), box)):
                 self.progress.warn(
                     f"the source of '{name}' is gone, has changed, or lies outside of the folder"
                 )
                 return None
-            for leaf, file, member in sources:
-                one = load_fields(file.path, draft.graph, [(leaf, file, member)], None).placed[0]
-                if one.reaches(box):
-                    sources_left.append(
-                        (replace(one, field=opened(one.field)), file.headers[member].precision)
-                    )
-        return sources_left
+            left += [
+                (replace(one, field=opened(one.field)), precision)
+                for one, precision in sources
+                if one.reaches(box)
+            ]
+        return left
 
-    def from_photos(self, request: DeleteRequest, leaf: Leaf) -> list[tuple[Placed, str]]:
-        """What photos show, learnt in the frame of a node's field."""
-        edit, one = self.edit, self.placed(leaf)
-        frame = Frame(self.draft.path, self.draft.graph, one.field, one.object_to_world)
-        field, self.told = learnt_from(request, frame, None, edit.memory, self.draft.device, self.progress)
-        precision = self.draft.fields.headers[leaf.field].precision
-        return [(Placed(LEARNT, field, one.object_to_world), precision)]
+    @cached_property
+    def others(self) -> list[tuple[str, dict, list[tuple[Placed, str]]]]:
+        """The other objects that were distilled: their names, what the history says of them, and their
+        sources and the precisions that these are stored in; no sources where they are not found."""
+        draft, others = self.draft, []
+        for name, node in draft.inside.items():
+            if name not in self.names:
+                found = source_of(node, leaf_of(node), draft.bundle, self.allow_outside)
+                sources = [
+                    (
+                        load_fields(file.path, draft.graph, [(leaf, file, member)], None).placed[0],
+                        file.headers[member].precision,
+                    )
+                    for leaf, file, member in found
+                ]
+                others.append((name, node, sources))
+        return others
+
+    def from_photos(self, request: DeleteRequest, leaf: Leaf, one: Placed) -> list[tuple[Placed, str]]:
+        """What photos show, learnt once, in the frame of a node's field."""
+        if self.learnt is None:
+            edit, precision = self.edit, self.draft.fields.headers[leaf.field].precision
+            frame = Frame(self.draft.path, self.draft.graph, one.field, one.object_to_world)
+            field, self.told = learnt_from(
+                request, frame, None, edit.memory, self.draft.device, self.progress
+            )
+            self.learnt = [(Placed(LEARNT, field, one.object_to_world), precision)]
+        return self.learnt
 
     def mend(self, request: DeleteRequest) -> dict:
         """What the report says of the hole that is left, which is filled where that was asked for."""
@@ -215,7 +241,7 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
     found, else with those that the field has in its box."""
     draft, entry = deletion.draft, deletion.draft.inside[name]
     leaf = replace(leaf_of(entry), name=new_name)
-    own = source_of(entry, leaf, draft.bundle, SourceFolder(None), deletion.allow_outside)
+    own = source_of(entry, leaf, draft.bundle, deletion.allow_outside)
     nodes = []
     for part, file, member in own:
         draft.writer.copy_field(file, member)
@@ -227,12 +253,9 @@ def released(deletion: Deletion, name: str, new_name: str) -> Node:
             "of the field is taken for it"
         )
         box = np.asarray(entry["aabb"], np.float64)
-        for number, holder in enumerate(deletion.holders(box)):
-            one = deletion.placed(holder)
-            grown = box + side_of(one) * np.repeat([-1, 1], 3)
-            part = deletion.part(one, "cropped", lambda at, box=grown: inside(at, box))
+        for number, (holder, one) in enumerate(deletion.holders(box)):
+            part = deletion.part_in(one, box, side_of(one))
             if part is not None:
-                part = registry.kind(part.kind).trimmed(part)
                 member = draft.put(part, draft.fields.headers[holder.field].precision)
                 at = placement_of(one.object_to_world)
                 nodes.append(Node(f"{new_name}/{number}", member, None, at, showing=showing_of(holder)))

@@ -7,7 +7,7 @@ from formats.bundle import OpenBundle
 from formats.graph import belongs
 from formats.scene import Leaf, SceneGraph
 from fusedrf_cli.bridge.scene import make_field
-from fusedrf_cli.bridge.sources import SourceFolder, leaf_of, source_of
+from fusedrf_cli.bridge.sources import leaf_of, source_of
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import occupied_at
 from fusedrf_cli.engine.kinds.field_cutting import CORNERS
@@ -27,7 +27,7 @@ class DistilledShape:
         """entry: what the history says of it; beside: how far from that, in the world, it may reach, since
         the field is coarser."""
         self.box, self.beside = np.asarray(entry["aabb"], np.float64), beside
-        own = source_of(entry, leaf_of(entry), bundle, SourceFolder(None), False)
+        own = source_of(entry, leaf_of(entry), bundle, False)
         self.placed = [
             Placed(leaf.name, make_field(file.field(member), str(file.path)), leaf.object_to_world)
             for leaf, file, member in own

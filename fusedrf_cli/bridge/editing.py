@@ -105,10 +105,12 @@ class Draft:
 
     def box(self, names: Iterable[str]) -> np.ndarray | None:
         """(6,) in the world around objects as they were; None where none of them is visible."""
-        inside = [np.asarray(self.inside[name]["aabb"]) for name in names if name in self.inside]
-        if inside:
-            return enclosing(inside)
-        return box_of(self.before, leaf_names(chosen(self.bundle.scene, set(names))))
+        names = set(names)
+        boxes = [np.asarray(self.inside[name]["aabb"]) for name in names & self.inside.keys()]
+        nodes = chosen(self.bundle.scene, names - self.inside.keys())
+        around = box_of(self.before, leaf_names(nodes)) if nodes else None
+        boxes += [] if around is None else [around]
+        return enclosing(boxes) if boxes else None
 
     @cached_property
     def framing(self) -> tuple[float, ...] | None:

@@ -27,8 +27,8 @@ class EvaluationConfig:
 
     views: int = 8
     size: tuple[int, int] = (400, 400)
-    seed: tuple[int, int] = (EvaluatorConfig.judged_seed, 1)
-    """A stream of their own."""
+    stream: int = 1
+    """Beside `judged_seed`: they are drawn from a stream of their own."""
 
 
 def evaluate(request: EvaluateRequest, progress) -> dict:
@@ -142,9 +142,9 @@ def scene_pairs(
     evaluation = current(EvaluationConfig)
     config = current(EvaluatorConfig)
     loaded = load_scene(against, allow_outside, budget, device)
-    size = size or evaluation.size
+    size, seed = size or evaluation.size, (config.judged_seed, evaluation.stream)
     field = composite_of(loaded, budget, frame_memory(None, *size) | measured(*size))
-    views = evaluation_views_of(loaded, field, evaluation.views, size, evaluation.seed)
+    views = evaluation_views_of(loaded, field, evaluation.views, size, seed)
     needed = frame_memory(field, *size) | measured(*size)
     budget.expect(sources(loaded.resident) | needed, advice="give a smaller --size")
     for look in views:

@@ -36,7 +36,6 @@ from fusedrf_cli.bridge.selecting import (
     watching,
 )
 from fusedrf_cli.bridge.sources import scene_as_stored
-from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placed_box, placement, squeezed
 from fusedrf_cli.engine.kinds import registry
@@ -78,9 +77,8 @@ def extract(request: ExtractRequest, progress) -> dict:
         named_views = views_by_name(request, pieces)
         progress.phase("choosing", None)
         named = named_nodes(request, pieces)
-        object_field, rest, figures = parted(request, pieces, named, named_views, progress)
-        shown = pieces.composed(object_field)
-        box = placed_box(subject(shown), pieces.origin)
+        object_field, shown, rest, figures = parted(request, pieces, named, named_views, progress)
+        box = placed_box(shown.occupancy.look_at_box, pieces.origin)
         left = pieces.composed(rest) if request.invert or request.preview else None
         if request.invert:
             if left is None:
@@ -139,11 +137,12 @@ def named_nodes(request: ExtractRequest, whole: Whole) -> set[str]:
 
 def parted(
     request: ExtractRequest, whole: Whole, named: set[str], named_views: dict[str, View], progress
-) -> tuple[Fields, Fields, dict]:
-    """The object's fields, those that are left, and what the report says of how it was chosen; named: its
-    nodes, where it is those. InvalidInput where there is no such object."""
+) -> tuple[Fields, RadianceField, Fields, dict]:
+    """The object's fields, what they show, those that are left, and what the report says of how it was
+    chosen; named: its nodes, where it is those. InvalidInput where there is no such object."""
     if named:
-        return *whole.named(named), {}
+        objects, rest = whole.named(named)
+        return objects, whole.composed(objects), rest, {}
     extracting = current(ExtractingConfig)
     config = current(SelectingConfig)
     by_name = request.name is not None
@@ -176,7 +175,7 @@ def parted(
     share = seen_share(
         [in_frame(small(view, config.seen_side), whole) for view in some(named_views)], object_shown
     )
-    return objects, rest, {"sure": round(selection.sure, 3), "seen": share}
+    return objects, object_shown, rest, {"sure": round(selection.sure, 3), "seen": share}
 
 
 def cues_by_name(name: str, whole: Whole) -> ObjectCues:
@@ -198,11 +197,6 @@ def cues_by_name(name: str, whole: Whole) -> ObjectCues:
     return ObjectCues(holds, [], [], none, none, touches=True)
 
 
-def subject(field: RadianceField) -> np.ndarray:
-    """(6,) the box of its frame that views of a field look at."""
-    return field.look_at_box if isinstance(field, ComposedField) else field.occupancy.look_at_box
-
-
 # -- what was seen of it -------------------------------------------------------------------------------------
 
 
@@ -221,7 +215,7 @@ def seen_share(capture_views: list[Camera], object_field: RadianceField) -> floa
         return None
     lens = framing_lens(config.seen_side, config.seen_side)
     around = [
-        replace(framing(subject(object_field), lens, azimuth, elevation).camera(lens), name="")
+        replace(framing(object_field.occupancy.look_at_box, lens, azimuth, elevation).camera(lens), name="")
         for elevation in (-0.6, 0.0, 0.6, 1.2)
         for azimuth in np.arange(6) * np.pi / 3
     ]

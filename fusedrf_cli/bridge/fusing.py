@@ -72,10 +72,11 @@ def fuse(
         if kind.field is None:
             note_options(request, loaded, progress)
         started = time.monotonic()
-        bundle = FusedBundle(request, everything, loaded, kind.field is not None)
+        bundle = FusedBundle(request, everything, scene, kind.field is not None)
+        warn_of_hidden(bundle.hidden, progress)
         cameras = result_cameras(loaded, progress)
         bundle.shown_as(result_view_box(loaded, scene.composed, cameras), cameras)
-        pixels = current(BuildingConfig).views * DistilConfig.view_size**2
+        pixels = current(BuildingConfig).views * current(DistilConfig).view_size ** 2
         warn_of_work(request.scene, scene.composed, pixels, progress)
         made = best_of(request, scene, kind, bundle.overhead, memory, device, progress, saved)
         entry = {
@@ -96,7 +97,7 @@ def fuse(
             )
             checkpoint_path(request.output).unlink(missing_ok=True)
         reports = made.resolution_reports()
-        warn_of_resolution(reports, remedy(kind, loaded, scene.composed), progress)
+        warn_of_resolution(reports, remedy(kind, scene.composed), progress)
         figures = made.figures()
     report = {
         "output": request.output,
@@ -223,7 +224,7 @@ def best_suited(composed: ComposedField) -> tuple[Kind, str]:
     return kind, suits.why
 
 
-def remedy(kind: Kind, loaded: LoadedScene, composed: ComposedField) -> str:
+def remedy(kind: Kind, composed: ComposedField) -> str:
     """What helps an object that is held too coarsely."""
     best = best_suited(composed)[0]
     return "a larger --max-size" if best is kind else f"--kind {best.name}, or a larger --max-size"
@@ -417,6 +418,13 @@ def without_empty(loaded: LoadedScene, scene: str, progress) -> LoadedScene:
     if not fields:
         raise InvalidInput(f"{scene}: all its fields are empty; train them again")
     return replace(loaded, fields=fields)
+
+
+def warn_of_hidden(names: list[str], progress) -> None:
+    """Say which nodes are left out because they are hidden."""
+    if names:
+        few = ", ".join(f"'{name}'" for name in names[:5]) + (", …" if len(names) > 5 else "")
+        progress.warn(f"what is hidden was left out: {few}; show it to have it fused")
 
 
 def make_room(memory: Memory, builder: DistilledBuilder, scene: FuseScene, request: FuseRequest) -> bool:

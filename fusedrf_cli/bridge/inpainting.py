@@ -142,11 +142,7 @@ def fill_hole(
     composed = rest
     if fillings:
         composed = as_composite(ComposedField([Placed("", rest, np.eye(4)), *fillings], origin=np.eye(4)))
-    box = (
-        object_field.look_at_box
-        if isinstance(object_field, ComposedField)
-        else object_field.occupancy.look_at_box
-    )
+    box = object_field.occupancy.look_at_box
     surfaces, unseen = smooth_patches(composed, box, up_of(frame.scene, frame.origin), object_field)
     if request.fill and surfaces:
         progress.phase("filling", None)

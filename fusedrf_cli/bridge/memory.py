@@ -17,7 +17,7 @@ import torch
 
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.composite import SLOTS_AT_ONCE, Composite
-from fusedrf_cli.engine.distillation.finetune import FinetuneRays
+from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import expected_points
 from fusedrf_cli.engine.fields.base import RadianceField
@@ -39,8 +39,6 @@ class MemoryConfig:
     """Kernels, once they are loaded, and the libraries that come with them."""
     reading: float = 1.5
     """Copies of a field's numbers while it is read: decoded arrays, and the file's pages."""
-    resampling: float = 2.5
-    """Copies while it becomes part of another: widened, by itself, and at its new resolution."""
     per_pixel: int = 350
     """Of a band: rays in float64, before and after turning, those of one block apart, pixels."""
     per_sample: int = 300
@@ -211,7 +209,7 @@ def teaching(settings: DistilConfig, points: int) -> dict[str, float]:
     return {"the teachers' answers": settings.rays * config.per_ray + points * config.per_point}
 
 
-def distil_config(rays: int) -> dict[str, float]:
+def rays_to_learn_from(rays: int) -> dict[str, float]:
     """Rays to learn from, and what they show."""
     return {"rays to learn from": rays * current(MemoryConfig).per_ray}
 
@@ -223,9 +221,9 @@ def stages(
     copies of the largest source, and bytes by what they are for."""
     needs = builder.needs()
     numbers, learnt, grids = needs.numbers, needs.numbers - needs.settled, ownership(scene.aabb)
-    settings = builder.distil_config_for(learnt, request.time_budget) or DistilConfig()
+    settings = builder.distil_config_for(learnt, request.time_budget) or current(DistilConfig)
     if builder.distil_config is None:
-        taught = distil_config(FinetuneRays.config.rays)
+        taught = rays_to_learn_from(current(FinetuneConfig).rays)
     else:
         points = needs.points
         if points is None:
@@ -245,7 +243,7 @@ def stages(
     making = needs.making | (taught | picture(256, 256, composed=True) if builder.learnt else {})
     return [
         (needs.copies, result(numbers, measured=False) | making | grids),
-        (0.0, result(numbers) | grids | evaluation_memory()),
+        (0.0, result(numbers) | grids | evaluation_memory(builder)),
         (0.0, learns | {"what does not learn": needs.settled * FLOAT} if learns else {}),
     ]
 
@@ -255,7 +253,7 @@ def asking_in_waves(builder: DistilledBuilder, scene: ComposedField) -> dict[str
     finished = result(builder.needs().numbers, measured=False)
     return (
         finished
-        | distil_config(FinetuneRays.config.rays)
+        | rays_to_learn_from(current(FinetuneConfig).rays)
         | ownership(scene.aabb)
         | picture(256, 256, composed=True)
     )
@@ -266,6 +264,7 @@ def will_learn(builder: DistilledBuilder, request: FuseRequest) -> bool:
     return builder.learnt or request.finetune
 
 
-def evaluation_memory() -> dict[str, float]:
+def evaluation_memory(builder: DistilledBuilder) -> dict[str, float]:
     """Looking at a scene to measure; some views are filled by one of its objects."""
-    return picture(DistilConfig.view_size, DistilConfig.view_size, composed=True)
+    side = (builder.distil_config or current(DistilConfig)).view_size
+    return picture(side, side, composed=True)

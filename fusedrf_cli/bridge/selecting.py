@@ -14,6 +14,7 @@ from formats.images import read_mask
 from formats.photos import pictures
 from formats.views import View
 from fusedrf_cli.bridge.cutting import Whole
+from fusedrf_cli.bridge.distilled import inside
 from fusedrf_cli.bridge.pictures import camera_of
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.occupancy import placement
@@ -72,27 +73,27 @@ def views_by_name(request: ExtractRequest, fused: Whole) -> dict[str, View]:
         return {view.name: view for view in read_cameras(request.cameras)}
     if fused.scene.cameras is None:
         return {}
-    camera_set = read_camera_set(fused.scene.cameras)
-    return {view.name: view for view in camera_set.test + camera_set.train}
+    kept = read_camera_set(fused.scene.cameras)
+    return {view.name: view for view in kept.test + kept.train}
 
 
-def cues_of(request: ExtractRequest, fused: Whole, camera_set: dict[str, View], progress) -> ObjectCues:
+def cues_of(request: ExtractRequest, fused: Whole, named_views: dict[str, View], progress) -> ObjectCues:
     """What a request says, read and checked."""
     if not (request.masks or request.points or request.boxes or request.spheres or request.mesh):
         raise UsageProblem("say which object: --masks, --points, --box, --sphere, --mesh or --name")
-    if (request.masks or request.points) and not camera_set:
+    if (request.masks or request.points) and not named_views:
         raise InvalidInput(
             f"{request.field}: it keeps no cameras that masks or points could be of; give --cameras"
         )
-    masks = masked_views(request, fused, camera_set, progress) if request.masks else []
-    pointed = [pointed_at(one, request, fused, camera_set) for one in request.points]
+    masks = masked_views(request, fused, named_views, progress) if request.masks else []
+    pointed = [pointed_at(one, request, fused, named_views) for one in request.points]
     if pointed and not masks and not any(shows for *_, shows in request.points):
         raise UsageProblem("--points: none of them shows the object; give one without ,out")
     points = {True: [], False: []}
     for look, (view, column, row, shows) in zip(pointed, request.points, strict=True):
         points[shows].append(surface_at(fused.field, look, f"--points {view}:{column:g},{row:g}"))
-    inside, outside = (np.array(points[shows]).reshape(-1, 3) for shows in (True, False))
-    return ObjectCues(in_shapes(request, fused), masks, pointed, inside, outside)
+    shown, hidden = (np.array(points[shows]).reshape(-1, 3) for shows in (True, False))
+    return ObjectCues(in_shapes(request, fused), masks, pointed, shown, hidden)
 
 
 def in_shapes(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -106,18 +107,18 @@ def in_shapes(request: ExtractRequest, fused: Whole) -> Callable[[np.ndarray], n
 
     def holds(points: np.ndarray) -> np.ndarray:
         at = points @ origin[:3, :3].T + origin[:3, 3]
-        inside = np.ones(len(at), bool)
+        held = np.ones(len(at), bool)
         if len(boxes):
-            inside &= np.any([((at >= b[:3]) & (at <= b[3:])).all(1) for b in boxes], 0)
+            held &= np.any([inside(at, box) for box in boxes], 0)
         if len(spheres):
-            inside &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
-        return inside & hull.contains(at) if hull else inside
+            held &= np.any([((at - s[:3]) ** 2).sum(1) <= s[3] ** 2 for s in spheres], 0)
+        return held & hull.contains(at) if hull else held
 
     return holds
 
 
 def masked_views(
-    request: ExtractRequest, fused: Whole, camera_set: dict[str, View], progress
+    request: ExtractRequest, fused: Whole, named_views: dict[str, View], progress
 ) -> list[MaskedView]:
     """The masks of a folder, each with the view that is named as it."""
     files = pictures(Path(request.masks))
@@ -125,13 +126,13 @@ def masked_views(
         raise InvalidInput(
             f"{request.masks}: no folder of pictures; give one of masks, each named as the view that it masks"
         )
-    pairs = [(path, camera_set.get(path.stem) or camera_set.get(Path(path.stem).stem)) for path in files]
+    pairs = [(path, named_views.get(path.stem) or named_views.get(Path(path.stem).stem)) for path in files]
     matched = [(path, view) for path, view in pairs if view is not None]
     if not matched:
-        names = ", ".join(list(camera_set)[:3])
+        names = ", ".join(list(named_views)[:3])
         raise InvalidInput(
             f"{request.masks}: none of its {len(files)} pictures is named as a view; the views are {names}, "
-            f"… ({len(camera_set)} in all)"
+            f"… ({len(named_views)} in all)"
         )
     if len(matched) < len(files):
         progress.warn(
@@ -176,17 +177,18 @@ def in_frame(view: View, fused: Whole) -> Camera:
 
 
 def pointed_at(
-    point: tuple, request: ExtractRequest, fused: Whole, camera_set: dict[str, View]
+    point: tuple, request: ExtractRequest, fused: Whole, named_views: dict[str, View]
 ) -> MaskedView:
     """The pixels around a point, which say whether they show the object."""
     config = current(SelectingConfig)
     name, column, row, shows = point
-    if name not in camera_set:
-        names = ", ".join(list(camera_set)[:3])
+    if name not in named_views:
+        names = ", ".join(list(named_views)[:3])
         raise InvalidInput(
-            f"{request.field}: there is no view '{name}'; the views are {names}, … ({len(camera_set)} in all)"
+            f"{request.field}: there is no view '{name}'; the views are {names}, … ({len(named_views)} in "
+            "all)"
         )
-    view = camera_set[name]
+    view = named_views[name]
     if column >= view.width or row >= view.height:
         raise UsageProblem(
             f"--points: {column:g},{row:g} lies outside of the view '{name}' of {view.width}x{view.height} "

@@ -31,7 +31,8 @@ def load_to_fuse(request: FuseRequest, memory: Memory, device: str, progress) ->
             raise UsageProblem(f"--sources applies to a fused bundle; {request.scene} tells of no sources")
         return load_scene(request.scene, request.allow_outside, memory, device)
     check_history(graph, request.scene)
-    anew, homes, missing = with_sources(bundle, SourceFolder(request.sources), request.allow_outside)
+    elsewhere = SourceFolder(request.sources) if request.sources else None
+    anew, homes, missing = with_sources(bundle, elsewhere, request.allow_outside)
     if not missing:
         leaves = [(leaf, homes[leaf.field], leaf.field) for leaf in anew.leaves() if leaf.visible]
         progress.tell(f"{request.scene} is fused anew from its {len(leaves)} sources")
@@ -54,7 +55,7 @@ def is_fused(graph: SceneGraph) -> bool:
 
 
 def with_sources(
-    bundle: OpenBundle, elsewhere: "SourceFolder", allow_outside: bool
+    bundle: OpenBundle, elsewhere: "SourceFolder | None", allow_outside: bool
 ) -> tuple[SceneGraph, dict[str, OpenBundle], list[str]]:
     """The scene of a fused bundle with the fields that it was made of, the bundle in which each member lies,
     and the names of objects of which no file is found. A node is its own source where its field is that of
@@ -63,7 +64,7 @@ def with_sources(
     made_of, inside = sources(scene.history), distilled(scene.history)
 
     def placed(name: str, entry: dict) -> tuple[Node, ...]:
-        own = source_of(entry, Leaf(name, None, None, np.eye(4), False), bundle, elsewhere, allow_outside)
+        own = source_of(entry, Leaf(name, None, None, np.eye(4), False), bundle, allow_outside, elsewhere)
         missing.extend([] if own else [name])
         homes.update({member: file for _, file, member in own})
         alone = f"{name}/source" if len(own) == 1 else None
@@ -101,14 +102,18 @@ def leaf_of(node: dict) -> Leaf:
 
 
 def source_of(
-    info: dict, leaf: Leaf, bundle: OpenBundle, elsewhere: "SourceFolder", allow_outside: bool
+    info: dict,
+    leaf: Leaf,
+    bundle: OpenBundle,
+    allow_outside: bool,
+    elsewhere: "SourceFolder | None" = None,
 ) -> list[FoundField]:
     """The fields that a leaf of a bundle was made of, as its history tells: kept inside, or in a file that is
-    as it was. Nothing where it is not found."""
+    as it was, where it was or elsewhere. Nothing where it is not found."""
     is_inside = info.get("kept") or not info.get("sha256")
     file = bundle if is_inside and bundle.placed(info.get("field", "")) else None
     if file is None:
-        file = source_bundle(info, bundle.path, elsewhere, allow_outside)
+        file = source_bundle(info, bundle.path, allow_outside, elsewhere)
     parts = () if file is None else file.placed(info.get("field", ""))
     if instance := info.get("instance"):
         parts = [part for part in parts if part.name == instance]
@@ -123,7 +128,7 @@ def source_of(
 
 
 def source_bundle(
-    info: dict, path: Path, elsewhere: "SourceFolder", allow_outside: bool
+    info: dict, path: Path, allow_outside: bool, elsewhere: "SourceFolder | None"
 ) -> OpenBundle | None:
     """The bundle that a history names by its checksum: where it was, else in the folder given."""
     if not info.get("sha256"):
@@ -133,7 +138,7 @@ def source_bundle(
     may_be_read = allow_outside or named.is_relative_to(folder)
     if may_be_read and (bundle := unchanged(named, info["sha256"])):
         return bundle
-    file = elsewhere.find(info["sha256"])
+    file = elsewhere and elsewhere.find(info["sha256"])
     return None if file is None else unchanged(file, info["sha256"])
 
 
@@ -148,9 +153,9 @@ def unchanged(path: Path, sha256: str) -> OpenBundle | None:
 class SourceFolder:
     """The bundles of a folder and of those in it, by checksum, each read once and only when it is needed."""
 
-    def __init__(self, folder: str | None):
+    def __init__(self, folder: str):
         self.known: dict[str, Path] = {}
-        self.left = bundles_in(folder) if folder else iter(())
+        self.left = bundles_in(folder)
 
     def find(self, sha256: str) -> Path | None:
         """The file of a checksum."""

@@ -123,8 +123,9 @@ class StorageSearch:
     ) -> Trial | None:
         """The fewest bytes at a PSNR of at least target (dB) under a size, None where nothing reaches it.
 
-        ways come in groups, the cheapest first; the first group in which one reaches the target decides.
-        gain (dB): what finishing may add at most, to leave out a way that is further away at its largest.
+        Storage settings come in groups, the cheapest first; the first group in which one reaches the target
+        decides. gain (dB): what finishing may add at most, to leave out one that is further away at its
+        largest.
         """
         for group in storage_settings:
             best = None

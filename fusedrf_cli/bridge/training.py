@@ -37,7 +37,7 @@ from fusedrf_cli.bridge.sizes import BundleSizes, HeaderConfig, camera_bytes, se
 from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.fit import FitRun
 from fusedrf_cli.engine.distillation.ray_dataset import Pictures
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, cell_counts
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import BuilderConfig, Plan, Section, StorageSetting
@@ -370,9 +370,9 @@ def _run(run: FitRun, output: str, progress) -> tuple[object, float]:
         field = run.finish(lambda share, figures: progress.advance(share, **figures), uninterrupted)
     run.forget()
     warn_of_nonfinite(run.nan_guard.figures(), progress)
-    if not run.found_matter:
+    if not run.found_density:
         progress.warn(
-            f"{output}: no matter was found, so that all of the box was kept; look at the photos' alpha, "
+            f"{output}: no density was found, so that all of the box was kept; look at the photos' alpha, "
             "their poses, and --aabb"
         )
     return field, time.monotonic() - started

@@ -3,13 +3,15 @@
 import click
 
 from fusedrf_cli import options, verbs
-from fusedrf_cli.option_types import InputType, KindType
+from fusedrf_cli.option_types import FieldKindType, InputType
 
 
 @click.command("convert")
 @click.argument("field", type=InputType())
 @options.writing("The field to write, OUT.rfpack.")
-@click.option("--kind", type=KindType(), required=True, help="Kind of field to make; see `fusedrf kinds`.")
+@click.option(
+    "--kind", type=FieldKindType(), required=True, help="Kind of field to make; see `fusedrf kinds`."
+)
 @options.max_size
 @options.smallest
 @options.time_budget

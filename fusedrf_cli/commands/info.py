@@ -5,8 +5,6 @@ import click
 from fusedrf_cli import options, verbs
 from fusedrf_cli.option_types import InputType
 
-"""Of a table about a capture, for people."""
-
 
 def _brief(summary: dict) -> dict:
     """The summary as people want it: matrices, arrays and checksums are for `--json`."""

@@ -77,8 +77,7 @@ def command(**words):
     were taken from one side, it swings to and fro between them. Anything else is framed from
     outside. --look-at, --view-from, --zoom and --up change that view or orbit.
 
-    A scene.json of vm fields is put together in memory first, which takes a second or two, and is then as
-    fast to look at as a fused one.
+    A scene.json is rendered as fast as a fused one; where memory does not hold all its fields, more slowly.
 
     \b
     Example:

@@ -3,14 +3,23 @@
 import click
 
 from fusedrf_cli import options, verbs
-from fusedrf_cli.option_types import BoxType, DownscaleType, InputType, KindType, PositiveType, VectorType
+from fusedrf_cli.option_types import (
+    BoxType,
+    DownscaleType,
+    FieldKindType,
+    InputType,
+    PositiveType,
+    VectorType,
+)
 from fusedrf_cli.requests import TrainRequest
 
 
 @click.command("train")
 @click.argument("source", type=InputType())
 @options.writing("The field to write, FIELD.rfpack.")
-@click.option("--kind", type=KindType(), default=TrainRequest.kind, show_default=True, help="Kind of field.")
+@click.option(
+    "--kind", type=FieldKindType(), default=TrainRequest.kind, show_default=True, help="Kind of field."
+)
 @options.ranks
 @options.sh_degree
 @options.max_size

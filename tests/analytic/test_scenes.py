@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.kinds.registry import field_kinds
 from tests.analytic import scenes
 from tests.analytic.export import EXPORTERS, NotExportable, exported
 from tests.analytic.fields import Ball, Box, Gaussian, Slab, Tint
 from tests.analytic.rays import points_in, rays_at, unit
+from tests.bundles import field_kinds
 
 SCENES = {
     "S1": scenes.s1_slabs(0.7, 2.0),

@@ -5,7 +5,7 @@ import importlib
 import json
 import shutil
 import signal
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -23,14 +23,14 @@ from fusedrf_cli.bridge.inpainting import InpaintingConfig
 from fusedrf_cli.bridge.scene import write_field
 from fusedrf_cli.bridge.training import TrainPresets
 from fusedrf_cli.engine.distillation.config import TrainConfig
-from fusedrf_cli.engine.distillation.finetune import FinetuneConfig, FinetuneRays
+from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
-from fusedrf_cli.engine.kinds import instances
-from fusedrf_cli.engine.kinds.builder import DistilConfig, DistilledBuilder
+from fusedrf_cli.engine.kinds.builder import DistilConfig
+from fusedrf_cli.engine.kinds.instances import InstancesConfig
 from fusedrf_cli.engine.kinds.resampled import ResampledBuilder
 from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
-from fusedrf_cli.engine.kinds.vm.builder import VMConfig
+from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.volume import render_image
@@ -40,18 +40,17 @@ from fusedrf_cli.signals import interrupt
 from tests.analytic.export import SHAPE, vm_field
 from tests.analytic.fields import Box, Tint
 
-
-@dataclass(frozen=True)
-class TinySettings(DistilConfig):
-    """A distillation of a second."""
-
-    rays: int = 3000
-    steps: int = 50
-    points_per_step: int = 1 << 13
-    rgb_steps: int = 10
-    rgb_samples: int = 1 << 12
-    views: int = 2
-    view_size: int = 32
+TinySettings = partial(
+    DistilConfig,
+    rays=3000,
+    steps=50,
+    points_per_step=1 << 13,
+    rgb_steps=10,
+    rgb_samples=1 << 12,
+    views=2,
+    view_size=32,
+)
+"""A distillation of a second."""
 
 
 PLACES = {"floor": (0, 0, -0.7), "red": (-0.5, 0, 0), "blue": (0.7, 0, 0)}
@@ -106,23 +105,22 @@ TINY = (
     OccupancyConfig(scene_cells=48),
     EvaluationViewConfig(whole=2, most_objects=0),
     BuildingConfig(views=2),
-    VMConfig(SHAPE),
+    VMBuilderConfig(SHAPE),
     InpaintingConfig(settings=TinySettings(), numbers=VMField.size_of(SHAPE, (20, 20, 20))),
     TrainPresets(DRAFT, DRAFT, DRAFT, DRAFT),
+    TinySettings(),
+    FinetuneConfig(rays=15_000, steps=30, rays_per_step=500),
+    InstancesConfig(ranks=(None,)),  # others would be compiled
 )
 """Coarse grids, few steps, and few pictures to judge by."""
 
 
 def make_tiny(patch: pytest.MonkeyPatch) -> None:
     """Few steps, small pictures: what is tested here is the way, not the quality."""
-    patch.setattr(DistilledBuilder, "distil_config", TinySettings())
-    patch.setattr(part("building"), "DistilConfig", TinySettings)  # for students that are not taught
     for made in (SparseBuilder, ResampledBuilder):
         patch.setattr(
             made, "distil_config", replace(made.distil_config, points_per_step=1 << 13, views=2, view_size=32)
         )
-    patch.setattr(instances.InstancesBuilder, "ranks", (None,))  # others would be compiled
-    patch.setattr(FinetuneRays, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,14 +1,16 @@
 """`add` and `delete` for real: what was not touched stays, and what was is right."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from formats.bundle import read_bundle
+from formats.bundle import BundleWriter, OpenBundle, read_bundle
+from formats.history import distilled
 from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
-from tests.bridge.conftest import FIELDS, PLACES, blues, done, write_views
+from tests.bridge.conftest import FIELDS, PLACES, blues, done, part, write_views
 
 VM = ("--kind", "vm", "--no-finetune", "--max-size", "400kB")
 AT = ("--name", "blue", "-t", "0.7,0,0")
@@ -157,6 +159,39 @@ def test_photos_of_the_place_show_what_an_object_hid(report, picture, folder):
     after, away = picture("less.rfpack"), ~covered("blue", 0.3)
     assert psnr(after[gone], wanted[gone]) > psnr(before[gone], wanted[gone]) + 3
     assert psnr(after[away], before[away]) >= 40
+
+
+def test_several_distilled_objects_are_cut_out_of_their_field_alone(report, picture, folder):
+    """Also where the first of them takes all of the field away: what stands beside it keeps its bytes."""
+    report("add", "vm.rfpack", "red.rfpack", "--name", "garden", "-t", "0.7,0,0", "-o", "beside.rfpack")
+    bundle, writer = OpenBundle(folder / "beside.rfpack"), BundleWriter()
+    floor = distilled(bundle.scene.history)["floor"] | {"aabb": [-9.0, -9.0, -9.0, 9.0, 9.0, 9.0]}
+    for member in bundle.headers:
+        writer.copy_field(bundle, member)
+    history = (*bundle.scene.history, {"event": "renamed", "names": [], "nodes": [floor]})
+    writer.write(folder / "wide.rfpack", replace(bundle.scene, history=history))
+    report("delete", "wide.rfpack", "floor", "red", "blue", "-o", "less.rfpack")
+    (leaf,) = read_bundle(folder / "less.rfpack").scene.leaves()
+    assert leaf.name == "garden" and leaf.field in read_bundle(folder / "red.rfpack").fields
+
+
+def test_a_node_and_a_distilled_object_are_deleted_together(report, folder):
+    """What is touched is the box around both."""
+    report("add", "vm.rfpack", "red.rfpack", "--name", "second", "-t", "0,0,2", "-o", "more.rfpack")
+    said = report("delete", "more.rfpack", "blue", "second", "-o", "less.rfpack")
+    low, high = np.split(np.array(said["touched"]["aabb"]), 2)
+    assert (low <= [-0.3, -0.3, -0.3]).all() and (high >= [1.0, 0.3, 2.3]).all()
+
+
+def test_photos_are_learnt_from_once(report, picture, folder, monkeypatch):
+    write_views(folder / "place", FIELDS["floor"], PLACES["floor"], 24, 5)
+    (folder / "floor.rfpack").write_bytes(b"another file")
+    learnt, deleting = [], part("deleting")
+    once = deleting.learnt_from
+    monkeypatch.setattr(deleting, "learnt_from", lambda *words: learnt.append(words) or once(*words))
+    words = ("--refit", "place", "--time-budget", "4", "--no-finetune")
+    said = report("delete", "vm.rfpack", "red", "blue", *words, "-o", "less.rfpack")
+    assert said["restored"] is True and len(learnt) == 1
 
 
 def test_one_more_of_the_same_object_costs_a_placement(report, picture, folder):

@@ -2,9 +2,11 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
+from formats import bundle
 from formats.bundle import read_bundle
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.engine.rendering.metrics import PSNR_CAP, psnr
@@ -26,6 +28,15 @@ def test_a_scene_becomes_blocks_that_look_the_same(report, folder, picture):
     assert [node.name for node in scene.nodes] == names and scene.nodes[0].background
     own = set().union(*(read_bundle(folder / f"{name}.rfpack").fields for name in names))
     assert read_bundle(folder / "fused.rfpack").fields.keys() == own  # their very bytes
+
+
+def test_every_source_is_opened_once(report, monkeypatch):
+    opened, once = [], bundle.read_archive
+    monkeypatch.setattr(
+        bundle, "read_archive", lambda path, **words: opened.append(Path(path).name) or once(path, **words)
+    )
+    report("fuse", "pair.json", "-o", "once.rfpack", "--kind", "blocks")
+    assert sorted(opened) == ["floor.rfpack", "red.rfpack"]
 
 
 def test_the_same_scene_gives_the_same_bytes(report, folder):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from formats.bundle import OpenBundle, single_field_bundle
+from formats.bundle import OpenBundle
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge import memory, training
@@ -37,6 +37,7 @@ from fusedrf_cli.errors import ResourceProblem
 from tests.analytic import scenes
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Box
+from tests.bundles import write_single
 
 ROOT = Path(__file__).parents[2]
 COMMANDS = {
@@ -168,7 +169,7 @@ def boxed(path: Path, name: str, texels: int, full: bool, precision: str, cells:
     }
     arrays["occupancy"] = np.packbits(grid.occupied)
     record = FieldRecord(name, arrays, metadata)
-    single_field_bundle(record, name, precision=precision).write(path)
+    write_single(path, record, name, precision=precision)
     return path
 
 
@@ -189,7 +190,7 @@ def placed(path: Path, name: str, texels: int, full: bool, precision: str, cells
     ranks = {"density_rank": shape.density_rank, "colour_rank": shape.colour_rank, "sh_degree": 2}
     named = [{"tensor": 0, "object_to_field": m.tolist(), "name": f"b{i}"} for i, m in enumerate(moves)]
     metadata = {"aabb": BOX, "shape": ranks, "tensors": [told], "blocks": named}
-    single_field_bundle(FieldRecord(name, arrays, metadata), name, precision=precision).write(path)
+    write_single(path, FieldRecord(name, arrays, metadata), name, precision=precision)
     return path
 
 
@@ -200,7 +201,7 @@ def bricks(path: Path, side: int, level: int = 0) -> Path:
     masks = np.ones((len(at), 4, 4, 4), bool)
     tree = BrickTree.of(np.zeros(3), 1 / side, counts, np.full(len(at), level, np.uint8), at << level, masks)
     field = SparseField(SparseShape(), VertexLattice(tree, 4), 1.0)
-    single_field_bundle(FieldRecord("sparse", *field.state()), "sparse", precision="int8").write(path)
+    write_single(path, FieldRecord("sparse", *field.state()), "sparse", precision="int8")
     return path
 
 

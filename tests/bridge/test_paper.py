@@ -2,6 +2,9 @@
 
 import csv
 import itertools
+import os
+import shutil
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.commit import commit_column, commit_line
 from benchmarks.paper import capacity, figures, quality, smallest, sources, table, times
 from benchmarks.paper.__main__ import EXPERIMENTS
 from benchmarks.paper.capacity import CapacityConfig
@@ -141,7 +145,25 @@ def test_the_table_keeps_what_other_parts_saw(work):
     table.update(work.out, {"seeds": "blocks 0.1 dB"})
     page = (work.out / "table.md").read_text()
     assert "| fused frame time at N = 8 over N = 1 | 1.00 | ≤ 1.10 | ≤ 1.02 | 1.01 |" in page
-    assert "| blocks 0.1 dB |" in page
+    assert "| blocks 0.1 dB |" in page and page.splitlines()[2] == commit_line()
+
+
+def test_pages_say_the_commit_and_its_date(tmp_path):
+    if not shutil.which("git"):
+        pytest.skip("needs git")
+    assert commit_line(tmp_path) == "Measured in no repository." and commit_column(tmp_path) == {"commit": ""}
+    who = {f"GIT_{role}_{what}": "a@b" for role in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
+    dates = {"GIT_AUTHOR_DATE": "2001-02-03T04:05:06Z", "GIT_COMMITTER_DATE": "2002-03-04T05:06:07Z"}
+    env = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")} | who | dates
+    git = ["git", "-C", str(tmp_path), "-c", "commit.gpgsign=false"]
+    for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "first"]):
+        subprocess.run(git + words, check=True, env=env)
+    short = commit_column(tmp_path)["commit"]
+    said = subprocess.run([*git, "rev-parse", "HEAD"], check=True, env=env, capture_output=True, text=True)
+    assert len(short) >= 7 and said.stdout.startswith(short)
+    assert commit_line(tmp_path) == f"Measured at commit {short}, 2002-03-04."
+    (tmp_path / "inside").mkdir()
+    assert commit_line(tmp_path / "inside") == "Measured in no repository."  # of somebody else's repository
 
 
 def test_seconds_to_a_psnr_lie_between_its_points(in_force):

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import placed, real
+from benchmarks import extraction, placed, real
+from benchmarks.commit import commit_line
 from benchmarks.real import RealConfig
 from formats.images import read_image_header, write_png
 from tests.formats.test_captures import looking_at
@@ -42,7 +43,9 @@ def test_the_page(data, shop, tmp_path, monkeypatch, in_force):
     assert [(row["capture"], row["minutes"]) for row in rows] == [("wall", "0.008333"), ("wall", "0.01667")]
     assert all(float(row["nearest photo"]) < 12 and float(row["seconds"]) > 0.5 for row in rows)
     assert read_image_header(out / "wall.jpg")[:2] == (640, 213)
-    assert "![wall](wall.jpg)" in (out / "table.md").read_text() and (out / "psnr.svg").exists()
+    page = (out / "table.md").read_text()
+    assert "![wall](wall.jpg)" in page and (out / "psnr.svg").exists()
+    assert page.splitlines()[2] == commit_line()
     assert real.stored_rows(out / "real.csv", "capture", {"wall"}) == []
     kept = real.stored_rows(out / "real.csv", "capture", {"fox"})
     assert [row["capture"] for row in kept] == ["wall", "wall"]
@@ -53,3 +56,11 @@ def test_rows_of_kinds_that_are_not_measured_stay(tmp_path):
     placed.write_page(tmp_path, [{"kind": "blocks", "MB": "3"}, {"kind": "vm", "MB": "4"}])
     page = (tmp_path / "placed.md").read_text()
     assert "| blocks | 3 |\n| vm | 4 |\n| sparse | 1 |" in page
+    assert page.splitlines()[2] == commit_line()
+
+
+def test_parts_of_extraction_that_are_not_measured_stay(tmp_path):
+    extraction.write_page(tmp_path, {"cup": [{"what": "cup", "commit": "1234567"}]})
+    extraction.write_page(tmp_path, {"tankard": [{"what": "tankard", "commit": "89abcde"}]})
+    page = (tmp_path / "extraction.md").read_text()
+    assert "| tankard | 89abcde |\n| cup | 1234567 |" in page and page.splitlines()[2] == commit_line()

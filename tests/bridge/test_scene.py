@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from formats.bundle import single_field_bundle
 from formats.records import FieldRecord
 from formats.scene import SceneGraph, make_node, write_scene
 from fusedrf_cli.bridge.scene import background_of, grouped, load_scene
@@ -16,6 +15,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.errors import InvalidInput
 from tests.bridge.conftest import FIELDS, PLACES
+from tests.bundles import write_single
 
 
 def test_a_scene_is_its_fields_at_their_places(folder):
@@ -57,7 +57,7 @@ def test_groups_place_their_children(folder):
 
 def test_an_unknown_kind_is_named(folder, run):
     record = FieldRecord("nebula", {"planes": np.zeros(3, np.float32)}, {"aabb": [0, 0, 0, 1, 1, 1]})
-    single_field_bundle(record, "cloud").write(folder / "cloud.rfpack")
+    write_single(folder / "cloud.rfpack", record, "cloud")
     with pytest.raises(InvalidInput, match="unknown kind 'nebula'; this version knows .*vm"):
         load_scene(str(folder / "cloud.rfpack"))
     result = run("render", "cloud.rfpack", "-o", "out.png")
@@ -67,7 +67,7 @@ def test_an_unknown_kind_is_named(folder, run):
 def test_a_malformed_field_is_named(folder):
     arrays, metadata = FIELDS["red"].state()
     arrays.pop("tensor_0.density_line_1")
-    single_field_bundle(FieldRecord("vm", arrays, metadata), "red").write(folder / "bad.rfpack")
+    write_single(folder / "bad.rfpack", FieldRecord("vm", arrays, metadata), "red")
     with pytest.raises(InvalidInput, match="'vm' field is malformed .*density_line_1"):
         load_scene(str(folder / "bad.rfpack"))
 

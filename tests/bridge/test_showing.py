@@ -132,6 +132,9 @@ def test_a_hidden_node_is_left_out_and_stays_in_the_scene(report, run, folder):
     assert [f.placed.name for f in load_scene(str(folder / "one.json")).fields] == ["red"]
     assert [leaf.name for leaf in read_scene(folder / "one.json").leaves()] == ["red", "blue"]
     assert json.loads((folder / "one.json").read_text())["version"] == "1.2"
+    said = report("fuse", "one.json", "-o", "one.rfpack", "--kind", "blocks")
+    assert said["nodes"] == 1
+    assert said["warnings"] == ["what is hidden was left out: 'blue'; show it to have it fused"]
     report("compose", "red.rfpack", "--hidden", "-o", "none.json")
     result = run("render", "none.json", "-o", "none.png")
     assert result.exit_code == 3 and "nothing of the scene is visible" in result.stderr

@@ -18,7 +18,7 @@ from fusedrf_cli.bridge.scene import load_scene, write_field
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import BuildRequest
@@ -31,7 +31,7 @@ from fusedrf_cli.python import open_scene
 from tests.analytic.export import SHAPE, vm_field, way_of
 from tests.analytic.fields import Gaussian, Tint
 from tests.analytic.rays import unit
-from tests.bridge.conftest import blues, done
+from tests.bridge.conftest import TinySettings, blues, done
 from tests.engine.conftest import random_vm
 
 BOX = np.array([-1.0, -1, -1, 1, 1, 1])
@@ -49,6 +49,9 @@ def walls(seed: int = 0) -> VMField:
     field = field.with_occupancy(middles.marked(there))
     field.shift = float(np.log(np.expm1(20 / field.scale)))
     return field.with_params(field.params * torch.tensor(2.0))
+
+
+MORE_STEPS = replace(TinySettings(), steps=400, rgb_steps=60, rays=20_000)
 
 
 def fine_walls() -> VMField:
@@ -147,8 +150,9 @@ def test_what_stands_in_a_place_is_learnt_turned_as_most_of_it_is():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 0.6])
-def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report, turn):
+def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, report, turn, in_force):
     """The place stays as it is; what is deleted leaves it so, and all others stay."""
+    in_force(MORE_STEPS)
     path = str(folder / "room.rfpack")
     write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
     places = {"room": (0, 0, 0), "red": (-0.5, 0, 0), "blue": (0.7, 0, 0)}
@@ -163,8 +167,7 @@ def test_what_stands_in_a_place_is_learnt_into_one_tensor(folder, picture, repor
         for n, at in places.items()
     ]
     write_scene(folder / "two.json", SceneGraph(tuple(nodes)))
-    words = ("fuse", "two.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
-    said = report(*words)
+    said = report("fuse", "two.json", "--kind", "vm", "-o", "one.rfpack")
     assert said["chosen"]["start"] == "'room' as it is" and said["nodes"] == 2
     (entry,) = read_bundle(folder / "one.rfpack").scene.history
     assert entry["objects"] == ["room"] and [n["name"] for n in entry["nodes"]] == ["red", "blue"]
@@ -214,13 +217,14 @@ def test_bricks_of_a_place_hold_its_colours_from_all_sides():
 
 
 @pytest.mark.slow
-def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report):
+def test_a_scene_that_adds_up_in_a_place_is_fused_to_the_place(folder, picture, report, in_force):
     """What stands around stays as it was, and the object comes in, where there are texels for it."""
+    in_force(MORE_STEPS)
     path = str(folder / "room.rfpack")
     write_field(path, fine_walls(), "room", precision="float16", overwrite=True, origin=LIES)
     scene = json.loads((folder / "place.json").read_text()) | {"composition": "add"}
     (folder / "place.json").write_text(json.dumps(scene))
-    said = report("fuse", "place.json", "--kind", "vm", "--time-budget", "8", "-o", "one.rfpack")
+    said = report("fuse", "place.json", "--kind", "vm", "-o", "one.rfpack")
     assert said["chosen"]["start"] == "the weights of 'room'"
     one, wanted = picture("one.rfpack"), picture("place.json")
     red = (wanted[..., 0] > 0.6) & (wanted[..., 2] < 0.4)
@@ -320,8 +324,11 @@ def test_what_masks_exclude_does_not_count(report, folder):
 @pytest.mark.parametrize("x", [-0.5, 4.0])
 def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     """As `sparse`, an object in the core and one far outside of it are there, and edits leave the rest."""
+    write_field(
+        str(fused / "fine.rfpack"), fine_walls(), "room", precision="float16", overwrite=True, origin=LIES
+    )
     nodes = [
-        make_node("room", source="room.rfpack", background=True),
+        make_node("room", source="fine.rfpack", background=True),
         make_node("red", source="red.rfpack", translation=(x, 0, 0), scale=(2, 2, 2)),
     ]
     more = make_node("more", source="red.rfpack", translation=(0.6, 0.5, 0))
@@ -329,13 +336,13 @@ def test_bricks_hold_a_place_and_what_stands_in_it(fused, x):
     write_scene(fused / "two.json", SceneGraph((*nodes, more)), overwrite=True)
     words = ("--kind", "sparse", "--no-finetune", "--max-size", "3MB", "-w")
     said = done(fused, "fuse", "one.json", *words, "-o", "bricks.rfpack")
-    assert said["psnr"]["stored"] > 34  # a place's colours take nine numbers each of the 3 MB
+    assert said["psnr"]["stored"] > 32  # the room's colours take nine numbers each of the 3 MB; steps show
     place = ("red.rfpack", "--name", "more", "-t", "0.6,0.5,0")
     done(fused, "add", "bricks.rfpack", *place, "-o", "more.rfpack", "-w")
     done(fused, "delete", "more.rfpack", "more", "-o", "less.rfpack", "-w")
     for bundle, against in (("more.rfpack", "two.json"), ("less.rfpack", "one.json")):
         like = done(fused, "eval", bundle, "--against", against, "--size", "48x48")["mean"]
-        assert like["psnr"] > 34
+        assert like["psnr"] > 32
 
 
 def test_a_short_time_leaves_a_student_of_a_place_room_to_begin_as_it_is():

@@ -11,9 +11,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 import fusedrf_cli
-from formats.bundle import single_field_bundle
 from formats.records import FieldRecord
 from fusedrf_cli.main import cli
+from tests.bundles import write_single
 
 ROOT = Path(__file__).parents[2]
 BRIDGE_VERBS = (
@@ -33,7 +33,7 @@ def folder(tmp_path, monkeypatch) -> Path:
     for value, name in enumerate(("chair", "table"), 1):
         arrays = {"planes": np.full((3, 2, 4, 4), value, np.float32)}
         record = FieldRecord("vm", arrays, {"aabb": [-1, -1, -1, 1, 1, 2]})
-        single_field_bundle(record, name).write(tmp_path / f"{name}.rfpack")
+        write_single(tmp_path / f"{name}.rfpack", record, name)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import click
 import pytest
 
-from formats.bundle import read_bundle, single_field_bundle
+from formats.bundle import read_bundle
 from formats.errors import MissingFile
 from formats.undo import keep
 from fusedrf_cli.main import COMMANDS, cli
+from tests.bundles import write_single
 
 WITH_INPUT = [name for name in COMMANDS if name not in ("completion", "kinds")]
 
@@ -49,11 +50,13 @@ def test_help_shows_an_example_that_runs(run, bridge, folder, name):
         (folder / file).write_bytes((folder / "chair.rfpack").read_bytes())
     assert run("compose", "chair.rfpack", "-w", "-o", "scene.json").exit_code == 0
     if name == "undo":
-        single_field_bundle(
+        write_single(
+            folder / "fused.rfpack",
             read_bundle(folder / "chair.rfpack").fields.popitem()[1],
             "chair",
             history=[{"event": "moved", "before": keep(folder / "chair.rfpack", folder / "fused.rfpack")}],
-        ).write(folder / "fused.rfpack", overwrite=True)
+            overwrite=True,
+        )
     for example in examples(result.stdout):
         words = [word.rstrip("/") for word in shlex.split(example)]
         assert words[0] == name

@@ -4,8 +4,9 @@ import json
 
 import numpy as np
 
-from formats.bundle import read_summary, single_field_bundle
+from formats.bundle import read_summary
 from formats.records import FieldRecord
+from tests.bundles import write_single
 from tests.formats.test_captures import frame, write
 from tests.formats.test_readers import noisy
 
@@ -58,7 +59,7 @@ def test_info_lists_the_objects_of_a_fused_bundle(run, folder):
     blocks = {"blocks": [block], "tensors": [{"aabb": [0, 0, 0, 9, 9, 9]}]}
     for name, kind, metadata in (("blocks", "vm", blocks), ("distilled", "lamp", {})):
         record = FieldRecord(kind, arrays, {"aabb": [0, 0, 0, 9, 9, 9], **metadata})
-        single_field_bundle(record, "fused", history=history).write(folder / f"{name}.rfpack")
+        write_single(folder / f"{name}.rfpack", record, "fused", history=history)
     lines = run("info", "blocks.rfpack").stdout.splitlines()
     start = lines.index("nodes:")
     assert [line.split()[:5] for line in lines[start + 1 : start + 3]] == [

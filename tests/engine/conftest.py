@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds.vm.field import VMField, VMShape
 from tests.analytic.export import SHAPE as THIRTY_TWO  # float32's: few shapes, since each is compiled

@@ -14,14 +14,13 @@ from pathlib import Path
 import pytest
 
 from fusedrf_cli.bridge.evaluation_views import EvaluationViewConfig
-from fusedrf_cli.engine.distillation.finetune import FinetuneConfig, FinetuneRays
+from fusedrf_cli.engine.distillation.finetune import FinetuneConfig
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig
-from fusedrf_cli.engine.kinds import instances
-from fusedrf_cli.engine.kinds.builder import DistilledBuilder
-from fusedrf_cli.engine.kinds.registry import field_kinds
-from fusedrf_cli.engine.kinds.vm.builder import VMConfig
+from fusedrf_cli.engine.kinds.instances import InstancesConfig
+from fusedrf_cli.engine.kinds.vm.builder import VMBuilderConfig
 from tests.analytic.export import SHAPE, NotExportable
 from tests.bridge.conftest import TinySettings
+from tests.bundles import field_kinds
 from tests.engine.kinds.cases import SLOW_TO_COMPILE
 
 ROW = re.compile(r"test_([a-z]+\d+)_")
@@ -76,14 +75,16 @@ def row(request) -> Row:
 
 
 @pytest.fixture
-def quick(monkeypatch, in_force) -> None:
+def quick(in_force) -> None:
     """Coarse grids over a scene, and commands that distil for a second and judge small pictures."""
-    in_force(OccupancyConfig(scene_cells=48), VMConfig(SHAPE))
-    monkeypatch.setattr(DistilledBuilder, "distil_config", TinySettings())
-    monkeypatch.setattr("fusedrf_cli.bridge.building.DistilConfig", TinySettings)  # for what is not taught
-    monkeypatch.setattr(instances.InstancesBuilder, "ranks", (None,))  # others would be compiled
-    monkeypatch.setattr(FinetuneRays, "config", FinetuneConfig(rays=15_000, steps=30, rays_per_step=500))
-    in_force(EvaluationViewConfig(whole=2, most_objects=0))
+    in_force(
+        OccupancyConfig(scene_cells=48),
+        VMBuilderConfig(SHAPE),
+        TinySettings(),
+        FinetuneConfig(rays=15_000, steps=30, rays_per_step=500),
+        InstancesConfig(ranks=(None,)),  # others would be compiled
+        EvaluationViewConfig(whole=2, most_objects=0),
+    )
 
 
 def pytest_generate_tests(metafunc):

@@ -22,7 +22,6 @@ from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting
-from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.vm import KIND as VM
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from fusedrf_cli.engine.rendering.metrics import psnr
@@ -37,6 +36,7 @@ from tests.analytic.measure import LSB, answers, depth_along, photo, worst_relat
 from tests.analytic.rays import affine, points_in, turn, unit
 from tests.analytic.scenes import Scene, camera_at, scene_of
 from tests.bridge.conftest import TinySettings, done, invoke
+from tests.bundles import field_kinds
 
 pytestmark = pytest.mark.usefixtures("quick")
 
@@ -170,9 +170,7 @@ def test_b5_a_rod_through_a_box(row, way):
     band = outline(wanted)
     what = f"{way}: against the truth, away from outlines"
     row.check("B5", what, psnr(found[~band], wanted[~band]), 50, scene="S4", unit="dB")
-    row.check(
-        "B5", f"{way}: in a band of 4 px", psnr(found[band], wanted[band]), 25, scene="S4", unit="dB"
-    )
+    row.check("B5", f"{way}: in a band of 4 px", psnr(found[band], wanted[band]), 25, scene="S4", unit="dB")
 
 
 def outline(picture: np.ndarray, width: int = 2) -> np.ndarray:

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from benchmarks import stability
+from benchmarks.commit import commit_line
 
 SUITE = """
 import pytest
@@ -75,7 +76,7 @@ def test_the_table_has_every_row_and_hides_no_failure(tmp_path):
     (tmp_path / "records").write_text("\n".join(json.dumps(r) for r in records))
     stability.main(str(tmp_path / "records"), str(tmp_path / "docs"))
     page = (tmp_path / "docs" / "stability.md").read_text()
-    assert "**1 of 2 rows" in page
+    assert page.splitlines()[2] == commit_line() and "**1 of 2 rows" in page
     assert "| A1 | S2 | PSNR (draft) | 31 dB | ≥ 30 dB | 3/3 | pass |" in page
     assert "| A2 | S2 | error | 3e-05 | ≤ 1e-05 | 0/1 | FAIL |" in page
     assert "skipped: nothing contracts yet" in page and page.count("not run") == 9 + 16 + 11 + 11 - 3

@@ -81,7 +81,7 @@ def test_t1_an_empty_occupancy_keeps_the_box(row, images, unseen_psnr, monkeypat
     monkeypatch.setattr(module, "occupancy_of", blind_twice)
     run = FitRun.start(CAMERAS, images, BOX, replace(BRIEF, steps=2 * SHOWS))
     field = run.finish()
-    assert run.found_nothing >= 2 and run.found_matter
+    assert run.found_nothing >= 2 and run.found_density
     moved = max(abs(box - BOX).max() for box in boxes[:3])
     row.check("T1", "largest move of the box", moved, 0, at_most=True)
     row.check("T1", "PSNR after two empty searches", unseen_psnr(field), 28, unit="dB")
@@ -130,7 +130,7 @@ def test_t1_pictures_of_nothing(row, images):
     """Nothing is ever found; the box is as large as it was, and every number is finite."""
     run = FitRun.start(CAMERAS, images * 0, BOX, replace(BRIEF, steps=30))
     field = run.finish()
-    assert not run.found_matter and torch.isfinite(field.params).all()
+    assert not run.found_density and torch.isfinite(field.params).all()
     row.check("T1", "move of the box over pictures of nothing", abs(field.aabb - BOX).max(), 0, at_most=True)
 
 

@@ -22,16 +22,15 @@ from formats.bundle import (
     field_member,
     is_bundle,
     member_name,
-    parse_bundle,
     read_bundle,
     read_headers,
     read_summary,
     sha256_of,
-    single_field_bundle,
     world_aabb,
 )
 from formats.records import FieldRecord, encode_field
 from formats.scene import SceneGraph, dump_scene, make_node, write_scene
+from tests.bundles import parse_bundle, write_single
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = Path(__file__).parent / "golden" / "lamp.rfpack"
@@ -143,7 +142,7 @@ def test_round_trip(tmp_path_factory, values):
 
 
 def test_one_field_in_one_call(tmp_path):
-    single_field_bundle(LAMP, "lamp", precision="float32", history=[{"verb": "train"}]).write(tmp_path / "a")
+    write_single(tmp_path / "a", LAMP, "lamp", precision="float32", history=[{"verb": "train"}])
     bundle = read_bundle(tmp_path / "a")
     assert bundle.scene.history == ({"verb": "train"},)
     (leaf,) = bundle.scene.leaves()
@@ -325,7 +324,7 @@ def test_an_opened_bundle_stays_the_version_that_was_opened(tmp_path):
     path, versions = tmp_path / "a.rfpack", []
     for number in (1.0, 2.0):
         record = FieldRecord("dense", {"sigma": np.full((4, 4, 4), number, np.float32)}, {})
-        single_field_bundle(record, "node").write(path, overwrite=True)
+        write_single(path, record, "node", overwrite=True)
         versions.append(path.read_bytes())
     path.write_bytes(versions[0])
     bundle = OpenBundle(path)

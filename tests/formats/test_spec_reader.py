@@ -7,7 +7,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from formats.bundle import BundleWriter, single_field_bundle
+from formats.bundle import BundleWriter
 from formats.records import FieldRecord, decode_field, encode_field
 from formats.scene import SceneGraph, make_node
 from fusedrf_cli.bridge.scene import make_field
@@ -15,6 +15,7 @@ from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.spaces import contracted_l2, contracted_linf, ndc, space_of, unbounded
 from fusedrf_cli.main import cli
 from fusedrf_cli.python import open_scene
+from tests.bundles import write_single
 from tests.engine.conftest import points_in, unit
 from tests.engine.kinds.cases import KINDS  # noqa: F401  (a fixture)
 from tests.formats import spec_reader
@@ -34,7 +35,7 @@ def test_a_reader_written_from_the_specification_answers_as_the_engine(name, pre
     made = KINDS[name]()
     arrays, metadata = made.state()
     record = FieldRecord(made.kind, arrays, metadata)
-    single_field_bundle(record, "node", precision=precision).write(tmp_path / "a.rfpack")
+    write_single(tmp_path / "a.rfpack", record, "node", precision=precision)
     field = make_field(decode_field(encode_field(record, precision), "here"), "here")
     points = points_in(field.aabb, COUNT, margin=0.05)
     dirs = unit(np.random.default_rng(5).normal(size=(COUNT, 3)))
@@ -63,7 +64,7 @@ SPACES = {
 def test_the_words_of_spaces(space, tmp_path):
     made = KINDS["dense"]().resampled(space.WHOLE, (6, 6, 6))
     made = made.with_occupancy(OccupancyGrid.full(space.WHOLE, 4, space))
-    single_field_bundle(FieldRecord(made.kind, *made.state()), "node").write(tmp_path / "a.rfpack")
+    write_single(tmp_path / "a.rfpack", FieldRecord(made.kind, *made.state()), "node")
     _, fields = spec_reader.open_bundle(tmp_path / "a.rfpack")
     points = space.inv_contract(torch.from_numpy(points_in(0.9 * space.WHOLE, COUNT)))
     dirs = unit(np.random.default_rng(5).normal(size=(COUNT, 3)))

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from formats import undo as undoing
-from formats.bundle import sha256_of, single_field_bundle
+from formats.bundle import sha256_of
 from formats.errors import BadSchema, FormatError, MissingFile, ResourceError
 from formats.records import FieldRecord
 from formats.undo import check_history_folder, history, history_folder, keep, undo
+from tests.bundles import write_single
 
 
 def write(path, value: int, *entries) -> bytes:
@@ -17,7 +18,7 @@ def write(path, value: int, *entries) -> bytes:
     record = FieldRecord(
         "vm", {"planes": np.full((3, 2, 4, 4), value, np.float32)}, {"aabb": [0] * 3 + [1] * 3}
     )
-    single_field_bundle(record, "one", history=entries).write(path, overwrite=True)
+    write_single(path, record, "one", history=entries, overwrite=True)
     return path.read_bytes()
 
 

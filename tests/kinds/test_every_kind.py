@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from formats.bundle import read_bundle
+from fusedrf_cli import verbs
 from fusedrf_cli.bridge.scene import load_scene
 from fusedrf_cli.engine.fields.streamed import opened
 from fusedrf_cli.engine.kinds import registry
-from fusedrf_cli.engine.kinds.builder import DistilledBuilder
 from fusedrf_cli.engine.kinds.sparse.builder import SparseBuilder
 from fusedrf_cli.engine.rendering.metrics import psnr
+from fusedrf_cli.engine.settings import using
+from fusedrf_cli.errors import UsageProblem
 from fusedrf_cli.requests import FuseRequest
 from fusedrf_cli.verbs import checked
 from tests.bridge.conftest import TinySettings, done, write_scene_of
@@ -28,10 +30,9 @@ PHOTOS = ("train", "photos", "-o", "out.rfpack", "--aabb", "-0.5,-0.5,-0.5,0.5,0
 
 @pytest.fixture(scope="module", autouse=True)
 def short(tiny):  # noqa: F811
-    with pytest.MonkeyPatch.context() as patch:
+    # a network takes its time
+    with pytest.MonkeyPatch.context() as patch, using(TinySettings(points_per_step=1 << 11)):
         patch.setattr(SparseBuilder, "distil_config", TinySettings(steps=0, rgb_steps=10, rgb_rate=0.015))
-        # a network takes its time
-        patch.setattr(DistilledBuilder, "distil_config", TinySettings(points_per_step=1 << 11))
         yield
 
 
@@ -106,7 +107,9 @@ def test_what_was_distilled_is_cut_out(fused, report, picture, folder, kind):
 def test_photos_become_a_field_of_it_or_a_clear_sentence(run, report, folder, kind):
     if not registry.kind(kind).trains:
         result = run(*PHOTOS, "--kind", kind)
-        assert result.exit_code == 2 and "does not begin from photos" in result.stderr
+        assert result.exit_code == 2 and f"{kind!r} is not one of" in result.stderr
+        with pytest.raises(UsageProblem, match="does not begin from photos"):
+            verbs.train("photos", "out.rfpack", kind=kind)
         assert not (folder / "out.rfpack").exists()
         return
     said = report(*PHOTOS, "--kind", kind)

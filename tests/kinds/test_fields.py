@@ -9,9 +9,9 @@ import torch
 from formats.records import FieldRecord, as_stored, decode_field, encode_field
 from fusedrf_cli.bridge.scene import make_field
 from fusedrf_cli.engine.fields.computed import Batch, ComputedField
-from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.engine.rendering.volume import march_rays, reach_of, render_rays
 from fusedrf_cli.errors import InvalidInput
+from tests.bundles import field_kinds
 from tests.engine.conftest import points_in, rays_at, unit
 from tests.engine.kinds.cases import KINDS, SLOW_TO_COMPILE  # noqa: F401  (a fixture)
 
@@ -38,7 +38,7 @@ def answers(field, points, dirs):
 
 
 def test_every_kind_of_field_is_tried():
-    assert {make().kind for make in FIELDS.values()} == set(registry.field_kinds())
+    assert {make().kind for make in FIELDS.values()} == set(field_kinds())
 
 
 def test_no_kind_hides_what_every_computed_field_does():
@@ -111,9 +111,7 @@ def test_as_stored_is_as_it_comes_back(field):
     single = field.with_params(field.params.float())
     points, dirs = asked(field)
     for precision in ("float32", "float16", "int8", "int4"):
-        told = single.stored(
-            lambda array, name, runs, p=precision: as_stored(array, p, name, runs)
-        )
+        told = single.stored(lambda array, name, runs, p=precision: as_stored(array, p, name, runs))
         data = encode_field(FieldRecord(field.kind, *single.state()), precision)
         read = make_field(decode_field(data, "bundle"), "bundle")
         for found, wanted in zip(*(answers(one, points, dirs) for one in (told, read)), strict=True):

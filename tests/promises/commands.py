@@ -21,12 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
-from formats.bundle import is_bundle, read_bundle, single_field_bundle
+from formats.bundle import is_bundle, read_bundle
 from formats.records import FieldRecord
 from fusedrf_cli import bridge  # noqa: F401  (imported before the first fork)
 from fusedrf_cli.engine import kernels  # noqa: F401
 from fusedrf_cli.engine.kinds import registry
 from fusedrf_cli.main import main as command_line
+from tests.bundles import write_single
 from tests.promises.fuzz import GOOD
 from tests.promises.mutations import mutated
 from tests.promises.packs import GOLDEN
@@ -63,7 +64,7 @@ def boxed(name: str, texels: tuple, cells: tuple, box: list, precision: str) -> 
             **{"aabb": box, "resolution": list(texels), "scale": 1.0, "shift": -8.0},
             **{"shape": vars(shape), "cells": {"aabb": box, "counts": list(cells)}},
         }
-        single_field_bundle(FieldRecord(name, arrays, metadata), "a", precision=precision).write(path)
+        write_single(path, FieldRecord(name, arrays, metadata), "a", precision=precision)
 
     return write
 
@@ -75,7 +76,7 @@ def of_blocks(count: int) -> Callable[[Path], None]:
         record = read_bundle(GOLDEN / "ring.rfpack").fields.popitem()[1]
         block = record.metadata["blocks"][0]
         record.metadata["blocks"] = [{**block, "name": f"b{i}"} for i in range(count)]
-        single_field_bundle(record, "a").write(path)
+        write_single(path, record, "a")
 
     return write
 

@@ -241,7 +241,7 @@ def network(unbounded: bool = False):
 
 def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
     """A closed room of mottled walls around an empty core, in all of space, with a hashed detail."""
-    from fusedrf_cli.engine.fields.hash_entries import HashGrid
+    from fusedrf_cli.engine.encodings.hash_runs import HashGrid
     from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
     from fusedrf_cli.engine.kinds.vm.field import VMField
     from fusedrf_cli.engine.spaces import unbounded
@@ -264,7 +264,7 @@ def walls(shape=None, hashed: bool = True, resolution: int = 17, seed: int = 0):
 
 def furnished():
     """Far walls and a ball in the core that shows some of the detail's rows."""
-    from fusedrf_cli.engine.fields.hash_entries import HashGrid
+    from fusedrf_cli.engine.encodings.hash_runs import HashGrid
     from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
     from fusedrf_cli.engine.kinds.vm.field import VMField
     from fusedrf_cli.engine.spaces import unbounded
@@ -326,7 +326,7 @@ MIRRORED[:3, 3] = 0.4, 0.5, 0.3
 
 def small_objects(folder: Path) -> None:
     """one, two and three: random `vm` fields, of which the second has a detail."""
-    from fusedrf_cli.engine.fields.hash_entries import HashGrid
+    from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 
     write(folder / "one.rfpack", tensor(1))
     write(folder / "two.rfpack", tensor(2, hashed=HashGrid((0.31, 0.07), 64), scale=30.0, shift=-6.0))

@@ -120,7 +120,7 @@ def test_a_history_cannot_send_an_edit_outside(folder, source, monkeypatch):
     monkeypatch.setattr(sources, "unchanged", opened)
     node = {"source": source, "sha256": "0" * 64, "field": "f"}
     try:
-        assert sources.source_bundle(node, folder / "fused.rfpack", sources.SourceFolder(None), False) is None
+        assert sources.source_bundle(node, folder / "fused.rfpack", False, None) is None
     except ValueError:
         assert not source.isprintable()  # such a history is refused before; see below
 

@@ -1,10 +1,9 @@
 """Placing a radiance field by an invertible affine map, so that every ray keeps its optical depth.
 
 With x_world = M x_object + t and a unit world direction d: x_object = M^-1 (x_world - t), v = M^-1 d, the
-direction in the object's
-frame is v/|v|, and σ_world(x, d) = σ_object(x_object) |v| (DESIGN, Conventions). That is
-exact for any invertible M; a uniform scale k gives σ_object / k. Matrices are (4, 4) float64; columns act
-on points.
+direction in the object's frame is v/|v|, and σ_world(x, d) = σ_object(x_object) |v| (DESIGN, Conventions).
+That is exact for any invertible M; a uniform scale k gives σ_object / k. Matrices are (4, 4) float64; columns
+act on points.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.fields.base import RadianceField
-from fusedrf_cli.engine.fields.occupancy import seen_placement, transformed_aabb
+from fusedrf_cli.engine.fields.occupancy import seen_placement, squeezed, transformed_aabb
 from fusedrf_cli.engine.kernels.reference import exact
 from fusedrf_cli.engine.spaces import bounded
 
@@ -81,9 +80,7 @@ class Placed:
     @property
     def voxel_size(self) -> float:
         """The field's finest detail in world units."""
-        return self.field.voxel_size * float(
-            np.linalg.svd(self.object_to_world[:3, :3], compute_uv=False)[-1]
-        )
+        return self.field.voxel_size * squeezed(self.object_to_world)
 
     def to_object(
         self, points: torch.Tensor, dirs: torch.Tensor, pose: torch.Tensor | None = None

@@ -31,15 +31,12 @@ class ComposedField:
     """The naive composition that fusing is measured against: every field is asked at every sample.
 
     Under `max` (FusedRF, eq. 2) the field with the highest σ gives σ and colour, ties going to the lower
-    index; since all share
-    the step that is the highest alpha, without the ties that alpha has in float32. Under `add` (D2NeRF) σ =
-    Σσ_i and
-    c = Σσ_i c_i / Σσ_i. The frame's origin is the scene's centre, `origin` in the world, so that a scene far
-    from the world's
-    origin loses no digits: world points and ray origins have `origin` subtracted in float64 before they come
-    here. Where a scene is of no ordinary size, `origin` is a placement (4, 4) with a unit (`frame_around`).
-    Where a field fills all of space, the frame is that field's, of the largest core where there are
-    several, and `origin` its placement (4, 4).
+    index; since all share the step that is the highest alpha, without the ties that alpha has in float32.
+    Under `add` (D2NeRF) σ = Σσ_i and c = Σσ_i c_i / Σσ_i. The frame's origin is the scene's centre, `origin`
+    in the world, so that a scene far from the world's origin loses no digits: world points and ray origins
+    have `origin` subtracted in float64 before they come here. Where a scene is of no ordinary size, `origin`
+    is a placement (4, 4) with a unit (`frame_around`). Where a field fills all of space, the frame is that
+    field's, of the largest core where there are several, and `origin` its placement (4, 4).
     """
 
     kind = "composed"
@@ -113,7 +110,7 @@ class ComposedField:
 
     @property
     def look_at_box(self) -> np.ndarray:
-        """(6,) box of this frame that views look at, as OccupancyGrid.subject."""
+        """(6,) box of this frame that views look at, as OccupancyGrid.look_at_box."""
         if not any(p.unbounded for p in self.placed):
             return self.occupancy.look_at_box
         around = largest(self.placed)

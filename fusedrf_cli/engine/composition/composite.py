@@ -320,11 +320,11 @@ class Waves:
             return
         meet, room = self.told("n_meeting")[shared], self.segments.meeting.shape[1]
         if meet.max() > room:
-            again, n_meeting = shared[meet > room], self.here()
-            wider = np.empty((len(n_meeting.end), meet.max()), np.int64)
-            wider[:, :room] = n_meeting.meeting
-            n_meeting.end[again] = n_meeting.alone_from[again]
-            self.segments = self.loops.on_device(n_meeting._replace(meeting=wider))
+            again, segments = shared[meet > room], self.here()
+            wider = np.empty((len(segments.end), meet.max()), np.int64)
+            wider[:, :room] = segments.meeting
+            segments.end[again] = segments.alone_from[again]
+            self.segments = self.loops.on_device(segments._replace(meeting=wider))
             self.segment_loops.next_segments(*arguments, again, self.segments)
 
     def parts(self, shared: np.ndarray) -> list[np.ndarray]:

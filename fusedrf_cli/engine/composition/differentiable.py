@@ -39,8 +39,8 @@ def query(
         kind, device = float_type(field), device_of(field)
         for part in parts(field):
             differentiable.settle(part)
-        structured = structure(field, poses).query(points, dirs, with_colour)
-        return tuple(answers.to(device, kind) for answers in structured)
+        answers = structure(field, poses).query(points, dirs, with_colour)
+        return tuple(answer.to(device, kind) for answer in answers)
     if isinstance(field, ComposedField):
         return composed_query(field, points, dirs, poses or {}, with_colour)
     if isinstance(field, Placed):

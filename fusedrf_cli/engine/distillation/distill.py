@@ -102,8 +102,8 @@ class DistillRun:
         recipe: Recipe = Recipe(),
         evaluator: Callable[[StoredField], float] | None = None,
     ):
-        """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. A judge
-        says how near a student comes, in dB; None: one of the same teacher and config.
+        """The arguments are those of `distill`; the recipe is for measuring what its parts are worth. The
+        evaluator says how near a student comes, in dB; None: one of the same teacher and config.
         """
         self.teacher, self.sampler, self.rgb, self.evaluator = teacher, sampler, rgb, evaluator
         self.config, self.recipe, self.step = config, recipe, sampling_step(student)

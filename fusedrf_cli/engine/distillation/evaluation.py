@@ -72,14 +72,6 @@ class Evaluator:
         return Evaluation(psnr(shots, self.truth), covered, float(seen.mean()), each)
 
 
-def rays_meeting(rays_o: np.ndarray, rays_d: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(N,) bool: which rays (N, 3) meet a box (6,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 on a face: nan, which nanmax passes over
-        faces = (box.reshape(2, 1, 3) - rays_o) / rays_d
-    enter, leave = np.nanmax(faces.min(0), 1), np.nanmin(faces.max(0), 1)
-    return (leave >= 0) & (enter <= leave)
-
-
 def scattered_evaluator(teacher: RadianceField, views: int, size: int, seed: int) -> Evaluator:
     """A judge by seeded views from around a teacher's density."""
     config = current(EvaluatorConfig)

@@ -13,6 +13,7 @@ from fusedrf_cli.engine.distillation.shuffle import Shuffle
 from fusedrf_cli.engine.fields.base import RadianceField, StoredField, sampling_step
 from fusedrf_cli.engine.kernels import working_time
 from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.settings import current
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,6 @@ class FinetuneConfig:
 class FinetuneRays:
     """Seeded rays around a scene and its objects, and what a teacher shows along them."""
 
-    config = FinetuneConfig()
-
     def __init__(
         self,
         teacher: RadianceField,
@@ -48,7 +47,7 @@ class FinetuneRays:
     ):
         """The sampler draws rays, as many as the config says by default, in the teacher's frame. share: of
         the rays, and of those of a step, where the teacher is one of several that share them."""
-        self.seed = seed
+        self.seed, self.config = seed, current(FinetuneConfig)
         self.rays_per_step = max(1, round(share * self.config.rays_per_step))
         generator = torch.Generator().manual_seed(seed)
         self.rays_o, self.rays_d = sampler.draw(rays or max(1, round(share * self.config.rays)), generator)

@@ -22,7 +22,7 @@ from fusedrf_cli.engine.distillation.occupancy_update import (
     occupancy_of,
     prune_low_density,
 )
-from fusedrf_cli.engine.distillation.optimiser import Adam, AdamConfig, alike
+from fusedrf_cli.engine.distillation.optimiser import Adam, alike
 from fusedrf_cli.engine.distillation.poses import (
     Poses,
     changed,
@@ -85,7 +85,7 @@ class FitRun:
         self.exposures = list(config.exposures.at) if config.exposure else []
         self.refinements = list(config.refining.at) if config.poses else []
         self.mse, self.rays = None, self.config.least_rays
-        self.found_matter, self.found_nothing = False, 0
+        self.found_density, self.found_nothing = False, 0
         self.held: tuple[dict[str, np.ndarray], dict] | None = None
         """What `checkpoint` said before the refresh that is going on, which may take long and changes no
         array."""
@@ -148,8 +148,7 @@ class FitRun:
 
     def fresh_optimiser(self) -> Adam:
         """An optimiser of the field as it is now."""
-        usual = current(AdamConfig).beta1
-        return Adam.of(self.field, self.config.unbounded_momentum if self.config.unbounded else usual)
+        return Adam.of(self.field, self.config.unbounded_momentum if self.config.unbounded else None)
 
     def forget(self) -> None:
         """Let go of what only another step would need, several times the field's numbers."""
@@ -184,7 +183,7 @@ class FitRun:
             "refreshes": self.refreshes,
             "exposures": self.exposures,
             "refinements": self.refinements,
-            "found": [self.found_matter, self.found_nothing],
+            "found": [self.found_density, self.found_nothing],
             "mse": self.mse,
             "rays": self.rays,
             "guard": self.nan_guard.state(),
@@ -211,7 +210,7 @@ class FitRun:
             self.maps = alike(arrays["exposure"], self.maps, "exposure")
         poses = {"rotation": self.pool.rotation, "position": self.pool.position}
         self.pool.set_poses(Poses(*(alike(arrays[name], part, name) for name, part in poses.items())))
-        self.found_matter, self.found_nothing = state["found"]
+        self.found_density, self.found_nothing = state["found"]
         self.mse, self.rays = state["mse"], state["rays"]
         self.started = working_time() - max(state["elapsed"], 0)
         self.nan_guard.restore(state["guard"])
@@ -265,7 +264,7 @@ class FitRun:
             )
         if self.refinements and share >= self.refinements[0]:
             self.refinements.pop(0)
-            if self.found_matter:
+            if self.found_density:
                 self.refine_poses(share)
 
     def refine_poses(self, share: float) -> None:
@@ -297,7 +296,7 @@ class FitRun:
             if self.refreshes and self.refreshes[0] > retry:
                 self.refreshes.insert(0, retry)
             return
-        self.found_matter = True
+        self.found_density = True
         self.occupy(occupancy)
         tight = occupancy.tight_aabb()
         if not self.config.unbounded and volume(tight) < self.config.shrink_below * volume(occupancy.aabb):
@@ -382,8 +381,8 @@ class FitRun:
         self.steps += 1
 
     def draw(self, share: float) -> tuple[np.ndarray, np.ndarray, torch.Tensor, np.ndarray, np.ndarray]:
-        """Rays of a step with their pixels and pictures, as RayPool.draw gives them, and the depths (m,) of
-        the first m, which are known."""
+        """Rays of a step with their pixels and pictures, as `RayDataset.draw` gives them, and the depths (m,)
+        of the first m, which are known."""
         n_depth = 0 if self.depth_points is None else self.depth_points.wanted(self.rays, share)
         if not n_depth:
             return *self.pool.draw(self.rays), NONE_KNOWN
@@ -395,7 +394,7 @@ class FitRun:
 
     def near(self, share: float) -> float:
         """The distance from a camera before which nothing is learnt, which shrinks while the scene takes
-        shape: the cheapest explanation of a photo is floaters right before its camera."""
+        shape: what explains a photo most cheaply are floaters right before its camera."""
         config = self.config
         early = max(0.0, 1 - share / self.config.settled) if config.unbounded else 0.0
         return config.near * (1 + (self.config.early_near - 1) * early)

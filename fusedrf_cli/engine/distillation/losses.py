@@ -18,7 +18,7 @@ class LossConfig:
     opaque: float = 5.0
     """Optical depth of a step beyond which more density cannot be seen."""
     depth_gain: float = 10.0
-    """In log1p(gain τ): how much thin floaters counts."""
+    """In log1p(gain τ): how much thin floaters count."""
     faint: float = 1e-8
     """Optical depth of a step under which a student that should be denser learns as if it had it."""
     most_lift: float = 1e30

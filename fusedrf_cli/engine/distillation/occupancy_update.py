@@ -32,16 +32,17 @@ CLOSE_PROBES = np.stack(np.meshgrid(*[(np.arange(4) + 0.5) / 4] * 3, indexing="i
 
 
 def occupancy_of(
-    field: StoredField, box: np.ndarray | None = None, cells: int = OccupancyConfig.cells
+    field: StoredField, box: np.ndarray | None = None, cells: int | None = None
 ) -> OccupancyGrid:
     """Cells of the box (6,) of a field on one grid, by default that of its present occupancy, in which the
-    optical depth across the cell passes `empty_below` somewhere, grown by one cell.
+    optical depth across the cell passes `empty_below` somewhere, grown by one cell. cells: along the longest
+    axis at most, by default those of `OccupancyConfig`.
 
     Cells whose centre the present grid calls empty stay so: they were grown by one when they were found.
     """
     space = field.occupancy.space
     box = field.aabb if box is None else box
-    counts = cell_counts(box, min(cells, max(field.resolution)))
+    counts = cell_counts(box, min(cells or current(OccupancyConfig).cells, max(field.resolution)))
     cell = (box[3:] - box[:3]) / counts
     index = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3)
     index = index[field.occupancy.contains(box[:3] + (index + 0.5) * cell)]

@@ -35,11 +35,13 @@ class Adam:
 
     field: ComputedField
     parts: int
-    beta1: float = AdamConfig.beta1
-    """How much of the moves before each step goes on; with 0 no first moment is kept."""
+    beta1: float | None = None
+    """How much of the moves before each step goes on; with 0 no first moment is kept. None: as `AdamConfig`
+    has it."""
 
     def __post_init__(self):
         params = self.field.params
+        self.beta1 = current(AdamConfig).beta1 if self.beta1 is None else self.beta1
         # Rows start on a cache line, so that a run of numbers touches no more lines than it must.
         count, kind = len(params), (params.dtype, params.device)
         self.gradient = large_pages.zeros(self.parts * count, *kind).view(self.parts, count)
@@ -49,7 +51,7 @@ class Adam:
         self.steps = 0
 
     @classmethod
-    def of(cls, field: ComputedField, beta1: float = AdamConfig.beta1) -> "Adam":
+    def of(cls, field: ComputedField, beta1: float | None = None) -> "Adam":
         """An optimiser with as many rows of gradients as the field's loops add to."""
         return cls(field, field.gradient_rows, beta1)
 

@@ -30,7 +30,7 @@ class TeacherConfig:
     occupied_depth: float = 1e-3
     """Optical depth of a step from which a sample counts as density."""
     empty_share: float = 0.15
-    """Of the samples with less that are kept: nine in ten are such, and without them floaters stays."""
+    """Of the samples with less that are kept: nine in ten are such, and without them floaters stay."""
     reckoned_rays: int = 2000
     """Of which the number of points is reckoned."""
 
@@ -99,12 +99,11 @@ def query_teacher(
     step: float,
     generator: torch.Generator,
     chance: Chance = surface_first,
-    at_once: int = RenderConfig.rays_at_once,
 ) -> TeacherSamples:
     """Render rays (R, 3) through a teacher and keep some samples in front of what is opaque as points, in
     random order.
     """
-    parts = []
+    parts, at_once = [], current(RenderConfig).rays_at_once
     for start in range(0, len(rays_o), at_once):
         part = slice(start, start + at_once)
         parts.append(_ask_part(teacher, rays_o[part], rays_d[part], step, generator, chance))
@@ -139,7 +138,7 @@ def _like(rows: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def expected_points(teacher: RadianceField, sampler: RaySampler, rays: int, step: float, seed: int) -> int:
-    """About how many points `ask` keeps of so many rays, reckoned from a few of them."""
+    """About how many points `query_teacher` keeps of so many rays, reckoned from a few of them."""
     config = current(TeacherConfig)
     generator = torch.Generator().manual_seed(seed)
     few = sampler.draw(config.reckoned_rays, generator)

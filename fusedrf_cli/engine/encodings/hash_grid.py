@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from fusedrf_cli.engine.encodings.hash_runs import PRIMES
 from fusedrf_cli.engine.fields.box import ParameterBlock, largest
 from fusedrf_cli.engine.kernels.prefetch import prefetch
 from fusedrf_cli.engine.kernels.primitives import accumulate
+from fusedrf_cli.engine.kernels.reference import OCTANTS, whole
 
-PRIMES = 2654435761, 805459861  # of y and z
 FILLED = 8  # rows of a level are filled up to a multiple of
 
 
@@ -66,8 +67,7 @@ def reference(
         at = unit * float(scale) + 0.5
         below = at.detach().floor()
         total = table.new_zeros(len(unit), features)
-        for corner in range(8):
-            offset = torch.tensor([corner >> 2, corner >> 1 & 1, corner & 1], device=unit.device)
+        for offset in whole(OCTANTS, unit.device):
             weight = torch.where(offset == 1, at - below, 1 - (at - below)).prod(1)
             x, y, z = (below.long() + offset).unbind(1)
             number = (z * side + y) * side + x
@@ -103,7 +103,7 @@ def corner(field, level, below, share, q):
     i, j, k = below[0] + a, below[1] + b, below[2] + c
     side, rows = field.sides[level], field.rows[level]
     if side * side * side > rows:
-        row = (i ^ (j * 2654435761) ^ (k * 805459861)) & (rows - 1)
+        row = (i ^ (j * PRIMES[0]) ^ (k * PRIMES[1])) & (rows - 1)
     else:
         row = ((k * side + j) * side + i) % rows
     return np.uint64(field.starts[level] + row * FEATURES), field.params.dtype.type(weight)

@@ -12,13 +12,12 @@ import numpy as np
 import torch
 
 from fusedrf_cli.engine.encodings import hash_runs, plane_line
+from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, HashGrid, rows_at, scatter_rows
 from fusedrf_cli.engine.encodings.hash_runs import prefetch_at as prefetch_rows
-from fusedrf_cli.engine.encodings.hash_runs import rows_at, scatter_rows
 from fusedrf_cli.engine.encodings.plane_line import prefetch_at as prefetch_planes
 from fusedrf_cli.engine.encodings.plane_line import summed as planes_summed
 from fusedrf_cli.engine.encodings.plane_line import summed_backward as planes_backward
 from fusedrf_cli.engine.fields.box import ParameterBlock
-from fusedrf_cli.engine.fields.hash_entries import EMPTY_FROM, HashGrid
 
 
 class Arrays(NamedTuple):
@@ -100,10 +99,10 @@ def pack_cell(cell):
     return cell[3]
 
 
-def unpack_cell(field, samples, unit):
+def unpack_cell(field, packed, unit):
     """See encodings."""
     real = field.params.dtype.type
-    return real(unit[0]), real(unit[1]), real(unit[2]), samples
+    return real(unit[0]), real(unit[1]), real(unit[2]), packed
 
 
 def summed(field, cell, scratch):

@@ -55,9 +55,25 @@ class Slot:
         ]
 
 
+class HarmonicShape:
+    """What the shapes of kinds have in common whose colours are spherical harmonics."""
+
+    sh_degree: int
+
+    def __post_init__(self):
+        """Refuse degrees that the kernels were not written for."""
+        if self.sh_degree not in range(4):
+            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
+
+    @property
+    def coefficients(self) -> int:
+        """SH coefficients per channel."""
+        return (self.sh_degree + 1) ** 2
+
+
 @dataclass(frozen=True)
-class RankedShape:
-    """Components of a decomposed field whose colours are spherical harmonics."""
+class RankedShape(HarmonicShape):
+    """Components of a decomposed field."""
 
     density_rank: int = 16
     """Components, per mode, of the density."""
@@ -66,18 +82,12 @@ class RankedShape:
     sh_degree: int = 2
 
     def __post_init__(self):
-        """Refuse what the kernels were not written for: runs of eight components, four SH bands."""
+        """Refuse what the kernels were not written for: runs of eight components, and HarmonicShape's."""
         for name in ("density_rank", "colour_rank"):
             rank = getattr(self, name)
             if type(rank) is not int or not 8 <= rank <= MAX_RANK or rank % 8:
                 raise ValueError(f"'{name}' should be a multiple of 8 up to {MAX_RANK}, found {rank}")
-        if self.sh_degree not in range(4):
-            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
-
-    @property
-    def coefficients(self) -> int:
-        """SH coefficients per channel."""
-        return (self.sh_degree + 1) ** 2
+        super().__post_init__()
 
 
 class Assembled(ComputedField):

@@ -89,9 +89,10 @@ class SamplingConfig:
     probed_at_once: int = 1 << 16
 
 
-def check_samples(samples: float, what: str, most: int = SamplingConfig.most_samples) -> None:
-    """Raise ValueError where a ray would take more samples than is bearable: of a box that is far thinner, or
-    has far finer texels, along one axis than along another."""
+def check_samples(samples: float, what: str, most: int | None = None) -> None:
+    """Raise ValueError where a ray would take more samples than `most`, by default `most_samples`: of a box
+    that is far thinner, or has far finer texels, along one axis than along another."""
+    most = current(SamplingConfig).most_samples if most is None else most
     if not samples <= most:
         raise ValueError(
             f"a ray through {what} would take up to {samples:,.0f} samples, expected at most {most:,}: it is "

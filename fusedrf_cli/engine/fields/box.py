@@ -65,7 +65,7 @@ class BoxField(ComputedField):
     which touch a voxel that an occupied cell reaches into: no answer depends on the others.
 
     A kind sets `kind`, `device_module` and `shape_type`, a frozen dataclass of whole numbers that refuses
-    what its bodies were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and
+    what its kernels were not written for, and defines `parts_of`, `kernel_arrays`, `reference` and
     `check_answers`.
     """
 
@@ -263,7 +263,7 @@ class BoxField(ComputedField):
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs."""
+        """See `Kind.field_memory`."""
         parts = cls.parts_of(cls.shape_type(**metadata["shape"]), tuple(metadata["resolution"]))
         numbers = sum(map(aligned, parts))
         counts, texels = metadata["cells"]["counts"], metadata["resolution"]

@@ -197,7 +197,7 @@ class ComputedField:
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs."""
+        """See `Kind.field_memory`."""
         return FieldMemory(4 * sum(math.prod(shape) for shape in shapes.values()), 0)
 
     @property
@@ -353,10 +353,10 @@ class ComputedField:
         elsewhere or nowhere: a is 0 where |t / D - 1| is up to DEPTH_TOLERANCE and 1 from twice that on. It
         is ours, after the losses along lidar's lines of sight of Urban Radiance Fields (Rematas et al. 2022).
         With batch.exposure, what is compared is gain_c (C_c + (1 - A) background_c) + offset_c, only
-        one-sided where a photo's range ends (kernels/primitives.py, `within`), and the squares are weighted.
-        loss (parts, 3) gains the sums over rays of the colour term, not weighted, where no depth is known, of
-        the opacity term and of the samples taken. With batch.light above 0 the gradient is an estimate, whose
-        mean over jitters is that of the loss (loops.py, `followed`).
+        one-sided where a photo's range ends (kernels/primitives.py, `within_range`), and the squares are
+        weighted. loss (parts, 3) gains the sums over rays of the colour term, not weighted, where no depth is
+        known, of the opacity term and of the samples taken. With batch.light above 0 the gradient is an
+        estimate, whose mean over jitters is that of the loss (loops.py, `stochastic_backprop`).
         """
         count = len(batch.rays_o)
         most = self.space.most_samples(self.aabb, batch.step)
@@ -416,9 +416,7 @@ def unpack_bits(arrays: dict[str, np.ndarray], name: str, shape: list[int]) -> n
     return np.unpackbits(packed, count=count).reshape(shape).view(bool)
 
 
-def unpacked_bricks(
-    marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]
-) -> np.ndarray:
+def unpacked_bricks(marks: np.ndarray, mixed: np.ndarray | None, name: str, shape: list[int]) -> np.ndarray:
     """(X, Y, Z) bool of the bricks of a grid. Raises ValueError where they are not its."""
     if np.prod(shape, dtype=float) > MOST_CELLS:
         raise ValueError(f"array '{name}' is of {shape} cells, but at most {MOST_CELLS:,} are read")

@@ -101,8 +101,7 @@ def gradient(
     params = field.params.detach()
     if not len(points):
         return torch.zeros_like(params)
-    on_cpu = params.device.type == "cpu"
-    rows = params.new_zeros(torch.get_num_threads() if on_cpu else 1, len(params))
+    rows = params.new_zeros(field.gradient_rows, len(params))
     back = (x.detach().cpu().contiguous() for x in (points, dirs, d_sigma, d_rgb))
     field.query_backward(*back, field.device_loops.shared(rows))
     total = rows.sum(0)

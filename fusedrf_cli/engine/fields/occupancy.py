@@ -162,17 +162,6 @@ class OccupancyGrid:
             along[:-1] |= before[1:]
         return self.marked(grown)
 
-    def halved(self) -> "OccupancyGrid":
-        """Cells twice as wide, occupied where any of the eight in them is."""
-        counts = -(-np.array(self.occupied.shape) // 2)
-        padded = np.pad(self.occupied, [(0, n) for n in 2 * counts - self.occupied.shape])
-        for axis in range(3):
-            padded = padded.take(range(0, padded.shape[axis], 2), axis) | padded.take(
-                range(1, padded.shape[axis], 2), axis
-            )
-        aabb = np.concatenate([self.aabb[:3], self.aabb[:3] + 2 * counts * self.cell])
-        return OccupancyGrid(aabb, padded, self.space)
-
     def contains(self, points: np.ndarray) -> np.ndarray:
         """(N,) bool: which points (N, 3) of the space's coordinates lie in an occupied cell."""
         index = np.floor((points - self.aabb[:3]) / self.cell).astype(np.int64)
@@ -200,8 +189,8 @@ class OccupancyGrid:
 
 def harmless_depth(depth: np.ndarray, most: float, shown: float) -> float:
     """The largest optical depth, at most `most`, up to which cells may be left out of a grid of optical
-    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin floaters is
-    no emptiness.
+    depths (X, Y, Z) without any axis-parallel line of cells losing more than `shown` in all: thin floaters
+    are no emptiness.
     """
     for threshold in most * 0.25 ** np.arange(12):
         lost = np.where(depth <= threshold, depth, 0)
@@ -240,17 +229,11 @@ def placed_cells(
 def unbounded_cells(placed: Iterable[tuple[OccupancyGrid, np.ndarray]], longest: int) -> Iterator[np.ndarray]:
     """Which cells of a grid over unbounded space, `longest` along each axis, each of several placed grids may
     reach; placed as in `placed_cells`, into the frame of that space."""
-    return (reached_cells(*one, unbounded.WHOLE, longest, unbounded) for one in placed)
-
-
-def reached_cells(
-    grid: OccupancyGrid, object_to_field: np.ndarray, aabb: np.ndarray, longest: int, space: ModuleType
-) -> np.ndarray:
-    """(X, Y, Z) bool: cells of a field's box, in the coordinates of its space, that a placed grid of either
-    space may reach; where that has no end, the field's has none."""
-    if grid.space is not bounded:
-        return shared_cells(grid, object_to_field, longest)
-    return marked_cells(grid, object_to_field, aabb, longest, space)
+    for grid, object_to_field in placed:
+        if grid.space is bounded:
+            yield marked_cells(grid, object_to_field, unbounded.WHOLE, longest, unbounded)
+        else:
+            yield shared_cells(grid, object_to_field, longest)
 
 
 def shared_cells(grid: OccupancyGrid, object_to_field: np.ndarray, longest: int) -> np.ndarray:
@@ -370,15 +353,6 @@ def seen_placement(object_to_world: np.ndarray, origin: np.ndarray) -> np.ndarra
     if origin.shape == (4, 4):
         matrix[:3] = np.linalg.inv(frame[:3, :3]) @ matrix[:3]
     return matrix
-
-
-def seen_change(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """(4, 4) that does in a frame, which lies at `origin` (4, 4), what another (4, 4) does in the world."""
-    linear, inverse = origin[:3, :3], np.linalg.inv(origin[:3, :3])
-    change = np.eye(4)
-    change[:3, :3] = inverse @ matrix[:3, :3] @ linear
-    change[:3, 3] = inverse @ ((matrix[:3, :3] - np.eye(3)) @ origin[:3, 3] + matrix[:3, 3])
-    return change
 
 
 def placed_box(box: np.ndarray, origin: np.ndarray) -> np.ndarray:

@@ -104,12 +104,12 @@ class _FirstCompilation(event.Listener):
     """Calls a function at the first compilation: what the cache holds is not compiled."""
 
     def __init__(self, report: Callable[[], None]):
-        self.tell, self.told = report, False
+        self.report, self.told = report, False
 
     def on_start(self, compile_event: event.Event) -> None:
         if not self.told:
             self.told = True
-            self.tell()
+            self.report()
 
     def on_end(self, compile_event: event.Event) -> None:
         """Nothing."""
@@ -119,7 +119,7 @@ class _FirstCompilation(event.Listener):
 def report_compilation(
     report: Callable[[], None], warn: Callable[[str], None] = warnings.warn
 ) -> Iterator[None]:
-    """Within it `tell` is called once, before the first kernel that has to be compiled, and `warn` where
+    """Within it `report` is called once, before the first kernel that has to be compiled, and `warn` where
     compiled kernels cannot be kept."""
     before, locator.KernelStore.warn = locator.KernelStore.warn, staticmethod(warn)
     try:

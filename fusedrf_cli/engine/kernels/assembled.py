@@ -28,7 +28,7 @@ HOOKS = (
 """What the loops below and other slots call; the rest of a module is reached from there."""
 BASE = "params", "lo", "side"
 """Fields of every assembly's Arrays: numbers (P,); corner (3,) and sides (3,) of the cube of `unit`."""
-OF_LOOPS = "KEPT", "LEARN_FROM", "SHADING_COST", "COLOUR_FROM"  # constants that loops.py reads
+OF_LOOPS = "KEPT", "LEARN_FROM", "SHADING_COST"  # constants that loops.py reads
 NOT_PREFIXED = {*BASE, "shape", "dtype", "type"}
 EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
 
@@ -171,8 +171,8 @@ def locate(field, unit):
 
 def steps_at(field, cell, unit, index):
     """Every sample in the box stands for one step."""
-    t_local, v, w = unit
-    return 1 if min(t_local, min(v, w)) >= -EDGE and max(t_local, max(v, w)) <= 1 + EDGE else 0
+    u, v, w = unit
+    return 1 if min(u, min(v, w)) >= -EDGE and max(u, max(v, w)) <= 1 + EDGE else 0
 
 
 def located(field, cell, scratch):

@@ -73,19 +73,19 @@ if SIMULATED:
 
 @device
 def accumulate(out, i, value):
-    """`parts.accumulate`, atomic."""
+    """`primitives.accumulate`, atomic."""
     cuda.atomic.add(out, i, value)
 
 
 @device
 def raise_to(out, i, value):
-    """`parts.raise_to`, atomic."""
+    """`primitives.raise_to`, atomic."""
     cuda.atomic.max(out, i, value)
 
 
 @device
 def scatter_4(out, o, weight, values, v):
-    """`parts.scatter_4`, atomic."""
+    """`primitives.scatter_4`, atomic."""
     add_4(
         out, o, weight * values[v], weight * values[v + np.uint64(1)], weight * values[v + np.uint64(2)],
         weight * values[v + np.uint64(3)],
@@ -94,7 +94,7 @@ def scatter_4(out, o, weight, values, v):
 
 @device
 def scatter_8(out, o, weight, values, v):
-    """`parts.scatter_8`, atomic."""
+    """`primitives.scatter_8`, atomic."""
     scatter_4(out, o, weight, values, v)
     scatter_4(out, o + np.uint64(4), weight, values, v + np.uint64(4))
 
@@ -257,7 +257,7 @@ def sums_thread(base, width, start, source, weight, target, keep, values):
 
 
 def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, correction1, correction2):
-    """See plain.adam."""
+    """See field_free.adam."""
     arrays = params, grads, moment1, moment2
     placed = [on_device(array) for array in arrays]
     rest = rate, low, high, beta1, beta2, eps, correction1, correction2
@@ -268,7 +268,7 @@ def adam(params, grads, moment1, moment2, rate, low, high, beta1, beta2, eps, co
 
 
 def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, correction1, correction2):
-    """See plain.adam_lines."""
+    """See field_free.adam_lines."""
     arrays = params, grads, moment1, moment2
     placed = [on_device(array) for array in arrays]
     rest = rate, on_device(lines), beta1, beta2, eps, correction1, correction2
@@ -278,7 +278,7 @@ def adam_lines(params, grads, moment1, moment2, rate, lines, beta1, beta2, eps, 
 
 
 def sums_of_rows(values, base, width, start, source, weight, target, keep):
-    """See plain.sums_of_rows."""
+    """See field_free.sums_of_rows."""
     inputs = base, width, start, source, weight, target, keep
     launch(plain_kernels().sums_thread, len(target), inputs, (values,))
 

@@ -34,7 +34,7 @@ LINES_AHEAD = 8  # a line's moments are asked for so many lines before it
 
 @serial
 def touched_of_all(grads, low, high, starts):
-    """How many of the cache lines of entries low..high some sample touched, and their starts in found."""
+    """How many of the cache lines of entries low..high some sample touched, and their starts."""
     count = 0
     for line in range(low, high, LINE):
         starts[count] = line
@@ -56,7 +56,7 @@ def touched_of_some(grads, lines, low, high, starts):
 def adam_task(
     params, grads, moment1, moment2, rate, starts, count, beta1, beta2, eps, correction1, correction2
 ):
-    """`adam` for the cache lines that begin at found[:count]. What only they need is asked for early: which
+    """`adam` for the cache lines that begin at starts[:count]. What only they need is asked for early: which
     they are follows no pattern, so that each would be waited for."""
     for i in range(count):
         ahead = starts[min(i + LINES_AHEAD, count - 1)]
@@ -111,7 +111,7 @@ def lens_task(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, low
 def lens_rays(pose, fl_x, fl_y, cx, cy, distortion, bent, width, top, order, rays_o, rays_d):
     """Rays (N, 3) of a camera at pose (4, 4), camera to world, OpenGL axes: ray i is that of pixel order[i]
     (N,), counted row by row of `width` pixels from row `top` on. The lens is a pinhole or, where it is
-    `bent`, has a `distortion`, a tuple of nine (`parts.bend`)."""
+    `bent`, has a `distortion`, a tuple of nine (`primitives.bend`)."""
     n = order.shape[0]
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)
@@ -127,8 +127,8 @@ def unbend_task(distorted, distortion, low, high, ideal):
 
 @loop
 def unbent(distorted, distortion, ideal):
-    """For every of distorted (N, 2) normalised image coordinates the ideal ones (`parts.unbend`), by a lens
-    of `distortion`, a tuple of nine."""
+    """For every of distorted (N, 2) normalised image coordinates the ideal ones (`primitives.unbend`), by a
+    lens of `distortion`, a tuple of nine."""
     n = distorted.shape[0]
     for part in prange((n + RAYS_PER_TASK - 1) // RAYS_PER_TASK):
         low, high = part * RAYS_PER_TASK, min(n, (part + 1) * RAYS_PER_TASK)

@@ -25,7 +25,7 @@ And what it may have, with the defaults below:
                                        `backward`: fold the direction into a basis; scatter its gradient, and
                                        leave 0 what has gathered it
     pack_cell, unpack_cell, next_index, is_inside, prefetch_density, prefetch_colour
-    COLOUR_FROM, LEARN_FROM, SHADING_COST among its sizes
+    LEARN_FROM, SHADING_COST among its sizes
 """
 
 import math
@@ -155,8 +155,9 @@ def unpack_cell(field, packed, p):
 
 
 def next_index(field, grid, cell, n_steps, strides, index, p, direction, t_local, t_begin, step):
-    """The number of the sample after k, which lies at p, t_local on a line along `direction`, and stands for
-    `n_steps` times `strides` steps, which is 0 where there is nothing. Sample n lies at t_begin + n step."""
+    """The number of the sample after `index`, which lies at p, t_local on a line along `direction`, and
+    stands for `n_steps` times `strides` steps, which is 0 where there is nothing. Sample n lies at t_begin +
+    n step."""
     return index + max(n_steps * strides, 1)
 
 
@@ -171,7 +172,7 @@ def prefetch_density(field, array, packed, p):
 
 
 def prefetch_colour(field, array, packed, p):
-    """As `ahead_density`, what `colour` will read."""
+    """As `prefetch_density`, what `colour` will read."""
 
 
 # -- one item of work ----------------------------------------------------------------------------------------
@@ -195,7 +196,7 @@ def depth_error(along, depth):
 
 
 def midpoint(index, n_steps):
-    """Twice the number, on a ray's lattice, of the middle of `n_steps` steps from step k on."""
+    """Twice the number, on a ray's lattice, of the middle of `n_steps` steps from step `index` on."""
     return 2 * index + n_steps - 1
 
 
@@ -206,8 +207,8 @@ def optical_length(warp, p, d, t_local, n_steps, strides, step):
 
 
 def alpha_at(field, grid, line, index, n_steps, t_local, step, d, scratch):
-    """What a ray meets at t_local of a piece, line (origin, direction, course), in `n_steps` steps from step
-    k on: the point; the share of the light that is lost there; and what `density` says besides σ."""
+    """What a ray meets at t_local of a piece, line (origin, direction, warp), in `n_steps` steps from step
+    `index` on: the point; the share of the light that is lost there; and what `density` says besides σ."""
     origin, direction, warp = line
     p = position_at(origin, direction, t_local)
     sigma, pre, strides, cell = density(field, grid, index, p, d, scratch)
@@ -287,9 +288,9 @@ def stochastic_backprop(batch, weight, chance):
 
 
 def prefetch_sample(field, packed, origin, direction, t_begin, step, index, n_steps):
-    """Ask for what the sample of `n_steps` steps from step k of a piece on, if there is one, will read;
-    `packed` is of the one before it. Planes and rows lie all over memory: asked for one sample early, their
-    misses overlap with the work on the one before."""
+    """Ask for what the sample of `n_steps` steps from step `index` of a piece on, if there is one, will
+    read; `packed` is of the one before it. Planes and rows lie all over memory: asked for one sample early,
+    their misses overlap with the work on the one before."""
     if index >= 0:
         p = position_at(origin, direction, t_begin + 0.5 * midpoint(index, n_steps) * step)
         prefetch_density(field, field.params, packed, p)

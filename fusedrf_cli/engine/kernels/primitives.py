@@ -79,9 +79,9 @@ def exit_distance(p, d, lo, cell, i, s):
 
 
 @device
-def next_sample(grid, origin, direction, u0, u1, step, index):
-    """(first k' >= k at which u0 + k' step of a straight line lies in an occupied cell, for how many steps
-    from there on one sample may stand), or (-1, 1) when there is no such k' before u1.
+def next_sample(grid, origin, direction, t_begin, t_end, step, index):
+    """(the first number n >= index at which t_begin + n step of a straight line lies in an occupied cell, for
+    how many steps from there on one sample may stand), or (-1, 1) when there is no such n before t_end.
 
     Samples stay on the ray's own lattice whatever is skipped, so that an image with and without skipping is
     the same: what stands for several steps ends at a whole multiple of them, or before.
@@ -90,10 +90,10 @@ def next_sample(grid, origin, direction, u0, u1, step, index):
     skip, lo, cell = grid.skip, grid.lo, grid.cell
     nx, ny, nz = skip.shape
     while True:
-        u = u0 + index * step
-        if u >= u1:
+        t_local = t_begin + index * step
+        if t_local >= t_end:
             return -1, 1
-        x, y, z = along(origin, direction, u)
+        x, y, z = along(origin, direction, t_local)
         i = cell_of(x, lo[0], cell[0], nx)
         j = cell_of(y, lo[1], cell[1], ny)
         m = cell_of(z, lo[2], cell[2], nz)
@@ -103,16 +103,16 @@ def next_sample(grid, origin, direction, u0, u1, step, index):
                 exit_distance(x, dx, lo[0], cell[0], i, s),
                 min(exit_distance(y, dy, lo[1], cell[1], j, s), exit_distance(z, dz, lo[2], cell[2], m, s)),
             )
-            index = max(index + 1, int(math.ceil((u + away - u0) / step - FACE_TOLERANCE)))
+            index = max(index + 1, int(math.ceil((t_local + away - t_begin) / step - FACE_TOLERANCE)))
             continue
         if grid.stride.shape[0] == 0:
             return index, 1
-        many = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
+        n_steps = int(grid.stride[np.uint64(i), np.uint64(j), np.uint64(m)])
         if grid.unit != step:
-            many = max(1, int(many * grid.unit / step + FACE_TOLERANCE))
-        most = max(1, int(math.ceil((u1 - u) / step + 0.5)) - 1)
-        # the same samples wherever a ray comes to cells of a stride; k % many takes twice as long
-        return index, min(many - (index - many * int(index / many)), most)
+            n_steps = max(1, int(n_steps * grid.unit / step + FACE_TOLERANCE))
+        most = max(1, int(math.ceil((t_end - t_local) / step + 0.5)) - 1)
+        # the same samples wherever a ray comes to cells of a stride; index % n_steps takes twice as long
+        return index, min(n_steps - (index - n_steps * int(index / n_steps)), most)
 
 
 @device

@@ -8,9 +8,7 @@ its upper one.
 
 import numpy as np
 import torch
-from torch.nn.functional import softplus
 
-EDGE = 1e-9  # share of a box by which rounding may put a point on its face outside
 OCTANTS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
 """(8, 3) the corners of a voxel, z first."""
 
@@ -64,11 +62,6 @@ def texel(unit: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     position = unit * (n - 1)
     lower = position.long().clamp(0, n - 2)
     return lower, (position - lower)[:, None]
-
-
-def density(feature: torch.Tensor, scale: float, shift: float) -> torch.Tensor:
-    """σ = scale * log(1 + exp(feature + shift)), in the unit of scale."""
-    return scale * softplus(feature + shift, threshold=40)
 
 
 def sh_basis(count: int, dirs: torch.Tensor) -> torch.Tensor:

@@ -24,7 +24,7 @@ class Loops:
     """The CPU's loops for the fields of a kind that share some sizes."""
 
     def __init__(self, device_module: ModuleType | None, sizes: dict[str, int], space: ModuleType):
-        """bodies are the kind's scalar functions; None: there is no field, only the space to march in."""
+        """device_module: the kind's scalar functions; None: there is no field, only the space to march in."""
         self.tag, self.names = specialised(device_module, sizes, space)
         self.runs: dict[tuple[str, str], FunctionType] = {}
 

@@ -127,7 +127,7 @@ class GridBuilder(DistilledBuilder):
         return self.scene.occupancy
 
     def plan(self, storage: StorageSetting, numbers: int) -> Plan:
-        """See Student; `numbers` counts what is stored."""
+        """See `DistilledBuilder`; `numbers` counts what is stored."""
         config = current(BoxKindConfig)
         box, kind, cells = self.scene.aabb, self.kind, self.cells
         share = min(1.0, float(cells.occupied.mean()))

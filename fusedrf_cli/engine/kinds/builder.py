@@ -13,8 +13,8 @@ import torch
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
 from fusedrf_cli.engine.composition.resolution_report import ResolutionReport
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.base import StoredField
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.fields.occupancy import texels
 from fusedrf_cli.engine.rendering.cameras import Camera
 from fusedrf_cli.engine.settings import current
@@ -267,13 +267,16 @@ class DistilledBuilder:
     """
 
     learnt = True
-    """Whether it learns from nothing; else it is made (MadeStudent) and learning only finishes it."""
-    distil_config: DistilConfig | None = DistilConfig()
-    """None: rays drawn once for all tries (distillation/finetune.py)."""
+    """Whether it learns from nothing; else it is made (`DirectBuilder`) and learning only finishes it."""
 
     def __init__(self, kind: "Kind", scene: ComposedField, request: BuildRequest):
         """scene: what it learns from."""
         self.kind, self.scene, self.request = kind, scene, request
+
+    @property
+    def distil_config(self) -> DistilConfig | None:
+        """How it learns; None: from rays drawn once for all tries (distillation/finetune.py)."""
+        return current(DistilConfig)
 
     def distil_config_for(self, numbers: int, seconds: float | None = None) -> DistilConfig | None:
         """How a student of so many numbers learns, in so many seconds where they are given: the more numbers

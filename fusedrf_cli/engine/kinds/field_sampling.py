@@ -13,6 +13,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.fields.base import RadianceField
+from fusedrf_cli.engine.fields.occupancy import PROBES
 from fusedrf_cli.engine.kernels.reference import OCTANTS, sh_basis
 from fusedrf_cli.engine.settings import current
 
@@ -64,9 +65,8 @@ def placed_in(teacher: RadianceField) -> list[Placed]:
 
 def density(source, positions: np.ndarray, space: ModuleType | None = None) -> np.ndarray:
     """(N,) float64 σ, per length of a space's coordinates, at positions (N, 3) in them, of a field or a
-    placed
-    one: the mean over three axes where that depends on the direction. The space is a field's own where none
-    is given."""
+    placed one: the mean over three axes where that depends on the direction. The space is a field's own where
+    none is given."""
     space = space or source.occupancy.space
     parts = [source] if isinstance(source, Placed) else placed_in(source)
     stretched = any(p.condition > 1 + 1e-6 for p in parts)
@@ -139,9 +139,8 @@ def density_features(
     corners = lattice.corners
     first = lattice.positions[corners[:, 0]]
     extent = lattice.positions[corners[:, 7]] - first
-    spots = 0.25 + 0.5 * OCTANTS
-    weights = np.where(OCTANTS == 1, spots[:, None], 1 - spots[:, None]).prod(2)
-    answers = np.stack([density(teacher, first + extent * spot) for spot in spots], 1)
+    weights = np.where(OCTANTS == 1, PROBES[:, None], 1 - PROBES[:, None]).prod(2)
+    answers = np.stack([density(teacher, first + extent * spot) for spot in PROBES], 1)
     half, deepest = (half_opaque(scale, size) for size in (extent.min(1)[:, None], lattice.finest_voxel))
     targets = np.clip(inverse_softplus(answers / scale), config.least, half + config.reach)
     targets = np.where(
@@ -179,7 +178,7 @@ def inverse_softplus(y: np.ndarray) -> np.ndarray:
 def colours(teacher: RadianceField, positions: np.ndarray, facing: np.ndarray, degree: int) -> np.ndarray:
     """(N, 3, coefficients) float32 of the harmonics of the teacher's colour logits at positions (N, 3) in the
     coordinates of its space, by least squares over the directions along which they are seen (facing (N, 3),
-    as `around` has it).
+    as `Vertices` have it).
 
     What a teacher says to those who look from inside was never learnt. Where it has no higher degree the fit
     is exact, however the teacher is turned, but for what `one_sided` leaves.

@@ -33,7 +33,8 @@ class InstancesConfig:
     """How sources are made smaller, and which ways a chart tries."""
 
     ranks: tuple[tuple[int, int] | None, ...] = ((8, 16), (8, 24), None)
-    """Fewer density components cost least and fewer colour components most (docs/how-fusing-works.md)."""
+    """That are compared where none are asked for. Fewer density components cost least and fewer colour
+    components most (docs/how-fusing-works.md)."""
     copies: float = 8.5
     """Of a source while it is made smaller: sections in float64 before and after, most of them."""
     finer: float = 1 / 8
@@ -96,8 +97,6 @@ class InstancesBuilder(DirectBuilder):
 
     distil_config = None
     gain = 5.0  # dB, the most that was seen
-    ranks: Sequence[tuple[int, int] | None] = InstancesConfig.ranks
-    """That are compared where none are asked for."""
 
     def __init__(self, kind: InstancesKind, scene: ComposedField, request: BuildRequest):
         super().__init__(kind, scene, request)
@@ -114,11 +113,14 @@ class InstancesBuilder(DirectBuilder):
         request = self.request
         precisions = (request.precision,) if request.precision else self.kind.precisions
         ranked = any("ranks" in kind.reduces for kind in self.kinds)
-        ranks = (request.ranks,) if request.ranks or not ranked else self.ranks
+        if request.ranks or not ranked:
+            ranks = (request.ranks,)
+        else:
+            ranks = current(InstancesConfig).ranks
         return [[StorageSetting(p, r, request.sh_degree) for r in ranks] for p in precisions]
 
     def unchanged(self) -> Candidate | None:
-        """See MadeStudent: with the bytes of the sources."""
+        """See `DistilledBuilder`: with the bytes of the sources."""
         request, size = self.request, self.bytes_as_they_are
         if request.precision or request.ranks or request.sh_degree is not None or request.target is not None:
             return None
@@ -185,7 +187,7 @@ class InstancesBuilder(DirectBuilder):
         return total
 
     def bytes_of(self, field: ComposedField, storage: StorageSetting) -> int:
-        """See Student."""
+        """See `DistilledBuilder`."""
         total = self.request.overhead
         for source, one in zip(self.fields, distinct_fields(field), strict=True):
             if one is source:
@@ -235,7 +237,7 @@ class InstancesBuilder(DirectBuilder):
         return [max(1 / squeezed(p.world_to_object) for p in own) for own in self.placed]
 
     def smallest(self) -> int:
-        """See MadeStudent."""
+        """See `DirectBuilder`."""
         return min(self.fitting(storage, 1)[1] for group in self.storage_settings() for storage in group)
 
     # -- telling ---------------------------------------------------------------------------------------------

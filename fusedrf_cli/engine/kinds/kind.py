@@ -44,7 +44,7 @@ class Kind:
     trains = True
     """Whether a field of it can begin from photos."""
     takes: frozenset[str] = frozenset()
-    """Which of Way's words it heeds, besides the precision: "ranks", "sh_degree"."""
+    """Which of StorageSetting's words it heeds, besides the precision: "ranks", "sh_degree"."""
     reduces: frozenset[str] = frozenset()
     """Which of them `reduction` heeds."""
     hashes = False

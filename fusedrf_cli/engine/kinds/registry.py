@@ -95,8 +95,3 @@ def kinds() -> "list[Kind]":
         with contextlib.suppress(BrokenKind):
             usable.append(kind(name))
     return usable
-
-
-def field_kinds() -> dict[str, type]:
-    """The fields that bundles may hold, by kind."""
-    return {kind.name: kind.field for kind in kinds() if kind.field is not None}

@@ -61,7 +61,7 @@ FLOAT = 4.0  # bytes
 
 @dataclass(frozen=True)
 class GridVertices:
-    """The used vertices of a field over one box; see asking.Vertices."""
+    """The used vertices of a field over one box; see `Vertices`."""
 
     index: np.ndarray
     """(V,) int64, of the vertices of the whole grid in order."""
@@ -146,7 +146,7 @@ class ResampledBuilder(DirectBuilder, GridBuilder):
         return self._shown or self.scene.occupancy
 
     def build(self, storage: StorageSetting, limit: int) -> Candidate | None:
-        """See MadeStudent."""
+        """See `DirectBuilder`."""
         try:
             if self._shown is None:
                 self._shown = self.shown(*self.asked(self.largest_of(storage, limit)))
@@ -210,7 +210,7 @@ class ResampledBuilder(DirectBuilder, GridBuilder):
         return occupancy if occupancy.occupied.any() else self.scene.occupancy
 
     def smallest(self) -> int:
-        """See MadeStudent."""
+        """See `DirectBuilder`."""
         return self.bytes_of_plan(self.plan(self.plain(), 1), self.plain())
 
     def needs(self) -> MemoryEstimate:

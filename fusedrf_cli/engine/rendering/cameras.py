@@ -31,8 +31,8 @@ class Camera:
     width: int
     height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `parts.bend`); of a fisheye k1, k2,
-    k3, k4 (see `bend_angle`)."""
+    """k1, k2, k3, p1, p2 and, where there are more, k4, d1, d2, d3 (see `primitives.bend`); of a fisheye k1,
+    k2, k3, k4 (see `bend_angle`)."""
     name: str = ""
     fisheye: bool = False
     """The distance from the image's centre grows with the angle from the axis, not with its tangent."""
@@ -96,15 +96,15 @@ def tile_order(width: int, rows: int) -> np.ndarray:
 
 
 def undistort(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Invert `parts.bend`: distorted to ideal normalised image coordinates (y down). A pixel that no ray
-    reaches gets the nearest that was found."""
+    """Invert `primitives.bend`: distorted to ideal normalised image coordinates (y down). A pixel that no
+    ray reaches gets the nearest that was found."""
     ideal = np.empty((np.size(x), 2))
     cpu.unbent(np.stack([np.ravel(x), np.ravel(y)], 1), of_nine(distortion), ideal)
     return ideal[:, 0].reshape(np.shape(x)), ideal[:, 1].reshape(np.shape(x))
 
 
 def of_nine(distortion: tuple[float, ...]) -> tuple[float, ...]:
-    """A lens's numbers as `parts.bend` takes them."""
+    """A lens's numbers as `primitives.bend` takes them."""
     return tuple(map(float, distortion)) + (0.0,) * (9 - len(distortion))
 
 
@@ -243,12 +243,13 @@ def framing_lens(width: int, height: int) -> Camera:
 
 
 def framing(
-    aabb: np.ndarray,
-    lens: Camera,
-    azimuth: float = FramingConfig.azimuth,
-    elevation: float = FramingConfig.elevation,
+    aabb: np.ndarray, lens: Camera, azimuth: float | None = None, elevation: float | None = None
 ) -> Outlook:
-    """The outlook from which a camera that stands outside a box (6,) frames its bounding ball."""
+    """The outlook from which a camera that stands outside a box (6,) frames its bounding ball; angles of None
+    are those of FramingConfig."""
+    config = current(FramingConfig)
+    azimuth = config.azimuth if azimuth is None else azimuth
+    elevation = config.elevation if elevation is None else elevation
     centre, radius = (aabb[:3] + aabb[3:]) / 2, float(np.linalg.norm(aabb[3:] - aabb[:3]) / 2)
     narrow = np.arctan(0.5 * min(lens.width, lens.height) / lens.fl_x)
     return Outlook(centre, 0.92 * radius / np.sin(narrow), azimuth, elevation)
@@ -264,9 +265,9 @@ def framing_camera(
 
 
 def orbit(
-    aabb: np.ndarray, count: int, width: int, height: int, elevation: float = FramingConfig.elevation
+    aabb: np.ndarray, count: int, width: int, height: int, elevation: float | None = None
 ) -> list[Camera]:
-    """`count` cameras evenly around a box, all at one elevation."""
+    """`count` cameras evenly around a box, all at one elevation; see `framing`."""
     lens = framing_lens(width, height)
     return framing(aabb, lens, elevation=elevation).orbit(lens, count)
 

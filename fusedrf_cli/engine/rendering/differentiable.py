@@ -73,7 +73,7 @@ def render_rays(
     rays_o, rays_d, per_length = seen_from(origin, rays_o, rays_d)
     structured, device = structure(field, poses), device_of(field)
     if per_length is not None and isinstance(field, ComposedField) and structured.occupancy.space is bounded:
-        unit = float(np.linalg.norm(field.origin[:3, 0]))
+        unit = float(np.linalg.norm(origin[:3, 0]))
         near, step = near / unit, step and step / unit
     step = step or sampling_step(structured)
     host = [np.ascontiguousarray(x.detach().cpu().numpy(), np.float64) for x in (rays_o, rays_d)]

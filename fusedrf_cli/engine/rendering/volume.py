@@ -28,7 +28,8 @@ class RenderConfig:
     work_at_once_cuda: int = 1 << 28
     """The same on a GPU."""
     colours: int = 500
-    """Of a ray, at most: each stands for a share of the light (LENT_FROM of loops.py)."""
+    """Of a ray, at most: each stands for a share of the light (SHARED_COLOUR_FROM of
+    loops.py)."""
     halvings: int = 6
     """Of the rays done at once, where memory is short."""
     samples_per_wave: int = 32
@@ -153,7 +154,7 @@ def march_rays(
     out: np.ndarray,
 ) -> None:
     """The general path for any field: waves of some samples per living ray, into out (N, 5)."""
-    n = len(rays_o)
+    n, seen_weight = len(rays_o), current(RenderConfig).seen_weight
     trans = np.ones(n, np.float32)
     total = np.zeros((n, 5), np.float32)
     for ray, ts, spans, counts in waves(
@@ -168,11 +169,11 @@ def march_rays(
         )
         sigma[mask] = densities.numpy()
         weights, trans[ray] = weights_from_depths(sigma * spans.astype(np.float32), trans[ray])
-        seen = weights > current(RenderConfig).seen_weight
+        seen = weights > seen_weight
         colour = np.zeros((*ts.shape, 3), np.float32)
         if seen.any():
-            _, densities = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
-            colour[seen] = densities.numpy()
+            _, rgb = field.query(torch.from_numpy(points[seen]), torch.from_numpy(dirs[seen]))
+            colour[seen] = rgb.numpy()
         total[ray, :3] += (weights[..., None] * colour).sum(1)
         # Along columns, so that every ray is summed in one order however long its wave's longest ray is.
         total[ray, 4] += np.add.reduce(np.asfortranarray(weights * ts), axis=1)

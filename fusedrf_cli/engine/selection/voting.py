@@ -44,9 +44,9 @@ class MaskedView:
 
     def depths(self, of) -> np.ndarray:
         """(H, W) see `depths`."""
-        if not any(camera is of for camera, _ in self.surfaces):
+        if not any(field is of for field, _ in self.surfaces):
             self.surfaces.append((of, depths(of, self.camera)))
-        return next(depth for camera, depth in self.surfaces if camera is of)
+        return next(depth for field, depth in self.surfaces if field is of)
 
 
 def chosen_by_masks(lattice: CellGrid, looks: Sequence[MaskedView]) -> Selection:

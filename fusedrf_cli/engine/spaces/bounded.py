@@ -49,7 +49,7 @@ def first_piece_at(o, d, t):
 
 
 def next_piece(piece_begin, grid, o, d, far):
-    """(origin, direction, t_begin, t_end, course) of the piece of a ray, in t < far, that begins there, and
+    """(origin, direction, t_begin, t_end, warp) of the piece of a ray, in t < far, that begins there, and
     where the next one begins: positions are position_at(origin, direction, t_local) for t_local in [t_begin,
     t_end), empty where t_end <= t_begin. `warp` is what `distance` and `span` need."""
     t0, t1 = hit_box(o, d, grid.lo, grid.hi)

@@ -14,14 +14,20 @@ import torch
 
 from fusedrf_cli.engine.kernels.primitives import along
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
+    CONSTANTS,
+    CONTRACTED_DENSITY,
     CURVED,
+    SHELL,
     clearance,
     contracted_by,
     density_rates_by,
+    depth_per_coordinate,
+    frame_point,
     next_change,
     next_sample,
     optical_length,
     placed_by,
+    point,
     position_at,
     rates_by,
     scale_of,
@@ -41,33 +47,16 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
 PIECES = 3  # up to the ball, or to where the ray is nearest to the origin; in the ball; behind it
 INWARDS, INSIDE, OUTWARDS, BEYOND = 0, 1, 2, 3  # regions of a ray, in order
 CLOSEST = 1e-9  # b at least
-SHELL = 1.0
-CONTRACTED_DENSITY = 0.0  # 1: σ is per length of the coordinates along the ray (DVGO); 0: of the frame
-CONSTANTS = {"shell": (1e-3, 1.0), "contracted_density": (0.0, 1.0)}
 
 
-def length_of(p):
+def size_of(p):
     """The Euclidean norm."""
     return math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
 
 
-def point(p):
-    """Where a point of the field's frame lies in the space's coordinates."""
-    n = length_of(p)
-    s = scale_of(n) if n > 1.0 else 1.0
-    return p[0] * s, p[1] * s, p[2] * s
-
-
-def frame_point(q):
-    """Inverse of `point`; what lies beyond FAR comes back at FAR."""
-    m = length_of(q)
-    s = size_before(m) / m if m > 1.0 else 1.0
-    return q[0] * s, q[1] * s, q[2] * s
-
-
 def rate(q, d):
     """See bounded.py."""
-    m = length_of(q)
+    m = size_of(q)
     if CONTRACTED_DENSITY == 0.0 or m <= 1.0:
         return 1.0
     n, out = size_before(m), (q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / m
@@ -75,18 +64,12 @@ def rate(q, d):
     return math.sqrt(SHELL * SHELL * out * out + max(1.0 - out * out, 0.0) * across * across) / (n * n)
 
 
-def depth_per_coordinate(q):
-    """See bounded.py: by the way out."""
-    m = length_of(q)
-    return 1.0 if CONTRACTED_DENSITY != 0.0 or m <= 1.0 else size_before(m) ** 2 / SHELL
-
-
 def nearest(o, d):
     """Of a ray, d of any length: the t at which it is nearest to the origin, how near (b), the length of d,
     and where in τ the unit ball and the ball of radius FAR end, 0 where it does not come there."""
-    speed = length_of(d)
+    speed = size_of(d)
     middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (speed * speed)
-    b = max(length_of(along(o, d, middle)), CLOSEST)
+    b = max(size_of(along(o, d, middle)), CLOSEST)
     return middle, b, speed, math.sqrt(max(1.0 - b * b, 0.0)), math.sqrt(max(FAR * FAR - b * b, 0.0))
 
 

@@ -15,14 +15,20 @@ import torch
 
 from fusedrf_cli.engine.kernels.primitives import along
 from fusedrf_cli.engine.spaces.curved import (  # noqa: F401
+    CONSTANTS,
+    CONTRACTED_DENSITY,
     CURVED,
+    SHELL,
     clearance,
     contracted_by,
     density_rates_by,
+    depth_per_coordinate,
+    frame_point,
     next_change,
     next_sample,
     optical_length,
     placed_by,
+    point,
     position_at,
     rates_by,
     scale_of,
@@ -48,31 +54,9 @@ from fusedrf_cli.engine.spaces.unbounded import (  # noqa: F401
     region_at,
     share_of,
     size_in,
+    size_of,
     span,
 )
-
-SHELL = 1.0
-CONTRACTED_DENSITY = 0.0  # see contracted_l2.py
-CONSTANTS = {"shell": (1e-3, 1.0), "contracted_density": (0.0, 1.0)}
-
-
-def largest_of(p):
-    """The largest magnitude of a coordinate."""
-    return max(abs(p[0]), max(abs(p[1]), abs(p[2])))
-
-
-def point(p):
-    """Where a point of the field's frame lies in the space's coordinates."""
-    n = largest_of(p)
-    s = scale_of(n) if n > 1.0 else 1.0
-    return p[0] * s, p[1] * s, p[2] * s
-
-
-def frame_point(q):
-    """Inverse of `point`; what lies beyond FAR comes back at FAR."""
-    m = largest_of(q)
-    s = size_before(m) / m if m > 1.0 else 1.0
-    return q[0] * s, q[1] * s, q[2] * s
 
 
 def speed_in(region, o, d, n):
@@ -89,14 +73,8 @@ def rate(q, d):
     if CONTRACTED_DENSITY == 0.0:
         return 1.0
     p = frame_point(q)
-    n = largest_of(p)
+    n = size_of(p)
     return 1.0 if n <= 1.0 else speed_in(region_at(p, d, 0.0), p, d, n) / (n * n)
-
-
-def depth_per_coordinate(q):
-    """See bounded.py: by the way out."""
-    m = largest_of(q)
-    return 1.0 if CONTRACTED_DENSITY != 0.0 or m <= 1.0 else size_before(m) ** 2 / SHELL
 
 
 def next_piece(piece_begin, grid, o, d, far):

@@ -15,6 +15,9 @@ import torch
 from fusedrf_cli.engine.kernels.primitives import FACE_TOLERANCE, along, cell_of
 
 CURVED = True
+SHELL = 1.0
+CONTRACTED_DENSITY = 0.0  # 1: σ is per length of the coordinates along the ray (DVGO); 0: of the frame
+CONSTANTS = {"shell": (1e-3, 1.0), "contracted_density": (0.0, 1.0)}
 
 
 def position_at(origin, direction, t_local):
@@ -32,11 +35,31 @@ def size_before(m):
     return SHELL / max(1.0 + SHELL - m, SHELL / FAR)
 
 
-def optical_length(warp, p, d, t_local, many, steps, step):
+def point(p):
+    """Where a point of the field's frame lies in the space's coordinates."""
+    n = size_of(p)
+    s = scale_of(n) if n > 1.0 else 1.0
+    return p[0] * s, p[1] * s, p[2] * s
+
+
+def frame_point(q):
+    """Inverse of `point`; what lies beyond FAR comes back at FAR."""
+    m = size_of(q)
+    s = size_before(m) / m if m > 1.0 else 1.0
+    return q[0] * s, q[1] * s, q[2] * s
+
+
+def depth_per_coordinate(q):
+    """See bounded.py: by the way out."""
+    m = size_of(q)
+    return 1.0 if CONTRACTED_DENSITY != 0.0 or m <= 1.0 else size_before(m) ** 2 / SHELL
+
+
+def optical_length(warp, p, d, t_local, n_steps, strides, step):
     """See kernels/loops.py. Where σ is per length of the coordinates, their length at the sample counts: far
     out an interval of t is of no use, since there t goes up manifold in one step."""
-    length = steps * many * step
-    middle = t_local + 0.5 * (length - many * step)
+    length = strides * n_steps * step
+    middle = t_local + 0.5 * (length - n_steps * step)
     if CONTRACTED_DENSITY == 0.0:
         return span(warp, middle, length)
     low, high = ends_of(warp, middle, length)
@@ -59,11 +82,11 @@ def clearance(p, lo, hi, cell, index, empty):
     return -1.0 if empty == 0 else max(away, 0.0)
 
 
-def next_sample(grid, origin, direction, t_begin, t_end, step, k):
+def next_sample(grid, origin, direction, t_begin, t_end, step, index):
     """See kernels/primitives.py; samples are a step apart everywhere."""
     nx, ny, nz = grid.skip.shape
     while True:
-        t_local = t_begin + k * step
+        t_local = t_begin + index * step
         if t_local >= t_end:
             return -1, 1
         p = position_at(origin, direction, t_local)
@@ -73,8 +96,8 @@ def next_sample(grid, origin, direction, t_begin, t_end, step, k):
         empty = int(grid.skip[np.uint64(i), np.uint64(j), np.uint64(m)])
         away = clearance(p, grid.lo, grid.hi, grid.cell, (i, j, m), empty)
         if away < 0.0:
-            return k, 1
-        k = max(k + 1, int(math.ceil((t_local + away - t_begin) / step - FACE_TOLERANCE)))
+            return index, 1
+        index = max(index + 1, int(math.ceil((t_local + away - t_begin) / step - FACE_TOLERANCE)))
 
 
 def next_change(instances, b, o, d, t, end, gap):

@@ -58,9 +58,9 @@ def depth_per_coordinate(q):
     return 1.0
 
 
-def optical_length(warp, p, d, t_local, many, steps, step):
+def optical_length(warp, p, d, t_local, n_steps, strides, step):
     """See loops.py: exactly, as lines are straight."""
-    low, high = share_of(warp, t_local + 0.5 * (steps - 1) * many * step, steps * many * step)
+    low, high = share_of(warp, t_local + 0.5 * (strides - 1) * n_steps * step, strides * n_steps * step)
     return (high - low) / warp[4]
 
 

@@ -33,9 +33,14 @@ LOOK_AT_BOX = np.array([-0.6] * 3 + [0.6] * 3)  # of the core: what views of all
 position_at = along
 
 
+def size_of(p):
+    """n of a point: the largest magnitude of a coordinate."""
+    return max(abs(p[0]), max(abs(p[1]), abs(p[2])))
+
+
 def point(p):
     """Where a point of the field's frame lies in the space's coordinates."""
-    n = max(abs(p[0]), max(abs(p[1]), abs(p[2])))
+    n = size_of(p)
     if n <= 1.0:
         return p
     x, y, z = p[0] / n, p[1] / n, p[2] / n
@@ -49,7 +54,7 @@ def point(p):
 
 def frame_point(q):
     """Inverse of `point`; what lies beyond FAR comes back at FAR."""
-    m = max(abs(q[0]), max(abs(q[1]), abs(q[2])))
+    m = size_of(q)
     if m <= 1.0:
         return q
     n = 1.0 / max(2.0 - m, 1.0 / FAR)
@@ -63,7 +68,7 @@ def frame_point(q):
 
 def rate(q, d):
     """How many units of the coordinates a unit of length of the frame is at `q`, radially: 1 / n²."""
-    m = max(abs(q[0]), max(abs(q[1]), abs(q[2])))
+    m = size_of(q)
     return 1.0 if m <= 1.0 else max(2.0 - m, 1.0 / FAR) ** 2
 
 
@@ -74,8 +79,8 @@ def depth_per_coordinate(q):
 
 def region_at(o, d, t):
     """The region of the point at t of a ray, on a border either."""
-    x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
-    n = max(abs(x), max(abs(y), abs(z)))
+    x, y, z = along(o, d, t)
+    n = size_of((x, y, z))
     if n <= 1.0:
         return CORE
     if abs(x) == n:
@@ -132,8 +137,7 @@ def next_piece(piece_begin, grid, o, d, far):
         region = NOWHERE
     following = t1, after
     t1 = min(t1, far)
-    p0 = (o[0] + t0 * d[0], o[1] + t0 * d[1], o[2] + t0 * d[2])
-    p1 = (o[0] + t1 * d[0], o[1] + t1 * d[1], o[2] + t1 * d[2])
+    p0, p1 = along(o, d, t0), along(o, d, t1)
     n0, n1 = 1.0, 1.0
     if region > CORE:
         n0, n1 = max(size_in(region, p0), 1.0), max(size_in(region, p1), 1.0)

@@ -11,7 +11,7 @@ from fusedrf_cli.engine.distillation.config import TrainConfig
 from fusedrf_cli.engine.distillation.depth_points import KnownPoints
 from fusedrf_cli.engine.distillation.fit import FitRun, fit, occupancy_of
 from fusedrf_cli.engine.distillation.ray_dataset import Pictures, RayDataset
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid, texels
 from fusedrf_cli.engine.rendering.cameras import Camera, look_at, orbit, scattered
 from fusedrf_cli.engine.rendering.metrics import psnr

@@ -6,7 +6,7 @@ import torch
 
 from fusedrf_cli.engine.distillation.sampler import RaySampler
 from fusedrf_cli.engine.distillation.teacher import TeacherConfig, query_teacher
-from fusedrf_cli.engine.rendering.volume import render_rays
+from fusedrf_cli.engine.rendering.volume import RenderConfig, render_rays
 from tests.engine.conftest import BOX, Gaussian, Slab
 
 
@@ -14,23 +14,25 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def test_pixels_are_those_of_the_renderer():
+def test_pixels_are_those_of_the_renderer(in_force):
     """In one part and in several; a smooth field hides the jitter."""
     field = Gaussian(density=8.0).occupy(12)
     rays_o, rays_d = RaySampler([BOX]).draw(400, seeded())
     wanted = render_rays(field, rays_o, rays_d, step=0.01, early_stop=1e-3)[:, :4]
     for at_once in (1 << 16, 150):
-        dataset = query_teacher(field, rays_o, rays_d, 0.01, seeded(3), at_once=at_once)
+        in_force(RenderConfig(rays_at_once=at_once))
+        dataset = query_teacher(field, rays_o, rays_d, 0.01, seeded(3))
         assert wanted[:, 3].max() > 0.8
         np.testing.assert_allclose(dataset.pixels.numpy(), wanted, atol=3e-3)
         np.testing.assert_array_equal(dataset.rays_o, rays_o)
 
 
 @pytest.mark.parametrize("at_once", [1 << 14, 30])
-def test_points_are_samples_with_the_teachers_answers(at_once):
+def test_points_are_samples_with_the_teachers_answers(at_once, in_force):
+    in_force(RenderConfig(rays_at_once=at_once))
     field = Gaussian(density=8.0)
     rays_o, rays_d = RaySampler([BOX]).draw(100, seeded())
-    points = query_teacher(field, rays_o, rays_d, 0.05, seeded(3), everything, at_once).points
+    points = query_teacher(field, rays_o, rays_d, 0.05, seeded(3), everything).points
     sigma, rgb = field.query(points.where, points.dirs)
     assert len(points) > 1000 and (sigma < 1e-3).any() and (sigma > 1).any()
     torch.testing.assert_close(sigma, points.sigma, rtol=1e-4, atol=1e-6)  # places are kept in float32

@@ -1,12 +1,13 @@
 """The protocol and the registry of field kinds."""
 
+import pytest
 import torch
 
-from fusedrf_cli.engine.fields.base import RadianceField, is_occupied
-from fusedrf_cli.engine.kinds.registry import field_kinds
+from fusedrf_cli.engine.fields.base import RadianceField, SamplingConfig, check_samples, is_occupied
 from fusedrf_cli.engine.kinds.vm.field import VMField
 from tests.analytic.export import vm_field
 from tests.analytic.fields import Box
+from tests.bundles import field_kinds
 from tests.engine.conftest import BOX, Ball, points_in, random_vm
 
 
@@ -34,3 +35,12 @@ def test_matter_is_what_can_be_seen_through_the_whole_box():
     for field, found in ((Box(1e-5), False), (Box(1e-2), True), (Ball(), True), (Ball(radius=0.0), False)):
         assert is_occupied(field) == found
     assert is_occupied(vm_field(Box(1e-2))) and not is_occupied(vm_field(Box(0.0)))
+
+
+def test_how_many_samples_are_too_many_is_a_setting(in_force):
+    check_samples(1000, "the field")
+    with pytest.raises(ValueError, match="the field would take up to 1,001 samples, expected at most 1,000"):
+        check_samples(1001, "the field", 1000)
+    in_force(SamplingConfig(most_samples=999))
+    with pytest.raises(ValueError, match="expected at most 999"):
+        check_samples(1000, "the field")

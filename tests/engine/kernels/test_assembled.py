@@ -19,8 +19,8 @@ from fusedrf_cli.engine.encodings import (
     plane_line_hash,
     trunk_features,
 )
+from fusedrf_cli.engine.encodings.hash_runs import HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
-from fusedrf_cli.engine.fields.hash_entries import HashGrid
 from fusedrf_cli.engine.kernels import instances, light, loops, primitives, specialise
 from fusedrf_cli.engine.kernels.assembled import OPTIONAL, READS, TEMPLATES, assemble
 from fusedrf_cli.engine.spaces import bounded, unbounded

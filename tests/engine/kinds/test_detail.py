@@ -15,9 +15,8 @@ from fusedrf_cli.bridge.scene import stored
 from fusedrf_cli.bridge.sizes import BundleSizes
 from fusedrf_cli.engine.distillation.optimiser import Adam
 from fusedrf_cli.engine.encodings import plane_line
-from fusedrf_cli.engine.encodings.hash_runs import hashed_row
+from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, STEPS, HashGrid, hashed_row
 from fusedrf_cli.engine.fields.base import sampling_step
-from fusedrf_cli.engine.fields.hash_entries import EMPTY_FROM, STEPS, HashGrid
 from fusedrf_cli.engine.kinds import field_cutting, registry
 from fusedrf_cli.engine.kinds.builder import StorageSetting
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape

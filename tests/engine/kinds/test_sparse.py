@@ -10,13 +10,13 @@ from fusedrf_cli.engine.encodings.bricks import COARSE, ROW, SIDE
 from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.kernels.reference import sh_basis
-from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.sparse.bricks import OCTANTS, BrickTree
 from fusedrf_cli.engine.kinds.sparse.field import SparseField, SparseShape
 from fusedrf_cli.engine.kinds.sparse.lattice import VertexLattice
 from fusedrf_cli.engine.rendering.volume import render_rays
 from tests.analytic.fields import Slow
 from tests.analytic.rays import points_in, rays_at, unit
+from tests.bundles import field_kinds
 from tests.engine.kinds.sparse_cases import random_sparse, random_tree
 
 

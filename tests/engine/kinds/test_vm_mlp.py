@@ -15,7 +15,6 @@ from fusedrf_cli.engine.fields.base import RadianceField
 from fusedrf_cli.engine.fields.computed import Batch
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
 from fusedrf_cli.engine.kernels import loops
-from fusedrf_cli.engine.kinds.registry import field_kinds
 from fusedrf_cli.engine.kinds.vm.field import VMConfig
 from fusedrf_cli.engine.kinds.vm.trimming import reshaped
 from fusedrf_cli.engine.kinds.vm_mlp.field import VMMLPField
@@ -23,6 +22,7 @@ from fusedrf_cli.engine.rendering.cameras import orbit
 from fusedrf_cli.engine.rendering.metrics import psnr
 from fusedrf_cli.engine.rendering.volume import reach_of, render_image
 from tests.analytic.export import way_of
+from tests.bundles import field_kinds
 
 from ..conftest import BOX, SIXTY_FOUR, THIRTY_TWO, Ball, points_in, random_vm, rays_at, unit
 from .cases import random_vm_mlp as random_field

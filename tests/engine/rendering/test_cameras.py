@@ -5,10 +5,12 @@ import pytest
 
 from fusedrf_cli.engine.rendering.cameras import (
     Camera,
+    FramingConfig,
     Outlook,
     azimuth_of,
     bend,
     fisheye_directions,
+    framing,
     framing_camera,
     framing_lens,
     level,
@@ -197,3 +199,13 @@ def test_scattered_views_follow_their_seed():
     poses = [[c.camera_to_world for c in scattered(BOX, 4, 8, 8, seed)] for seed in (1, 1, 2)]
     assert np.array_equal(poses[0], poses[1]) and not np.array_equal(poses[0], poses[2])
     assert len({c.name for c in scattered(BOX, 4, 8, 8, 1)}) == 4
+
+
+def test_boxes_are_framed_from_where_the_settings_in_force_say(in_force):
+    in_force(FramingConfig(azimuth=0.2, elevation=-0.3))
+    wanted = framing_camera(BOX, 0.2, -0.3, 16, 12).camera_to_world
+    lens = framing_lens(16, 12)
+    np.testing.assert_array_equal(framing(BOX, lens).camera(lens).camera_to_world, wanted)
+    np.testing.assert_array_equal(orbit(BOX, 3, 16, 12)[0].camera_to_world, wanted)
+    level_view = framing(BOX, lens, 0.0, 0.0)
+    assert (level_view.azimuth, level_view.elevation) == (0, 0)

@@ -1,6 +1,8 @@
 """Pictures as functions of torch: against the one-pass renderer, and their gradients in float64 against
 finite differences, by camera poses, placements and numbers, for each kind."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -103,6 +105,51 @@ def test_gradient_by_the_numbers_of_a_placed_field(field):
     assert torch.autograd.gradcheck(picture, params, **CHECK)
     picture(params).sum().backward()
     assert (params.grad != 0).sum() > 50
+
+
+@pytest.mark.parametrize("rule", ["max", "add"])
+def test_gradient_through_opacity_and_tint(rule):
+    """By placements, numbers and rays of a scene whose instances are shown fainter, or denser, and tinted."""
+    plain = scene(random_vm(), rule)
+    shown = [(0.4, (0.2, 1.0, 0.5)), (1.7, (0.9, 0.3, 0.0))]
+    composed = ComposedField(
+        [
+            replace(p, opacity=opacity, tint=tint)
+            for p, (opacity, tint) in zip(plain.placed, shown, strict=True)
+        ],
+        rule,
+        np.zeros(3),
+    )
+    rays_o, rays_d = rays(composed)
+
+    def picture(one, other, params, origins):
+        placed = [replace(composed.placed[0], field=composed.placed[0].field.with_params(params))]
+        now = ComposedField([*placed, composed.placed[1]], rule, np.zeros(3))
+        return render_rays(now, origins, rays_d, poses={"one": one, "other": other}, step=STEP)
+
+    leaves = [matrix(composed, name) for name in ("one", "other")]
+    leaves = [x.clone().requires_grad_() for x in (*leaves, composed.placed[0].field.params, rays_o)]
+    assert torch.autograd.gradcheck(picture, leaves, **CHECK)
+    found = picture(*leaves)
+    found[:, :4].sum().backward()
+    assert (leaves[2].grad != 0).sum() > 50 and all((x.grad.abs() > 1e-6).any() for x in leaves)
+    assert (found.detach() - render_rays(plain, rays_o, rays_d, step=STEP)).abs().max() > 0.05
+
+
+def test_a_frame_of_another_size_has_near_and_step_in_units_of_the_world():
+    """Also where the scene was composed in another frame than that in which it is said to lie."""
+    composed, size = scene(random_vm()), 4.0
+    rays_o, rays_d = rays(composed)
+    rays_o.requires_grad_()
+    here = render_rays(composed, rays_o, rays_d, near=2.3, step=STEP).detach()
+    origin = affine(size, (10, -20, 30))
+    world = rays_o.detach() * size + torch.from_numpy(origin[:3, 3])
+    there = render_rays(
+        composed, world.requires_grad_(), rays_d, origin=origin, near=2.3 * size, step=STEP * size
+    ).detach()
+    torch.testing.assert_close(there[:, :4], here[:, :4], rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(there[:, 4], size * here[:, 4], rtol=1e-6, atol=1e-6)
+    assert not torch.equal(here, render_rays(composed, rays_o, rays_d, step=STEP).detach())
 
 
 def test_gradient_by_the_rays(field):

@@ -8,7 +8,7 @@ import torch
 
 from fusedrf_cli.engine.decoders import density_sum, sh
 from fusedrf_cli.engine.encodings import grid
-from fusedrf_cli.engine.fields.assembled import AssembledField, Slot
+from fusedrf_cli.engine.fields.assembled import AssembledField, HarmonicShape, Slot
 from fusedrf_cli.engine.settings import current
 
 
@@ -23,20 +23,10 @@ class DenseConfig:
 
 
 @dataclass(frozen=True)
-class DenseShape:
+class DenseShape(HarmonicShape):
     """What a vertex holds."""
 
     sh_degree: int = 1
-
-    def __post_init__(self):
-        """Refuse degrees that the kernels were not written for."""
-        if self.sh_degree not in range(4):
-            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
-
-    @property
-    def coefficients(self) -> int:
-        """SH coefficients per channel."""
-        return (self.sh_degree + 1) ** 2
 
     @property
     def numbers(self) -> int:
@@ -68,7 +58,7 @@ class DenseField(AssembledField):
         }
 
     def fill_vertices(self, index: np.ndarray, features: np.ndarray, colours: np.ndarray) -> None:
-        """See AskedStudent."""
+        """See `ResampledBuilder`."""
         sections, index = self.sections(), torch.from_numpy(index)
         sections["density"].view(-1)[index] = torch.from_numpy(features - self.shift).float()
         sections["colour"].view(-1, self.shape.width)[index, : self.shape.numbers] = torch.from_numpy(colours)

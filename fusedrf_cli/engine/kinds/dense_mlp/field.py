@@ -1,7 +1,7 @@
 """The `dense-mlp` field: a grid of vertices with density and features, and a small decoder of colours, its
 own or one that it shares with other fields (Control-NeRF, Lazova et al., WACV 2023)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from fusedrf_cli.engine.decoders import density_sum, sh_mlp
 from fusedrf_cli.engine.encodings import grid
@@ -59,21 +59,6 @@ class DenseMLPField(DenseField):
             "sigma": Slot(density_sum),
             "rgb": Slot(sh_mlp, layers, "decoder.", 0.0 if shape.shared else densemlp.decoder_rate),
         }
-
-    def sharing(self, other: "DenseMLPField") -> "DenseMLPField":
-        """This field with another one's decoder, which learns no further. Raises ValueError where it does not
-        fit."""
-        if (other.shape.width, other.shape.hidden) != (self.shape.width, self.shape.hidden):
-            raise ValueError(
-                f"its decoder takes {other.shape.width} features through {other.shape.hidden} numbers, "
-                f"expected {self.shape.width} through {self.shape.hidden}"
-            )
-        shape = replace(self.shape, shared=True)
-        new = type(self)(
-            shape, self.box, self.resolution, self.scale, self.shift, self.params.clone(), self.occupancy
-        )
-        new.params[int(self.starts[2]) :] = other.params[int(other.starts[2]) :]
-        return new
 
     def state(self):
         """See BoxField; the decoder is a part that fields may have in common."""

@@ -224,17 +224,6 @@ class BrickTree:
         voxel = (voxel[:, 0] * n + voxel[:, 1]) * n + voxel[:, 2]
         return np.where(in_brick, brick, -1), voxel, in_brick & active[safe, voxel]
 
-    def extended(self, aabb: np.ndarray) -> "BrickTree":
-        """The same bricks in a box of whole top cells around another box (6,) too. Raises ValueError where
-        those would be too many."""
-        before = np.maximum(np.ceil((self.lo - aabb[:3]) / self.top), 0).astype(np.int64)
-        behind = np.maximum(np.ceil((aabb[3:] - self.aabb[3:]) / self.top), 0).astype(np.int64)
-        counts = before + np.asarray(self.counts) + behind
-        check_counts(counts)
-        at = self.at + (before << self.level[:, None].astype(np.int64))
-        phase = (self.phase - before) % 2
-        return BrickTree.of(self.lo - before * self.top, self.top, counts, self.level, at, self.mask, phase)
-
     def occupancy(self, longest: int) -> OccupancyGrid:
         """Cells that active voxels reach: top cells, or their halves or quarters while at most `longest` of
         them lie along an axis."""

@@ -162,7 +162,7 @@ class SparseBuilder(DirectBuilder):
     compares = False
 
     def distil_config_for(self, numbers: int, seconds: float | None = None) -> DistilConfig:
-        """See Student: the more numbers, the more rays, steps and samples."""
+        """See `DistilledBuilder`: the more numbers, the more rays, steps and samples."""
         config = current(SparseConfig)
         distil_config, told = self.distil_config, (config.told_by_rays, config.told_by_steps)
         rays, more = (max(1.0, numbers / n) for n in told)

@@ -19,7 +19,7 @@ from fusedrf_cli.engine.decoders import density_sum, sh
 from fusedrf_cli.engine.encodings import bricks
 from fusedrf_cli.engine.encodings.bricks import ROW, SIDE, active_at
 from fusedrf_cli.engine.fields import large_pages
-from fusedrf_cli.engine.fields.assembled import Assembled, Slot
+from fusedrf_cli.engine.fields.assembled import Assembled, HarmonicShape, Slot
 from fusedrf_cli.engine.fields.base import FieldMemory, SamplingConfig, check_samples
 from fusedrf_cli.engine.fields.box import MAX_ANSWER
 from fusedrf_cli.engine.fields.computed import (
@@ -63,20 +63,10 @@ MAX_TERMS = 64.0  # of a logit, each a coefficient times at most 3
 
 
 @dataclass(frozen=True)
-class SparseShape:
+class SparseShape(HarmonicShape):
     """What a vertex holds."""
 
     sh_degree: int = 2
-
-    def __post_init__(self):
-        """Refuse degrees that the kernels were not written for."""
-        if self.sh_degree not in range(4):
-            raise ValueError(f"'sh_degree' should be 0, 1, 2 or 3, found {self.sh_degree}")
-
-    @property
-    def coefficients(self) -> int:
-        """SH coefficients per channel."""
-        return (self.sh_degree + 1) ** 2
 
     @property
     def band_numbers(self) -> int:
@@ -338,7 +328,7 @@ class SparseField(Assembled):
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs; with the tables that follow from the tree."""
+        """See `Kind.field_memory`; with the tables that follow from the tree."""
         config = current(BricksConfig)
         (bricks,), counts = shapes["masks"], metadata["counts"]
         top, bricks = math.prod(counts), bricks // 8

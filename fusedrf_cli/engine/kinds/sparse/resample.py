@@ -390,7 +390,7 @@ def leaves(needed: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def harmless(depth: np.ndarray, positions: np.ndarray) -> float:
     """The largest optical depth of a voxel up to which voxels (K,) at positions (K, 3) may be left out, when
     one in `odd_lines` of the axis-parallel lines through them may lose more than `lost_depth`: thin floaters
-    is no emptiness."""
+    are no emptiness."""
     config = current(ResampleConfig)
     if not len(depth):
         return 0.0

@@ -7,8 +7,8 @@ import torch
 
 from fusedrf_cli.engine.composition.affine import Placed
 from fusedrf_cli.engine.composition.composed import ComposedField
+from fusedrf_cli.engine.encodings.hash_runs import ROW
 from fusedrf_cli.engine.fields.assembled import MAX_RANK
-from fusedrf_cli.engine.fields.hash_entries import PER_BLOCK, ROW, TOGETHER, StoredEntries
 from fusedrf_cli.engine.fields.occupancy import OccupancyConfig, OccupancyGrid, overlapped
 from fusedrf_cli.engine.kinds.box_kind import BoxKind
 from fusedrf_cli.engine.kinds.builder import (
@@ -21,6 +21,7 @@ from fusedrf_cli.engine.kinds.builder import (
 )
 from fusedrf_cli.engine.kinds.reduction import Reduction, coarser
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
+from fusedrf_cli.engine.kinds.vm.stored_entries import PER_BLOCK, TOGETHER, StoredEntries
 from fusedrf_cli.engine.kinds.vm.trimming import (
     common_shape,
     components,
@@ -34,14 +35,6 @@ from fusedrf_cli.engine.kinds.vm.trimming import (
 )
 from fusedrf_cli.engine.settings import current
 
-
-@dataclass(frozen=True)
-class VMConfig:
-    """What a vm field has where nothing else is asked."""
-
-    shape: VMShape = VMShape()
-
-
 MAX_DEGREE = 3
 
 
@@ -49,6 +42,8 @@ MAX_DEGREE = 3
 class VMBuilderConfig:
     """How students of planes and lines begin, and how coarse they get."""
 
+    shape: VMShape = VMShape()
+    """Where nothing else is asked."""
     coarser: float = 1.5
     """Times its own voxel: how coarse a field can get before it is left without its detail."""
     noise: float = 0.03
@@ -75,7 +70,7 @@ class VMKind(BoxKind):
     @property
     def usual(self) -> VMShape:
         """See BoxKind."""
-        return current(VMConfig).shape
+        return current(VMBuilderConfig).shape
 
     def shape(self, storage: StorageSetting) -> VMShape:
         """See BoxKind."""
@@ -83,7 +78,7 @@ class VMKind(BoxKind):
 
     def suits(self, scene: ComposedField) -> Suitability:
         """It holds any scene, one that is not stretched and has its detail everywhere best."""
-        return Suitability(1.0, "one tensor over the scene learns any sources by any rule")
+        return Suitability(1.0, "one vm field over the scene learns any sources by any rule")
 
     def warm_start(
         self, background: Placed, plan: Plan, scene: ComposedField, generator: torch.Generator

@@ -15,6 +15,7 @@ import torch
 from fusedrf_cli.engine.composition.affine import WHITE
 from fusedrf_cli.engine.decoders import density_sum, sh_basis
 from fusedrf_cli.engine.encodings import plane_line, plane_line_hash
+from fusedrf_cli.engine.encodings.hash_runs import MAX_LEVELS, MAX_ROWS, MAX_VERTEX, ROW, HashGrid
 from fusedrf_cli.engine.fields.assembled import AssembledField, RankedShape, Slot
 from fusedrf_cli.engine.fields.base import FieldMemory
 from fusedrf_cli.engine.fields.box import LINE, ParameterBlock, checked_box, whole_numbers
@@ -26,15 +27,8 @@ from fusedrf_cli.engine.fields.computed import (
     packed_bits,
     runs_of,
 )
-from fusedrf_cli.engine.fields.hash_entries import (
-    MAX_LEVELS,
-    MAX_ROWS,
-    MAX_VERTEX,
-    ROW,
-    HashGrid,
-    StoredEntries,
-)
 from fusedrf_cli.engine.fields.occupancy import OccupancyGrid
+from fusedrf_cli.engine.kinds.vm.stored_entries import StoredEntries
 from fusedrf_cli.engine.settings import current
 from fusedrf_cli.engine.spaces import bounded, name_of
 
@@ -159,7 +153,7 @@ class VMField(AssembledField):
 
     @classmethod
     def needs(cls, metadata: dict, shapes: Mapping[str, tuple[int, ...]], array: Reads) -> FieldMemory:
-        """See Kind.field_needs."""
+        """See `Kind.field_memory`."""
         own, rows = box_metadata(cls.kind, metadata), cls.stored_name(DETAIL)
         hashed = own["shape"].get("hashed")
         whole = dict(shapes) | ({} if hashed is None else {rows: hashed.shape})  # a file may have few of them

@@ -8,9 +8,8 @@ from itertools import product
 import numpy as np
 import torch
 
-from fusedrf_cli.engine.encodings.hash_runs import hashed_row
+from fusedrf_cli.engine.encodings.hash_runs import EMPTY_FROM, HashGrid, hashed_row
 from fusedrf_cli.engine.encodings.plane_line import MODES
-from fusedrf_cli.engine.fields.hash_entries import EMPTY_FROM, HashGrid
 from fusedrf_cli.engine.kinds.vm.field import DETAIL, VMField, VMShape
 from fusedrf_cli.engine.settings import current
 
