@@ -27,15 +27,6 @@ from formats.surfaces.surface import Notes, Surface
 from formats.surfaces.tracing import Mesh, embree_scene, render_mesh, seen_from_behind
 from formats.views import Capture, View
 
-__all__ = [
-    "is_mesh",
-    "mesh_capture",
-    "mesh_facts",
-    "mesh_surfaces",
-    "mesh_type",
-    "render_mesh",
-]
-
 READERS = {
     "glb": read_gltf,
     "gltf": read_gltf,

@@ -178,31 +178,27 @@ class _Binary:
 
     def _walked(self, element: Element) -> dict:
         """Row by row; the numbers of a list are cut out as bytes."""
-        parts = [[] for _ in element.properties]
-        counts = [[] for _ in element.properties]
-        data, order, at = self.data, self.order, self.at
-        sizes = [np.dtype(each.kind).itemsize for each in element.properties]
-        count_kinds = [each.counted and np.dtype(order + each.counted) for each in element.properties]
-        property_order = range(len(element.properties))
+        columns = [(each, np.dtype(self.order + each.kind), [], []) for each in element.properties]
         for _ in range(element.count):
-            for i in property_order:
+            for each, kind, parts, counts in columns:
                 length = 1
-                if count_kinds[i]:
-                    length = self._count(element.properties[i], at)
-                    counts[i].append(length)
-                    at += count_kinds[i].itemsize
-                stop = at + length * sizes[i]
-                if stop > len(data):
+                if each.counted:
+                    length = self._count(each, self.at)
+                    counts.append(length)
+                    self.at += np.dtype(each.counted).itemsize
+                stop = self.at + length * kind.itemsize
+                if stop > len(self.data):
                     raise self.wrong(
                         f"{self.path}: ends within {element.name[:40]!r}; copy or export it again"
                     )
-                parts[i].append(data[at:stop])
-                at = stop
-        self.at, columns = at, {}
-        for i, each in enumerate(element.properties):
-            values = np.frombuffer(b"".join(parts[i]), order + each.kind)
-            columns[each.name] = Lists(np.array(counts[i], int), values) if each.counted else values
-        return columns
+                parts.append(self.data[self.at : stop])
+                self.at = stop
+        read = {each.name: np.frombuffer(b"".join(parts), kind) for each, kind, parts, _ in columns}
+        return read | {
+            each.name: Lists(np.array(counts, int), read[each.name])
+            for each, _, _, counts in columns
+            if each.counted
+        }
 
 
 class _Text:
