@@ -40,6 +40,7 @@ from formats.photos import (
     natural,
     on_photo,
     pictures,
+    visible_files,
 )
 from formats.pose_files import PoseFiles, pose_files, read_box, read_lens, read_view, splits
 from formats.transforms import (
@@ -307,11 +308,11 @@ def _counted(images: Path, count: int, downscale: int | None) -> Folder | None:
 
 
 def _read_polycam(path: Path, images: Path, cameras: Path, downscale: int | None) -> Capture:
-    files = [(file.stem, file) for file in polycam.camera_files(cameras)]
+    listed = [(file.stem, file) for file in visible_files(cameras, ".json")]
     parts = read_listed(
         cameras,
         images,
-        [files],
+        [listed],
         lambda file, header, _: (str(file), polycam.read_camera(file, header[:2]), None),
         downscale,
     )

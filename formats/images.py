@@ -192,7 +192,7 @@ def write_smaller(path: Path | str, smaller: Path, longest: int) -> tuple[int, i
         shrink = min(1.0, longest / max(image.size))
         size = tuple(max(1, round(side * shrink)) for side in image.size)
         image.draft("RGB", size)  # a JPEG is decoded at about this size, which is several times faster
-        picture = _eight_bits(image).convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        picture = eight_bits(image).convert("RGB").resize(size, Image.Resampling.LANCZOS)
     picture.save(smaller, "PNG", compress_level=1)
     return size
 
@@ -217,7 +217,7 @@ def _flipped(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 def _rgba(image, alpha: bool):
     """A decoded picture of any mode as RGBA, opaque where `alpha` is False."""
-    picture = _eight_bits(image).convert("RGBA")  # first, since palettes lose transparency with a warning
+    picture = eight_bits(image).convert("RGBA")  # first, since palettes lose transparency with a warning
     return picture if alpha else picture.convert("RGB").convert("RGBA")
 
 
@@ -228,13 +228,15 @@ def _straight(image):
     return Image.frombytes("RGBa", image.size, image.tobytes()).convert("RGBA")
 
 
-def _eight_bits(image):
-    """A picture of 16 bits of grey with 8, which Pillow would clip; others as they are."""
+def eight_bits(image):
+    """Grey levels of 16 bits and more as 8, which Pillow would clip; other pictures as they are."""
     from PIL import Image
 
-    if not image.mode.startswith("I"):
+    if not image.mode.startswith(("I", "F")):
         return image
-    return Image.fromarray(((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8))
+    scale = 255 / 65535 if image.mode.startswith("I") else 255
+    levels = np.rint(np.asarray(image).astype(np.float64) * scale)
+    return Image.fromarray(np.clip(levels, 0, 255).astype(np.uint8))
 
 
 def _orientation(image) -> int:

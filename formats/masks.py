@@ -1,12 +1,12 @@
 """Masks that lie beside photos: in a folder `masks` or `mask`, or among them under names that say so."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from formats.names import folded
-from formats.photos import EXTENSIONS, MOVING, with_mask
+from formats.photos import EXTENSIONS, MOVING, folders, with_mask
 from formats.views import View
 
 FOLDERS = ("masks", "mask")
@@ -25,13 +25,13 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
     photos = [view for view in views if view.image_path is not None]
     if not photos or any(view.mask_path for view in views):
         return tuple(views), ()
-    listed: dict[Path, _PictureFolder] = {}
+    pictures_of = cache(_PictureFolder.of)
     around = {view.image_path.parent: _places(view.image_path, root) for view in photos}
     masked_views, used, unused, arrays = [], {}, {}, {}
     for view in views:
         mask = None
         for folder, inner in around[view.image_path.parent] if view.image_path else ():
-            pictures = listed.get(folder) or listed.setdefault(folder, _PictureFolder.of(folder))
+            pictures = pictures_of(folder)
             is_own = folder == view.image_path.parent
             if (mask := pictures.mask_of(view.image_path, inner, is_own)) is not None:
                 break
@@ -59,7 +59,7 @@ def with_masks_beside(views: Sequence[View], root: Path) -> tuple[tuple[View, ..
 def _places(photo: Path, root: Path) -> list[tuple[Path, Path]]:
     """Folders in which the mask of a photo may be, the likeliest first, each with the folder in it where the
     photo lies in one among those of the others."""
-    parent, folders = photo.parent, []
+    parent, places = photo.parent, []
     for above in (parent, *parent.parents[:2]):
         inside = above == root or above.is_relative_to(root)
         below = photo.relative_to(above).parts[:-1]
@@ -67,17 +67,16 @@ def _places(photo: Path, root: Path) -> list[tuple[Path, Path]]:
             break
         copy = below[0].rpartition("_")[2] if below else ""
         names = [*(f"{name}_{copy}" for name in FOLDERS if copy.isdecimal()), *FOLDERS]
-        folders += [(folder, Path(*below[1:])) for folder in _named_so(above, names)]
+        places += [(folder, Path(*below[1:])) for folder in _named_so(above, names)]
         if above == root or not below and not inside:
             break
-    return [*folders, (parent, Path())]
+    return [*places, (parent, Path())]
 
 
 def _named_so(folder: Path, names: Sequence[str]) -> list[Path]:
     """The folders in a folder that have one of the names, in any case, in the order of the names."""
-    with os.scandir(folder) as entries:
-        unique = [entry.name for entry in entries if entry.name.casefold() in names and entry.is_dir()]
-    return [folder / name for name in sorted(unique, key=lambda name: names.index(name.casefold()))]
+    named = [entry for entry in folders(folder) if entry.name.casefold() in names]
+    return sorted(named, key=lambda entry: names.index(entry.name.casefold()))
 
 
 def _of_photos(name: str) -> bool:
@@ -96,7 +95,7 @@ class _PictureFolder:
     @classmethod
     def of(cls, folder: Path) -> "_PictureFolder":
         """Hidden files are no masks."""
-        nested = [folder] + [entry for entry in sorted(folder.iterdir()) if entry.is_dir()]
+        nested = [folder, *folders(folder)]
         files = [file for at in nested for file in sorted(at.iterdir()) if not file.name.startswith(".")]
         pictures = [file for file in files if file.suffix.lower() in EXTENSIONS]
         named = {(file.parent.relative_to(folder), folded(file.stem)): file for file in pictures}

@@ -136,6 +136,12 @@ def folders(path: Path) -> list[Path]:
     return sorted(entries, key=lambda entry: natural(entry.name))
 
 
+def visible_files(folder: Path, ending: str) -> list[Path]:
+    """The visible files in a folder whose names end so, in natural order."""
+    entries = [file for file in folder.glob(f"*{ending}") if not is_hidden(file.name)]
+    return sorted(entries, key=lambda entry: natural(entry.name))
+
+
 def is_file(path: Path) -> bool:
     """Whether this is a file; False for names that the file system cannot hold."""
     try:

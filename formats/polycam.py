@@ -7,7 +7,7 @@ from pathlib import Path
 
 from formats.cameras import checked_focal, checked_size, read_document, stated_number
 from formats.errors import BadIntrinsics, BadPose
-from formats.photos import is_hidden, natural
+from formats.photos import visible_files
 from formats.views import View, checked_pose
 
 FOLDERS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
@@ -19,15 +19,9 @@ def keyframes(path: Path) -> tuple[Path, Path] | None:
     """The folders of photos and of cameras of an export, or of its `keyframes`; None if it is none."""
     for folder in (path / "keyframes", path):
         for photos, cameras in FOLDERS:
-            if (folder / photos).is_dir() and camera_files(folder / cameras):
+            if (folder / photos).is_dir() and visible_files(folder / cameras, ".json"):
                 return folder / photos, folder / cameras
     return None
-
-
-def camera_files(folder: Path) -> list[Path]:
-    """The cameras of a folder in the natural order of their photos."""
-    files = [file for file in folder.glob("*.json") if not is_hidden(file.name)]
-    return sorted(files, key=lambda file: natural(file.name))
 
 
 def read_camera(path: Path, size: tuple[int, int]) -> View:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Hashable
 import numpy as np
 
 from formats.errors import BadImage, FormatError, LimitExceeded, MissingExtra, printable
-from formats.images import DECODING_ERRORS
+from formats.images import DECODING_ERRORS, eight_bits
 from formats.surfaces.surface import Notes
 
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF", "TIFF", "DDS", "TGA")
@@ -123,21 +123,10 @@ def _reduced(image, factor: int) -> np.ndarray:
     rows = max(1, STRIP // max(width, 1) // factor) * factor
     for top in range(0, height, rows):
         strip = image.crop((0, top, width, min(top + rows, height)))
-        strip = _eight_bits(strip).convert("RGBA")
+        strip = eight_bits(strip).convert("RGBA")
         done = np.asarray(strip.reduce(factor) if factor > 1 else strip)
         out[top // factor : top // factor + len(done)] = done
     return out
-
-
-def _eight_bits(image):
-    """Grey levels of 16 bits and more scaled to 8, which Pillow would clip."""
-    from PIL import Image
-
-    if not image.mode.startswith(("I", "F")):
-        return image
-    levels = np.asarray(image).astype(np.float64)
-    scale = 255 / 65535 if image.mode.startswith("I") else 255
-    return Image.fromarray(np.clip(np.rint(levels * scale), 0, 255).astype(np.uint8))
 
 
 def _ktx2(data: bytes, name: str) -> np.ndarray:
